@@ -52,14 +52,14 @@ def __dir__() -> list[str]:
 
 
 def _register_environment() -> None:
-    """Tell Gymnasium of ``crashhunt/SUMO-v0``, which imports nothing until somebody makes one."""
+    """Register ``crashhunt/SUMO-v0`` with Gymnasium, without imports until the environment is made."""
     from gymnasium.envs.registration import register, registry
 
     if "crashhunt/SUMO-v0" not in registry:
         register(id="crashhunt/SUMO-v0", entry_point="crashhunt.envs:SumoEnv")
 
 
-# gymnasium.make("crashhunt:crashhunt/SUMO-v0") imports this module. Nobody else should wait for Gymnasium's import,
+# gymnasium.make("crashhunt:crashhunt/SUMO-v0") imports this module. Other users must not wait for Gymnasium's import,
 # the command line least of all.
 if "gymnasium" in sys.modules:
     _register_environment()

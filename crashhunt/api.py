@@ -29,12 +29,12 @@ class HuntCall(HuntOptions):
     """What `prepare` takes: the options of the list, and what only Python has.
 
     Args:
-        directory: where everything is kept; made where it does not exist. The same hunt there goes on.
+        directory: where everything is kept; made where it does not exist. The same hunt there resumes.
         parallel: trials at a time; 0 for one per core.
         trials: how many at most; 0 for no limit, where there is a ``duration``.
         max_steps: the bound on each, in steps.
         snapshot: the ``snapshot_…`` options in one, which is instead of them.
-        overwrite: begin anew, whatever hunt is there.
+        overwrite: begin again, and replace an existing hunt.
         command: the command line, as a comment in ``hunt.toml``.
     """
 
@@ -53,13 +53,13 @@ class RunCall(HuntCall):
     """What `run` takes: all that `prepare` does, and who watches.
 
     Args:
-        directory: where everything is kept; made where it does not exist. The same hunt there goes on.
+        directory: where everything is kept; made where it does not exist. The same hunt there resumes.
         parallel: trials at a time; 0 for one per core.
         trials: how many at most; 0 for no limit, where there is a ``duration``.
         max_steps: the bound on each, in steps.
         watch: called about ten times a second.
         snapshot: the ``snapshot_…`` options in one, which is instead of them.
-        overwrite: begin anew, whatever hunt is there.
+        overwrite: begin again, and replace an existing hunt.
         command: the command line, as a comment in ``hunt.toml``.
     """
 
@@ -78,7 +78,7 @@ def prepare(asked: HuntCall) -> Hunt:
 
 
 def _prepared(asked: HuntCall) -> Hunt:
-    # What is out of its range is refused before anything large is imported: somebody waits at a terminal.
+    # Refuse values out of range before large imports: the user waits at a terminal.
     request = request_of(asked, trials=asked.trials, max_steps=asked.max_steps, parallel=asked.parallel).checked()
     from crashhunt.plans import plan
 

@@ -1,4 +1,4 @@
-"""The errors of crashhunt, for whoever catches or raises them."""
+"""The errors of crashhunt, to catch or to raise."""
 
 from crashhunt.base import errors as _errors
 from crashhunt.base.errors import *  # noqa: F403 - every one of them

@@ -146,7 +146,7 @@ def child_step(scenario: str) -> dict[str, float]:
         simulator = SumoSimulator(chosen, stage)
         box = BlackBox(stage / "blackbox.bin")
         arguments = argument_values(chosen)
-        spec = TrialSpec(0, 1, {}, arguments, max_steps=steps)
+        spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments=arguments, max_steps=steps)
 
         def whole(*, parts: bool = False) -> float:
             box.begin(pid=os.getpid(), trial=0, started=time.monotonic())
@@ -213,11 +213,19 @@ def bench_step() -> Iterator[Figure]:
         found = in_child("child_step", scenario)
         note = f"{found['vehicles']:.0f} vehicles; whole {found['whole']:.0f} µs, bare {found['bare']:.0f} µs"
         target = 1.15 if found["vehicles"] > 40 else 1.6
-        yield Figure(f"step_ratio_{scenario}", found["ratio"], "x", "lower", target, note)
+        yield Figure(
+            name=f"step_ratio_{scenario}", value=found["ratio"], unit="x", better="lower", target=target, note=note
+        )
         if scenario == "loop":
             for label, value in found.items():
                 if label.startswith("part "):
-                    yield Figure(f"step_{label.removeprefix('part ').replace(' ', '_')}", value, "µs", "lower", None)
+                    yield Figure(
+                        name=f"step_{label.removeprefix('part ').replace(' ', '_')}",
+                        value=value,
+                        unit="µs",
+                        better="lower",
+                        target=None,
+                    )
 
 
 def child_core(scenario: str) -> dict[str, float]:
@@ -245,7 +253,15 @@ def child_core(scenario: str) -> dict[str, float]:
                     began = slot.cpu_s()
                     for again in range(at_once if number else 1):
                         trial = (2 * number + turn) * at_once + again
-                        slot.run(TrialSpec(trial, trial, arguments, argument_values(chosen), steps))
+                        slot.run(
+                            TrialSpec(
+                                number=trial,
+                                seed=trial,
+                                arguments=arguments,
+                                scenario_arguments=argument_values(chosen),
+                                max_steps=steps,
+                            )
+                        )
                     if number:  # the first warms everything up
                         spent.setdefault((steps, native), []).append((slot.cpu_s() - began) / at_once)
     found = {f"{steps}_{native}": statistics.median(seconds) for (steps, native), seconds in spent.items()}
@@ -287,7 +303,15 @@ def child_isolation(scenario: str) -> dict[str, float]:
                     began, wall = slot.cpu_s(), time.perf_counter()
                     for again in range(at_once if number else 1):
                         trial = number * 1000 + again
-                        run(TrialSpec(trial, trial, arguments, values, steps))
+                        run(
+                            TrialSpec(
+                                number=trial,
+                                seed=trial,
+                                arguments=arguments,
+                                scenario_arguments=values,
+                                max_steps=steps,
+                            )
+                        )
                     if number:  # the first warms everything up
                         spent.setdefault((steps, way), []).append((slot.cpu_s() - began) / at_once)
                         spent.setdefault((steps, f"{way}_wall"), []).append((time.perf_counter() - wall) / at_once)
@@ -300,10 +324,14 @@ def bench_isolation() -> Iterator[Figure]:
     for steps, target in ((85, 1.15), (600, 1.05)):
         apart, together = found[f"{steps}_apart"], found[f"{steps}_together"]
         note = f"{apart * 1e3:.1f} ms of CPU a trial of {steps} steps on loop, {together * 1e3:.1f} ms in one process"
-        yield Figure(f"isolation_loop_{steps}", apart / together, "x", "lower", target, note)
+        yield Figure(
+            name=f"isolation_loop_{steps}", value=apart / together, unit="x", better="lower", target=target, note=note
+        )
     found = in_child("child_isolation", "toy")
     note = f"wall time of a trial of one step of the toy; {found['1_together_wall'] * 1e3:.2f} ms in one process"
-    yield Figure("isolation_toy", found["1_apart_wall"] * 1e3, "ms", "lower", 1.5, note)
+    yield Figure(
+        name="isolation_toy", value=found["1_apart_wall"] * 1e3, unit="ms", better="lower", target=1.5, note=note
+    )
 
 
 def bench_core() -> Iterator[Figure]:
@@ -313,7 +341,14 @@ def bench_core() -> Iterator[Figure]:
         for steps in (85, 600):
             with_it, without = found[f"{steps}_True"], found[f"{steps}_False"]
             note = f"{60 / with_it:.0f} against {60 / without:.0f} trials a minute of CPU time, {steps} steps each"
-            yield Figure(f"core_{scenario}_{steps}", found[f"{steps}_ratio"], "x", "higher", None, note)
+            yield Figure(
+                name=f"core_{scenario}_{steps}",
+                value=found[f"{steps}_ratio"],
+                unit="x",
+                better="higher",
+                target=None,
+                note=note,
+            )
 
 
 def bench_parallel() -> Iterator[Figure]:
@@ -326,7 +361,14 @@ def bench_parallel() -> Iterator[Figure]:
                 found = hunt(place / "h", parallel, 60, 1000, *QUIET, "--crash-on", "hang")
                 rates[parallel] = found["trials_run"] / found["wall_s"]
         ratios.append(rates[2] / rates[1])
-    yield Figure("parallel_speedup", statistics.median(ratios), "x", "higher", 1.8, "trials a second, 2 workers to 1")
+    yield Figure(
+        name="parallel_speedup",
+        value=statistics.median(ratios),
+        unit="x",
+        better="higher",
+        target=1.8,
+        note="trials a second, 2 workers to 1",
+    )
 
 
 def bench_orchestration() -> Iterator[Figure]:
@@ -344,7 +386,9 @@ def bench_orchestration() -> Iterator[Figure]:
             ledger = Ledger(directory / "ledger.sqlite", writable=True)
             ledger._database.execute("BEGIN")
             for number in range(1, already):
-                spec = TrialSpec(number, number, {"ego": {"speed": 1.0}}, {}, max_steps=1)
+                spec = TrialSpec(
+                    number=number, seed=number, arguments={"ego": {"speed": 1.0}}, scenario_arguments={}, max_steps=1
+                )
                 ledger.record(TrialResult(spec, Outcome.SURVIVED, steps=1, wall_s=0.0), snapshot="")
             ledger._database.execute("COMMIT")
             ledger.close()
@@ -352,8 +396,17 @@ def bench_orchestration() -> Iterator[Figure]:
             many = hunt(directory, 1, already + 1 + trials, 1, *options)["wall_s"]
             costs[already] = 1e3 * (many - few) / trials
             note = f"ms of wall time of a trial of one step that costs nothing, {already} trials in the ledger"
-            yield Figure(f"orchestration_{already}", costs[already], "ms", "lower", None, note)
-    yield Figure("orchestration_growth", costs[100_000] / costs[100], "x", "lower", 1.5, "100,000 against 100 trials")
+            yield Figure(
+                name=f"orchestration_{already}", value=costs[already], unit="ms", better="lower", target=None, note=note
+            )
+    yield Figure(
+        name="orchestration_growth",
+        value=costs[100_000] / costs[100],
+        unit="x",
+        better="lower",
+        target=1.5,
+        note="100,000 against 100 trials",
+    )
 
 
 def bench_waves() -> Iterator[Figure]:
@@ -374,7 +427,7 @@ def bench_waves() -> Iterator[Figure]:
                 raise RuntimeError("a trial of the wave failed")
     theirs = trials / (time.monotonic() - began)
     note = f"{60 * ours:.0f} against {60 * theirs:.0f} trials a minute, {steps} steps each"
-    yield Figure("waves_ratio", ours / theirs, "x", "higher", 5.0, note)
+    yield Figure(name="waves_ratio", value=ours / theirs, unit="x", better="higher", target=5.0, note=note)
 
 
 def bench_warmup() -> Iterator[Figure]:
@@ -399,13 +452,31 @@ def bench_warmup() -> Iterator[Figure]:
         note = (
             f"{60 / shared:.0f} against {60 / alone:.0f} trials a minute on {scenario}, {steps} steps each, one worker"
         )
-        yield Figure(f"warmup_{scenario}", alone / shared, "x", "higher", target, note)
+        yield Figure(
+            name=f"warmup_{scenario}", value=alone / shared, unit="x", better="higher", target=target, note=note
+        )
         alone, shared = (statistics.fmean(spent) for spent in worked.values())
         note = f"the same in processor time: {1e3 * shared:.0f} against {1e3 * alone:.0f} ms a trial"
-        yield Figure(f"warmup_{scenario}_cpu", alone / shared, "x", "higher", None, note)
+        yield Figure(
+            name=f"warmup_{scenario}_cpu", value=alone / shared, unit="x", better="higher", target=None, note=note
+        )
     found = in_child("child_fork")
-    yield Figure("fork", found["ms"], "ms", "lower", None, "CPU time of a copy on loop, its end included")
-    yield Figure("fork_probe", found["probe_ms"], "ms", "lower", None, "the same, with 50 steps in the copy")
+    yield Figure(
+        name="fork",
+        value=found["ms"],
+        unit="ms",
+        better="lower",
+        target=None,
+        note="CPU time of a copy on loop, its end included",
+    )
+    yield Figure(
+        name="fork_probe",
+        value=found["probe_ms"],
+        unit="ms",
+        better="lower",
+        target=None,
+        note="the same, with 50 steps in the copy",
+    )
 
 
 def bench_first_crash() -> Iterator[Figure]:
@@ -415,7 +486,7 @@ def bench_first_crash() -> Iterator[Figure]:
     found = first_crash.ratios(first_crash.measured(("merge",), repetitions=4, most=12000))
     for problem, (pairs, alone, copies, ratio) in found.items():
         note = f"{copies:.0f} against {alone:.0f} steps on {problem}, {pairs} pairs; scripts/first_crash has all six"
-        yield Figure("first_crash", ratio, "x", "lower", 1 / 3, note)
+        yield Figure(name="first_crash", value=ratio, unit="x", better="lower", target=1 / 3, note=note)
 
 
 def child_fork() -> dict[str, float]:
@@ -430,7 +501,7 @@ def child_fork() -> dict[str, float]:
     found = {}
     with folder() as stage:
         simulator = SumoSimulator(scenario, stage)
-        spec = TrialSpec(0, 1, {}, argument_values(scenario), max_steps=1000)
+        spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments=argument_values(scenario), max_steps=1000)
         made = KeepLaneWithSpeed(5.0)
         with Episode(spec, simulator=simulator, make_agent=lambda *_: made, forks=True) as episode:
             episode.start()
@@ -474,7 +545,9 @@ def bench_help() -> Iterator[Figure]:
         began = time.perf_counter()
         subprocess.run([str(CRASHHUNT), "--help"], stdout=subprocess.DEVNULL, check=True)
         times.append(time.perf_counter() - began)
-    yield Figure("help_s", statistics.median(times), "s", "lower", 0.3, "crashhunt --help")
+    yield Figure(
+        name="help_s", value=statistics.median(times), unit="s", better="lower", target=0.3, note="crashhunt --help"
+    )
 
 
 def child_projection(first: str, second: str) -> dict[str, float]:
@@ -497,7 +570,15 @@ def child_projection(first: str, second: str) -> dict[str, float]:
                 began = slots[name].cpu_s()
                 for again in range(at_once):
                     trial = number * at_once + again
-                    slots[name].run(TrialSpec(trial, trial, {"ego": {"speed": 5.0}}, argument_values(chosen), 84))
+                    slots[name].run(
+                        TrialSpec(
+                            number=trial,
+                            seed=trial,
+                            arguments={"ego": {"speed": 5.0}},
+                            scenario_arguments=argument_values(chosen),
+                            max_steps=84,
+                        )
+                    )
                 if number:  # the first warms everything up
                     spent[name].append((slots[name].cpu_s() - began) / at_once)
     return {"ratio": statistics.median(map(float.__truediv__, spent[second], spent[first])),
@@ -518,7 +599,7 @@ def bench_projection() -> Iterator[Figure]:
         net.write_text(text.replace('projParameter="!"', projection))
         found = in_child("child_projection", str(place / "projected"), str(place / "flat"))
     note = f"trials of 84 steps for the same CPU time; {60 / found['first']:.0f} a minute of it with a projection"
-    yield Figure("projected_network", found["ratio"], "x", "higher", 0.97, note)
+    yield Figure(name="projected_network", value=found["ratio"], unit="x", better="higher", target=0.97, note=note)
 
 
 def bench_replay_cpu() -> Iterator[Figure]:
@@ -533,7 +614,14 @@ def bench_replay_cpu() -> Iterator[Figure]:
             subprocess.run([CRASHHUNT, "replay", place / "h"], check=True, stdout=subprocess.DEVNULL)
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
             spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    yield Figure("replay_cpu", statistics.median(spent[1:]), "s", "lower", 0.6, "crashhunt replay of a crash of loop")
+    yield Figure(
+        name="replay_cpu",
+        value=statistics.median(spent[1:]),
+        unit="s",
+        better="lower",
+        target=0.6,
+        note="crashhunt replay of a crash of loop",
+    )
 
 
 def child_memory(trials: str) -> dict[str, float]:
@@ -549,7 +637,15 @@ def child_memory(trials: str) -> dict[str, float]:
         sizes = {}
         for number in range(1, int(trials) + 1):
             values = argument_values(scenario)
-            slot.run(TrialSpec(number, number, {"ego": {"speed": 8.0}}, values, max_steps=50))
+            slot.run(
+                TrialSpec(
+                    number=number,
+                    seed=number,
+                    arguments={"ego": {"speed": 8.0}},
+                    scenario_arguments=values,
+                    max_steps=50,
+                )
+            )
             if number in (int(trials) // 10, int(trials)):
                 pages = sum(
                     int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in (os.getpid(), slot.zygote)
@@ -563,7 +659,14 @@ def bench_memory() -> Iterator[Figure]:
     """The memory of a slot over 2,000 trials."""
     found = in_child("child_memory", "2000")
     note = f"{found['first']:.0f} MiB after 200 trials, {found['last']:.0f} MiB after 2,000"
-    yield Figure("worker_memory_growth", found["last"] / found["first"], "x", "lower", 1.05, note)
+    yield Figure(
+        name="worker_memory_growth",
+        value=found["last"] / found["first"],
+        unit="x",
+        better="lower",
+        target=1.05,
+        note=note,
+    )
 
 
 def bench_bundle() -> Iterator[Figure]:
@@ -574,11 +677,20 @@ def bench_bundle() -> Iterator[Figure]:
         crash = json.loads(next((place / "h" / "crashes").glob("*/crash.json")).read_text())
         size = sum(path.stat().st_size for path in (place / "h" / "crashes").glob("*/log.mcap"))
         note = f"log.mcap with view channels, {crash['step']} steps, trial {crash['trial']} of {found['trials_run']}"
-        yield Figure("log_bytes_per_step", size / max(1, crash["step"]), "B", "lower", None, note)
+        yield Figure(
+            name="log_bytes_per_step",
+            value=size / max(1, crash["step"]),
+            unit="B",
+            better="lower",
+            target=None,
+            note=note,
+        )
         out = place / "crash.zip"
         subprocess.run([CRASHHUNT, "export", place / "h", out], check=True, stdout=subprocess.DEVNULL)
         note = "an exported crash with its snapshot, crashhunt itself in it"
-        yield Figure("export_kib", out.stat().st_size / 1024, "KiB", "lower", None, note)
+        yield Figure(
+            name="export_kib", value=out.stat().st_size / 1024, unit="KiB", better="lower", target=None, note=note
+        )
 
 
 _CRASHES_AMONG_HANGING = """
@@ -618,7 +730,9 @@ def bench_stop() -> Iterator[Figure]:
             raised = float(next(crashes.glob("*/run.log")).read_text().split("raised at")[1].split()[0])
             seconds.append(crashes.stat().st_mtime - raised)  # the bundle's folder is renamed into place last
     note = "from the crash to all workers killed and the bundle saved, with two of three workers hung in C"
-    yield Figure("crash_to_saved_s", statistics.median(seconds), "s", "lower", 1.0, note)
+    yield Figure(
+        name="crash_to_saved_s", value=statistics.median(seconds), unit="s", better="lower", target=1.0, note=note
+    )
 
 
 _RAISES_LATE = """
@@ -657,7 +771,14 @@ def bench_replay() -> Iterator[Figure]:
         subprocess.run([str(CRASHHUNT), *words], cwd=place, stdout=subprocess.DEVNULL, check=True)
         found = in_child("child_replay", str(place / "h"))
     note = f"2,000 steps in {found['replay']:.2f} s; process, warm-up and comparison take {found['rest']:.2f} s"
-    yield Figure("replay_speed", found["hunt"] / found["replay"], "of the hunt's", "higher", 0.9, note)
+    yield Figure(
+        name="replay_speed",
+        value=found["hunt"] / found["replay"],
+        unit="of the hunt's",
+        better="higher",
+        target=0.9,
+        note=note,
+    )
 
 
 class Costless:
@@ -712,9 +833,11 @@ def bench_ceiling() -> Iterator[Figure]:
             spent[trials] = found["wall_s"], used.ru_maxrss / 1024
     (small, small_memory), (large, memory) = spent[100_000], spent[1_000_000]
     note = f"a million trials; {100_000 / small:.0f} the first hundred thousand"
-    yield Figure("ceiling", 1_000_000 / large, "trials/s", "higher", 5000, note)
+    yield Figure(name="ceiling", value=1_000_000 / large, unit="trials/s", better="higher", target=5000, note=note)
     note = f"{memory:.0f} MiB at a million trials, {small_memory:.0f} at a hundred thousand"
-    yield Figure("ceiling_memory_growth", memory / small_memory, "x", "lower", 1.1, note)
+    yield Figure(
+        name="ceiling_memory_growth", value=memory / small_memory, unit="x", better="lower", target=1.1, note=note
+    )
 
 
 def _large_ledger(directory: Path, trials: int) -> None:
@@ -754,8 +877,8 @@ def bench_scale() -> Iterator[Figure]:
     for name, limit in (("status", 5.0), ("compare", 10.0), ("trials", 60.0)):
         (small, small_memory), (large, memory) = spent[name]
         note = f"{small:.2f} s for 100,000; {memory:.0f} MiB against {small_memory:.0f}"
-        yield Figure(f"{name}_million_s", large, "s", "lower", limit, note)
-        yield Figure(f"{name}_growth", large / small / 10, "of linear", "lower", 1.2)
+        yield Figure(name=f"{name}_million_s", value=large, unit="s", better="lower", target=limit, note=note)
+        yield Figure(name=f"{name}_growth", value=large / small / 10, unit="of linear", better="lower", target=1.2)
 
 
 def bench_panels() -> Iterator[Figure]:
@@ -798,7 +921,7 @@ def bench_panels() -> Iterator[Figure]:
     rounds = [(per_frame(theirs, 10), per_frame(ours, 200)) for _ in range(3)]
     ratio = statistics.median(slow / fast for slow, fast in rounds)
     note = f"a heatmap and a curve in {1000 * rounds[0][1]:.2f} ms; matplotlib takes {1000 * rounds[0][0]:.0f} ms"
-    yield Figure("panels_vs_matplotlib", ratio, "x", "higher", 20.0, note)
+    yield Figure(name="panels_vs_matplotlib", value=ratio, unit="x", better="higher", target=20.0, note=note)
 
 
 def child_accelerator(name: str, vehicles: str, rounds: str, how: str = "") -> dict[str, float]:
@@ -875,23 +998,34 @@ def bench_accelerator() -> Iterator[Figure]:
     for name, target in (("highway-v0", 8.0), ("highway-fast-v0", 4.0)):
         found = in_child("child_accelerator", name, "0", "5")
         note = f"{found['slow']:.1f} steps a second become {found['fast']:.0f}"
-        yield Figure(f"accelerated_{name}", found["ratio"], "x", "higher", target, note)
+        yield Figure(
+            name=f"accelerated_{name}", value=found["ratio"], unit="x", better="higher", target=target, note=note
+        )
     for name, how in (
         ("highway-v0", "episodes"), ("highway-fast-v0", "episodes"), ("merge-v0", "episodes"),
         ("highway-v0", "road"), ("highway-v0", "neighbours"),
     ):  # fmt: skip
         found = in_child("child_accelerator", name, "0", "3", how)
         note = f"{found['slow']:.1f} steps a second become {found['fast']:.1f}"
-        yield Figure(f"accelerated_{name}_{how}", found["ratio"], "x", "higher", None, note)
+        yield Figure(
+            name=f"accelerated_{name}_{how}", value=found["ratio"], unit="x", better="higher", target=None, note=note
+        )
     names = [name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("highway_env")]
     ratios = {name: in_child("child_accelerator", name, "0", "3")["ratio"] for name in sorted(names)}
     worst = min(ratios, key=ratios.__getitem__)
     note = f"{worst}; the median of {len(ratios)} environments is {statistics.median(ratios.values()):.1f}"
-    yield Figure("accelerated_least", ratios[worst], "x", "higher", 1.0, note)
+    yield Figure(name="accelerated_least", value=ratios[worst], unit="x", better="higher", target=1.0, note=note)
     counts = {count: in_child("child_accelerator", "highway-v0", str(count), "3") for count in (20, 200)}
     growth = {which: counts[20][which] / counts[200][which] for which in ("slow", "fast")}
     note = f"without it {growth['slow']:.0f}; at 200 vehicles it is {counts[200]['ratio']:.0f} times as fast"
-    yield Figure("accelerated_time_of_10_times_the_vehicles", growth["fast"], "x", "lower", None, note)
+    yield Figure(
+        name="accelerated_time_of_10_times_the_vehicles",
+        value=growth["fast"],
+        unit="x",
+        better="lower",
+        target=None,
+        note=note,
+    )
 
 
 def bench_report() -> Iterator[Figure]:
@@ -925,7 +1059,7 @@ def bench_report() -> Iterator[Figure]:
             browser.quit()
         size = (place / "h" / "report.html").stat().st_size / 2**20
     note = f"200 actors, 3,000 steps, without a GPU; the page has {size:.0f} MiB"
-    yield Figure("report_draw_ms", drawn, "ms", "lower", 16.7, note)
+    yield Figure(name="report_draw_ms", value=drawn, unit="ms", better="lower", target=16.7, note=note)
 
 
 def _large_bundle(directory: Path, *, actors: int, steps: int) -> None:
@@ -942,8 +1076,25 @@ def _large_bundle(directory: Path, *, actors: int, steps: int) -> None:
     scratch.mkdir()
     box = BlackBox(scratch / BLACK_BOX)
     box.begin(pid=1, trial=0, started=0.0)
-    box.prologue(Prologue((AgentChannel("ego", "<f4", (1,), "<f8", (1,), ("speed",)),), 0.1).encode(), 1)
-    roster = Roster(tuple(Actor(f"car {n}" if n else "ego", "passenger", 4.5, 1.8) for n in range(actors)))
+    box.prologue(
+        Prologue(
+            (
+                AgentChannel(
+                    id="ego",
+                    observation_dtype="<f4",
+                    observation_shape=(1,),
+                    action_dtype="<f8",
+                    action_shape=(1,),
+                    action_names=("speed",),
+                ),
+            ),
+            0.1,
+        ).encode(),
+        1,
+    )
+    roster = Roster(
+        tuple(Actor(id=f"car {n}" if n else "ego", kind="passenger", length=4.5, width=1.8) for n in range(actors))
+    )
     box.append(Tag.ACTORS, 0, encode_actors(roster.actors))
     box.append(Tag.ROSTER, 0, np.arange(actors, dtype="<u4").tobytes())
     rng = np.random.default_rng(0)
@@ -954,8 +1105,8 @@ def _large_bundle(directory: Path, *, actors: int, steps: int) -> None:
             box.action(0, np.ones(1))
         points = [(float(x + speed * step / 10), float(y)) for (x, y), speed in zip(place, speeds, strict=True)]
         box.step(step, Scene(step / 10, roster, points, [0.0] * actors, speeds.tolist()), (0.0,))
-    collision = Collision("ego", "collider", "ego", "car 1", ("overlap",))
-    spec = TrialSpec(0, 1, {"ego": {}}, {}, max_steps=steps)
+    collision = Collision(agent="ego", role="collider", collider="ego", victim="car 1", seen_by=("overlap",))
+    spec = TrialSpec(number=0, seed=1, arguments={"ego": {}}, scenario_arguments={}, max_steps=steps)
     digest = digest_of(box.committed())
     result = TrialResult(spec, Outcome.COLLISION, steps=steps, digest=digest, collision=collision)
     snapshot = next((directory / "snapshots").iterdir()).name
@@ -976,9 +1127,23 @@ def bench_search() -> Iterator[Figure]:
         problem = PROBLEMS[name]
         if problem.hint and problem.rate <= 1 / 200:
             rare.append(row["guided"])
-        yield Figure(f"guided, {name}: one in {1 / problem.rate:.0f}", row["guided"], "x", "lower", 1.2, note)
+        yield Figure(
+            name=f"guided, {name}: one in {1 / problem.rate:.0f}",
+            value=row["guided"],
+            unit="x",
+            better="lower",
+            target=1.2,
+            note=note,
+        )
     mean = statistics.geometric_mean(rare)
-    yield Figure("guided, one in 200 and rarer, with a hint", mean, "x", "lower", 1 / 3, "geometric mean of the above")
+    yield Figure(
+        name="guided, one in 200 and rarer, with a hint",
+        value=mean,
+        unit="x",
+        better="lower",
+        target=1 / 3,
+        note="geometric mean of the above",
+    )
 
 
 def _toy(place: Path) -> Path:
@@ -1008,24 +1173,31 @@ def bench_ray() -> Iterator[Figure]:
                 f"{one['interval'][0]:.3f} to {one['interval'][1]:.3f} (95 %); load {found['load']:.1f}"
             )
             yield Figure(
-                "ray_rate" if figure == "wall" else "ray_cpu", one["ratio"], "of the pool's", "higher", 0.95, note
+                name="ray_rate" if figure == "wall" else "ray_cpu",
+                value=one["ratio"],
+                unit="of the pool's",
+                better="higher",
+                target=0.95,
+                note=note,
             )
     with ray.cluster(2) as address:
         found = ray.in_child("child_wire", address)
         note = f"a trial that costs nothing; besides, {found['idle']:.0f} B a second and node"
-        yield Figure("ray_bytes_a_trial", found["trial"], "B", "lower", None, note)
+        yield Figure(name="ray_bytes_a_trial", value=found["trial"], unit="B", better="lower", target=None, note=note)
         note = "CPU of the bridge, with Ray in it, for each trial, where they come one by one"
-        yield Figure("ray_bridge_ms_a_trial", found["ms"], "ms", "lower", None, note)
+        yield Figure(name="ray_bridge_ms_a_trial", value=found["ms"], unit="ms", better="lower", target=None, note=note)
         for name, executor in (("pool", "pool"), ("running", f"ray:{address}"), ("own", "ray:local")):
             found = ray.first_trial("--executor", executor)
             note = f"from the command to its first trial; {found['cpu']:.1f} s of CPU and {found['mb']:.0f} MB in all"
-            yield Figure(f"ray_first_trial_{name}", found["first"], "s", "lower", None, note)
+            yield Figure(
+                name=f"ray_first_trial_{name}", value=found["first"], unit="s", better="lower", target=None, note=note
+            )
     with ray.cluster(2, 2, 2, 2) as address:
         found = ray.stopped(address, "8")
         note = (
             f"from a crash to the last step of {found['running']:.0f} trials on 4 nodes; load {os.getloadavg()[0]:.1f}"
         )
-        yield Figure("ray_crash_to_stop_s", found["last"], "s", "lower", 1.0, note)
+        yield Figure(name="ray_crash_to_stop_s", value=found["last"], unit="s", better="lower", target=1.0, note=note)
 
 
 BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {

@@ -109,7 +109,15 @@ def run(
     while done < count:
         while submitted < count and submitted - done < 2 * executor.capacity:
             number = first + submitted
-            executor.submit(TrialSpec(number, number, {"ego": {"speed": speed}}, arguments or {}, max_steps=steps))
+            executor.submit(
+                TrialSpec(
+                    number=number,
+                    seed=number,
+                    arguments={"ego": {"speed": speed}},
+                    scenario_arguments=arguments or {},
+                    max_steps=steps,
+                )
+            )
             submitted += 1
         for result in executor.completed(1.0):
             done += 1
@@ -165,7 +173,15 @@ def _in_full_swing(executor: Executor, kind: str, first: int, arguments: dict[st
     began, spent, done = 0.0, 0.0, 0
     while done < _SWING + _TRIALS:
         while number - first - done < 2 * executor.capacity:
-            executor.submit(TrialSpec(number, number, {"ego": {"speed": 5.0}}, arguments, max_steps=1000))
+            executor.submit(
+                TrialSpec(
+                    number=number,
+                    seed=number,
+                    arguments={"ego": {"speed": 5.0}},
+                    scenario_arguments=arguments,
+                    max_steps=1000,
+                )
+            )
             number += 1
         for _ in executor.completed(1.0):
             done += 1

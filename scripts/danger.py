@@ -120,7 +120,7 @@ class Place:
             (arguments[agent] if agent else scenario)[name] = value
         self._box.begin(pid=os.getpid(), trial=0, started=time.monotonic())
         return run_episode(
-            TrialSpec(0, seed, arguments, scenario, max_steps=self._steps),
+            TrialSpec(number=0, seed=seed, arguments=arguments, scenario_arguments=scenario, max_steps=self._steps),
             simulator=self._simulator,
             make_agent=self._parts.agent,
             box=self._box,
@@ -149,7 +149,9 @@ class Share:
         steps = round(FOLLOWED_S / episode.simulator.step_length_s)
 
         for what, who, strong, long in PROBES:
-            one = Disturbance(episode.steps + 2, who, what, strong, long, episode.names[0])
+            one = Disturbance(
+                step=episode.steps + 2, who=who, what=what, how_strong=strong, how_long=long, agent=episode.names[0]
+            )
             answer = episode.fork(partial(follow, one, steps), observed=False).answer(60.0)
             if answer is None:
                 raise RuntimeError("a copy has not answered")

@@ -101,7 +101,14 @@ class Place:
         seed = int(rng.integers(2**31))
         traffic = {name: one.sample(rng) for name, one in self._varied.items() if one is not None}
         planned = self._disturber.draw(seed, self.steps)
-        return TrialSpec(0, seed, {self._ego: self._given}, traffic, self.steps, disturbances=planned)
+        return TrialSpec(
+            number=0,
+            seed=seed,
+            arguments={self._ego: self._given},
+            scenario_arguments=traffic,
+            max_steps=self.steps,
+            disturbances=planned,
+        )
 
     def run(self, spec: TrialSpec, **asking: Any) -> TrialResult:
         """Run a trial."""

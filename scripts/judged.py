@@ -29,9 +29,9 @@ from towns import TOWNS, make_town
 
 from crashhunt.crashes import ending_of, fault_of, list_bundles, overruled_trial
 from crashhunt.replays import ReplayOptions, Rerun, prepare
-from crashhunt.replays._causes import _Search
-from crashhunt.replays._prepare import Reruns
 from crashhunt.trial import KINDS, Disturbance, Outcome
+from crashhunt.whatif._causes import _Search
+from crashhunt.whatif._reruns import Reruns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -158,7 +158,9 @@ def _stopped_behind(rerun: Rerun, runs: Reruns, ago_s: float) -> str:
     assert hit is not None
     if hit.role != "victim" or hit.other in rerun.recorded.agents:
         return "cannot"
-    brakes = Disturbance(step + 1, "behind", "stop", 9.0, ago_s + 5.0, hit.agent)
+    brakes = Disturbance(
+        step=step + 1, who="behind", what="stop", how_strong=9.0, how_long=ago_s + 5.0, agent=hit.agent
+    )
     spec = overruled_trial(result, rerun.recorded, step, None, "brake")
     before = tuple(one for one in rerun.spec.disturbances if one.step <= step)
     (ended,) = runs.run([replace(spec, overruled=None, disturbances=(*before, brakes))])

@@ -154,7 +154,12 @@ def nearest_tests(file: Path) -> tuple[Path, ...]:
 def targets_of(name: str, tests: Sequence[Path] | None = None) -> list[Target]:
     """Return the modules of a package with the tests nearest to each, or with those that are given."""
     return [
-        Target(name, file, (ROOT / file).read_text(encoding="utf-8"), tests or nearest_tests(file))
+        Target(
+            package=name,
+            file=file,
+            source=(ROOT / file).read_text(encoding="utf-8"),
+            tests=tests or nearest_tests(file),
+        )
         for file in modules_of(name)
     ]
 

@@ -160,20 +160,49 @@ def _as_floats(danger: Danger) -> Danger:
 _WORDS: dict[str, tuple[str, Kind | None]] = {f"c{index}": ("a|b|c|d|e", None) for index in range(4)}
 
 PROBLEMS = {
-    "easy": Problem("a ball in 3 dimensions", _numbers(3), 1 / 50, _as_floats(_ball(1, 3, 1 / 50, 1.0))),
-    "smooth": Problem("a ball in 5 dimensions", _numbers(5), 1 / 500, _as_floats(_ball(2, 5, 1 / 500, 1.0))),
+    "easy": Problem(
+        about="a ball in 3 dimensions", arguments=_numbers(3), rate=1 / 50, danger=_as_floats(_ball(1, 3, 1 / 50, 1.0))
+    ),
+    "smooth": Problem(
+        about="a ball in 5 dimensions",
+        arguments=_numbers(5),
+        rate=1 / 500,
+        danger=_as_floats(_ball(2, 5, 1 / 500, 1.0)),
+    ),
     "needle": Problem(
-        "a ball in 3 dimensions, danger only near it", _numbers(3), 1 / 5000, _as_floats(_ball(3, 3, 1 / 5000, 0.12))
+        about="a ball in 3 dimensions, danger only near it",
+        arguments=_numbers(3),
+        rate=1 / 5000,
+        danger=_as_floats(_ball(3, 3, 1 / 5000, 0.12)),
     ),
-    "deceptive": Problem("danger leads elsewhere", _numbers(3), 1 / 200, _as_floats(_deceptive)),
+    "deceptive": Problem(
+        about="danger leads elsewhere", arguments=_numbers(3), rate=1 / 200, danger=_as_floats(_deceptive)
+    ),
     "discrete": Problem(
-        "four words and a whole number", {**_WORDS, "n": ("1:10", "int")}, 0.6 / 625, _discrete
+        about="four words and a whole number",
+        arguments={**_WORDS, "n": ("1:10", "int")},
+        rate=0.6 / 625,
+        danger=_discrete,
     ),
-    "twenty": Problem("a sum of 20 arguments", _numbers(20), 1 / 1000, _as_floats(_twenty(1 / 1000))),
-    "traffic": Problem("the seed decides more than the arguments", _numbers(5), 1 / 500, _as_floats(_traffic(1 / 500))),
-    "seeds": Problem("other arguments with every seed", _numbers(4), 1 / 1000, _as_floats(_seeds(1 / 1000))),
-    "blind": Problem("danger says nothing", _numbers(2), 1 / 300, _as_floats(_blind(1 / 300)), hint=False),
-}  # fmt: skip
+    "twenty": Problem(
+        about="a sum of 20 arguments", arguments=_numbers(20), rate=1 / 1000, danger=_as_floats(_twenty(1 / 1000))
+    ),
+    "traffic": Problem(
+        about="the seed decides more than the arguments",
+        arguments=_numbers(5),
+        rate=1 / 500,
+        danger=_as_floats(_traffic(1 / 500)),
+    ),
+    "seeds": Problem(
+        about="other arguments with every seed",
+        arguments=_numbers(4),
+        rate=1 / 1000,
+        danger=_as_floats(_seeds(1 / 1000)),
+    ),
+    "blind": Problem(
+        about="danger says nothing", arguments=_numbers(2), rate=1 / 300, danger=_as_floats(_blind(1 / 300)), hint=False
+    ),
+}
 
 REAL = {
     "motorway": Real(

@@ -197,7 +197,15 @@ def hunted(settings: HuntSettings, place: Place, most: int, name: str) -> Run:
         steps += results[first].steps + place.warmup_steps
         if not place.confirmed(results[first]):
             print(f"{name}, {settings.sampler}, {settings.seed}: trial {first} does not come again", file=sys.stderr)
-    return Run(name, settings.sampler, settings.seed, min(first + 1, most), found, steps, spent)
+    return Run(
+        problem=name,
+        sampler=settings.sampler,
+        seed=settings.seed,
+        trials=min(first + 1, most),
+        found=found,
+        steps=steps,
+        cpu_s=spent,
+    )
 
 
 def synthetic_run(name: str, sampler: str, seed: int) -> Run:
@@ -210,7 +218,15 @@ def synthetic_run(name: str, sampler: str, seed: int) -> Run:
         })},
     )  # fmt: skip
     found = hunted(settings, AtOnce(problem), math.ceil(GIVE_UP / problem.rate), name)
-    return Run(name, sampler, seed, found.trials, found.found, found.steps, found.cpu_s)
+    return Run(
+        problem=name,
+        sampler=sampler,
+        seed=seed,
+        trials=found.trials,
+        found=found.found,
+        steps=found.steps,
+        cpu_s=found.cpu_s,
+    )
 
 
 def real_runs(
@@ -268,7 +284,9 @@ def stored(path: Path) -> dict[Hunt, Run]:
         for sampler, of in row.items():
             for seed, what in of.items():
                 trials, steps = what if isinstance(what, list) else (what, abs(what))
-                runs[name, sampler, int(seed)] = Run(name, sampler, int(seed), abs(trials), trials > 0, steps)
+                runs[name, sampler, int(seed)] = Run(
+                    problem=name, sampler=sampler, seed=int(seed), trials=abs(trials), found=trials > 0, steps=steps
+                )
     return runs
 
 

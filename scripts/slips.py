@@ -309,7 +309,7 @@ class _Finder(ast.NodeVisitor):
     def _add(self, node: ast.expr | ast.stmt, start: int, end: int, text: str, what: str) -> None:
         line = self._source.count("\n", 0, start) + 1
         span = (min(self._span[0], line), max(self._span[1], node.lineno if isinstance(node, ast.expr) else line))
-        self.slips.append(Slip(line, span, what, start, end, text))
+        self.slips.append(Slip(line=line, span=span, what=what, start=start, end=end, text=text))
 
     def _text(self, node: ast.expr) -> str:
         return self._source[slice(*self._range(node))]

@@ -1,5 +1,5 @@
 from ._network import Network as Network
-from ._substep_loop import Onlooker as Onlooker, Unasked as Unasked
+from ._substep_loop import Onlooker as Onlooker, SkippedObservation as SkippedObservation
 from ._switch import (
     Acceleration as Acceleration,
     accelerate as accelerate,

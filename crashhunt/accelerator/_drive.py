@@ -1,7 +1,8 @@
-"""How vehicles decide: `Road.act`, with everybody's arithmetic done at once.
+"""Decisions of vehicles: `Road.act`, with the arithmetic of all vehicles in arrays.
 
-Vehicles decide one after another, and may see where those before them now want to go. All that such a decision
-depends on besides, who drives where and how hard each would brake, does not change meanwhile and is computed before.
+highway-env's vehicles decide one after another, and a vehicle reads the target lanes of the vehicles before it. All
+other inputs of a decision, such as positions and accelerations, stay constant meanwhile. So they are computed first,
+for all vehicles together.
 """
 
 from __future__ import annotations
@@ -31,23 +32,25 @@ __all__ = ["decide"]
 
 
 _AIM = attrgetter("target_lane_index")
-_WHOLE = 2**53  # up to here, floats hold whole numbers
+_WHOLE = 2**53  # floats represent all integers up to this number exactly
 
 
 def decide(road: Road, frame: Frame, crowd: Crowd) -> bool:
-    """Let all vehicles decide; False where one of them is not known or something fails, and nothing was done.
+    """Let all vehicles decide; return False, with nothing changed, if a vehicle is unknown or an error occurs.
 
     Args:
-        road: with its vehicles.
-        frame: where everybody is.
-        crowd: who they are; it is known how all of them drive.
+        road: The road.
+        frame: The positions of its vehicles.
+        crowd: The vehicles; the accelerator knows how all of them decide.
     """
     decisions = _Decisions(road, frame, crowd)
     if not decisions.are_usual:
         return False
     try:
         decisions.take()
-    except Exception:  # highway-env is to fail at the same vehicle, those before which have decided
+    except (
+        Exception
+    ):  # highway-env's own code must then fail at the same vehicle, after the decisions of the vehicles before it
         decisions.undo()
         return False
     return True
@@ -67,11 +70,11 @@ class _Decisions:
         self.aims = list(map(_AIM, map(vehicles.__getitem__, self.rows)))
         self.wanted = [getattr(vehicle, "target_speed", 0) for vehicle in vehicles]
         self.timers = [vehicles[row].timer for row in self.idm]
-        #: whether all that they reckon with are numbers of the usual kinds, and lanes of this road
+        #: whether all inputs are floats, ints or NumPy floats, and all lanes belong to this road
         self.are_usual = _are_speeds(self.wanted) and are_numbers(self.timers)
         try:
             targets = list(map(index.get, self.aims))
-        except TypeError:  # a list names a lane as well
+        except TypeError:  # highway-env accepts a list as a lane index, which is not hashable
             targets = [None]
         self.are_usual &= None not in targets and bool((self.lanes >= 0).all())
         if not self.are_usual:
@@ -80,16 +83,16 @@ class _Decisions:
         self.along, self.across = frame.coordinates_of(self.rows, self.targets)
         over = self.along > self.network.every_length[self.targets] - 5 / 2
         self.leaving = [self.rows[number] for number in np.flatnonzero(over).tolist()]
-        #: what is left of the routes of those who see the end of theirs
+        #: the routes of vehicles near the end of their target lane, with a copy of the remaining parts
         self.routes = [(vehicles[row].route, list(vehicles[row].route or ())) for row in self.leaving]
         if self.leaving:
             routes = [id(vehicles[row].route) for row in self.rows if vehicles[row].route]
-            self.are_usual = len(set(routes)) == len(routes)  # else what one drops from its route matters to others
-        #: of whom by whose numbers, behind whom, the accelerations are computed
+            self.are_usual = len(set(routes)) == len(routes)  # with a shared route, one vehicle's change affects others
+        #: the accelerations to compute: rows of the drivers with the parameters, of the vehicles, of those ahead
         self.asked: tuple[list[int], list[int], list[int]] = ([], [], [])
-        #: where among these is what a vehicle does on a lane that it is not on, by its row and that lane
+        #: index in `asked` of a vehicle's acceleration on another lane, by the vehicle's row and that lane
         self.elsewhere: dict[tuple[int, LaneIndex], int] = {}
-        #: the lanes that vehicles wanted to be on, of those who see the end of theirs
+        #: previous target lanes of vehicles near the end of their target lane
         self.before: dict[int, LaneIndex] = {}
         self.directions = np.empty((len(crowd.headings), 2))
         np.cos(crowd.headings, out=self.directions[:, 0])
@@ -114,7 +117,7 @@ class _Decisions:
         self._ask_all(elsewhere)
         self.tame = not thinking or (self.crowd.tame and math.isfinite(np.add.reduce(self.velocities, None)))
         ways = {row: self._ways(row) for row in thinking}
-        accelerations = [*self._accelerations(), 0.0]  # of nobody, it is 0
+        accelerations = [*self._accelerations(), 0.0]  # index -1: the acceleration of a missing vehicle is 0
         for row in sorted(elsewhere + thinking):
             if row in ways:
                 self._choose(row, ways[row], accelerations)
@@ -129,14 +132,14 @@ class _Decisions:
         self._act(accelerations[: len(self.idm)])
 
     def undo(self) -> None:
-        """Have everybody as they were; what they do is said last."""
+        """Restore all vehicles; their actions need no restoring, because `_act` sets them last."""
         vehicles = self.crowd.vehicles
         for row, key in zip(self.rows, self.aims, strict=True):
             vehicles[row].target_lane_index = key
         for row, timer in zip(self.idm, self.timers, strict=True):
             vehicles[row].timer = timer
         for route, rest in self.routes:
-            if type(route) is list:  # nothing else can have lost a part
+            if type(route) is list:  # highway-env removes parts of lists only
                 route[:] = rest
 
     def _act(self, accelerations: list[float]) -> None:
@@ -161,7 +164,7 @@ class _Decisions:
         return found
 
     def _ask(self, driver: int, vehicle: RoadObject | None, ahead: RoadObject | None) -> int:
-        """Have an acceleration computed: `IDMVehicle.acceleration`; return which it is."""
+        """Request an acceleration, as by `IDMVehicle.acceleration`; return its index."""
         if vehicle is None or not isinstance(vehicle, Vehicle):
             return -1
         drivers, whose, behind = self.asked
@@ -171,7 +174,7 @@ class _Decisions:
         return len(drivers) - 1
 
     def _ask_all(self, elsewhere: list[int]) -> None:
-        """Ask how all accelerate behind those ahead of them, on their lanes and on those that they want to be on."""
+        """Request the accelerations of all vehicles on their lanes, and on their target lanes if these differ."""
         vehicles, idm = self.crowd.vehicles, self.idm
         lanes = self.lanes[idm]
         columns = self.network.axis_columns[lanes]
@@ -190,7 +193,7 @@ class _Decisions:
             self.elsewhere[row, key] = self._ask(row, vehicles[row], self._neighbours(row, key)[0])
 
     def _ways(self, row: int) -> list[tuple[LaneIndex, tuple[int, ...]]]:
-        """The lanes beside that a vehicle could change to, and the accelerations that decide about each."""
+        """Return the neighbouring lanes that a vehicle can reach, each with the accelerations that MOBIL compares."""
         vehicle = self.crowd.vehicles[row]
         found = []
         for key in self.road.network.side_lanes(vehicle.lane_index):
@@ -200,7 +203,7 @@ class _Decisions:
             ahead, behind = self._neighbours(row, key)
             self.elsewhere[row, key] = own_then = self._ask(row, vehicle, ahead)
             asked = [own_then, self._ask(row, behind, vehicle)]
-            # Nothing of what others gain matters, unless it is no number: then not even nothing of it is.
+            # With politeness 0 the gain of others has no effect. But 0 times infinity is NaN, so compute it then.
             if vehicle.POLITENESS != 0 or not self.tame:
                 old_ahead, old_behind = self._neighbours(row, vehicle.lane_index)
                 pairs = ((behind, ahead), (old_behind, vehicle), (old_behind, old_ahead))
@@ -209,7 +212,7 @@ class _Decisions:
         return found
 
     def _choose(self, row: int, ways: list[tuple[LaneIndex, tuple[int, ...]]], accelerations: list[float]) -> None:
-        """`IDMVehicle.change_lane_policy`, where it is time to think of that."""
+        """Do what `IDMVehicle.change_lane_policy` does when the timer allows a lane change."""
         vehicle = self.crowd.vehicles[row]
         vehicle.timer = 0
         own = accelerations[self.idm.index(row)]
@@ -220,7 +223,7 @@ class _Decisions:
     def _recommends(
         self, vehicle: Vehicle, key: LaneIndex, own_now: float, own_then: float, behind_then: float, *others: float
     ) -> bool:
-        """`IDMVehicle.mobil`."""
+        """Return the result of `IDMVehicle.mobil`."""
         limit = -vehicle.LANE_CHANGE_MAX_BRAKING_IMPOSED
         if behind_then < limit:
             return False
@@ -237,7 +240,7 @@ class _Decisions:
         return not gain < vehicle.LANE_CHANGE_MIN_ACC_GAIN
 
     def _turn_back(self, row: int) -> None:
-        """The same while a vehicle changes lanes, if somebody else is about to change to the same one."""
+        """Do what `change_lane_policy` does during a lane change: abort it if another vehicle has the same target."""
         vehicles = self.crowd.vehicles
         vehicle = vehicles[row]
         lane, target = vehicle.lane_index, vehicle.target_lane_index
@@ -247,26 +250,26 @@ class _Decisions:
             if number == row or not aims or other.lane_index == target:
                 continue
             wanted = other.target_lane_index
-            if number > row:  # who does not yet see the end of its lane
+            if number > row:  # in highway-env, this vehicle has not updated its target lane yet
                 wanted = self.before.get(number, wanted)
             if wanted == target and 0 < self._lane_distance(row, number) < self._desired_gap(row, number):
                 vehicle.target_lane_index = lane
                 return
 
     def _lane_distance(self, row: int, other: int) -> float:
-        """`RoadObject.lane_distance_to`."""
+        """Return the result of `RoadObject.lane_distance_to`."""
         lane = int(self.lanes[row])
         return self.frame.coordinates(other, lane)[0] - self.frame.coordinates(row, lane)[0]
 
     def _desired_gap(self, row: int, other: int) -> float:
-        """`IDMVehicle.desired_gap`."""
+        """Return the result of `IDMVehicle.desired_gap`."""
         rows, others = np.array([row]), np.array([other])
         return float(self._desired_gaps(rows, rows, others)[0])
 
     def _desired_gaps(
         self, drivers: NDArray[np.intp], whose: NDArray[np.intp], ahead: NDArray[np.intp]
     ) -> NDArray[np.float64]:
-        """The same of many, with their drivers' parameters."""
+        """Return the desired gaps of vehicles ``whose`` behind ``ahead``, with the parameters of ``drivers``."""
         comfort, braking, wanted, time = self.crowd.of_gaps[:, drivers]
         speed, limit = self.crowd.speeds[whose], -comfort * braking
         closing = np.vecdot(self.velocities[whose] - self.velocities[ahead], self.directions[whose])
@@ -274,7 +277,7 @@ class _Decisions:
         return gap
 
     def _accelerations(self) -> list[float]:
-        """`IDMVehicle.acceleration` of all that have been asked for."""
+        """Return the requested accelerations, as `IDMVehicle.acceleration` computes them."""
         if not self.asked[0]:
             return []
         drivers, whose, ahead = map(np.array, self.asked)
@@ -293,7 +296,7 @@ class _Decisions:
         return listed
 
     def _look_again(self, rows: set[int]) -> None:
-        """Find the coordinates of those who may have chosen another lane."""
+        """Update the coordinates of vehicles whose target lane may have changed."""
         index, vehicles = self.network.index, self.crowd.vehicles
         for number, row in enumerate(self.rows if rows else ()):
             if row in rows:
@@ -301,7 +304,7 @@ class _Decisions:
                 self.along[number], self.across[number] = self.frame.coordinates(row, lane)
 
     def _steer(self) -> list[float]:
-        """`ControlledVehicle.steering_control` of many."""
+        """Return the steering angles of all vehicles, as `ControlledVehicle.steering_control` computes them."""
         rows = self.rows
         pursuit, lateral, turning, length, most = self.crowd.of_steering[:, rows]
         heading, speed = self.crowd.headings[rows], self.crowd.speeds[rows]
@@ -316,12 +319,12 @@ class _Decisions:
 
 
 def _not_zero(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`highway_env.utils.not_zero` of many."""
+    """Return the result of `highway_env.utils.not_zero` for each element."""
     return np.where(np.abs(x) > 1e-2, x, np.where(x >= 0, 1e-2, -1e-2))
 
 
 def _are_speeds(values: Sequence[object]) -> bool:
-    """Whether target speeds are usual numbers, or whole ones of NumPy's that a float holds: out of a list."""
+    """Whether all target speeds are usual numbers, or NumPy integers that a float represents exactly."""
     return are_numbers(values) or all(map(_is_speed, values))
 
 

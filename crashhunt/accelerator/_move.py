@@ -1,4 +1,4 @@
-"""How vehicles move and collide: `Road.step`, and the rules of an intersection."""
+"""Movement and collisions of vehicles: `Road.step`, and the right-of-way rules of intersections."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ __all__ = ["as_numpy", "collide", "collide_one_by_one", "enforce", "move"]
 
 
 _DICTS, _FLOATS = frozenset((dict,)), frozenset((float,))
-_MARGIN = 1e-6  # m; what is nearer than this is left to the exact test
+_MARGIN = 1e-6  # m; objects that are separated by less than this get highway-env's exact test
 
 
 def move(crowd: Crowd, network: Network, dt: float, frame: Frame | None = None, *, alone: bool = False) -> Frame | None:
-    """Move all vehicles, of whom it is known how they move, and have the crowd know.
+    """Move all vehicles for a sub-step, and update the arrays of the crowd.
 
     Args:
-        crowd: the vehicles, where they are.
-        network: the lanes of their road.
-        dt: how long, in s.
-        frame: where they are, if that is known.
-        alone: whether headings may be Python's floats, until `as_numpy` is called.
+        crowd: The vehicles with their positions; the accelerator knows how all of them move.
+        network: The lanes of their road.
+        dt: Length of the sub-step, in s.
+        frame: Their positions before the sub-step, if known.
+        alone: Whether headings may be Python floats until `as_numpy` is called.
 
     Returns:
-        Where everybody is then, or None where numbers are not of the usual kinds and nothing was done.
+        The new positions, or None, with nothing changed, if a number has an unusual type.
     """
     vehicles, count = crowd.vehicles, len(crowd.vehicles)
     actions = [vehicle.action for vehicle in vehicles]
@@ -68,7 +68,7 @@ def move(crowd: Crowd, network: Network, dt: float, frame: Frame | None = None, 
     turned = heading + speed * np.sin(slip) / (crowd.numbers["LENGTH"][:count] / 2) * dt
     faster = speed + acceleration * dt
     speeds: list[float] = faster.tolist()
-    # Of what kind a number is decides what arithmetic with others makes of it.
+    # Keep the type of each speed, Python's or NumPy's, because later arithmetic depends on it.
     for row in range(count) if type(dt) is np.float64 else crowd.of_numpy:
         speeds[row] = faster[row]
     _write(crowd, places, turned.tolist() if alone else list(turned), speeds)
@@ -91,14 +91,14 @@ def move(crowd: Crowd, network: Network, dt: float, frame: Frame | None = None, 
 
 
 def as_numpy(vehicles: list[Vehicle]) -> None:
-    """Make NumPy's floats of headings, as they are after a step of highway-env."""
+    """Convert headings to NumPy floats, which they are after a step of highway-env."""
     for vehicle in vehicles:
         if type(vehicle.heading) is float:
             vehicle.heading = np.float64(vehicle.heading)
 
 
 def _slide(vehicle: Vehicle, dt: float) -> None:
-    """Move a vehicle by its own model; the lane that it is on is looked for with everybody else's."""
+    """Move a vehicle by its own model, without the search for its lane, which `move` does for all vehicles."""
     road, vehicle.road = vehicle.road, None
     try:
         vehicle.step(dt)
@@ -107,7 +107,7 @@ def _slide(vehicle: Vehicle, dt: float) -> None:
 
 
 def _write(crowd: Crowd, places: NDArray[np.float64], headings: list[float], speeds: list[float]) -> None:
-    """Tell vehicles where they are; those that something has hit are pushed, and their places here as well."""
+    """Write the new state into the vehicles; push vehicles that were hit, and update their rows in ``places``."""
     for row, (vehicle, (x, y)) in enumerate(zip(crowd.vehicles, places[: len(headings)].tolist(), strict=True)):
         if row in crowd.sliding:
             continue
@@ -124,7 +124,7 @@ def _write(crowd: Crowd, places: NDArray[np.float64], headings: list[float], spe
 
 
 def _clip_all(crowd: Crowd, acts: list[float], speed: NDArray[np.float64]) -> None:
-    """`Vehicle.clip_actions` of all where it does something, but for those that do it themselves."""
+    """Apply `Vehicle.clip_actions` where it has an effect, except to vehicles with their own dynamic model."""
     vehicles, numbers, count = crowd.vehicles, crowd.numbers, len(crowd.vehicles)
     over = (speed > numbers["MAX_SPEED"][:count]) | (speed < numbers["MIN_SPEED"][:count])
     rows = {*np.flatnonzero(over).tolist(), *[row for row, vehicle in enumerate(vehicles) if vehicle.crashed]}
@@ -138,7 +138,7 @@ def _clip_all(crowd: Crowd, acts: list[float], speed: NDArray[np.float64]) -> No
 
 
 def _clip_actions(vehicle: Vehicle) -> None:
-    """`Vehicle.clip_actions`."""
+    """Do what `Vehicle.clip_actions` does."""
     action, speed = vehicle.action, vehicle.speed
     if vehicle.crashed:
         action["steering"] = 0
@@ -152,7 +152,7 @@ def _clip_actions(vehicle: Vehicle) -> None:
 
 
 def _closest(frame: Frame, heading: NDArray[np.float64]) -> list[int]:
-    """`RoadNetwork.get_closest_lane_index` of every vehicle."""
+    """Return the number of the closest lane of every vehicle, as by `RoadNetwork.get_closest_lane_index`."""
     network = frame.network
     count = len(heading)
     best = [math.inf] * count
@@ -172,7 +172,7 @@ def _closest(frame: Frame, heading: NDArray[np.float64]) -> list[int]:
     for row in range(count):
         found, lane = best[row], nearest[row]
         last = network.number.get(id(vehicles[row].lane), -1)
-        if last >= 0 and not network.is_axis[last]:  # where it was is where it is, most of the time
+        if last >= 0 and not network.is_axis[last]:  # a vehicle is mostly still on its last lane
             found, lane = min((found, lane), (_distance(frame, row, last, headings[row]), last))
         for column in np.flatnonzero(boxes[row] <= found).tolist():
             other = network.others[column]
@@ -187,10 +187,10 @@ def _distance(frame: Frame, row: int, lane: int, heading: float) -> float:
 
 
 def collide(road: Road, dt: float, crowd: Crowd) -> bool:
-    """Let everybody collide with everybody, as `Road.step` does, but without the pairs that cannot touch.
+    """Check all pairs of objects for collisions, as `Road.step` does, but skip the pairs that cannot touch.
 
     Returns:
-        Whether it is known how all collide; otherwise highway-env's own code has done everything.
+        Whether the accelerator knows how all objects collide. Otherwise highway-env's own code has checked all pairs.
     """
     pairs = crowd.pairs if crowd.collides else None
     if pairs is None:
@@ -213,7 +213,7 @@ def collide(road: Road, dt: float, crowd: Crowd) -> bool:
 
 
 def collide_one_by_one(road: Road, dt: float) -> None:
-    """Let everybody collide with everybody, in highway-env's own words."""
+    """Check all pairs of objects for collisions, with highway-env's own code."""
     for number, vehicle in enumerate(road.vehicles):
         for other in road.vehicles[number + 1 :]:
             vehicle.handle_collisions(other, dt)
@@ -222,7 +222,7 @@ def collide_one_by_one(road: Road, dt: float) -> None:
 
 
 def _stay_apart(one: RoadObject, two: RoadObject, dt: float) -> bool:
-    """Whether some axis surely separates two outlines, now and until the next moment."""
+    """Whether an axis separates the outlines of two objects with certainty, now and during the sub-step."""
     (x, y), (other_x, other_y) = one.position.tolist(), two.position.tolist()
     dx, dy = other_x - x, other_y - y
     first, second = float(one.heading), float(two.heading)
@@ -245,7 +245,11 @@ def _stay_apart(one: RoadObject, two: RoadObject, dt: float) -> bool:
 
 
 def enforce(road: RegulatedRoad) -> bool:
-    """`RegulatedRoad.enforce_road_rules`, foreseeing each vehicle once; False where one is not known."""
+    """Do what `RegulatedRoad.enforce_road_rules` does, with one prediction per vehicle.
+
+    Returns:
+        False, with nothing changed, if the class of a vehicle is unknown.
+    """
     vehicles, kinds = road.vehicles, kinds_of(road.vehicles)
     if not all(kind.predicts and kind.is_of(vehicle) for kind, vehicle in zip(kinds, vehicles, strict=True)):
         return False
@@ -282,13 +286,13 @@ def enforce(road: RegulatedRoad) -> bool:
 
 
 def _foresee(vehicle: Vehicle, kind: Kind, times: NDArray[np.float64]) -> Path:
-    """`predict_trajectory_constant_speed`, on a copy of the vehicle alone instead of one of the whole road."""
+    """Return `predict_trajectory_constant_speed`, computed with a copy of the vehicle and not of the whole road."""
     if kind.base != "nothing" or vehicle.prediction_type not in ("zero_steering", "constant_steering"):
         path: Path = vehicle.predict_trajectory_constant_speed(times)
         return path
     steering = 0.0 if vehicle.prediction_type == "zero_steering" else vehicle.action["steering"]
     ahead = copy.copy(vehicle)
-    ahead.road, ahead.position = None, vehicle.position.copy()  # without a road, it looks for no lanes
+    ahead.road, ahead.position = None, vehicle.position.copy()  # without a road, the copy does not search for its lane
     ahead.action = {"acceleration": 0.0, "steering": steering}
     positions, headings = [], []
     for dt in np.diff(np.concatenate(([0.0], times))):
@@ -299,7 +303,7 @@ def _foresee(vehicle: Vehicle, kind: Kind, times: NDArray[np.float64]) -> Path:
 
 
 def _conflict(one: Vehicle, two: Vehicle, first: Path, second: Path) -> bool:
-    """The rest of `RegulatedRoad.is_conflict_possible`."""
+    """Return the result of `RegulatedRoad.is_conflict_possible` from the predicted paths."""
     for place, heading, other_place, other_heading in zip(*first, *second, strict=False):
         if np.linalg.norm(other_place - place) > one.LENGTH:
             continue

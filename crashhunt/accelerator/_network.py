@@ -1,8 +1,8 @@
-"""The lanes of a road network, prepared so that coordinates on many of them are computed at once.
+"""The lanes of a road network as arrays, so that coordinates on many lanes are computed together.
 
-A lane along an axis needs no rounding that depends on how a processor multiplies and adds, so that arrays give what
-highway-env's scalar products give. For all other lanes highway-env's own expressions are used, one lane at a time, and
-only where the bounding box of the lane says that they can matter.
+On a lane along an axis, the scalar product has no rounding that depends on the processor's multiply-add instructions.
+So arrays give the same bits as highway-env's scalar products. For all other lanes this module evaluates highway-env's
+own expressions, one lane at a time, and only if the lane's bounding box is near enough.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 __all__ = ["Network", "wrap_to_pi"]
 
 
-_SAMPLES = 65  # of a bend, for its bounding box
+_SAMPLES = 65  # points of a curved lane for its bounding box
 _TAU = 2 * np.pi
-_ON_LANE_MARGIN = 1  # m, with which a road looks for neighbours
+_ON_LANE_MARGIN = 1  # m; highway-env's lateral margin for neighbours on a lane
 
 
 def wrap_to_pi(x: float) -> float:
-    """An angle between -pi and pi, in highway-env's own expression."""
+    """Return an angle between -pi and pi, with highway-env's own expression."""
     return ((x + np.pi) % _TAU) - np.pi
 
 
@@ -38,11 +38,11 @@ class Network:
     """The lanes of a network, numbered in the order in which highway-env compares them.
 
     Attributes:
-        lanes: all of them.
-        index: key to number.
-        number: identity of a lane to its number.
-        keys: number to key.
-        plain: whether every lane is of a kind that is known; otherwise nothing here may be used.
+        lanes: All lanes, by number.
+        index: The number of each lane, by its key.
+        number: The number of each lane, by the ``id()`` of the lane.
+        keys: The keys of all lanes, by number.
+        plain: Whether all lanes have a known class; otherwise the object must not be used.
     """
 
     def __init__(self, network: RoadNetwork) -> None:
@@ -75,28 +75,28 @@ class Network:
         table = np.array(columns, float).reshape(-1, 8).T
         self.start_x, self.start_y, self.along_x, self.along_y, self.across_x, self.across_y = table[:6]
         self.length, self.heading = table[6:]
-        # One for all of them where they run in parallel.
+        # Parallel lanes share one heading, which makes the arrays of angles smaller.
         self.headings = self.heading[:1] if len(set(self.heading.tolist())) == 1 else self.heading
         self.every_length = np.array([lane.length for lane in self.lanes], float)
         self.lengths = [float(lane.length) for lane in self.lanes]
         self.half_widths = [float(lane.width) / 2 + _ON_LANE_MARGIN for lane in self.lanes]
         self.widths = [float(lane.width) for lane in self.lanes]
-        self.half_width = np.array(self.half_widths)[straight]  # as `length` and `heading`, of those along an axis
+        self.half_width = np.array(self.half_widths)[straight]  # of lanes along an axis, like `length` and `heading`
         self.limit = np.array([_limits(lane.speed_limit) for lane in self.lanes]).T
         boxes = np.array([_box(self.lanes[number]) for number in self.others]).reshape(-1, 4)
         self.low_x, self.low_y, self.high_x, self.high_y = boxes.T
         self.axis_columns = np.full(len(self.lanes), -1)
         self.axis_columns[self.axis] = np.arange(len(self.axis))
-        #: a lane's place among the columns of the arrays of lanes along an axis, or of the others
+        #: the column of a lane in the arrays of lanes along an axis, or in the arrays of the other lanes
         self.column = {number: column for column, number in enumerate(self.axis.tolist())}
         self.column |= {number: column for column, number in enumerate(self.others)}
 
     def is_of(self, network: RoadNetwork) -> bool:
-        """Whether the network still has these very lanes, in these places, and they are what they were."""
+        """Whether the network still has the same lane objects with unchanged keys and attributes."""
         keys, lanes = _laid_out(network)
         if network is not self.network or keys != self.keys or list(map(id, lanes)) != list(map(id, self.lanes)):
             return False
-        try:  # of arrays that are not the very same, Python cannot say whether they are equal
+        try:  # comparing two different array objects raises ValueError
             same = _values(lanes) == self._seen and self._reach == _reach()
         except ValueError:
             return False
@@ -105,20 +105,20 @@ class Network:
     def on_axis(
         self, x: NDArray[np.float64], y: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Longitudinal and lateral coordinates on the lanes along an axis, each of shape (points, lanes)."""
+        """Return longitudinal and lateral coordinates on the lanes along an axis, each of shape (points, lanes)."""
         dx, dy = x[:, None] - self.start_x, y[:, None] - self.start_y
-        # A scalar product begins with zero, which decides the sign of a result of zero.
+        # NumPy's scalar product begins with 0.0, which decides the sign of a zero result.
         return (0.0 + dx * self.along_x) + dy * self.along_y, (0.0 + dx * self.across_x) + dy * self.across_y
 
     def box_distance(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A lower bound of every distance from a lane not along an axis, shape (points, lanes), in m."""
+        """Return lower bounds of the distances from the lanes not along an axis, of shape (points, lanes), in m."""
         dx = np.maximum(np.maximum(self.low_x - x[:, None], x[:, None] - self.high_x), 0.0)
         dy = np.maximum(np.maximum(self.low_y - y[:, None], y[:, None] - self.high_y), 0.0)
         distance: NDArray[np.float64] = np.hypot(dx, dy) - 1e-6
         return distance
 
     def coordinates(self, number: int, position: NDArray[np.float64]) -> tuple[float, float]:
-        """Coordinates on one lane, by highway-env's own expressions."""
+        """Return the coordinates of a position on one lane, by highway-env's own expressions."""
         lane = self.lanes[number]
         if type(lane) is CircularLane:
             delta = position - lane.center
@@ -130,7 +130,7 @@ class Network:
         return float(s), float(r)
 
     def heading_at(self, number: int, s: float) -> float:
-        """The heading of a lane at a longitudinal coordinate."""
+        """Return the heading of a lane at a longitudinal coordinate."""
         lane = self.lanes[number]
         if type(lane) is StraightLane:
             return float(lane.heading)
@@ -139,7 +139,7 @@ class Network:
         return float(lane.heading_at(s))
 
     def headings_at(self, numbers: NDArray[np.intp], s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The headings of lanes, each at a longitudinal coordinate."""
+        """Return the headings of lanes, each at a longitudinal coordinate."""
         columns = self.axis_columns[numbers]
         if not len(columns) or columns.min() >= 0:
             found: NDArray[np.float64] = self.heading[columns]
@@ -147,24 +147,24 @@ class Network:
         return np.array([self.heading_at(number, at) for number, at in zip(numbers.tolist(), s.tolist(), strict=True)])
 
     def distance(self, number: int, s: float, r: float, heading: float) -> float:
-        """How far a vehicle is from a lane, its heading counted in, as highway-env weighs it."""
+        """Return highway-env's distance of a vehicle from a lane, which includes the difference in heading."""
         length = self.lengths[number]
         angle = abs(wrap_to_pi(heading - self.heading_at(number, s)))
         return abs(r) + (s - length if s > length else 0) + (0 - s if s < 0 else 0) + 1.0 * angle
 
     def is_on(self, number: int, s: float, r: float) -> bool:
-        """Whether somebody is on a lane, for whoever looks for neighbours there."""
+        """Whether highway-env's search for neighbours counts a position as on the lane."""
         return abs(r) <= self.half_widths[number] and -5 <= s < self.lengths[number] + 5
 
     def is_reachable(self, number: int, s: float, r: float) -> bool:
-        """Whether somebody may change to a lane."""
+        """Whether highway-env counts the lane as reachable from a position, for a lane change."""
         return (
             not self.lanes[number].forbidden and abs(r) <= 2 * self.widths[number] and 0 <= s < self.lengths[number] + 5
         )
 
 
 def _laid_out(network: RoadNetwork) -> tuple[list[tuple[str, str, int]], list[AbstractLane]]:
-    """All keys and lanes, in the order in which highway-env compares lanes; nothing where it has methods of its own."""
+    """Return all keys and lanes in highway-env's order of comparison; empty if the network has its own methods."""
     keys, lanes = [], []
     if type(network) is RoadNetwork and vars(network).keys() == {"graph"}:
         for start, ends in network.graph.items():
@@ -180,12 +180,12 @@ def _values(lanes: list[AbstractLane]) -> list[tuple[object, ...]]:
 
 
 def _limits(speed_limit: float | None) -> tuple[float, float]:
-    """Between which a driver's speed is kept on a lane, in m/s."""
+    """Return the bounds of a driver's target speed on a lane, in m/s."""
     return (0.0, float(speed_limit)) if speed_limit is not None else (-math.inf, math.inf)
 
 
 def _reach() -> list[float]:
-    """How far beyond its end a lane of each kind counts, in m."""
+    """Return the distance in m by which each class of lanes extends beyond its end."""
     return [kind.VEHICLE_LENGTH for kind in _KNOWN]
 
 
@@ -223,7 +223,7 @@ _DTYPES = (np.dtype(np.float64), np.dtype(np.int64))
 
 
 def _box(lane: AbstractLane) -> tuple[float, float, float, float]:
-    """A box around the centre line, and around what its curve swings to beyond its ends."""
+    """Return the bounding box of a lane's centre line, padded for the curve between samples and beyond the ends."""
     spacing = float(lane.length) / (_SAMPLES - 1)
     points = np.array([lane.position(spacing * number, 0.0) for number in range(_SAMPLES)])
     pad = 1e-6

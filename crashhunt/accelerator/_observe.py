@@ -1,4 +1,4 @@
-"""What an agent is shown: `KinematicObservation.observe` without data frames, and who is close by."""
+"""Observations: `KinematicObservation.observe` without data frames, and the search for close objects."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def close_objects(
     sort: bool,
     vehicles_only: bool,
 ) -> list[RoadObject] | None:
-    """`Road.close_objects_to`; None where that must be asked."""
+    """Return the result of `Road.close_objects_to`; None if highway-env's own code must run."""
     lane = frame.network.number.get(id(vehicle.lane))
     row = frame.row.get(id(vehicle))
     kind = kind_of(type(vehicle))
@@ -72,7 +72,7 @@ def close_objects(
 
 
 def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.generic] | None:
-    """`KinematicObservation.observe`; None where that must be asked."""
+    """Return the result of `KinematicObservation.observe`; None if highway-env's own code must run."""
     env, vehicle, features = kinematic.env, kinematic.observer_vehicle, kinematic.features
     if frame is None or not _are_known(features) or not _is_plain(vehicle, features):
         return None
@@ -105,7 +105,7 @@ def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.
 
 
 def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.float64]] | None:
-    """`KinematicsGoalObservation.observe`; None where that must be asked."""
+    """Return the result of `KinematicsGoalObservation.observe`; None if highway-env's own code must run."""
     vehicle, features = kinematic.observer_vehicle, kinematic.features
     goal = getattr(vehicle, "goal", None)
     if vehicle is None or goal is None or type(features) is not list or not _KNOWN.issuperset(features):
@@ -113,7 +113,9 @@ def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.f
     things = [vehicle, goal]
     if not are_plain(things) or not all(_is_plain(thing, features) for thing in things):
         return None
-    if any(getattr(thing, "route", None) for thing in things):  # whose end is asked for, shown or not
+    if any(
+        getattr(thing, "route", None) for thing in things
+    ):  # `to_dict` would compute the destination, which may fail
         return None
     here, there = (np.array([values[name] for name in features]) for values in (_values(vehicle), _values(goal)))
     scales = kinematic.scales
@@ -121,9 +123,9 @@ def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.f
 
 
 def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, reach: float) -> None:
-    """`OccupancyGridObservation.fill_road_layer_by_lanes`, all points of a lane at once.
+    """Do what `OccupancyGridObservation.fill_road_layer_by_lanes` does, for all points of a lane together.
 
-    What lies so near to the border of a cell that rounding could decide is asked of highway-env.
+    highway-env's own code decides about points so near to the border of a cell that rounding matters.
     """
     observer = grid.observer_vehicle
     spacing, low, cells = np.amin(grid.grid_step), grid.grid_size[:, 0], grid.grid.shape[-2:]
@@ -145,7 +147,7 @@ def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, rea
 
 
 def _along(lane: AbstractLane, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places on the centre line, shape (points, 2); the last bits may differ from highway-env's."""
+    """Return positions on the centre line, of shape (points, 2); the last bits may differ from highway-env's."""
     if isinstance(lane, CircularLane):
         phi = lane.direction * points / lane.radius + lane.start_phase
         found = lane.center + lane.radius * np.stack((np.cos(phi), np.sin(phi)), axis=1)
@@ -159,12 +161,12 @@ def _along(lane: AbstractLane, points: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def _are_known(features: object) -> bool:
-    """Whether features are known, and each is asked for once: of the others, a data frame has more columns."""
+    """Whether all features are known and each occurs once; a data frame repeats the column of a repeated feature."""
     return type(features) is list and _KNOWN.issuperset(features) and len(set(features)) == len(features)
 
 
 def _arrives(thing: RoadObject, network: Network) -> bool:
-    """Whether the end of its route is on the road: whoever describes a vehicle asks for it, shown or not."""
+    """Whether the end of a vehicle's route is on the road; otherwise highway-env's `to_dict` fails."""
     route = getattr(thing, "route", None)
     if not route:
         return True
@@ -183,7 +185,7 @@ def _is_plain(thing: RoadObject, features: list[str]) -> bool:
 
 
 def _values(thing: RoadObject) -> dict[str, float]:
-    """The part of `to_dict` that is asked for."""
+    """Return the part of highway-env's `to_dict` that observations use."""
     x, y = thing.position.tolist()
     c, s = float(np.cos(thing.heading)), float(np.sin(thing.heading))
     vx, vy = (float(thing.speed) * c, float(thing.speed) * s) if isinstance(thing, Vehicle) else (0.0, 0.0)

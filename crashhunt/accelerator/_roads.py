@@ -1,4 +1,4 @@
-"""What is known about the roads that are driven on: their lanes, and who is on them."""
+"""Caches for the roads in use: their lanes, and the state of their vehicles."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ __all__ = [
 ]
 
 
-_ROADS = 16  # that are remembered: those of several environments in one process
+_MAX_ROADS = 16  # number of cached roads: one process may run several environments
 _roads: dict[int, Prepared] = {}
 watches: dict[str, Watch] = {}
-"""``roads`` and ``observations``, while it is fast."""
+"""The watches ``roads`` and ``observations`` while the accelerator is on; otherwise empty."""
 
 
 class Prepared:
-    """What is computed once for a road: its network, and where everybody is.
+    """The cached data of a road: its network, and the state of its vehicles.
 
     Attributes:
-        network: its lanes.
-        frame: where everybody was when that was last asked for.
-        alone: whether nobody else's code runs between its sub-steps, so that who is there is looked at once.
+        network: The lanes of the road.
+        frame: The positions at the last access.
+        alone: Whether no foreign code runs between the sub-steps of the road, so that the state stays valid.
     """
 
     def __init__(self, road: Road) -> None:
-        self.road = road  # held, so that no other road can have its identity
+        self.road = road  # keeps the road alive, so that no other road can get its id()
         self.network = Network(road.network)
         self.frame: Frame | None = None
         self.alone = False
@@ -57,31 +57,31 @@ class Prepared:
         self._moved: list[Vehicle] = []
 
     def move(self, crowd: Crowd, dt: float, before: Frame | None) -> Frame | None:
-        """Move everybody, as `move` does."""
+        """Move all vehicles with `move`, and remember which vehicles need `as_numpy` afterwards."""
         frame = move(crowd, self.network, dt, before, alone=self.alone)
         if self.alone and frame is not None:
             self._moved = crowd.vehicles
         return frame
 
     def keep(self, crowd: Crowd, frame: Frame) -> None:
-        """Trust what is known about everybody until somebody else's code runs."""
+        """Keep the state of all vehicles until foreign code runs."""
         self.frame = frame
         self._crowd = crowd if self.alone and crowd.drives and crowd.moves else None
 
     def trusted(self) -> Everybody | None:
-        """Who is there, as they were kept; nobody is, until they are kept again."""
+        """Return the kept state and discard it; None if no state has been kept since the last call."""
         crowd, self._crowd = self._crowd, None
         return (self, crowd, self.frame) if crowd is not None and self.frame is not None else None
 
     def distrust(self) -> None:
-        """Have somebody else's code run: everybody is as in highway-env, and is looked at again afterwards."""
+        """Prepare for foreign code: restore highway-env's types, and discard the kept state."""
         self._crowd = None
         as_numpy(self._moved)
         self._moved = []
 
 
 def look(road: Road) -> Everybody | None:
-    """Look at everybody on a road; None where it is not known, or how all of them drive."""
+    """Return the current state of a road; None if the road or the decisions of a vehicle are unknown."""
     found = prepared(road) if all(kind.drives for kind in kinds_of(road.vehicles)) else None
     if found is None:
         return None
@@ -94,7 +94,7 @@ def look(road: Road) -> Everybody | None:
 
 
 def take(road: Road) -> Everybody | None:
-    """Everybody on a road on which nobody else's code has run since they were kept."""
+    """Return the kept state of a road; None if foreign code may have run since."""
     found = _roads.get(id(road))
     return found.trusted() if found is not None and found.road is road else None
 
@@ -106,24 +106,24 @@ def forget() -> None:
 
 
 def prepared(road: Road, *, known: bool = False) -> Prepared | None:
-    """Return what is known about a road; None where it, its lanes or highway-env itself are not what is known.
+    """Return the cached data of a road; None if the road, its lanes or highway-env itself are unknown.
 
     Args:
-        road: the road.
-        known: whether `is_known` has just said that it is.
+        road: The road.
+        known: Whether `is_known` has just returned true for the road.
     """
     if not known and not is_known(road):
         return None
     found = _roads.get(id(road))
     if found is None or not found.network.is_of(road.network):
         found = _roads[id(road)] = Prepared(road)
-        while len(_roads) > _ROADS:  # an episode has one road, which nobody needs afterwards
+        while len(_roads) > _MAX_ROADS:  # each episode has a new road
             del _roads[next(iter(_roads))]
     return found if found.network.plain else None
 
 
 class _RoadKind:
-    """What is known about a class of roads; those that have no method in the way are as good as highway-env's own."""
+    """Properties of a class of roads: whether it overrides a method that the accelerator bypasses."""
 
     def __init__(self, kind: type[Road]) -> None:
         base = RegulatedRoad if issubclass(kind, RegulatedRoad) else Road
@@ -133,13 +133,13 @@ class _RoadKind:
 
 _READ = ("network", "vehicles", "objects", "np_random", "record_history", "neighbour_vehicles_connected_lanes")
 _BYPASSED = ("neighbour_vehicles", "is_conflict_possible")
-"""The methods of a road that are not called where it is sped up; all others are."""
-_CALLED = {"act", "step"}  # one road may have its own, which call the class's
+"""The methods of a road that the accelerator does not call; it calls all others."""
+_CALLED = {"act", "step"}  # a road object may have its own, which call the methods of the class
 _road_kinds: dict[type, _RoadKind] = {}
 
 
 def is_known(road: Road) -> bool:
-    """Whether a road is of a kind that is known, and highway-env as it was."""
+    """Whether a road has a known class, and no function of highway-env has been replaced."""
     if not watches or not watches["roads"].intact:
         return False
     kind = type(road)
@@ -153,13 +153,13 @@ def is_known(road: Road) -> bool:
 
 
 def network_of(road: Road) -> Network | None:
-    """The lanes of a road."""
+    """Return the lanes of a road; None if the road is unknown."""
     found = prepared(road)
     return found.network if found is not None else None
 
 
 def frame_of(road: Road) -> Frame | None:
-    """Where everybody is on a road now."""
+    """Return the current positions on a road; None if the road or an object is unknown."""
     found = prepared(road)
     if found is None:
         return None
@@ -169,7 +169,7 @@ def frame_of(road: Road) -> Frame | None:
 
 
 def methods_of(kind: type) -> frozenset[str]:
-    """The names of all that a class has and that is no mere value."""
+    """Return the names of all members of a class that are not plain values."""
     return frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name)))
 
 

@@ -1,4 +1,8 @@
-"""An environment's sub-steps, in which nobody is looked at again for as long as nobody else's code can have run."""
+"""The loop over an environment's sub-steps, which keeps the vehicles' state in arrays while no foreign code runs.
+
+Foreign code is code of the user or of a library other than highway-env. It may change a vehicle at any time, so the
+state is read again after it has run.
+"""
 
 from __future__ import annotations
 
@@ -28,23 +32,24 @@ if TYPE_CHECKING:
     from highway_env.envs.common.observation import ObservationType
 
 
-__all__ = ["Onlooker", "Unasked", "can_run_alone", "simulate"]
+__all__ = ["Onlooker", "SkippedObservation", "can_run_alone", "simulate"]
 
 
-# Somebody who looks on while a road moves on, and says when he does more than that.
+# A wrapper of a road's `step` that declares whether it changes the road.
 
 
 class Onlooker:
-    """Stands on a road in the place of its ``step``. What has been computed for a road holds while he only looks.
+    """Replaces the ``step`` of a road object, and calls observers before and after it.
 
-    Meanwhile headings may be Python's floats, which are NumPy's after a step of the environment.
+    The kept state of the road stays valid while the observers do not interfere. Until the end of the environment's
+    step, headings may then be Python floats in place of NumPy floats.
 
     Args:
-        advance: the road's own ``step``.
-        before: called before it, with how long the sub-step is (s).
-        after: called after it.
-        interferes: whether these two may change anything about the road, as it is asked before and after each
-            sub-step; never, if that is not said.
+        advance: The road's own ``step``.
+        before: Called before each sub-step with its length, in s.
+        after: Called after each sub-step.
+        interferes: Returns whether the two observers may change the road; called before and after each sub-step. By
+            default they never do.
     """
 
     def __init__(
@@ -61,11 +66,11 @@ class Onlooker:
         self.interferes = interferes
 
     def __deepcopy__(self, memo: dict[int, object]) -> Onlooker:
-        """Stay the same on a copy of the road, as a function does."""
+        """Return the same object for a copy of the road, as for a function."""
         return self
 
     def __call__(self, dt: float) -> None:
-        """Move the road on."""
+        """Run a sub-step of the road with its observers."""
         if self._before is not None:
             self._before(dt)
         self._advance(dt)
@@ -79,19 +84,19 @@ _kinds: dict[type, Own] = {}
 
 
 def can_run_alone() -> bool:
-    """Whether what highway-env calls between sub-steps is its own; remembers it."""
+    """Whether the functions that highway-env calls between sub-steps are its own; stores them in `originals`."""
     found = {f"AbstractEnv.{name}": getattr(AbstractEnv, name) for name in _CALLED}
     originals.update(found)
     return all(is_genuine(name, function) for name, function in found.items())
 
 
 def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[type, str, object]]) -> None:
-    """`AbstractEnv._simulate`.
+    """Do what `AbstractEnv._simulate` does.
 
     Args:
-        env: the environment.
-        action: of its agents, if any.
-        replaced: what has to be in place: the owner of a method, its name and what that has been replaced with.
+        env: The environment.
+        action: The action of its agents, or None.
+        replaced: The replacements that must be in place: the owner of a method, its name and its replacement.
     """
     road = env.road
     found = prepared(road) if _runs_alone(env) and _are_in_place(replaced) else None
@@ -126,7 +131,7 @@ def _frames(env: AbstractEnv) -> int:
 
 
 def _runs_alone(env: AbstractEnv) -> bool:
-    """Whether only the actions' code and what looks on runs between the sub-steps of an environment."""
+    """Whether only the agents' actions and an `Onlooker` run between the sub-steps of an environment."""
     road, kind = env.road, type(env)
     if type(road) not in (Road, RegulatedRoad) or env.viewer is not None:
         return False
@@ -143,7 +148,7 @@ def _runs_alone(env: AbstractEnv) -> bool:
 
 
 def _are_in_place(replaced: Iterable[tuple[type, str, object]]) -> bool:
-    """Whether nobody has wrapped what highway-env calls in a sub-step."""
+    """Whether no method that highway-env calls in a sub-step has been wrapped or replaced."""
     rendering = vars(AbstractEnv).get("_automatic_rendering")
     return rendering is originals["AbstractEnv._automatic_rendering"] and all(
         vars(owner).get(name) is faster for owner, name, faster in replaced
@@ -155,42 +160,47 @@ def _interferes(road: Road) -> bool:
     return onlooker is not None and (type(onlooker) is not Onlooker or onlooker.interferes())
 
 
-# Leaves out an environment's own observation where something else is shown, and nobody can tell.
+# Skips an environment's own observation if the agent gets another observation and the skip has no other effect.
 
-_LASTING_NOTHING = (KinematicObservation, ExitObservation, OccupancyGridObservation)
-_HOMES = tuple(str(Path(file).parent) for file in (highway_env.__file__, __file__))  # one method is the accelerator's
+_STATELESS = (KinematicObservation, ExitObservation, OccupancyGridObservation)
+_HOMES = tuple(str(Path(file).parent) for file in (highway_env.__file__, __file__))  # the accelerator replaces a method
 
 
-class Unasked:
-    """While this is entered, an environment observes nothing; it must be stepped there, and no more.
+class SkippedObservation:
+    """A context in which one step of an environment skips its own observation.
 
-    It observes as ever where an observation lasts, such as one that draws random numbers, where the environment needs
-    it, and where code of somebody's is asked for it: a class of environments or vehicles, a method that is replaced.
+    The environment still observes in three cases:
+
+    - The observation has effects, such as drawing random numbers.
+    - The environment itself needs the observation.
+    - A class or method of the user could notice the skip.
 
     Args:
-        env: the environment, after its reset.
+        env: The environment, after its reset.
     """
 
     def __init__(self, env: AbstractEnv) -> None:
         self._env = env
-        self._left_out: ObservationType | None = None
+        self._skipped: ObservationType | None = None
 
     def __enter__(self) -> None:
         seeing = self._env.observation_type
-        if self._can_be_left_out(seeing):
-            seeing.observe = _nothing
-            self._left_out = seeing
+        if self._can_be_skipped(seeing):
+            seeing.observe = _observe_nothing
+            self._skipped = seeing
 
     def __exit__(self, *_: object) -> None:
-        if self._left_out is not None:
-            del self._left_out.observe
-            self._left_out = None
+        if self._skipped is not None:
+            del self._skipped.observe
+            self._skipped = None
 
-    def _can_be_left_out(self, seeing: ObservationType) -> bool:
+    def _can_be_skipped(self, seeing: ObservationType) -> bool:
         if not watches:
             return False
         eyes = seeing.agents_observation_types if type(seeing) is MultiAgentObservation else [seeing]
-        if not all(map(_lasts_not, eyes)) or not all(_methods_of(eye).isdisjoint(vars(eye)) for eye in (seeing, *eyes)):
+        if not all(map(_is_stateless, eyes)):
+            return False
+        if not all(_methods_of(eye).isdisjoint(vars(eye)) for eye in (seeing, *eyes)):
             return False
         road = self._env.road
         things = [*road.vehicles, *road.objects]
@@ -201,34 +211,34 @@ class Unasked:
         )
 
 
-def _nothing() -> None:
-    """See nothing."""
+def _observe_nothing() -> None:
+    """Return no observation."""
 
 
-def _lasts_not(eye: ObservationType) -> bool:
-    """Whether an observation changes nothing but what it returns."""
-    if type(eye) not in _LASTING_NOTHING:
+def _is_stateless(eye: ObservationType) -> bool:
+    """Whether making an observation has no effect except its return value."""
+    if type(eye) not in _STATELESS:
         return False
     values = vars(eye)
-    # The range of the features is chosen when it is first needed.
+    # The first observation sets the range of the features, which later observations use.
     settled = bool(values["features_range"]) or not values.get("normalize", True)
     return settled and values.get("order") != "shuffled"
 
 
 class _Environments:
-    """A class of environments, all of whose methods are highway-env's own, or not."""
+    """Properties of a class of environments: whether all its methods are highway-env's own."""
 
     def __init__(self, kind: type[AbstractEnv]) -> None:
         self.own = Own(kind, AbstractEnv, ())
         self.methods = methods_of(kind)
-        # A car park looks at what is shown to say who has arrived.
+        # A parking environment reads the observation to decide whether the vehicle has arrived.
         self.genuine = not issubclass(kind, ParkingEnv) and all(
             base in (object, Env, Generic) or _is_own(base) for base in kind.__mro__
         )
 
 
 def _is_own(kind: type) -> bool:
-    """Whether a class is defined in highway-env, and so are all functions of its."""
+    """Whether a class and all its functions are defined in highway-env or in the accelerator."""
     if not kind.__module__.startswith("highway_env."):
         return False
     functions = (getattr(found, "fget", None) or getattr(found, "__func__", found) for found in vars(kind).values())

@@ -1,7 +1,7 @@
-"""The accelerator of highway-env: the same results to the bit, with far less work.
+"""Switches the accelerator of highway-env on and off: bit-identical results in a fraction of the time.
 
-It replaces a few methods of highway-env's roads and of one observation, in this process only. Whatever it does not
-know, such as a class that overrides what it speeds up, is left to highway-env's own code.
+The accelerator replaces methods of highway-env's roads, environments and observations, in this process only. For
+everything that it does not know, such as a class that overrides one of these methods, highway-env's own code runs.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ __all__ = ["Acceleration", "accelerate", "is_on", "left_alone", "switch_off", "s
 
 
 def switch_on() -> str:
-    """Speed highway-env up in this process.
+    """Accelerate highway-env in this process.
 
     Returns:
-        Why not; empty where it is faster now.
+        The reason if highway-env cannot be accelerated; otherwise empty.
     """
     if watches:
         return why_not()
-    _restore()  # what a user's module replaced while it was on, and put back after it was switched off
+    _restore()  # a user's module may have put back one of our methods after the accelerator was switched off
     reason = reason_against()
     if not reason:
         alone = can_run_alone()
@@ -62,7 +62,8 @@ def switch_on() -> str:
             if owner is not AbstractEnv or alone:
                 originals[_name(owner, name)] = getattr(owner, name)
                 setattr(owner, name, faster)
-        # Whoever replaces one of ours has it called; but vehicles that decide together ask nobody for neighbours.
+        # highway-env calls a replacement of one of our methods, so watching them is unnecessary. The exception is
+        # `neighbour_vehicles`, which accelerated decisions bypass.
         ours = {_name(owner, name) for owner, name, _ in _REPLACED}
         watches["roads"] = Watch.of_roads(ours - {"Road.neighbour_vehicles"})
         watches["observations"] = Watch.of_observations(ours)
@@ -70,7 +71,7 @@ def switch_on() -> str:
 
 
 def switch_off() -> None:
-    """Have highway-env as it was; what somebody else has replaced meanwhile stays, and does without us."""
+    """Restore highway-env's methods; a method that other code has replaced meanwhile stays replaced."""
     forget()
     _restore()
 
@@ -86,12 +87,12 @@ def _name(owner: type, name: str) -> str:
 
 
 def is_on() -> bool:
-    """Whether somebody has asked for it, and it could be done."""
+    """Whether the accelerator is switched on."""
     return bool(watches)
 
 
 def why_not() -> str:
-    """Say why it is not fast at this moment; empty where it is, or where nobody has asked for it."""
+    """Return why the accelerator has no effect at the moment; empty if it has, or if it is switched off."""
     return next((watch.reason for watch in watches.values() if watch.reason), "")
 
 
@@ -100,9 +101,9 @@ def _act(self: Road) -> None:
         for vehicle in self.vehicles:
             vehicle.act()
         return
-    everybody = take(self) or look(self)
-    if everybody is not None:
-        found, crowd, frame = everybody
+    state = take(self) or look(self)
+    if state is not None:
+        found, crowd, frame = state
         if decide(self, frame, crowd):
             found.keep(crowd, frame)
             return
@@ -110,17 +111,17 @@ def _act(self: Road) -> None:
 
 
 def _step(self: Road, dt: float) -> None:
-    if len(self.vehicles) + len(self.objects) < 2:  # nothing to gain: cheaper than the original, which looks for pairs
+    if len(self.vehicles) + len(self.objects) < 2:  # cheaper than the original, which loops over pairs
         for vehicle in self.vehicles:
             vehicle.step(dt)
         if len(self.vehicles) + len(self.objects) > 1:
             collide_one_by_one(self, dt)
         return
-    everybody = take(self)
-    if everybody is None and not is_known(self):
+    state = take(self)
+    if state is None and not is_known(self):
         originals["Road.step"](self, dt)
         return
-    found, crowd, before = everybody or (prepared(self, known=True), Crowd(self), None)
+    found, crowd, before = state or (prepared(self, known=True), Crowd(self), None)
     frame = None
     if found is not None and crowd.moves and not self.record_history:
         frame = found.move(crowd, dt, before)
@@ -170,10 +171,10 @@ def _close_objects_to(
 
 
 def _enforce_road_rules(self: RegulatedRoad) -> None:
-    everybody = take(self)
-    if (everybody is not None or prepared(self) is not None) and enforce(self):
-        if everybody is not None:
-            found, crowd, frame = everybody
+    state = take(self)
+    if (state is not None or prepared(self) is not None) and enforce(self):
+        if state is not None:
+            found, crowd, frame = state
             found.keep(crowd, frame)
     else:
         originals["RegulatedRoad.enforce_road_rules"](self)
@@ -203,7 +204,7 @@ def _fill_road_layer_by_lanes(
 
 
 def _is_plain(observation: KinematicObservation | OccupancyGridObservation, kind: Any) -> bool:
-    """Whether an observation of a road is of a class that is known, and nobody has replaced a part of it."""
+    """Whether an observation has a known class, observes a road, and has no replaced method."""
     return bool(
         type(observation) is kind
         and watches
@@ -229,13 +230,13 @@ _REPLACED: tuple[tuple[type, str, Callable[..., object]], ...] = (
 _OF_ROADS = [replaced for replaced in _REPLACED if issubclass(replaced[0], Road)]
 
 
-# ``crashhunt.accelerate()``: highway-env faster in a process of your own, such as one that trains a policy.
+# ``crashhunt.accelerate()`` accelerates highway-env in the user's process, such as a training of a policy.
 
 
 class Acceleration:
-    """What `accelerate` has done, as it stands at the moment: true where highway-env is faster.
+    """The current state of the acceleration: true if highway-env is accelerated.
 
-    As a context manager it is undone at the end of the block, unless it was in place before.
+    As a context manager, it switches the accelerator off at the end of the block, unless it was on before.
     """
 
     def __init__(self, reason: str, *, before: bool) -> None:
@@ -244,25 +245,19 @@ class Acceleration:
 
     @property
     def reason(self) -> str:
-        """Why highway-env is as slow as ever, such as that a module of yours has replaced one of its functions."""
-        from crashhunt.accelerator import _switch
-
+        """Why highway-env is not accelerated, such as a replaced function; empty if it is accelerated."""
         if self._reason:
             return self._reason
-        return _switch.why_not() if _switch.is_on() else "it has been undone"
+        return why_not() if is_on() else "it has been undone"
 
     @property
     def left_alone(self) -> dict[str, tuple[str, ...]]:
-        """The classes of vehicles met so far that are not sped up, or in part only, with what is their own."""
-        from crashhunt.accelerator import _switch
-
-        return {name: tuple(own) for name, own in _switch.left_alone.items()}
+        """Classes of vehicles that are not accelerated, or only in part, each with the members that it overrides."""
+        return {name: tuple(own) for name, own in left_alone.items()}
 
     def undo(self) -> None:
-        """Have highway-env as it was."""
-        from crashhunt.accelerator import _switch
-
-        _switch.switch_off()
+        """Switch the accelerator off."""
+        switch_off()
 
     def __bool__(self) -> bool:
         return not self.reason
@@ -284,15 +279,19 @@ class Acceleration:
 
 
 def accelerate() -> Acceleration:
-    """Speed highway-env up in this process: the same results to the bit, in a fraction of the time.
+    """Accelerate highway-env in this process: bit-identical results in a fraction of the time.
 
-    What it does not know is left to highway-env's own code, and looked at again in every step: another version of it,
-    classes of yours that override what is sped up, functions and methods that somebody replaces, on a class, a module
-    or one object. A hunt does this by itself.
+    Hunts do this by themselves. Call this function in your own process, such as a training. highway-env's own code runs
+    for everything that the accelerator does not know, and the accelerator checks that in every step:
+
+    - another version of highway-env
+    - your classes that override an accelerated method
+    - functions and methods that other code has replaced, on a class, a module or an object
 
     Returns:
-        What came of it: its truth value says whether, ``reason`` why not, ``left_alone`` which classes are not sped
-        up, and ``undo()``, or the end of a ``with`` block, has highway-env as it was.
+        The state of the acceleration. Its truth value says whether highway-env is accelerated. ``reason`` says why not.
+        ``left_alone`` lists classes that are not accelerated. ``undo()``, or the end of a ``with`` block, switches the
+        accelerator off.
 
     Example:
         >>> import crashhunt
@@ -300,7 +299,5 @@ def accelerate() -> Acceleration:
         ...     print(faster)
         <highway-env is accelerated>
     """
-    from crashhunt.accelerator import _switch
-
-    before = _switch.is_on()
-    return Acceleration(_switch.switch_on(), before=before)
+    before = is_on()
+    return Acceleration(switch_on(), before=before)

@@ -1,4 +1,4 @@
-"""Everybody on a road at one instant, with their coordinates on the lanes: computed once, shared by all who ask."""
+"""The vehicles and objects of a road as arrays: positions, coordinates on lanes, and parameters of drivers."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ if TYPE_CHECKING:
     from crashhunt.accelerator._network import Network
     from crashhunt.accelerator._versions import Kind
 
-    Pairs = tuple[NDArray[np.bool_], NDArray[np.float64]]  # who may touch whom, and within which distance
+    Pairs = tuple[NDArray[np.bool_], NDArray[np.float64]]  # who may touch which, and within which distance
 
 
-__all__ = ["ASK", "MANY", "NOBODY", "Crowd", "Frame", "are_plain"]
+__all__ = ["ASK", "MANY", "NO_VEHICLE", "Crowd", "Frame", "are_plain"]
 
 
-MANY = 12  # from so many on, arrays are faster than one after another
-NOBODY, ASK = -1, -2
+MANY = 12  # from this number of vehicles on, arrays are used in place of a loop
+NO_VEHICLE, ASK = -1, -2
 
 
 class Frame:
-    """Positions do not change while vehicles decide.
+    """The positions of all objects at one instant, with lazily computed coordinates on the lanes.
 
     Args:
-        network: of the road.
-        road: with its vehicles and objects.
-        places: where they are, of shape (things, 2) and in m, if that has been looked at.
-        before: of the same ones earlier, if there is one.
+        network: The lanes of the road.
+        road: The road with its vehicles and objects.
+        places: The positions in m, of shape (things, 2); None to read them from the objects.
+        before: An earlier frame of the same objects, or None.
 
     Attributes:
-        plain: whether all have a place of the usual kind; otherwise nothing here may be used.
+        plain: Whether all positions have the usual type; otherwise the frame must not be used.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Frame:
         self._queues: dict[LaneIndex, tuple[list[float], list[RoadObject]]] = {}
 
     def is_of(self, road: Road) -> bool:
-        """Whether everybody is still there, and where they were."""
+        """Whether the road still has the same objects at the same positions."""
         things = road.vehicles + road.objects
         if not self.plain or not are_plain(things):
             return False
@@ -80,8 +80,8 @@ class Frame:
         return self.has(things, places)
 
     def has(self, things: list[RoadObject], places: NDArray[np.float64]) -> bool:
-        """Whether these are everybody, and this is where they were."""
-        # By identity: a class of somebody's may call two vehicles equal.
+        """Whether the frame has exactly these objects at these positions."""
+        # Compare identities, because a user's class may define equality.
         return (
             self.plain
             and list(map(id, things)) == list(self.row)
@@ -91,22 +91,22 @@ class Frame:
 
     @cached_property
     def on_axis(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Coordinates of all on the lanes along an axis, each of shape (things, lanes)."""
+        """Coordinates of all objects on the lanes along an axis, each of shape (things, lanes)."""
         return self.network.on_axis(self.places[:, 0], self.places[:, 1])
 
     @cached_property
     def no_landmark(self) -> NDArray[np.bool_]:
-        """Which of all somebody may meet on a lane."""
+        """Whether each object counts as a neighbour on a lane; landmarks do not."""
         return np.array([not isinstance(thing, Landmark) for thing in self.things], bool)
 
     @cached_property
     def boxes(self) -> NDArray[np.float64]:
-        """Lower bounds of the distances of all from the other lanes."""
+        """Lower bounds of the distances of all objects from the lanes not along an axis."""
         return self.network.box_distance(self.places[:, 0], self.places[:, 1])
 
     @cached_property
     def _order(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
-        """All who are on a lane along an axis, by lane and by their place there: column of the lane, row, m."""
+        """Objects on lanes along an axis, sorted by lane and position: column of the lane, row of the object, m."""
         (s, r), network = self.on_axis, self.network
         on = (np.abs(r) <= network.half_width) & (s >= -5) & (s < network.length + 5) & self.no_landmark[:, None]
         columns, rows = np.nonzero(on.T)
@@ -116,15 +116,16 @@ class Frame:
 
     @cached_property
     def ahead(self) -> NDArray[np.intp]:
-        """Who is next on the lanes along an axis, of shape (things, lanes): a row, or one of the two below.
+        """Row of the next object ahead on each lane along an axis, of shape (things, lanes).
 
-        `NOBODY`, or `ASK` for those who are not on the lane themselves, or where two are in the same place.
+        The value `NO_VEHICLE` means that no object is ahead. The value `ASK` means that the caller must search: the
+        object is not on the lane, or two objects are at the same position.
         """
         columns, rows, along = self._order
         found = np.full((len(self.things), len(self.network.axis)), ASK)
         same = columns[1:] == columns[:-1]
         if not (same & (along[1:] == along[:-1])).any():
-            after = np.full(len(rows), NOBODY)
+            after = np.full(len(rows), NO_VEHICLE)
             after[:-1][same] = rows[1:][same]
             found[rows, columns] = after
         return found
@@ -132,7 +133,7 @@ class Frame:
     def coordinates_of(
         self, rows: Sequence[int] | NDArray[np.intp], lanes: NDArray[np.intp]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Coordinates of so many, each on a lane of its own."""
+        """Return the coordinates of objects, each on its given lane."""
         columns = self.network.axis_columns[lanes]
         if len(rows) >= MANY and columns.min() >= 0:
             s, r = self.on_axis
@@ -141,7 +142,7 @@ class Frame:
         return np.array([s for s, _ in pairs]), np.array([r for _, r in pairs])
 
     def coordinates(self, row: int, lane: int) -> tuple[float, float]:
-        """Coordinates of one on one lane."""
+        """Return the coordinates of an object on a lane."""
         columns = self._columns.get(lane)
         if columns is None and self.network.is_axis[lane]:
             columns = self.column(lane)
@@ -153,7 +154,7 @@ class Frame:
         return found
 
     def column(self, lane: int) -> tuple[list[float], list[float]]:
-        """Coordinates of all on one lane along an axis."""
+        """Return the coordinates of all objects on a lane along an axis."""
         found = self._columns.get(lane)
         if found is None:
             (s, r), column = self.on_axis, self.network.column[lane]
@@ -163,10 +164,10 @@ class Frame:
     def neighbours(
         self, vehicle: RoadObject, row: int, key: LaneIndex
     ) -> tuple[RoadObject | None, RoadObject | None] | None:
-        """Who is ahead and who is behind on a lane: `Road.neighbour_vehicles`. None where that must be asked."""
+        """Return the result of `Road.neighbour_vehicles`, the objects ahead and behind; None if the lane is unknown."""
         try:
             lane = self.network.index.get(key)
-        except TypeError:  # a list names a lane as well
+        except TypeError:  # highway-env accepts a list as a lane index, which is not hashable
             return None
         if lane is None:
             return None
@@ -180,12 +181,14 @@ class Frame:
         ahead = behind = None
         at = s
         first = bisect_left(places, s)
-        for number in range(first, len(places)):  # of those in the same place, the last one counts
+        for number in range(
+            first, len(places)
+        ):  # of several objects at the same position, highway-env returns the last
             if things[number] is not vehicle:
                 if ahead is not None and places[number] != at:
                     break
                 ahead, at = things[number], places[number]
-        for number in range(first - 1, -1, -1):  # and here the first one
+        for number in range(first - 1, -1, -1):  # behind, highway-env returns the first
             if things[number] is not vehicle:
                 if behind is not None and places[number] != at:
                     break
@@ -193,7 +196,7 @@ class Frame:
         return ahead, behind
 
     def _queue(self, lane: int) -> tuple[list[float], list[RoadObject]]:
-        """Those on a lane, and with it on those that lead to it and on from it, by their place along it."""
+        """Return the positions and objects on a lane, and on connected lanes if the road wants them, in order."""
         if not self._looks_further and len(self.things) >= MANY and self.network.is_axis[lane]:
             return self._axis_queue(lane)
         if not self._looks_further:
@@ -203,14 +206,14 @@ class Frame:
             seen: set[int] = set()
             for other, offset in self._connected(lane):
                 for s, row in self._on_lane(other):
-                    if row not in seen:  # the first lane on which it is decides
+                    if row not in seen:  # the first lane of an object decides
                         seen.add(row)
                         found.append((s + offset, row))
         found.sort()
         return [s for s, _ in found], [self.things[row] for _, row in found]
 
     def _axis_queue(self, lane: int) -> tuple[list[float], list[RoadObject]]:
-        """The same on one lane along an axis alone."""
+        """Return the positions and objects on a lane along an axis, without connected lanes."""
         columns, rows, along = self._order
         begin, end = columns.searchsorted((self.network.column[lane], self.network.column[lane] + 1)).tolist()
         return along[begin:end].tolist(), [self.things[row] for row in rows[begin:end].tolist()]
@@ -231,7 +234,7 @@ class Frame:
         return found
 
     def _connected(self, lane: int) -> list[tuple[int, float]]:
-        """The lane, those that follow and those that lead to it, each with the offset of its coordinates."""
+        """Return the lane, its successors and its predecessors, each with the offset of its coordinates, in m."""
         graph, network = self.road.network.graph, self.network
         start, end, number = network.keys[lane]
         found = [(lane, 0.0)]
@@ -248,7 +251,7 @@ class Frame:
 
 
 def are_plain(things: list[RoadObject], kinds: list[Kind] | None = None) -> bool:
-    """Whether all have a place of the usual kind, which nobody else has; nobody is on the road twice."""
+    """Whether all positions have the usual type, no two objects share a position array, and no object occurs twice."""
     if not all(map(_PLAIN, kinds or kinds_of(things))):
         return False
     positions = [thing.position for thing in things]
@@ -260,7 +263,7 @@ def are_plain(things: list[RoadObject], kinds: list[Kind] | None = None) -> bool
 
 
 def _is_place(position: NDArray[np.float64]) -> bool:
-    # That of an array that has been pickled is another one that is equal.
+    # An unpickled array has an equal dtype that is another object.
     return (position.dtype is _FLOAT or position.dtype == _FLOAT) and position.shape == (2,)
 
 
@@ -269,35 +272,35 @@ _FLOAT = np.dtype(np.float64)
 _ARRAYS = frozenset((np.ndarray,))
 
 
-# Everybody on a road, with what of them stays as it is for as long as nobody else's code runs.
+# All objects of a road, with the attributes that stay constant while no foreign code runs.
 
 _COLLIDES, _MOVES = attrgetter("collides"), attrgetter("moves")
-_STEEP = 20.0  # what has an exponent above need not be finite
+_STEEP = 20.0  # with a larger IDM exponent, an acceleration may overflow
 _POSE = attrgetter("heading", "speed")
-_NAMES = NUMBERS_OF["idm"]  # which all others have the first of
+_NAMES = NUMBERS_OF["idm"]  # the names of all other bases are a prefix of these
 _READ = {how: attrgetter(*names) for how, names in NUMBERS_OF.items()}
 
 
 class Crowd:
-    """Looked at when it is made; `move` keeps up to date where everybody is, and says so here.
+    """The state and parameters of all vehicles and objects of a road; `move` updates the state.
 
     Args:
-        road: with its vehicles and objects.
+        road: The road with its vehicles and objects.
 
     Attributes:
-        drives: whether it is known how all vehicles decide, and all that they reckon with are numbers.
-        moves: whether it is known how all vehicles move.
-        collides: whether it is known how all collide.
-        things: the vehicles, and the objects after them, of which all others have one entry each.
-        places: shape (things, 2), in m.
-        headings: in rad.
-        speeds: in m/s.
-        lanes: the numbers of the lanes on which vehicles are, once `move` has found them.
-        idm: the rows of vehicles that decide by themselves.
-        controlled: the rows of vehicles that keep to a speed and a lane.
-        sliding: the rows of vehicles that move by the dynamic model.
-        of_numpy: the rows of vehicles whose speeds are NumPy's floats, as which they stay.
-        timed: the vehicles that count the time since they last thought of changing lanes.
+        drives: Whether the accelerator knows how all vehicles decide, and all their parameters are usual numbers.
+        moves: Whether the accelerator knows how all vehicles move.
+        collides: Whether the accelerator knows how all objects collide.
+        things: The vehicles, then the objects; the arrays have a row for each.
+        places: Positions in m, of shape (things, 2).
+        headings: Headings in rad.
+        speeds: Speeds in m/s.
+        lanes: The numbers of the vehicles' lanes; None until `move` has found them.
+        idm: Rows of the vehicles with the IDM and MOBIL models.
+        controlled: Rows of the vehicles that keep a target speed and a target lane.
+        sliding: Rows of the vehicles with the dynamic bicycle model.
+        of_numpy: Rows of the vehicles whose speeds are NumPy floats and must stay so.
+        timed: The vehicles that count the time since their last decision about a lane change.
     """
 
     def __init__(self, road: Road) -> None:
@@ -327,8 +330,8 @@ class Crowd:
         self.timed = [vehicle for vehicle, kind in zip(self.vehicles, kinds, strict=False) if kind.times]
 
     def _read(self, kinds: list[Kind]) -> bool:
-        """Read the numbers that a class usually has for all of its vehicles."""
-        shared: dict[int, int] = {}  # of each class, where its numbers are among those found
+        """Read the parameters of all objects, once per class; return False if one is missing or not a number."""
+        shared: dict[int, int] = {}  # index in `found` of the parameters of each class
         found: list[tuple[float, ...]] = []
         which: list[int] = []
         try:
@@ -344,7 +347,7 @@ class Crowd:
                         shared[id(kind)] = number
                 which.append(number)
             deltas = [thing.DELTA for thing, kind in zip(self.things, kinds, strict=True) if kind.base == "idm"]
-        except AttributeError:  # highway-env may never ask for what somebody's vehicle lacks
+        except AttributeError:  # a user's vehicle may lack a parameter that highway-env never reads
             return False
         if not are_numbers(chain.from_iterable(found)) or not are_numbers(deltas):
             return False
@@ -356,17 +359,17 @@ class Crowd:
 
     @cached_property
     def row(self) -> dict[int, int]:
-        """The row of everybody by their identity."""
+        """The row of each object, by its ``id()``."""
         return {id(thing): row for row, thing in enumerate(self.things)}
 
     @cached_property
     def aims(self) -> list[bool]:
-        """Which vehicles have a lane that they want to be on."""
+        """Whether each vehicle has a target lane."""
         return [isinstance(vehicle, ControlledVehicle) for vehicle in self.vehicles]
 
     @cached_property
     def tame(self) -> bool:
-        """Whether every acceleration that drivers reckon with is finite, as long as everybody's velocity is."""
+        """Whether the parameters guarantee finite accelerations for finite velocities."""
         found = self.of_gaps[:, self.idm]
         comfort, braking, *_ = found
         steep = np.abs(self.numbers["DELTA"][self.idm])
@@ -374,17 +377,17 @@ class Crowd:
 
     @cached_property
     def of_steering(self) -> NDArray[np.float64]:
-        """Shape (5, things)."""
+        """The parameters of steering, of shape (5, things)."""
         return self._table("TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "LENGTH", "MAX_STEERING_ANGLE")
 
     @cached_property
     def of_speeds(self) -> NDArray[np.float64]:
-        """Shape (2, things)."""
+        """The parameters of free-road acceleration, of shape (2, things)."""
         return self._table("COMFORT_ACC_MAX", "DELTA")
 
     @cached_property
     def of_gaps(self) -> NDArray[np.float64]:
-        """Shape (4, things)."""
+        """The parameters of the desired gap, of shape (4, things)."""
         return self._table("COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DISTANCE_WANTED", "TIME_WANTED")
 
     def _table(self, *names: str) -> NDArray[np.float64]:
@@ -392,9 +395,9 @@ class Crowd:
 
     @cached_property
     def pairs(self) -> Pairs | None:
-        """Which vehicles ask whether they touch which things, and within which distance of standing vehicles.
+        """The pairs of vehicles and things to check for collisions, and the reach of each pair at standstill in m.
 
-        None where a number is of no usual kind. Of shape (vehicles, things), in m.
+        Both arrays have the shape (vehicles, things). None if a diagonal is not a usual number.
         """
         things, count = self.things, len(self.vehicles)
         try:
@@ -407,6 +410,6 @@ class Crowd:
         checks = np.array([bool(thing.check_collisions) for thing in things], bool)
         ghosts = np.array([not thing.collidable for thing in things], bool)
         rows = np.arange(len(things))
-        # Of two that neither of them look for collisions, nothing is asked.
+        # highway-env skips a pair if neither object checks for collisions.
         asked = (rows > rows[:count, None]) & (checks | checks[:count, None]) & ~(ghosts | ghosts[:count, None])
         return asked, radius[:count, None] + radius

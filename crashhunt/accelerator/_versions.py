@@ -1,4 +1,4 @@
-"""What the accelerator knows: versions of highway-env by their source, and classes by their methods."""
+"""Checks that the accelerator applies: known versions of highway-env, genuine functions, and known classes."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ __all__ = [
 ]
 
 
-# Whether highway-env's functions are still its own: a user's module may replace them at any time.
+# Detects replaced functions of highway-env, which a user's module may replace at any time.
 
 MODULES = (utils, lane, regulation, road, behavior, controller, dynamics, kinematics, objects)
-"""In which everything matters to the accelerator; of `observation`, a few classes do."""
+"""The modules in which every function matters to the accelerator; of `observation`, only a few classes matter."""
 
 _NUMPY = (
     "abs", "arange", "arccos", "arcsin", "arctan", "arctan2", "argmin", "array", "array_equal", "clip", "concatenate",
@@ -55,23 +55,23 @@ _NUMPY = (
 
 
 class Watch:
-    """Notices whatever is replaced, added or removed, but for numbers: these are read where they are used.
+    """Detects replaced, added and removed members of namespaces, except numbers, which are read where they are used.
 
-    Looking costs about ten microseconds, so that it can be done in every sub-step.
+    A check costs about ten microseconds, so it can run in every sub-step.
 
     Args:
-        places: namespaces by how messages name them.
-        but: members that do not matter, as ``Class.name``.
+        places: Namespaces with their names in messages.
+        but: Members that do not matter, as ``Class.name``.
     """
 
     def __init__(self, places: Iterable[tuple[str, Mapping[str, object]]], but: Iterable[str] = ()) -> None:
         skipped = frozenset(but)
         self._places: list[_Place] = [_Place(name, space, skipped) for name, space in places]
-        self._told = ""
+        self._reported = ""
 
     @classmethod
     def of_roads(cls, but: Iterable[str]) -> Watch:
-        """Watch all that roads, lanes and vehicles are made of, and what of NumPy they use."""
+        """Watch roads, lanes and vehicles, and the functions of NumPy that they use."""
         places = [(module.__name__, vars(module)) for module in MODULES]
         for module in MODULES:
             places += _classes(module)
@@ -83,7 +83,7 @@ class Watch:
 
     @classmethod
     def of_observations(cls, but: Iterable[str]) -> Watch:
-        """Watch what the observations that are sped up are made of."""
+        """Watch the classes of the accelerated observations."""
         kinds = ("", "Kinematic", "KinematicsGoal", "OccupancyGrid", "Exit", "MultiAgent")
         wanted = ("ObservationType", *[f"{kind}Observation" for kind in kinds])
         places = [(name, space) for name, space in _classes(observation) if name in wanted]
@@ -91,26 +91,26 @@ class Watch:
 
     @property
     def intact(self) -> bool:
-        """Whether all is as it was; where it is not, that is logged once."""
+        """Whether no member has changed; logs each changed member once."""
         for place in self._places:
             if len(place.space) != place.size or not place.same():
                 changed = place.changed()
                 if changed:
-                    if changed != self._told:
-                        self._told = changed
-                        message = "the accelerator steps aside: %s has been replaced"
+                    if changed != self._reported:
+                        self._reported = changed
+                        message = "the accelerator is disabled: %s has been replaced"
                         logging.getLogger("crashhunt").warning(message, changed)
                     return False
         return True
 
     @property
     def reason(self) -> str:
-        """What has been replaced; empty where all is as it was."""
-        return f"{self._told} has been replaced" if not self.intact else ""
+        """A sentence about the replaced member; empty if no member has changed."""
+        return f"{self._reported} has been replaced" if not self.intact else ""
 
 
 class _Place:
-    """One namespace."""
+    """A namespace with the members that it had at the start."""
 
     def __init__(
         self, name: str, space: Mapping[str, object], but: frozenset[str], names: tuple[str, ...] | None = None
@@ -126,7 +126,7 @@ class _Place:
             )
             self._seen = frozenset(space)
             self._but = frozenset(key for key in space if f"{name}.{key}" in but)
-        else:  # of a namespace that is large and others' business, only these
+        else:  # of a large foreign namespace such as NumPy's, watch only these names
             self._seen = self._but = frozenset(space)
         self._names = names
         self._get: Callable[[Mapping[str, object]], tuple[object, ...]] = _getter(names)
@@ -134,20 +134,20 @@ class _Place:
 
     def same(self) -> bool:
         try:
-            # Tuples compare what is not the very same by its own `==`: nobody's function is equal to another.
+            # Tuples compare identities first, and different functions are never equal.
             return self._get(self.space) == self._values
         except Exception:
             return False
 
     def changed(self) -> str:
-        """The first name that matters and is not what it was."""
+        """Return the first changed name that matters; empty if there is none."""
         missing = object()
         for name, value in zip(self._names, self._values, strict=True):
             if self.space.get(name, missing) is not value:
                 return f"{self.name}.{name}"
         if self._but is not self._seen:
             for name in self.space.keys() - self._seen - self._but:
-                # A name that is new may be in the way of one further up, or of one that Python has.
+                # A new name may hide a method of a base class or a built-in function.
                 if not is_plain(self.space[name]) or hasattr(builtins, name) or _is_method(self.name, name):
                     return f"{self.name}.{name}"
         self.size = len(self.space)
@@ -155,7 +155,7 @@ class _Place:
 
 
 def is_plain(value: object) -> bool:
-    """Whether a member of a class is a mere value: no function, property or other thing with a life of its own."""
+    """Whether a member of a class is a plain value: no function, property, other descriptor, or module."""
     return not callable(value) and not hasattr(type(value), "__get__") and not inspect.ismodule(value)
 
 
@@ -175,7 +175,7 @@ def _classes(module: ModuleType) -> list[tuple[str, Mapping[str, object]]]:
 
 
 def _is_method(owner: str, name: str) -> bool:
-    """Whether a class has a method of that name further up, which a value would hide."""
+    """Whether a base class of a class has a method of this name, which a value would hide."""
     kinds = [kind for module in (*MODULES, observation) for key, kind in vars(module).items() if key == owner]
     return any(not is_plain(inspect.getattr_static(base, name)) for kind in kinds if isinstance(kind, type)
                for base in kind.__mro__[1:] if name in vars(base))  # fmt: skip
@@ -195,13 +195,13 @@ _SPECIAL = (
     "__delattr__", "__copy__", "__deepcopy__", "__reduce__", "__reduce_ex__", "__getstate__", "__setstate__",
     "__class__", "__array__", "__float__", "__iter__", "__getitem__", "__contains__", "__add__", "__radd__",
 )  # fmt: skip
-"""A class with one of these of its own may do anything wherever highway-env touches it."""
+"""A class that overrides one of these may run arbitrary code wherever highway-env uses an object of it."""
 _VALUES = (
     "road", "position", "heading", "speed", "lane_index", "lane", "collidable", "solid", "check_collisions", "diagonal",
     "crashed", "hit", "impact", "prediction_type", "action", "history", "target_lane_index", "target_speed", "route",
     "timer", "enable_lane_change", "speed_index", "target_speeds", "is_yielding", "yield_timer", "color", "log",
 )  # fmt: skip
-"""What vehicles have, each its own: values, and read as often as is convenient."""
+"""Attributes of vehicles that must be plain values, so that the accelerator may read them any number of times."""
 _BASES = {
     behavior.IDMVehicle: "idm",
     controller.MDPVehicle: "controlled",
@@ -218,7 +218,7 @@ _STEERED = (*_LIMITED, "TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "MAX_STEERING_
 _THINKING = (*_STEERED, "COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DISTANCE_WANTED", "TIME_WANTED", "ACC_MAX", "POLITENESS")
 _THINKING += ("LANE_CHANGE_DELAY", "LANE_CHANGE_MIN_ACC_GAIN", "LANE_CHANGE_MAX_BRAKING_IMPOSED")
 NUMBERS_OF = {"": _OUTLINE, "nothing": _LIMITED, "controlled": _STEERED, "idm": _THINKING}
-"""The numbers that classes have for all of their vehicles, as long as none has its own, by how they decide."""
+"""Class attributes with the parameters of vehicles, by model of decision; a vehicle may override them."""
 _METHODS = frozenset((*_COLLIDES, *_MOVES, *_SLIDES, *_DRIVES, *_PREDICTS, *_DESCRIBES))
 _ORIGINALS = {
     (owner, name): inspect.getattr_static(owner, name, None) for owner in _BASES for name in (*_METHODS, *_SPECIAL)
@@ -226,22 +226,22 @@ _ORIGINALS = {
 _OWN = frozenset(module.__name__ for module in MODULES) | {"abc", "builtins"}
 
 originals: dict[str, Callable[..., Any]] = {}
-"""The methods of highway-env that are replaced, by class and name, as they were; nothing before the first time."""
+"""The replaced methods of highway-env by ``Class.name``; empty until the accelerator is first switched on."""
 
 
 class Own:
-    """What a class of somebody's has instead of what its base in highway-env has.
+    """The members of a user's class that override members of its base class in highway-env.
 
     Args:
-        kind: the class.
-        base: in highway-env.
-        values: names that have to be mere values.
+        kind: The class.
+        base: Its base class in highway-env.
+        values: Names of members that must be plain values.
     """
 
     def __init__(self, kind: type, base: type, values: Iterable[str]) -> None:
         self._kind, self._base = kind, base
         self._mro = kind.__mro__
-        # Everything that a user can have changed since: highway-env's own classes are watched elsewhere.
+        # The members that a user can change later; `Watch` covers highway-env's own classes.
         self._members = [(vars(part), tuple(vars(part).items())) for part in self._mro if part.__module__ not in _OWN]
         values = {*values, *(name for name in dir(base) if is_plain(inspect.getattr_static(base, name)))}
         self.names = [name for name in _SPECIAL if self.has(name)]
@@ -249,7 +249,7 @@ class Own:
         self.plain = type(kind) is type(base) and not self.names
 
     def has(self, name: str) -> bool:
-        """Whether it has another member of that name than its base."""
+        """Whether the class overrides this member of its base class."""
         return self._of(name) is not inspect.getattr_static(self._base, name, None)
 
     def _of(self, name: str) -> object:
@@ -257,7 +257,7 @@ class Own:
 
     @property
     def current(self) -> bool:
-        """Whether the class is still what it was."""
+        """Whether the class has not changed since."""
         return self._kind.__mro__ is self._mro and all(
             len(space) == len(seen)
             and all(a is b and v is w for (a, v), (b, w) in zip(space.items(), seen, strict=True))
@@ -266,23 +266,23 @@ class Own:
 
 
 class Kind:
-    """What is known about a class of vehicles or objects: what it leaves as its base in highway-env has it.
+    """The behaviour that a class of vehicles or objects inherits unchanged from its base class in highway-env.
 
     Args:
-        kind: the class.
+        kind: The class.
 
     Attributes:
-        plain: whether what it is made of is mere values, wherever they are read.
-        collides: whether it collides as that does.
-        moves: whether it moves so.
-        slides: whether it moves by the dynamic model, which nobody does at once for many.
-        times: whether it counts the time since it last thought of changing lanes.
-        drives: how it decides: ``idm``, ``controlled``, ``nothing``; empty where that is not known.
-        predicts: whether where it will be is foreseen so.
-        describes: whether it describes itself so.
-        base: how its base in highway-env decides.
-        methods: all names that an object must not have of its own.
-        fixed: these, and those of the numbers that its objects share, if none of them has its own.
+        plain: Whether all attributes that the accelerator reads are plain values.
+        collides: Whether the collision check is inherited.
+        moves: Whether the movement is inherited.
+        slides: Whether the class has the dynamic bicycle model, which the accelerator runs one vehicle at a time.
+        times: Whether its vehicles count the time since their last decision about a lane change.
+        drives: The model of decision, if inherited: ``idm``, ``controlled`` or ``nothing``; otherwise empty.
+        predicts: Whether the prediction of trajectories is inherited.
+        describes: Whether ``to_dict`` and its parts are inherited.
+        base: The model of decision of the base class.
+        methods: Names of methods, which an object of the class must not override.
+        fixed: These names, and the names of the parameters that objects of the class usually share.
     """
 
     def __init__(self, kind: type) -> None:
@@ -317,16 +317,16 @@ class Kind:
                 logging.getLogger("crashhunt").info("not accelerated: %s has its own %s", name, ", ".join(own))
 
     def is_of(self, thing: object) -> bool:
-        """Whether an object has no method of its own instead of its class's."""
+        """Whether an object overrides no method of its class."""
         return self.methods.isdisjoint(vars(thing))
 
 
 left_alone: dict[str, list[str]] = {}
-"""The classes that have been met and are not sped up, or not wholly, with what they have of their own."""
+"""Classes that are not accelerated, or only in part, each with the members that it overrides."""
 
 
 def kind_of(kind: type) -> Kind:
-    """Return what is known about a class, as it is now."""
+    """Return the properties of a class in its current state."""
     found = _kinds.get(kind)
     if found is None or not found.own.current:
         found = _kinds[kind] = Kind(kind)
@@ -334,7 +334,7 @@ def kind_of(kind: type) -> Kind:
 
 
 def kinds_of(things: Iterable[object]) -> list[Kind]:
-    """Return what is known about the class of each object."""
+    """Return the properties of the class of each object."""
     types = list(map(type, things))
     known = {kind: kind_of(kind) for kind in set(types)}
     return list(map(known.__getitem__, types))
@@ -344,7 +344,7 @@ _kinds: dict[type, Kind] = {}
 
 
 def are_numbers(values: Iterable[object]) -> bool:
-    """Whether arithmetic on all of these is that of Python's and NumPy's usual numbers."""
+    """Whether all values are of the types float, int or NumPy's float64, and not of a subclass."""
     return _NUMBERS.issuperset(map(type, values))
 
 
@@ -352,12 +352,12 @@ _NUMBERS = frozenset((float, int, np.float64))
 
 
 def reason_against() -> str:
-    """Say why the accelerator must not be used in this process; empty where it may."""
+    """Return why the accelerator must not be used in this process; empty if it may be used."""
     version = highway_env.__version__
     if version not in ACCELERATED:
-        return f"highway-env {version} is not known to it; it knows {', '.join(ACCELERATED)}"
+        return f"highway-env {version} is not supported (supported: {', '.join(ACCELERATED)})"
     digest = hashlib.blake2b(digest_size=8)
-    for module in (*_MODULES, abstract):  # of the last one, a single function is replaced
+    for module in (*_MODULES, abstract):  # the accelerator replaces one function of `abstract`
         digest.update(Path(str(module.__file__)).read_bytes())
     if digest.hexdigest() != ACCELERATED[version]:
         return f"the installed highway-env {version} is not the published one"
@@ -365,12 +365,12 @@ def reason_against() -> str:
         place = getattr(getattr(function, "__code__", None), "co_filename", "something else")
         if place not in _FILES:
             return f"{name} has been replaced by {place}"
-        if function.__qualname__ != name:  # such as another method of its own
+        if function.__qualname__ != name:  # such as another method of highway-env
             return f"{name} has been replaced by {function.__qualname__}"
     if not hasattr(np, "vecdot"):
-        return f"it needs NumPy 2.0, and {np.__version__} is installed"
+        return f"NumPy {np.__version__} is installed; the accelerator needs NumPy 2.0 or later"
     if not _arrays_equal_scalars():
-        return "NumPy's functions give other results for arrays than for single numbers on this processor"
+        return "on this processor, NumPy's functions return different results for arrays than for single numbers"
     return ""
 
 
@@ -378,13 +378,13 @@ _FILES = {str(module.__file__) for module in (*_MODULES, abstract)}
 
 
 def is_genuine(name: str, function: Callable[..., object]) -> bool:
-    """Whether a function is the one that highway-env's source has by this name, such as ``Class.method``."""
+    """Whether a function comes from highway-env's source and has this name, such as ``Class.method``."""
     found = inspect.unwrap(function)
     return getattr(getattr(found, "__code__", None), "co_filename", "") in _FILES and found.__qualname__ == name
 
 
 def _functions() -> Iterator[tuple[str, Callable[..., object]]]:
-    """All functions and methods that the sources of the modules define, by name, as they are now."""
+    """Yield the current functions and methods of all classes and functions that the modules define, with names."""
     for module in _MODULES:
         source = Path(str(module.__file__)).read_text(encoding="utf-8")
         for kind, name in re.findall(r"^(def|class) (\w+)", source, re.MULTILINE):
@@ -397,7 +397,7 @@ def _functions() -> Iterator[tuple[str, Callable[..., object]]]:
 
 
 def _arrays_equal_scalars() -> bool:
-    """Whether the functions that are used on arrays give the very numbers that highway-env gets one at a time."""
+    """Whether the functions return the same bits for arrays as for single numbers, on 203 random values."""
     rng = np.random.default_rng(0)
     values, others = rng.normal(size=203) * 10.0 ** rng.integers(-6, 3, 203).astype(float), rng.uniform(3.5, 4.5, 203)
     inside = np.clip(values, -1.0, 1.0)

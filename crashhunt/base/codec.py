@@ -152,7 +152,8 @@ def _write_function(kind: Any) -> _Convert:
     for name in kind.json_keys or known:
         key = name.removesuffix("?")
         metadata = known[key].metadata if key in known else {}
-        convert, condition = _finite if "null" in metadata else _writer(hints.get(key, object)), ""
+        convert = _finite if "null" in metadata else _writer(hints[key]) if key in hints else _plain_property
+        condition = ""
         names |= {
             f"to_{key}": convert,
             f"if_{key}": metadata.get("written_if"),
@@ -173,6 +174,11 @@ def _write_function(kind: Any) -> _Convert:
 
 def _default(item: Field[Any]) -> object:
     return item.default_factory() if item.default_factory is not MISSING else item.default
+
+
+def _plain_property(value: object) -> object:
+    """Return the value of a property, which is plain already but for a tuple: JSON has lists only."""
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _finite(value: float) -> float | None:

@@ -15,6 +15,7 @@
     ├── BundleError                a crash bundle or log that is damaged or incomplete
     ├── SnapshotError              the code of a hunt cannot be captured: too large, unreadable
     ├── RecorderError              a trial could not be recorded: a full disk
+    ├── WorkerError                the process of a trial refused it, or ended before it began
     └── EpisodeError               raised inside an episode; becomes the trial's outcome
         ├── InvalidEpisodeError    the episode could not be set up
         ├── ActionError            the agent returned something outside its action space
@@ -49,6 +50,7 @@ __all__ = [
     "SnapshotError",
     "UntrustedError",
     "UsageError",
+    "WorkerError",
     "remedy",
 ]
 
@@ -148,6 +150,10 @@ class SnapshotError(CrashhuntError):
 
 class RecorderError(CrashhuntError):
     """A trial could not be recorded."""
+
+
+class WorkerError(CrashhuntError):
+    """The process of a trial refused the trial, or ended before it began."""
 
 
 class EpisodeError(CrashhuntError):

@@ -15,7 +15,17 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["adopt_orphans", "children_of", "die_with", "end_descendants", "has_child", "is_alive", "kill", "resume"]
+__all__ = [
+    "adopt_orphans",
+    "children_of",
+    "die_with",
+    "end_descendants",
+    "has_child",
+    "is_alive",
+    "kill",
+    "outlive_parent",
+    "resume",
+]
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # of <sys/prctl.h>
 _libc = ctypes.CDLL(None) if sys.platform == "linux" else None  # looked up once, not in every fork
@@ -35,6 +45,11 @@ def die_with(parent: int) -> None:
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it died before the prctl call
         os._exit(1)
+
+
+def outlive_parent() -> None:
+    """Undo `die_with`: this process continues when its parent ends."""
+    _prctl(_PR_SET_PDEATHSIG, 0)
 
 
 def children_of(pid: int) -> list[int]:

@@ -99,7 +99,16 @@ class SharedState:
             self.remaining = f"a file without a name of {found.st_size >> 20} MB"
             return
         position = os.lseek(descriptor, 0, os.SEEK_CUR)
-        self._files.append(_File(descriptor, flags & _KEPT_FLAGS, position, inode, is_nameless, found.st_size))
+        self._files.append(
+            _File(
+                descriptor=descriptor,
+                flags=flags & _KEPT_FLAGS,
+                position=position,
+                inode=inode,
+                is_nameless=is_nameless,
+                size=found.st_size,
+            )
+        )
 
     def _add_mapping(self, line: bytes) -> None:
         place, _, offset, device, inode, *name = line.split(maxsplit=5)
@@ -112,7 +121,7 @@ class SharedState:
             return
         major, minor = (int(part, 16) for part in device.split(b":"))
         at = os.makedev(major, minor), int(inode)
-        self._mappings.append(_Mapping(start, end - start, int(offset, 16), at))
+        self._mappings.append(_Mapping(start=start, length=end - start, offset=int(offset, 16), inode=at))
 
     def _reopen(self, file: _File, copies: dict[tuple[int, int], int]) -> None:
         path = f"/proc/self/fd/{file.descriptor}"

@@ -113,11 +113,11 @@ def _owner(pid: int) -> Owner:
         boot = Path(_BOOT_ID).read_text(encoding="ascii").replace("-", "")[:_BOOT_DIGITS]
         names = [_namespace(kind) for kind in ("pid", "time")]
     except (OSError, UnicodeError):
-        return Owner(pid, 0, _UNKNOWN_BOOT, "0" * 8)
+        return Owner(pid=pid, started=0, boot=_UNKNOWN_BOOT, namespace="0" * 8)
     started = start_time(pid)
     if started <= 0 or len(boot) < _BOOT_DIGITS:
-        return Owner(pid, 0, _UNKNOWN_BOOT, "0" * 8)
-    return Owner(pid, started, boot, f"{zlib.crc32(' '.join(names).encode()):08x}")
+        return Owner(pid=pid, started=0, boot=_UNKNOWN_BOOT, namespace="0" * 8)
+    return Owner(pid=pid, started=started, boot=boot, namespace=f"{zlib.crc32(' '.join(names).encode()):08x}")
 
 
 def _namespace(kind: str) -> str:
@@ -134,7 +134,7 @@ def owner_in(name: str) -> Owner | None:
     if len(found) != 1:  # a user's file name may have such a token as well
         return None
     ((pid, started, boot, namespace),) = found
-    return Owner(int(pid), int(started), boot, namespace)
+    return Owner(pid=int(pid), started=int(started), boot=boot, namespace=namespace)
 
 
 def has_ended(owner: Owner) -> bool:

@@ -53,7 +53,7 @@ def validate(
     try:
         return cast(T, _built(kind, data))
     except _NotToTheLetterError:
-        return _validated(kind, data, _Place(where, error, under, keys))
+        return _validated(kind, data, _Place(where=where, error=error, under=under, keys=keys))
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,7 @@ from crashhunt.cli._guide import add_guide
 from crashhunt.cli._judge import add_judge
 from crashhunt.cli._list import add_lists
 from crashhunt.cli._logs import add_logs
+from crashhunt.cli._rate import add_rate
 from crashhunt.cli._replay import add_replay
 from crashhunt.cli._report import add_report
 from crashhunt.cli._run import add_run
@@ -60,7 +61,7 @@ examples:
   crashhunt show crash
       what happened, in words and numbers
 
-exit codes: 0 done, 1 the answer is no, 2 bad usage or input, 3 not one valid trial, 130 interrupted
+exit codes: 0 done, 1 the answer is no, 2 bad usage or input, 3 not one valid trial or undecided, 130 interrupted
 """
 
 
@@ -153,11 +154,12 @@ def make_parser() -> argparse.ArgumentParser:
         "crashhunt", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--version", action="version", version=f"crashhunt {__version__}")
+    parser.set_defaults(parser=parser)  # `guide` describes all of it
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
         add_crashes, add_judge, add_whatif, add_shrink, add_corpus, add_bisect, add_trust_command, add_check,
-        add_compare, add_lists, add_guide, add_completion,
+        add_compare, add_rate, add_lists, add_guide, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

@@ -29,6 +29,7 @@ __all__ = [
     "BAD_INPUT",
     "DONE",
     "INTERRUPTED",
+    "NO_ANSWER",
     "NO_VALID_TRIAL",
     "THE_ANSWER_IS_NO",
     "Commands",
@@ -286,6 +287,7 @@ DONE: Final = 0
 THE_ANSWER_IS_NO: Final = 1
 BAD_INPUT: Final = 2
 NO_VALID_TRIAL: Final = 3
+NO_ANSWER: Final = 3
 INTERRUPTED: Final = 130
 
 

@@ -24,17 +24,17 @@ def add_crashes(commands: Commands) -> None:
     """Add the command."""
     crashes = commands.add_parser(
         "crashes",
-        help="say how many different crashes were found",
-        description="Group the crashes of hunts: those are one kind that happened in the same manner, with the agent "
-        "in the same role, or in the same function. A line a kind, the most frequent first.",
+        help="list the different crash types",
+        description="Group the crashes of hunts by crash type: the same kind of encounter with the agent in the same "
+        "role, or an exception in the same function. Prints one line for each type, the most frequent first.",
     )
     crashes.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of hunts or suites")
     crashes.add_argument(
         "--known", metavar="CORPUS", type=Path,
-        help="say which kinds a corpus has already, as cases that are expected to crash still",
+        help="show which crash types a corpus already contains, as cases that are expected to reproduce",
     )  # fmt: skip
     crashes.add_argument(
-        "--sarif", metavar="FILE", type=Path, help="write the kinds as SARIF 2.1.0, for code scanning and editors"
+        "--sarif", metavar="FILE", type=Path, help="write the crash types as SARIF 2.1.0, for code scanning and editors"
     )
     add_ci_options(crashes)
     add_json(crashes)
@@ -53,7 +53,7 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     known = _known(found.groups, cases)
     say(describe_groups(found.groups, known), as_json=options.json)
     for why in found.left_out:
-        say(f"left out: {why}", as_json=True)
+        say(f"skipped: {why}", as_json=True)
     _tell(options, found.groups, known)
     if options.json:
         groups = [dict(group.to_json()) for group in found.groups]
@@ -64,7 +64,7 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _cases(corpus: Path | None) -> list[Case] | None:
-    """The cases of a corpus; of a folder that has none yet, none."""
+    """Return the cases of a corpus; None where no corpus was given."""
     from crashhunt.corpus import find_cases, read_case
 
     if corpus is None:
@@ -75,7 +75,7 @@ def _cases(corpus: Path | None) -> list[Case] | None:
 
 
 def _known(groups: Sequence[Group], cases: list[Case] | None) -> dict[Signature, str] | None:
-    """The cases of a corpus by kind; None where no corpus was given."""
+    """Return crash type to the case of the corpus; None where no corpus was given."""
     from crashhunt.corpus import known_kinds
 
     if cases is None:

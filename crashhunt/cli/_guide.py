@@ -32,7 +32,6 @@ def add_guide(commands: Commands) -> None:
 
 
 def _guide(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.cli import make_parser
     from crashhunt.guide import find_page, for_terminal, list_pages
 
     if not options.topic:
@@ -44,7 +43,7 @@ def _guide(options: argparse.Namespace, _words: list[str]) -> int:
             print(_listing(pages))
         return 0
     page = find_page(options.topic)
-    text = page.text(make_parser())
+    text = page.text(options.parser)
     if options.json:
         print(json.dumps({"topic": page.topic, "section": page.section, "title": page.title, "text": text}))
     elif sys.stdout.isatty():

@@ -114,8 +114,9 @@ def _judge_one(
     options: argparse.Namespace, bundle: Bundle, stops: list[int], trusted: bool | None, *, write: bool
 ) -> dict[str, object]:
     from crashhunt.crashes import judgement_of, with_judgement
-    from crashhunt.replays import ReplayOptions, judge
+    from crashhunt.replays import ReplayOptions
     from crashhunt.report import Story
+    from crashhunt.whatif import judge
 
     with shown_progress(f"running {bundle.id}", as_json=options.json) as watch:
         found: Judgement = judge(

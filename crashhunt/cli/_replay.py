@@ -185,10 +185,27 @@ def _shot(
     lanes = read_lanes(bundle.path / layout.LOG)
     near = most_dangerous(recording) if bundle.is_near_miss and not crashed else None
     if near is not None:
-        return Shot(recording, lanes, near.agent, near.other, -1, panels, meanings, nearest=near.step)
+        return Shot(
+            recording=recording,
+            lanes=lanes,
+            agent=near.agent,
+            other=near.other,
+            crash_step=-1,
+            panels=panels,
+            meanings=meanings,
+            nearest=near.step,
+        )
     hit = result.collision
     other = hit.other if hit else ""
-    return Shot(recording, lanes, bundle.driver, other, recording.steps if crashed else -1, panels, meanings)
+    return Shot(
+        recording=recording,
+        lanes=lanes,
+        agent=bundle.driver,
+        other=other,
+        crash_step=recording.steps if crashed else -1,
+        panels=panels,
+        meanings=meanings,
+    )
 
 
 def add_replay(commands: Commands) -> None:

@@ -21,6 +21,7 @@ from crashhunt.cli._common import (
     chosen_options,
     integer,
 )
+from crashhunt.cli._rate import exit_code_of
 
 if TYPE_CHECKING:
     import argparse
@@ -88,6 +89,8 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         return NO_VALID_TRIAL
     if report.stopped_because == "interrupted":
         return INTERRUPTED
+    if report.rate is not None:
+        return exit_code_of([report.rate.verdict])
     found = report.crashes or report.copied is not None
     return THE_ANSWER_IS_NO if found and options.fail_on_crash else DONE
 

@@ -85,7 +85,7 @@ def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
     with opened_crash(options.directory, options.crash) as (bundle, _), stop_requests() as asked:
 
         def run(trusted: bool | None) -> Shrunk:
-            with shown_progress(f"making {bundle.id} smaller", as_json=options.json) as watch:
+            with shown_progress(f"minimizing {bundle.id}", as_json=options.json) as watch:
                 return shrink(
                     bundle, budget=options.budget, time_s=time_s, form=options.form, parallel=options.parallel,
                     watch=watch, stopped=lambda: bool(asked), trusted=trusted,
@@ -104,8 +104,8 @@ def _summary_of(found: Shrunk) -> str:
     was, small = found.bundle.result, found.small
     lines = [f"{found.bundle.id}: {was.summary}"]
     if small is None:
-        what = "nothing had been taken away yet" if _early(found) else "nothing could be taken away"
-        what = "it cannot be made smaller" if found.verdict == "not_reproduced" else what
+        what = "nothing has been removed yet" if _early(found) else "nothing can be removed"
+        what = "cannot be minimized" if found.verdict == "not_reproduced" else what
         why = found.why or (found.ended if _early(found) else "")
         lines.append(f"  {what}: {why}" if why else f"  {what}")
         lines += [f"  note: {note}" for note in found.notes]
@@ -114,12 +114,11 @@ def _summary_of(found: Shrunk) -> str:
     moved = "" if found.scripted is None else _moved(found.scripted)
     lines += [
         f"{small.id}: {result.summary}",
-        f"  {before} were seen, and {after} are left; {was.steps} steps, and now {result.steps}",
+        f"  other actors: {before} before, {after} now; steps: {was.steps} before, {result.steps} now",
         *([f"  {moved}"] if moved else []),
-        *([f"  the first {found.steps_cut} steps are cut off"] if found.steps_cut else []),
+        *([f"  the first {found.steps_cut} steps are removed"] if found.steps_cut else []),
         *(f"  {name} was {left} and is {right}" for name, (left, right) in found.changed.items()),
-        f"  {found.trials} trials"
-        + (f"; ended before it was done: {found.why or found.ended}" if _early(found) else ""),
+        f"  {found.trials} trials" + (f"; stopped early: {found.why or found.ended}" if _early(found) else ""),
         f"  saved in {small.path}",
         _confirmed(small),
         *(f"  note: {note}" for note in found.notes),
@@ -129,16 +128,16 @@ def _summary_of(found: Shrunk) -> str:
 
 def _confirmed(small: Bundle) -> str:
     if small.confirmed:
-        return "  confirmed: a fresh process did the same to the bit"
+        return "  confirmed: bit-identical when replayed in a new process"
     if small.confirmed is None:
         return f"  not confirmed: {small.why_unconfirmed or 'interrupted'}"
-    return "  flaky: a fresh process did not do the same"
+    return "  flaky: the replay in a new process deviates"
 
 
 def _moved(names: Sequence[str]) -> str:
     if not names:
-        return "the traffic takes no part"
-    return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} moved as recorded, whatever the agent does"
+        return "no traffic"
+    return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} moved as recorded, independent of the agent"
 
 
 def _early(found: Shrunk) -> bool:

@@ -30,8 +30,8 @@ def add_status(commands: Commands) -> None:
     """Add the command."""
     status = commands.add_parser(
         "status",
-        help="say where hunts stand",
-        description="Say where hunts stand, also while they run and after they were killed.",
+        help="show the progress of hunts",
+        description="Show the progress and results of hunts: running, finished, interrupted or killed ones.",
     )
     status.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of a hunt or a suite")
     status.add_argument("--watch", action="store_true", help="refresh every second, until all have ended")
@@ -66,7 +66,7 @@ def _states(directories: list[Path]) -> list[HuntState]:
 
 
 def states_console(*, stderr: bool = False) -> Console:
-    """Return the console for the table; where its width is unknown, as wide as most logs."""
+    """Return the console for the table; its width is 120 columns where it is not a terminal."""
     from rich.console import Console
 
     console = Console(stderr=stderr, highlight=False)
@@ -138,19 +138,19 @@ def _confirmed(sums: ProbeSums | BranchSums) -> str:
 
 
 def _crashes(state: HuntState) -> str:
-    """How many, of how many kinds, and of a hunt that runs how long ago the last new one came."""
+    """Return the number of crashes and crash types and, if the hunt runs, the age of the last new type."""
     from crashhunt.report import format_seconds
 
     said = [] if state.disturbed is None else [f"{state.disturbed} disturbed"]
     if state.kinds:
-        said.append(f"{len(state.kinds)} {'kind' if len(state.kinds) == 1 else 'kinds'}")
+        said.append(f"{len(state.kinds)} {'type' if len(state.kinds) == 1 else 'types'}")
         if state.state == "running" and state.newest_kind_s is not None:
             said.append(f"last new {format_seconds(state.newest_kind_s)} ago")
     return str(state.crashes) + (f" ({', '.join(said)})" if said else "")
 
 
 def show_states(states: list[HuntState], console: Console) -> None:
-    """Print hunts as a table, and below it why some failed."""
+    """Print hunts as a table, and below it the errors of failed hunts."""
     console.print(states_table(states))
     for state in states:
         if state.detail:

@@ -114,7 +114,7 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
     except KeyboardInterrupt:
         finish()
         _tell([hunt_state(hunt) for hunt in find_hunts(options.directory)], options.directory, as_json=options.json)
-        say("Interrupted; the same command goes on from here.", as_json=options.json)
+        say("Interrupted. Run the same command to resume.", as_json=options.json)
         raise
     finally:
         finish()

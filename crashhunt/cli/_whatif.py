@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import (
@@ -21,6 +21,7 @@ from crashhunt.cli._common import (
     say,
     shown_progress,
 )
+from crashhunt.trial import Manoeuvre
 
 if TYPE_CHECKING:
     import argparse
@@ -65,7 +66,7 @@ def add_whatif(commands: Commands) -> None:
         help="give the simulator's random generators another seed after step K, a different one in each run",
     )  # fmt: skip
     whatif.add_argument(
-        "--overrule", metavar="HOW", choices=("brake", "left", "right", "keep_lane", "keep_speed"), default="",
+        "--overrule", metavar="HOW", choices=get_args(Manoeuvre), default="",
         help="from step K on, have the vehicle brake, change lanes and brake, or keep its lane or its speed",
     )  # fmt: skip
     whatif.add_argument("--leave-out", metavar="ID,…", default="", help="actors that do not take part, from the start")
@@ -79,8 +80,9 @@ def add_whatif(commands: Commands) -> None:
     )
     whatif.add_argument("--parallel", metavar="N", type=integer, default=0, help="at a time; default: one per core")
     whatif.add_argument(
-        "--for", metavar="TIME", default="", dest="time", help="stop after this time and count the runs that ended"
-    )
+        "--for", metavar="TIME", default="", dest="time",
+        help="stop after this time; the runs before the first unfinished one count",
+    )  # fmt: skip
     add_trust(whatif)
     add_json(whatif)
     whatif.set_defaults(command=_whatif)

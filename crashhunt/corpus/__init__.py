@@ -1,4 +1,4 @@
-"""A corpus: crashes that somebody keeps in their own repository, each with what is expected of today's code."""
+"""A corpus: crashes that users keep in their own repository as regression tests."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Which commit brought a crash: git bisect, in a work tree of its own, with the crash as the test."""
+"""Finds the commit that introduced a crash: git bisect in a separate work tree, with the crash as the test."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ _ORIGIN = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1
 
 @dataclass(frozen=True, slots=True)
 class Bisected:
-    """What came of it.
+    """The result of a bisection.
 
     Args:
-        commit: the first in which it crashes; empty where revisions that cannot run are in the way.
-        subject: of its message.
-        candidates: those among which it is, where they are several.
-        tried: revisions, and what the crash did in each.
+        commit: The first commit with the crash; empty if revisions that cannot run make it ambiguous.
+        subject: The subject of the commit message.
+        candidates: The commits among which the first one is, if it is ambiguous.
+        tried: The tried revisions, each with the status of the crash.
     """
 
     commit: str
@@ -68,19 +68,19 @@ def bisect(
     folder: Path | None = None,
     watch: Callable[[str, Got], None] = lambda _revision, _got: None,
 ) -> Bisected:
-    """Find the commit of the agent's repository with which a crash came.
+    """Find the commit of the agent's repository that introduced a crash.
 
-    Revisions are checked out in a work tree of their own, which is removed in the end; the user's is left alone.
+    Revisions are checked out in a temporary work tree. The user's work tree does not change.
 
     Args:
-        bundle: the crash.
-        good: a revision in which it does not crash.
-        bad: one in which it does.
-        folder: from which the agent can be imported, inside its repository; the current one by default.
-        watch: called with each revision that was tried, and what came of it.
+        bundle: The crash.
+        good: A revision without the crash.
+        bad: A revision with the crash.
+        folder: The folder inside the agent's repository from which the agent is imported; by default the current one.
+        watch: Called with each tried revision and the status of the crash.
 
     Raises:
-        UsageError: a revision is none, or does not do what is said of it; the code would not come from the work tree.
+        UsageError: A revision does not exist or has the wrong status, or the code does not come from the work tree.
         CrashhuntError: git fails.
     """
     folder = (folder or Path.cwd()).resolve()
@@ -93,7 +93,7 @@ def bisect(
     }
     tried: dict[str, Got] = {}
     token = f"crashhunt-{this_process().token}"  # git gives the name of the work tree to what it writes about it
-    known = Path(top, _git(top, "rev-parse", "--git-common-dir"), "worktrees", token)
+    known = Path(actor=top, first=_git(top, "rev-parse", "--git-common-dir"), states="worktrees", lanes=token)
     with temporary_folder("bisect") as scratch, temporary_beside(known, name=token):
         tree, case = scratch.resolve() / token, add_case(bundle, scratch / "corpus").case.path.resolve()
         _git(top, "worktree", "add", "--detach", "--quiet", str(tree), ends[1])
@@ -105,38 +105,48 @@ def bisect(
                 watch(revision, got)
                 return got
 
-            _see(run(), "still", bad, "--bad")
+            _require_status(run(), "still", bad, "--bad")
             _git(tree, "checkout", "--quiet", "--detach", ends[0])
-            _see(run(), "fixed", good, "--good")
+            _require_status(run(), "fixed", good, "--good")
             said = _git(tree, "bisect", "start", ends[1], ends[0])
-            told = set()
+            judged = set()
             while not (found := _FOUND.search(said)) and "only 'skip'ped commits left" not in said:
                 head = _git(tree, "rev-parse", "HEAD")
-                if head in told:  # git goes on to no other
+                if head in judged:  # git proposes the same revision again if it finds no path
                     raise _no_way(good, bad, head)
-                told.add(head)
+                judged.add(head)
                 said = _git(tree, "bisect", _WORDS[tried[head] if head in tried else run()], skipped=True)
             if found is not None:
-                return Bisected(found[1], _git(tree, "log", "-1", "--format=%s", found[1]), (), tried)
-            return Bisected("", "", tuple(re.findall(r"^[0-9a-f]{40,64}$", said, re.MULTILINE)), tried)
+                return Bisected(
+                    commit=found[1],
+                    subject=_git(tree, "log", "-1", "--format=%s", found[1]),
+                    candidates=(),
+                    tried=tried,
+                )
+            return Bisected(
+                commit="",
+                subject="",
+                candidates=tuple(re.findall(r"^[0-9a-f]{40,64}$", said, re.MULTILINE)),
+                tried=tried,
+            )
         finally:
             _git(top, "worktree", "remove", "--force", str(tree), skipped=True)
 
 
 def _no_way(good: str, bad: str, parts: str) -> UsageError:
-    """No way leads from the one to the other: they part, and where they do, it crashes already."""
-    message = f"--good {good} is not before --bad {bad}: they part at {parts[:12]}, where it crashes already"
-    return UsageError(message, fix="give a revision before that")
+    """Return the error for revisions on two branches whose common ancestor already has the crash."""
+    message = f"--good {good} is not before --bad {bad}: their common ancestor {parts[:12]} already has the crash"
+    return UsageError(message, fix="give a --good revision before that ancestor")
 
 
-def _see(got: Got, expected: Got, revision: str, option: str) -> None:
+def _require_status(got: Got, expected: Got, revision: str, option: str) -> None:
     if got != expected:
         message = f"{option} {revision}: there, the crash is {got.replace('_', ' ')}, and not {expected}"
         raise UsageError(message, fix="give another revision")
 
 
 def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
-    """Run a case with the code of a work tree, in a process that begins there."""
+    """Run a case with the code of a work tree, in a new process."""
     environment = _environment(folder, tree)
     for module in sorted(modules):
         place = [sys.executable, "-c", _ORIGIN, module]
@@ -161,7 +171,7 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
 def _ran(
     command: Sequence[str], folder: Path | None, environment: Mapping[str, str]
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end, and return what it printed; where this process is killed, it is killed too."""
+    """Run a command to its end and return its output; if this process is killed, the command is killed too."""
     return subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, check=False,
         preexec_fn=partial(die_with, os.getpid()),
@@ -175,7 +185,7 @@ def _environment(folder: Path, tree: Path) -> dict[str, str]:
 
 
 def _git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str:
-    """Return what git says; with ``skipped``, also where it ends with an error."""
+    """Return git's output; with ``skipped``, also if git ends with an error."""
     command: Sequence[str] = ["git", "-C", str(folder), *words]
     try:
         environment = {**environment_of_git(), "LC_ALL": "C"}

@@ -1,7 +1,7 @@
-"""A case: a folder with a crash, and what is expected of today's code.
+"""Cases of a corpus: folders with a crash and the expected result of the current code.
 
-It is laid out as a hunt's directory with one crash in it, so that whatever looks at crashes looks at it too; beside
-these lies ``crashhunt-case.toml``, which people edit.
+A case has the layout of a hunt's directory with one crash, so that all commands that read crashes can read it. In
+addition it has the file ``crashhunt-case.toml``, which users edit.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _ON_TOP = """\
 
 @dataclass(frozen=True, kw_only=True)
 class _File:
-    """``crashhunt-case.toml``."""
+    """The content of ``crashhunt-case.toml``."""
 
     expect: Expectation
     note: str = ""
@@ -57,11 +57,11 @@ class Case:
     """A case on disk.
 
     Args:
-        path: of its folder.
-        expect: what is expected: that it crashes ``still``, or that it is ``fixed``.
-        note: of whoever keeps it.
-        crash: what happened, in words.
-        signature: of the crash, by the names of its parts; a later version may know more of them.
+        path: The folder of the case.
+        expect: The expected status: ``still`` (reproduces) or ``fixed``.
+        note: A note of the user.
+        crash: A description of the crash.
+        signature: The parts of the crash's signature by name; later versions may add parts.
     """
 
     path: Path
@@ -72,28 +72,28 @@ class Case:
 
     @property
     def name(self) -> str:
-        """What it is called in its corpus."""
+        """The name of the case in its corpus."""
         return self.path.name
 
     def bundle(self) -> Bundle:
         """Read the crash.
 
         Raises:
-            BundleError: it is missing or damaged, or there are several.
+            BundleError: The crash is missing or damaged, or the case has several crashes.
         """
         found = list_bundles(self.path)
         if len(found) != 1:
-            message = f"a case has one crash, and this one {len(found) or 'none'}"
+            message = f"the case has {len(found)} crashes; it must have 1"
             raise BundleError(
-                message, fix="get it back from the repository, or add the crash anew", where=str(self.path)
+                message, fix="restore it from the repository, or add the crash again", where=str(self.path)
             )
         return found[0]
 
     def expecting(self, expect: Expectation | None, note: str | None) -> Case:
-        """Return it with another expectation or note, which is written down; None stays as it is.
+        """Write another expectation or note into the case and return the changed case; None changes nothing.
 
         Raises:
-            HuntDirectoryError: it cannot be written.
+            HuntDirectoryError: The file cannot be written.
         """
         changed = replace(
             self, expect=self.expect if expect is None else expect, note=self.note if note is None else note
@@ -103,10 +103,10 @@ class Case:
         return changed
 
     def write(self, into: Path) -> None:
-        """Write ``crashhunt-case.toml``, all of it or nothing.
+        """Write ``crashhunt-case.toml`` atomically.
 
         Raises:
-            HuntDirectoryError: it cannot be written.
+            HuntDirectoryError: The file cannot be written.
         """
         import tomli_w
 
@@ -132,7 +132,7 @@ def read_case(path: Path) -> Case:
     """Read the case of a folder.
 
     Raises:
-        BundleError: it has none, or one that is not valid, with the key, its value and the fix.
+        BundleError: The folder has no valid case; the message has the key, its value and the fix.
     """
     file = path / layout.CASE
     try:
@@ -142,14 +142,14 @@ def read_case(path: Path) -> Case:
     except OSError as error:
         raise BundleError(f"cannot be read: {error.strerror}", fix="see to the file", where=str(file)) from None
     said = validate(_File, known_part(_File, data)[0], where=str(file), error=BundleError)
-    return Case(path, said.expect, said.note, said.crash, said.signature)
+    return Case(path=path, expect=said.expect, note=said.note, crash=said.crash, signature=said.signature)
 
 
 def find_cases(places: list[Path]) -> list[Path]:
-    """Return the folders of all cases in some folders, or that are these themselves, in order of their names.
+    """Return the folders of all cases in the given folders, sorted by name; a given folder may itself be a case.
 
     Raises:
-        BundleError: there is none in one of them.
+        BundleError: A folder has no case.
     """
     found: dict[Path, None] = {}
     for place in places:
@@ -169,18 +169,18 @@ def _is_hidden(path: Path) -> bool:
     return any(part.startswith(".") for part in path.parts)
 
 
-# Putting a crash into a corpus: small, without code, and with the scenario that it needs.
+# Adding a crash to a corpus: small, without code, and with the scenario that it needs.
 
-_MOST = 100 * 1024  # bytes of a case with its log; beyond, it is left out: a repository keeps every version for ever
+_MAX_BYTES_WITH_LOG = 100 * 1024  # a larger case omits the log, because a repository keeps every version forever
 
 
 @dataclass(frozen=True, slots=True)
 class Added:
-    """What came of adding a crash.
+    """The result of adding a crash.
 
     Args:
-        case: in the corpus.
-        new: whether it was not there yet.
+        case: The case in the corpus.
+        new: Whether the corpus did not have the case before.
     """
 
     case: Case
@@ -188,30 +188,36 @@ class Added:
 
 
 def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None, note: str | None = None) -> Added:
-    """Put a crash into a corpus; what is there already only gets the expectation and the note that are given.
+    """Add a crash to a corpus. If the corpus has the crash already, update only the expectation and the note.
 
-    No code is run. The case is this user's from then on, whoever made the crash, so see first that it is trusted. Two
-    may add to the same corpus at once.
+    The function runs no code. Afterwards the case counts as made by this user, so check first that the bundle is
+    trusted. Two processes may add to the same corpus at the same time.
 
     Args:
-        bundle: the crash.
-        corpus: the folder of the corpus; made where it is not there.
-        expect: what is expected of it from now on; ``still`` by default.
-        note: of whoever keeps it.
+        bundle: The crash.
+        corpus: The folder of the corpus; created if it does not exist.
+        expect: The expected status; ``still`` by default.
+        note: A note of the user.
 
     Raises:
-        BundleError: the crash is damaged.
-        HuntDirectoryError: the folder cannot be written.
+        BundleError: The crash is damaged.
+        HuntDirectoryError: The folder cannot be written.
     """
     if bundle.result.outcome in (Outcome.SURVIVED, Outcome.FINISHED):
-        raise UsageError(f"{bundle.id!r} is a near miss, and nothing crashes in it", fix="give a crash")
+        raise UsageError(f"{bundle.id!r} is a near miss, not a crash", fix="give a crash")
     name = f"{_id(bundle)}-{bundle.result.digest[:6]}"
     final = corpus / name
     try:
         corpus.mkdir(parents=True, exist_ok=True)
         remove_ended(corpus)
         if not final.exists():
-            case = Case(final, expect or "still", note or "", bundle.result.summary, dict(_signature(bundle)))
+            case = Case(
+                path=final,
+                expect=expect or "still",
+                note=note or "",
+                crash=bundle.result.summary,
+                signature=dict(_signature(bundle)),
+            )
             with temporary_beside(final) as building:
                 _build(bundle, case, building)
                 try:
@@ -219,7 +225,7 @@ def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None,
                     sync_folder(corpus)
                     return Added(case, new=True)
                 except OSError:
-                    if not (final / layout.CASE).is_file():  # else somebody else has added the same meanwhile
+                    if not (final / layout.CASE).is_file():  # otherwise another process has added the same crash
                         raise
         return Added(read_case(final).expecting(expect, note), new=False)
     except OSError as error:
@@ -232,7 +238,7 @@ def _signature(bundle: Bundle) -> dict[str, str | bool]:
 
 
 def _id(bundle: Bundle) -> str:
-    return bundle.id.removesuffix(layout.SMALL)  # it is the only one there
+    return bundle.id.removesuffix(layout.SMALL)  # a case has only one bundle
 
 
 def _build(bundle: Bundle, case: Case, folder: Path) -> None:
@@ -246,23 +252,23 @@ def _build(bundle: Bundle, case: Case, folder: Path) -> None:
     kept = replace(kept, authentication_code=authenticate_bundle(kept))
     kept.write(into=crash)
     write_log(crash / layout.LOG, recording, views=False)
-    if sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) > _MOST:
+    if sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) > _MAX_BYTES_WITH_LOG:
         (crash / layout.LOG).unlink()
     kept.write(into=crash)  # with the digest of the log
     sync_tree(folder)
 
 
-# Which kinds of crashes a corpus has already.
+# The crash types that a corpus already has.
 
 
 def known_kinds(signatures: Iterable[Signature], cases: Iterable[Case]) -> dict[Signature, Case]:
-    """Return the cases that are of the same kinds as some crashes.
+    """Return a case of the same crash type for each signature that has one.
 
-    A case that is ``fixed`` makes nothing known: it must not crash any more.
+    Cases with the status ``fixed`` are ignored, because their crashes must not occur any more.
 
     Args:
-        signatures: of the crashes.
-        cases: of the corpus.
+        signatures: The signatures of the crashes.
+        cases: The cases of the corpus.
     """
     still = [case for case in cases if case.expect == "still" and case.signature]
     found = {}

@@ -1,4 +1,4 @@
-"""Running the cases of a corpus with today's code, several at a time, and whether each is as expected."""
+"""Runs the cases of a corpus with the current code, several at a time, and compares them with their expectations."""
 
 from __future__ import annotations
 
@@ -38,24 +38,24 @@ if TYPE_CHECKING:
 __all__ = ["CaseReport", "Got", "run_cases", "untrusted_case"]
 
 Got = Literal["still", "fixed", "changed", "cannot_run"]
-_LOOK_EVERY_S = 0.01  # at each of those that run
+_LOOK_EVERY_S = 0.01  # wait for a result of each running case
 _NO_CRASH = (Outcome.SURVIVED, Outcome.FINISHED)
 
 
 @dataclass(frozen=True, slots=True)
 class CaseReport(Serializable):
-    """What came of a case.
+    """The result of a case.
 
     Args:
-        path: of its folder.
-        expected: what was expected of it.
-        got: whether it crashes ``still``, in the same manner; is ``fixed``; has ``changed`` into another crash; or
+        path: The folder of the case.
+        expected: The expected status.
+        got: The status: ``still`` (reproduces with the same crash type), ``fixed``, ``changed`` (another crash type) or
             ``cannot_run``.
-        was: what happened, in words.
-        now: what happens today, or why it cannot run.
-        note: of whoever keeps it.
-        warnings: what may make a difference besides the code.
-        kept: where today's crash has been kept.
+        was: A description of the recorded crash.
+        now: A description of the current result, or the reason why the case cannot run.
+        note: The user's note.
+        warnings: Differences other than the code that may change the result.
+        kept: The bundle of the current crash, if it was kept.
     """
 
     path: Path
@@ -71,21 +71,21 @@ class CaseReport(Serializable):
 
     @property
     def ok(self) -> bool:
-        """Whether it is as expected, or better."""
+        """Whether the status is as expected, or better."""
         return self.got == self.expected or self.got == "fixed"
 
     @property
     def may_be_tightened(self) -> bool:
-        """Whether it is fixed and nobody has said so yet. In the traffic of another simulator, nobody knows."""
+        """Whether the case is fixed although ``still`` is expected; false with warnings, because they raise doubt."""
         return self.expected == "still" and self.got == "fixed" and not self.warnings
 
     @property
     def line(self) -> str:
-        """What happens today and the note, in one line."""
+        """The current result and the note, in one line."""
         return one_line(f"{self.now} ({self.note})" if self.note else self.now)
 
     def describe(self) -> str:
-        """Return what happened and how to look at it, in lines."""
+        """Return a text of several lines with the result and the command to show it."""
         lines = [f"{self.path.name}: {_WORDS[self.got]}" + ("" if self.ok else f", and {self.expected} was expected")]
         if self.was:
             lines.append(f"  it was: {self.was}")
@@ -116,22 +116,22 @@ def run_cases(
     stopped: Callable[[], bool] = lambda: False,
     trusted: bool = False,
 ) -> list[CaseReport]:
-    """Run cases with today's code, each in a fresh process.
+    """Run cases with the current code, each in a new process.
 
     Args:
-        cases: their folders.
-        parallel: how many at a time; 0 for one per core.
-        keep: where to keep what crashes, as the directory of a hunt with everything in it, by the name of the case.
-        watch: called after each with how many are done, and how many there are.
-        stopped: asked now and then whether to give up.
-        trusted: whether what the cases name may run; otherwise each has to be trusted, before the first one runs.
+        cases: The folders of the cases.
+        parallel: Number of cases at a time; 0 for one per core.
+        keep: A folder for the crashes; each crash gets a hunt's directory with the name of the case.
+        watch: Called with the number of completed cases and the number of all cases.
+        stopped: Returns whether to stop; called repeatedly.
+        trusted: Whether to run the cases without a check; otherwise all cases must be trusted before the first runs.
 
     Returns:
-        What came of each, in their order; of those that had not ended when it was given up, nothing.
+        The reports of the completed cases, in the order of the cases.
 
     Raises:
-        UntrustedError: what a case names is neither made here nor trusted.
-        CrashhuntError: the scratch folder, or the one to keep crashes in, cannot be written.
+        UntrustedError: A case is neither made by this user nor trusted.
+        CrashhuntError: The scratch folder or the folder for crashes cannot be written.
     """
     if not trusted:
         _refuse_untrusted_cases(cases)
@@ -146,22 +146,22 @@ def run_cases(
                     reports[path] = began
                 else:
                     running[path] = began
-            for path, one in list(running.items()):
-                report = one.look(keep)
+            for path, run in list(running.items()):
+                report = run.look(keep)
                 if report is not None:
                     reports[path] = report
                     del running[path]
-                    one.close()
+                    run.close()
             if watch is not None:
                 watch(len(reports), len(cases))
     return [reports[path] for path in cases if path in reports]
 
 
 def _refuse_untrusted_cases(cases: Sequence[Path]) -> None:
-    """Refuse cases of which nothing proves that they are this user's; those that cannot be read do not run anyway.
+    """Refuse cases that are neither this user's nor trusted; unreadable cases do not run anyway.
 
     Raises:
-        UntrustedError: with the first of them.
+        UntrustedError: A case is not trusted; the message names the first such case.
     """
     for path in cases:
         bundle = untrusted_case(path)
@@ -170,7 +170,7 @@ def _refuse_untrusted_cases(cases: Sequence[Path]) -> None:
 
 
 def untrusted_case(path: Path) -> Bundle | None:
-    """Return the crash of a case that is not trusted; None where it is, or cannot run because it is damaged."""
+    """Return the crash of a case that is not trusted; None if it is trusted, or damaged and so cannot run."""
     try:
         bundle = read_case(path).bundle()
         snapshot_of(bundle).verify()
@@ -202,19 +202,35 @@ class _Running:
         self._executor.submit(bundle.result.spec)
 
     def look(self, keep: Path | None) -> CaseReport | None:
-        """Return what came of it; None where it goes on."""
+        """Return the report of the case; None while the case is running."""
         case = self._case
         try:
             result = next(iter(self._executor.completed(_LOOK_EVERY_S)), None)
             return None if result is None else self._report(result, keep)
-        except BundleError as error:  # a process that died before it had recorded anything
-            return CaseReport(case.path, case.expect, "cannot_run", case.crash, str(error), case.note, self._warnings)
+        except BundleError as error:  # the process died before it recorded anything
+            return CaseReport(
+                path=case.path,
+                expected=case.expect,
+                got="cannot_run",
+                was=case.crash,
+                now=str(error),
+                note=case.note,
+                warnings=self._warnings,
+            )
         except CrashhuntError as error:
             why = f"{error.message} ({error.fix})" if error.fix else error.message
-            return CaseReport(case.path, case.expect, "cannot_run", case.crash, why, case.note, self._warnings)
+            return CaseReport(
+                path=case.path,
+                expected=case.expect,
+                got="cannot_run",
+                was=case.crash,
+                now=why,
+                note=case.note,
+                warnings=self._warnings,
+            )
 
     def close(self) -> None:
-        """End it, and leave nothing behind; may be called twice."""
+        """End the process and remove its files; a second call does nothing."""
         self._executor.close()
         self._folder.remove()
 
@@ -228,11 +244,19 @@ class _Running:
             )
             now = signature_of(kept).to_json()
             got = "still" if all(now.get(name, value) == value for name, value in case.signature.items()) else "changed"
-        found = CaseReport(case.path, case.expect, got, case.crash, result.summary, case.note, self._warnings)
+        found = CaseReport(
+            path=case.path,
+            expected=case.expect,
+            got=got,
+            was=case.crash,
+            now=result.summary,
+            note=case.note,
+            warnings=self._warnings,
+        )
         return replace(found, kept=kept.path if kept is not None and keep is not None else None)
 
     def _keep(self, result: TrialResult, directory: Path, *, whole: bool) -> Bundle:
-        """Make a bundle of today's crash, and what else a hunt's directory has."""
+        """Write a bundle of the current crash; with ``whole``, also the other files of a hunt's directory."""
         digest = self._bundle.snapshot
         if whole:
             directory.mkdir(parents=True, exist_ok=True)
@@ -248,7 +272,7 @@ class _Running:
 
 
 def _begin(path: Path, stack: ExitStack) -> _Running | CaseReport:
-    expected: Expectation = "fixed"  # whatever it is, a case that cannot be read does not meet it
+    expected: Expectation = "fixed"  # an unreadable case never meets its expectation
     was = note = ""
     try:
         case = read_case(path)
@@ -257,7 +281,7 @@ def _begin(path: Path, stack: ExitStack) -> _Running | CaseReport:
         snapshot = _whole(Snapshot(path / layout.SNAPSHOTS / bundle.snapshot))
         running = _Running(case, bundle, read_settings(path / layout.HUNT), snapshot)
     except CrashhuntError as error:
-        return CaseReport(path, expected, "cannot_run", was, str(error), note)
+        return CaseReport(path=path, expected=expected, got="cannot_run", was=was, now=str(error), note=note)
     stack.callback(running.close)
     return running
 
@@ -266,18 +290,18 @@ def _whole(snapshot: Snapshot) -> Snapshot:
     """Return the snapshot of a case.
 
     Raises:
-        BundleError: it is damaged; what a replay could do about it, nobody can here.
+        BundleError: The snapshot is damaged; the fix names the repository, because a case has no other copy.
     """
     try:
         snapshot.verify()
     except BundleError as error:
-        fix = "get the case back from the repository, or add the crash anew"
+        fix = "restore the case from the repository, or add the crash again"
         raise BundleError(error.message, fix=fix, where=error.where) from None
     return snapshot
 
 
 def _warnings(snapshot: Snapshot) -> tuple[str, ...]:
-    """What else than the code is another: the same seed then draws other traffic."""
+    """Return the differences of the environment because of which the same seed may draw other traffic."""
     environment, scenario = snapshot.environment(), snapshot.scenario()
     changed = environment_changes(environment)
     names = (name for name in scenario.backend.versions if name in changed)

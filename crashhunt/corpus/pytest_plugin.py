@@ -1,6 +1,6 @@
-"""``pytest crashes/``: every case of a corpus is a test.
+"""The pytest plugin: every case of a corpus is a test.
 
-pytest imports this module whenever it starts, so nothing else is imported before a case is run.
+pytest imports this module at every start, so the module imports the rest of crashhunt only when a case runs.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ class _CaseItem(pytest.Item):
     def runtest(self) -> None:
         from crashhunt.corpus import run_cases
 
-        # pytest imports every conftest.py of the folders that it runs, so whoever runs it trusts them.
+        # pytest imports every conftest.py of the folders that it runs, so its user already trusts them.
         (report,) = run_cases([self.path.parent], parallel=1, trusted=True)
         self.user_properties += [("crashhunt_expected", report.expected), ("crashhunt_got", report.got)]
-        told = report.describe()
+        text = report.describe()
         if not report.ok:
-            kept = report.got != "cannot_run"  # else there is nothing to look at
-            raise _FailedError(f"{told}\n  {_how_to_look(self)}" if kept else told)
+            kept = report.got != "cannot_run"  # otherwise there is no crash to show
+            raise _FailedError(f"{text}\n  {_how_to_look(self)}" if kept else text)
         if report.may_be_tightened:
-            self.add_report_section("call", "crashhunt", f'{told}\n  {self.path.name} may say: expect = "fixed"')
+            self.add_report_section("call", "crashhunt", f'{text}\n  {self.path.name} may say: expect = "fixed"')
         elif report.got == "still":
             pytest.xfail(report.line)
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: object = None) -> str:
-        """Tell what came of it; a traceback of crashhunt's helps nobody."""
+        """Return the report of a failed case, without a traceback of crashhunt."""
         return str(excinfo.value) if isinstance(excinfo.value, _FailedError) else str(super().repr_failure(excinfo))
 
     def reportinfo(self) -> tuple[Path, int | None, str]:
-        """Say where it is."""
+        """Return the path and the title of the case."""
         return self.path, None, f"crash {self.name}"
 
 
 class _FailedError(Exception):
-    """It is not as expected."""
+    """The status of a case differs from the expected status."""
 
 
 def _how_to_look(item: pytest.Item) -> str:

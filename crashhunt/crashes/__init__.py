@@ -1,4 +1,4 @@
-"""Crashes: the bundle of one, its archive, how near it came, whether braking would have helped, whom to trust."""
+"""Crashes: bundles, archives, trust, encounters, criticality, signatures, crash types, fault and preventability."""
 
 import lazy_loader
 

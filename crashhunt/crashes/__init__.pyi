@@ -3,13 +3,16 @@ from ._bundle import (
     Bundle as Bundle,
     CrashData as CrashData,
     CrashSummary as CrashSummary,
+    authenticate_bundle as authenticate_bundle,
     crash_folders as crash_folders,
     files_of as files_of,
     find_bundle as find_bundle,
+    is_bundle_made_here as is_bundle_made_here,
     list_bundles as list_bundles,
     list_near_misses as list_near_misses,
     read_bundle as read_bundle,
     read_params as read_params,
+    snapshot_of as snapshot_of,
     write_bundle as write_bundle,
     write_trial as write_trial,
 )
@@ -56,9 +59,7 @@ from ._signature import (
 from ._trust import (
     TrustedOrigin as TrustedOrigin,
     add_trusted as add_trusted,
-    authenticate_bundle as authenticate_bundle,
     describe_code as describe_code,
-    is_bundle_made_here as is_bundle_made_here,
     is_bundle_trusted as is_bundle_trusted,
     is_fingerprint_trusted as is_fingerprint_trusted,
     is_hunt_trusted as is_hunt_trusted,
@@ -67,7 +68,6 @@ from ._trust import (
     refuse_side_effects as refuse_side_effects,
     refuse_untrusted as refuse_untrusted,
     remove_trusted as remove_trusted,
-    snapshot_of as snapshot_of,
     trust_snapshot as trust_snapshot,
 )
 from ._types import (

@@ -21,8 +21,8 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import FILES, parse_object, typed
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.watching import watched
-from crashhunt.crashes._bundle import ArchiveIndex
-from crashhunt.crashes._trust import is_bundle_made_here, is_made_here, signature
+from crashhunt.crashes._bundle import ArchiveIndex, is_bundle_made_here
+from crashhunt.crashes._trust import is_made_here, signature
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 __all__ = ["Archive", "export_crash", "open_archive"]
 
 SCHEMA = 1
-_MAX_BYTES = 4 * 10**9  # unpacked; a few hundred bytes of a zip can stand for terabytes
+_MAX_BYTES = 4 * 10**9  # unpacked size, because a small zip file can contain terabytes
 _MAX_FILES = 100_000  # so many make a file system slow
 _CHUNK = 1 << 20  # bytes at a time, so that a large file needs little memory
 
@@ -77,7 +77,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
     snapshot = Snapshot(hunt / layout.SNAPSHOTS / bundle.snapshot)
     snapshot.verify()
     files = [hunt / layout.HUNT, *sorted(bundle.path.rglob("*"))]
-    # Of the snapshot what its manifest names: an agent may have left data beside its code.
+    # Export only the snapshot's files that its manifest names, because an agent may have written data into its folder.
     files += [snapshot.path / name for name in snapshot.manifest["files"]]
     files += sorted(path for path in snapshot.path.iterdir() if path.is_file())
     entries: dict[str, FileEntry] = {}
@@ -124,10 +124,10 @@ def open_archive(path: Path) -> Iterator[Archive]:
             name = "" if isinstance(error, zipfile.BadZipFile) else f"{type(error).__name__}: "
             raise _refusal(path, f"not an undamaged zip file: {name}{' '.join(str(error).split())}") from None
         yield Archive(
-            directory,
-            str(index.get("made_by", "?")),
-            str(index.get("made_at", "?")),
-            is_made_here(index),
+            directory=directory,
+            made_by=str(index.get("made_by", "?")),
+            made_at=str(index.get("made_at", "?")),
+            made_here=is_made_here(index),
         )
 
 
@@ -194,12 +194,12 @@ def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, directory: Path, 
 def _user() -> str:
     try:
         return getpass.getuser()
-    except (KeyError, OSError):  # as in a container that was given a user whom its files do not know
+    except (KeyError, OSError):  # a container may run as a user without an entry in its user database
         return str(os.getuid())
 
 
 def _refusal(path: Path, message: str) -> BundleError:
-    return BundleError(message, fix="get an undamaged copy from whoever exported it", where=str(path))
+    return BundleError(message, fix="get an undamaged copy from the person who exported it", where=str(path))
 
 
 def _hash(data: bytes) -> str:

@@ -10,15 +10,23 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError
+from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree, whole_file
-from crashhunt.base.integrity import FILES, changed_file, describe_files, digest_of_data, read_object, typed
+from crashhunt.base.integrity import (
+    FILES,
+    authentication_code,
+    changed_file,
+    describe_files,
+    digest_of_data,
+    is_authentic,
+    read_object,
+    typed,
+)
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.text import listed, near_path, one_of
 from crashhunt.base.tolerance import known_part, merged, typed_where_there
-from crashhunt.crashes._trust import authenticate_bundle
 from crashhunt.recording import Recording, read_black_box
-from crashhunt.snapshots import versions
+from crashhunt.snapshots import Snapshot, versions
 from crashhunt.trial import (
     Collision,
     Disturbance,
@@ -50,16 +58,19 @@ __all__ = [
     "CrashData",
     "CrashSummary",
     "Protected",
+    "authenticate_bundle",
     "collect_output",
     "crash_folders",
-    "files_beside",
+    "describe_other_files",
     "files_of",
     "find_bundle",
+    "is_bundle_made_here",
     "list_bundles",
     "list_near_misses",
     "read_bundle",
     "read_params",
     "refuse_damaged",
+    "snapshot_of",
     "write_bundle",
     "write_trial",
 ]
@@ -71,7 +82,7 @@ __all__ = [
 
 
 class Protected(TypedDict):
-    """What says of itself, and of the files beside it, what they were when they were written."""
+    """The keys with the digests of a file itself and of the other files in its folder."""
 
     schema: int
     files: dict[str, FileEntry]
@@ -146,7 +157,7 @@ class ArchiveIndex(TypedDict):
     signature: NotRequired[str]
 
 
-# The files beside ``crash.json``, and beside ``params.json`` of a trial that is kept for another reason.
+# The other files of a bundle, next to ``crash.json``, or next to ``params.json`` of a trial kept for another reason.
 
 
 def refuse_damaged(data: Protected) -> None:
@@ -162,7 +173,7 @@ def refuse_damaged(data: Protected) -> None:
     for name, entry in data["files"].items():
         typed(entry, {"size": int, "blake2b": str})
         if "/" in name or name in ("", ".", ".."):
-            raise ValueError(f"the file {name!r} is not beside it")
+            raise ValueError(f"the file {name!r} is not in the folder of the bundle")
 
 
 def files_of(folder: Path) -> dict[str, FileEntry]:
@@ -176,8 +187,8 @@ def files_of(folder: Path) -> dict[str, FileEntry]:
     return {}
 
 
-def files_beside(folder: Path) -> dict[str, FileEntry]:
-    """Return size and digest of every file of a folder but the one that says so."""
+def describe_other_files(folder: Path) -> dict[str, FileEntry]:
+    """Return size and digest of every file of a folder, except of the file that holds this list."""
     found = describe_files(folder)
     return {
         name: entry for name, entry in found.items() if name not in (layout.CRASH, layout.PARAMS) and name[0] != "."
@@ -209,10 +220,10 @@ def collect_output(result: TrialResult, scratch: Path, target: Path) -> None:
 
 
 SCHEMA = 5
-_ALL_DRIVE = 4  # what is written where nobody is scripted
-_ALL_TAKE_PART = 3  # what is written where nobody is left out
-_UNDISTURBED = 2  # what is written where there are no disturbances: without them, it would be another trial
-_PROTECTED = 2  # the first version with a digest of itself and of the files beside it
+_ALL_DRIVE = 4  # schema of bundles without scripted actors
+_ALL_TAKE_PART = 3  # schema of bundles without excluded actors
+_UNDISTURBED = 2  # schema of bundles without disturbances, which older versions would ignore
+_PROTECTED = 2  # the first schema with digests of the file itself and of the other files
 _KNOWN = bool | float | str | None
 _NEEDED: Plain = {
     **dict.fromkeys(("trial", "seed", "max_steps", "step"), int),
@@ -248,12 +259,12 @@ class Bundle:
         result: the crash.
         hunt_seed: of the hunt that found it.
         snapshot: the digest of the code that it ran.
-        confirmed: whether a fresh process did the same to the bit; None where nobody tried, or no try came to its end.
-        divergence: where it did not.
-        files: size and digest of the files beside ``crash.json``, as they were written; earlier versions did not say.
-        added: what a later version says of it, which is written back.
-        why_unconfirmed: why the try did not come to its end; empty where it did, or nobody tried.
-        authentication_code: proves to the user who made it what determines the trial; empty where nothing does.
+        confirmed: Whether a replay in a new process was bit-identical; None if no replay has run to its end.
+        divergence: Where the replay deviated, if it did.
+        files: Size and digest of the other files of the bundle; empty in bundles of earlier versions.
+        added: Keys that a later version has added, which are written back.
+        why_unconfirmed: Why no replay has run to its end; empty if one has, or if none was started.
+        authentication_code: Proves to the user who made the bundle that its trial is unchanged; may be empty.
     """
 
     path: Path
@@ -308,7 +319,7 @@ class Bundle:
         return found
 
     def faults(self) -> list[str]:
-        """Return which files beside ``crash.json`` are not as they were written, and those that were not there."""
+        """Return the changed, missing and added files of the bundle."""
         found = [
             f"{name} {wrong}" for name, entry in self.files.items() if (wrong := changed_file(self.path / name, entry))
         ]
@@ -373,7 +384,7 @@ class Bundle:
             "versions": versions(),
             "confirmed": self.confirmed,
             "divergence": self.divergence,
-            "files": dict(self.files) or files_beside(folder),
+            "files": dict(self.files) or describe_other_files(folder),
         }
         if self.why_unconfirmed:
             data["why_unconfirmed"] = self.why_unconfirmed
@@ -450,10 +461,10 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
     if not re.fullmatch(r"\w+", data["snapshot"]):
         raise ValueError(f"snapshot {data['snapshot']!r} is no name of one")
     spec = TrialSpec(
-        data["trial"],
-        data["seed"],
-        data.get("arguments", {}),
-        data.get("scenario_arguments", {}),
+        number=data["trial"],
+        seed=data["seed"],
+        arguments=data.get("arguments", {}),
+        scenario_arguments=data.get("scenario_arguments", {}),
         max_steps=data["max_steps"],
         disturbances=tuple(map(Disturbance.from_json, data.get("planned_disturbances") or ())),
         only=tuple(only) if (only := data.get("only")) is not None else None,
@@ -478,13 +489,13 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
     )
     files = data.get("files", {}) if data["schema"] >= _PROTECTED else {}
     return Bundle(
-        path,
-        result,
-        data.get("hunt_seed", 0),
-        data["snapshot"],
-        data.get("confirmed"),
-        data.get("divergence"),
-        files,
+        path=path,
+        result=result,
+        hunt_seed=data.get("hunt_seed", 0),
+        snapshot=data["snapshot"],
+        confirmed=data.get("confirmed"),
+        divergence=data.get("divergence"),
+        files=files,
         added=_added(data),
         why_unconfirmed=data.get("why_unconfirmed", ""),
         authentication_code=data.get("authentication_code", ""),
@@ -499,6 +510,54 @@ def _added(data: CrashData) -> dict[str, object]:
         if rest:
             added[name] = rest
     return added
+
+
+# Who made a bundle: an authentication code shows that this user made it on this machine.
+
+_PURPOSE = "crash bundle"
+
+
+def snapshot_of(bundle: Bundle) -> Snapshot:
+    """Return the snapshot of the code that a bundle ran."""
+    return Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot)
+
+
+def authenticate_bundle(bundle: Bundle) -> str:
+    """Return the authentication code of a bundle that this process makes; empty where its code is not of this user.
+
+    Without that condition, a crash that was minimized or confirmed in a stranger's hunt would pass for one made here.
+    """
+    try:
+        made_here = snapshot_of(bundle).is_made_here
+    except CrashhuntError:  # there is none, as of a candidate of a minimization
+        return ""
+    return authentication_code(_PURPOSE, _statement(bundle)) if made_here else ""
+
+
+def is_bundle_made_here(bundle: Bundle) -> bool:
+    """Return whether this user made a bundle and its snapshot on this machine; files of the snapshot are not read.
+
+    Raises:
+        BundleError: the manifest of the snapshot is missing or damaged.
+    """
+    return snapshot_of(bundle).is_made_here and is_authentic(_PURPOSE, _statement(bundle), bundle.authentication_code)
+
+
+def _statement(bundle: Bundle) -> dict[str, object]:
+    """Everything of a bundle that determines what runs, and the digest of what was recorded."""
+    spec = bundle.result.spec.to_json()
+    return {
+        "number": spec["number"],
+        "seed": spec["seed"],
+        "max_steps": spec["max_steps"],
+        "arguments": spec["arguments"],
+        "scenario_arguments": spec["scenario_arguments"],
+        "disturbances": spec.get("disturbances") or [],
+        "only": spec.get("only"),
+        "script": spec.get("script"),
+        "digest": bundle.result.digest,
+        "snapshot": bundle.snapshot,
+    }
 
 
 def write_bundle(
@@ -522,7 +581,7 @@ def write_bundle(
         scratch: the trial's scratch folder; it is emptied.
         hunt_seed: of the hunt.
         snapshot: the digest of the code that ran.
-        lanes: of the map, for whoever looks at the log.
+        lanes: The lanes of the map, for viewers of the log.
         name: of its folder, where that is not made of the trial's number and the outcome.
         place: the folder of the directory that it goes into.
         confirmed: whether a fresh process did the same, where that is known already.
@@ -541,7 +600,14 @@ def write_bundle(
         write_log(building / layout.LOG, recording, lanes=lanes, metadata=metadata, crash=crash)
         (building / layout.FOXGLOVE_LAYOUT).write_text(view, encoding="utf-8")
         collect_output(result, scratch, building)
-        bundle = Bundle(final, result, hunt_seed, snapshot, confirmed, files=files_beside(building))
+        bundle = Bundle(
+            path=final,
+            result=result,
+            hunt_seed=hunt_seed,
+            snapshot=snapshot,
+            confirmed=confirmed,
+            files=describe_other_files(building),
+        )
         if authenticate:
             bundle = replace(bundle, authentication_code=authenticate_bundle(bundle))
         bundle.write(into=building)
@@ -557,14 +623,14 @@ def write_trial(directory: Path, result: TrialResult, scratch: Path) -> None:
     target = directory / layout.TRIALS / f"{result.spec.number:06d}"
     target.mkdir(parents=True, exist_ok=True)
     collect_output(result, scratch, target)
-    data = {**result.to_json(), "schema": _UNDISTURBED, "files": files_beside(target)}
+    data = {**result.to_json(), "schema": _UNDISTURBED, "files": describe_other_files(target)}
     data["integrity"] = digest_of_data(data)
     with whole_file(target / layout.PARAMS, lasting=False) as temporary:
         temporary.write_text(json.dumps(data, indent=2), encoding="utf-8")
     shutil.rmtree(scratch, ignore_errors=True)
 
 
-# Finding the crashes of a hunt, and the one that somebody means.
+# Finding the crashes of a hunt, and the crash that the user names.
 
 
 def list_bundles(directory: Path) -> list[Bundle]:
@@ -593,13 +659,13 @@ def crash_folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
 def find_bundle(directory: Path, crash: str = "") -> Bundle:
     """Return one crash or near miss of a hunt: the one that is named, or the crash with the fewest steps.
 
-    Of a hunt that has near misses only, that is the most dangerous of them; else one that copies have found; and else
-    one that was made smaller, as in the file to which that was exported.
+    A hunt without crashes gives its most critical near miss. Without near misses, it gives a crash of a fork, or else a
+    minimized crash, as in an exported file.
 
     Args:
         directory: of the hunt, or of the bundle itself.
-        crash: its id or that of a near miss, or else of what probes or branches have found; the beginning of it, or its
-            trial's number, with leading zeros or without. One that was made smaller is only meant by its whole id.
+        crash: The id of a crash, of a near miss, or of a crash that probes or branches have found. The beginning of an
+            id suffices, or the number of the trial. A minimized crash needs its whole id.
 
     Raises:
         BundleError: there is no such crash.
@@ -653,7 +719,7 @@ def _may_be(bundle: Bundle, crash: str) -> bool:
 
 
 def _readable(directory: Path, crash: str, places: Sequence[str]) -> list[Bundle]:
-    """The crashes of a hunt; one that is damaged is in the way of nobody who means another."""
+    """Return the readable crashes of a hunt; a damaged crash raises an error only if the user names it."""
     found = []
     for path in (folder for place in places for folder in crash_folders(directory, place)):
         try:
@@ -666,7 +732,7 @@ def _readable(directory: Path, crash: str, places: Sequence[str]) -> list[Bundle
 
 
 def _named(bundles: Sequence[Bundle], crash: str, directory: Path) -> Bundle:
-    """The one crash that somebody can mean; an id is exact, and else a number, before the beginning of an id."""
+    """Return the crash that the user names: by its id, else by its number, else by the beginning of its id."""
     number = int(crash) if crash.isdecimal() else None
     for meant in (
         [bundle for bundle in bundles if bundle.id == crash],

@@ -124,12 +124,12 @@ class Encounter:
         turn = math.remainder(scene.headings[other] - scene.headings[own], math.tau)
         one, two = scene.roster.actors[own], scene.roster.actors[other]
         along, across = abs(math.cos(turn)), abs(math.sin(turn))
-        # Beside: their lengths overlap, seen from the agent, and not by touching ends only.
-        beside = (
+        # Side by side: the lengths overlap, as seen from the agent, by more than touching ends.
+        is_alongside = (
             abs(ahead) < (one.length + two.length * along + two.width * across) / 2
             and abs(left) > (one.width + two.width * along + two.length * across) / 3
         )
-        if beside or abs(left) > abs(ahead):
+        if is_alongside or abs(left) > abs(ahead):
             return Position("left" if left > 0 else "right", turn)
         return Position("ahead" if ahead > 0 else "behind", turn)
 
@@ -184,7 +184,7 @@ class Encounter:
         ]
 
     def _bent(self, scene: Scene, rows: tuple[int, int], straight_m: float) -> tuple[float, float]:
-        """Time to collision and gap of two of whom one is bent; further away, the gap is as if it were straight."""
+        """Return time to collision and gap of a bent and another vehicle; a distant vehicle is treated as straight."""
         pair = Scene(
             scene.time_s,
             Roster(tuple(scene.roster.actors[row] for row in rows)),
@@ -200,14 +200,14 @@ class Encounter:
 def last_escape(recording: Recording, agent: str, other: str, *, braking: float) -> int | None:
     """Return the last step after which full braking would have avoided the crash, as calculated.
 
-    The agent goes on along the path that it drove, braking from that step on; the other one does what it did, and
-    beyond the end of the recording goes on at its last velocity. That is not what would have happened, since others
-    react (see `crashhunt.escape`, which runs it).
+    The agent follows its recorded path and brakes from that step on. The collision partner repeats its recorded motion,
+    and keeps its last velocity after the end of the recording. In reality other actors react, so the result is only an
+    estimate. `crashhunt.escape` runs the trial again.
 
     Args:
         recording: of the crash.
-        agent: who brakes.
-        other: whom it crashed into, or who crashed into it.
+        agent: The agent that brakes.
+        other: The collision partner.
         braking: deceleration, in m/s².
 
     Returns:
@@ -263,11 +263,11 @@ class _Model:
             if self._touch_on_the_way(index, driven, after):
                 return False
             speed, driven, index = slower, after, index + 1
-        # The other one may still drive into somebody who stands; that is not for the agent's brakes to avoid.
+        # The partner may still drive into the standing agent, which the agent's brakes cannot avoid.
         return True
 
     def _touch_on_the_way(self, index: int, driven: float, after: float) -> bool:
-        """Whether they touch within a step, the beginning left out."""
+        """Whether the two touch within a step, after its beginning."""
         (x, y, _), (x_after, y_after, _) = self._other(float(index)), self._other(float(index + 1))
         way = after - driven + math.hypot(x_after - x, y_after - y)
         parts = min(_MOST_PARTS, max(1, math.ceil(way / _PART_M)))
@@ -321,21 +321,21 @@ def _turned(vectors: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArr
 
 # How dangerous a recorded trial was from step to step: for the agent, and by those behind it.
 
-_UNKNOWN_S = 4.0  # before the end: whoever would have been met later is not in the recording
+_UNKNOWN_S = 4.0  # before the end, a criticality of 0 is unknown: later actors are not in the recording
 
 
 @dataclass(frozen=True, slots=True)
 class DangerCourse:
     """The danger of a recorded trial over time, measured after the fact.
 
-    A danger is not a number in steps in which the agent is not there, and where it would be 0 within the last 4 s: it
-    is measured by what came afterwards, and that was not recorded.
+    The criticality is NaN in steps without the agent. It is also NaN where it would be 0 within the last 4 s, because
+    it depends on later steps, which were not recorded.
 
     Args:
         agent: whose.
         steps: that have a scene.
-        own: the danger of each of them that is the agent's own: towards whoever is ahead or crosses its way.
-        behind: that of each by those who close in on the agent from behind, on its way.
+        own: The criticality in each of them towards actors ahead of the agent or crossing its path.
+        behind: The rear criticality in each of them: by actors that approach the agent from behind.
         greatest: the moment of the greatest own danger.
         greatest_behind: likewise of those behind; ``other`` is who.
         own_total: the integral over the trial, from 0 to below 1: for a trial without a crash and with one agent that
@@ -376,14 +376,14 @@ def danger_course(recording: Recording, agent: str) -> DangerCourse | None:
     known[there] = True
     unsure = np.arange(len(steps)) > there[-1] - _UNKNOWN_S / dt
     return DangerCourse(
-        agent,
-        steps,
-        np.where(known & ((own > 0) | ~unsure), own, np.nan),
-        np.where(known & ((behind > 0) | ~unsure), behind, np.nan),
-        greatest._replace(step=steps[greatest.step]),
-        greatest_behind._replace(step=steps[greatest_behind.step]),
-        meter.danger or 0.0,
-        behind_total,
+        agent=agent,
+        steps=steps,
+        own=np.where(known & ((own > 0) | ~unsure), own, np.nan),
+        behind=np.where(known & ((behind > 0) | ~unsure), behind, np.nan),
+        greatest=greatest._replace(step=steps[greatest.step]),
+        greatest_behind=greatest_behind._replace(step=steps[greatest_behind.step]),
+        own_total=meter.danger or 0.0,
+        behind_total=behind_total,
     )
 
 
@@ -404,16 +404,15 @@ _COLUMNS = ("presence", "x", "y")
 
 
 def visible_from(recording: Recording, agent: str, other: str) -> int | None:
-    """Return the first step after which an agent was shown somebody; None where it never was, or nobody knows.
+    """Return the first step after which an agent's observation had an actor; None if it never had, or if unknown.
 
-    That is known where what it is shown is a table with a row an actor, and the places in it are those of the scene:
-    x ahead of it and y to its right, in m, as `Kinematics` shows them. Where a row is of nobody, as with noise or
-    delays, nothing is known.
+    The step is known if the observation is a table with a row per actor and positions as in `Kinematics`: x ahead and y
+    to the right, in m. If a row matches no actor, as with noise or delays, the step is unknown.
 
     Args:
         recording: of the episode.
-        agent: who is shown something.
-        other: whom.
+        agent: The agent whose observations are examined.
+        other: The actor to look for.
     """
     names = next((list(one.observation_names) for one in recording.prologue.agents if one.id == agent), [])
     if not all(name in names for name in _COLUMNS):
@@ -434,7 +433,7 @@ def visible_from(recording: Recording, agent: str, other: str) -> int | None:
 
 
 def _shown(rows: NDArray[Any], scene: Scene, agent: str) -> set[str] | None:
-    """Who is in the rows of others; None where one of them is nobody's."""
+    """Return the actors in the rows of an observation; None if a row matches no actor."""
     row = scene.roster.index[agent]
     offset = scene.centers - scene.centers[row]
     c, s = math.cos(scene.headings[row]), math.sin(scene.headings[row])

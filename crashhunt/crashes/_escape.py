@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.crashes._encounter import Encounter, last_escape
+from crashhunt.recording import has_same_scenes
 from crashhunt.trial import Escape, Outcome, Overruled
 
 if TYPE_CHECKING:
@@ -21,16 +22,18 @@ if TYPE_CHECKING:
 __all__ = ["Ending", "ending_of", "find_escape", "overruled_trial", "partner", "slowing"]
 
 _RUNS = 12  # enough to bisect a thousand steps
-_BEFORE_S = 10.0  # nobody asks what could have been done longer ago
-_WALL_S = 60.0  # a crash is confirmed while somebody waits
-_GUESS = 4.5  # m/s², where nobody knows better; a guess costs nothing but runs
+_BEFORE_S = 10.0  # earlier braking is not examined
+_WALL_S = 60.0  # the search runs while the user waits for the confirmation of a crash
+_GUESS = 4.5  # m/s², if the deceleration is unknown; a wrong guess only costs more runs
 _STANDS = 0.1  # m/s
 _AFTERWARDS_S = 5.0  # past the old end, so that a collision that only comes later is seen
 _AS_IT_CAN = "as hard as it can"
 
 Ending = Literal["avoided", "hit", "other", "unclear", "diverged"]
-"""What became of a crash when its trial was run with the agent overruled: no crash, the same two again, another crash,
-something that does not say it, or a run that was not the same before that."""
+"""The result of a run with overridden actions.
+
+In order: no crash, a crash of the same two actors, another crash, an unclear end, a run that deviated before the
+override."""
 
 
 def partner(result: TrialResult) -> str:
@@ -62,7 +65,7 @@ def find_escape(
     hit = result.collision
     if result.outcome is not Outcome.COLLISION or hit is None or hit.role != "collider":
         return None
-    search = _Search(result, recording, braking, run)
+    search = _Search(result=result, recording=recording, braking=braking, run=run)
     found = search.last()
     if found is None:
         return None
@@ -155,7 +158,7 @@ def overruled_trial(
         result: of the trial.
         recording: of it.
         after: the step.
-        deceleration: at which the vehicle stops, in m/s²; None where nobody knows.
+        deceleration: The deceleration with which the vehicle stops, in m/s²; None if it is unknown.
         manoeuvre: as in `Overruled`.
     """
     assert result.collision is not None
@@ -180,11 +183,7 @@ def ending_of(
     """
     hit = result.collision
     assert hit is not None
-    # The same up to there, to the bit: else it says nothing about this crash.
-    if rerun_recording.steps < after or any(
-        recording.scene(step).frame[1].tobytes() != rerun_recording.scene(step).frame[1].tobytes()
-        for step in range(after + 1)
-    ):
+    if not has_same_scenes(recording, rerun_recording, after):
         return "diverged"
     if rerun.outcome is Outcome.COLLISION and rerun.collision is not None:
         same = {rerun.collision.collider, rerun.collision.victim} == {hit.collider, hit.victim}

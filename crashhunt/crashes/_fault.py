@@ -1,4 +1,4 @@
-"""Whose fault a collision was: what rules with names and sources say, or that nobody can tell."""
+"""The fault of a collision, by rules with names and sources; undecided if no rule applies or rules contradict."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["RULES", "Blame", "Fault", "Finding", "Verdict", "fault_in", "fault_of", "safe_gap_m"]
 
 
-# The rules by which a collision is somebody's fault. A rule is right, or it is silent.
+# The rules that assign the fault of a collision. A rule returns a finding only if it is certain.
 #
 # A rule looks at a `Case` and returns a finding, or None where it has nothing to say. Names of sources: *Vienna* is the
 # Convention on Road Traffic of 1968; *StVO* the German traffic code; *RSS* is S. Shalev-Shwartz, S. Shammah and
@@ -35,7 +35,7 @@ __all__ = ["RULES", "Blame", "Fault", "Finding", "Verdict", "fault_in", "fault_o
 
 Blame = Literal["ego", "other", "both"]
 
-_RESPONSE_S = 1.0  # RSS: until somebody reacts
+_RESPONSE_S = 1.0  # RSS: response time
 _SPEEDS_UP = 3.5  # m/s², RSS: at most, until then
 _BRAKES = 4.0  # m/s², RSS: at least, from then on
 _BRAKES_HARD = 8.0  # m/s², RSS: at most, who is ahead
@@ -43,13 +43,13 @@ _MERGES = math.radians(30)  # who meets at a smaller angle follows, or changes l
 _IMPOSSIBLE = 10.0  # m/s²; who stops faster has not braked
 _FOLLOWS_S = 3.5  # who has been ahead for so long has not just come there
 _CHANGE_S = 3.0  # a lane change that began longer ago is over
-_AT_ONCE_S = 1.5  # nobody who drives behind can do anything about what comes so late
+_AT_ONCE_S = 1.5  # an event that begins less than this before the contact is too late for a driver behind
 _TOGETHER_S = 0.5  # of each other: neither was there first
 _STANDS = 0.1  # m/s
 _STANDS_S = 1.0
-_STEP_M = 1.0  # beside a car; who is nearer walks in its way
-_OFF_M = 2.5  # beside the middle of a car; who is nearer may be on the road
-_WALKS = 3.0  # m/s; whoever drives so slowly can stop for anybody
+_STEP_M = 1.0  # lateral distance from a car's side; a nearer person walks in its way
+_OFF_M = 2.5  # lateral distance from a car's axis; a nearer person may be on the road
+_WALKS = 3.0  # m/s; a slower vehicle can stop for any actor
 _CLEARS_S = 3.0
 _RED_S = 8.0  # after a red light, a junction is left by then
 _EARLY_S = 1.0  # what crashes so soon was put there
@@ -61,7 +61,7 @@ class Finding:
 
     Args:
         rule: its name.
-        blames: whom.
+        blames: The party at fault.
         words: the evidence, a clause.
         source: where the rule is from.
     """
@@ -84,7 +84,7 @@ def _who(case: Case, actor: str) -> Blame:
 
 
 def _red_light(case: Case) -> Finding | None:
-    """Who ran a red light and meets somebody from another side, at the same junction; both, where both ran one."""
+    """Blame the party that ran a red light at a junction with traffic from another side; blame both if both did."""
     if case.same_way:
         return None
     ran: dict[str, str] = {}
@@ -96,14 +96,21 @@ def _red_light(case: Case) -> Finding | None:
     if not ran:
         return None
     blames = "both" if len(ran) == 2 else _who(case, *ran)
-    return Finding("red light", blames, ", and ".join(ran.values()), "Vienna, article 23; StVO § 37")
+    return Finding(
+        rule="red light", blames=blames, words=", and ".join(ran.values()), source="Vienna, article 23; StVO § 37"
+    )
 
 
 def _wrong_way(case: Case) -> Finding | None:
     """Who drove against the direction of its lane."""
     for time_s, event in reversed(case.events):
         if event.kind == "wrong_way" and event.agent in (case.agent, case.other) and case.time_s - time_s <= _RED_S:
-            return Finding("wrong way", _who(case, event.agent), event.what, "Vienna, article 10; StVO § 2")
+            return Finding(
+                rule="wrong way",
+                blames=_who(case, event.agent),
+                words=event.what,
+                source="Vienna, article 10; StVO § 2",
+            )
     return None
 
 
@@ -119,7 +126,7 @@ def _lane_change(case: Case) -> Finding | None:
         at_once = abs(times[0] - times[1]) <= _TOGETHER_S
         if case.follower or not at_once or not all(case.meets_sideways(actor) for actor in changers):
             return None  # the one may have been there when the other came
-        return Finding("lane change", "both", "both moved sideways into each other", source)
+        return Finding(rule="lane change", blames="both", words="both moved sideways into each other", source=source)
     if len(changers) != 1:
         return None
     changer = changers[0]
@@ -131,22 +138,22 @@ def _lane_change(case: Case) -> Finding | None:
         if not case.meets_sideways(changer):
             return None
         words = f"{changer} moved sideways into {other}, which was beside it and stayed in its lane"
-        return Finding("lane change", _who(case, changer), words, source)
+        return Finding(rule="lane change", blames=_who(case, changer), words=words, source=source)
     if case.follower == changer:
         if case.hardest_braking(other) > _IMPOSSIBLE or case.way(other).speeds[-1] < -_STANDS:
             return None
-        if case.turn >= _MERGES or not case.was_beside(changer, int(np.argmin(np.abs(case.times - before)))):
+        if case.turn >= _MERGES or not case.was_off_path(changer, int(np.argmin(np.abs(case.times - before)))):
             return None  # it turned off, or was behind all the time: that leaves a lane sideways, too
         words = f"{changer} changed lanes {before:.1f} s before, to behind {other}, and drove into it"
-        return Finding("lane change", _who(case, changer), words, source)
+        return Finding(rule="lane change", blames=_who(case, changer), words=words, source=source)
     return _cut_in(case, changer, before, source)
 
 
 def _cut_in(case: Case, changer: str, before: float, source: str) -> Finding | None:
-    """Who came in front of somebody, by how much, and what that one could do."""
+    """Blame a cut-in, by its gap and by what the driver behind could do."""
     other = case.partner(changer)
     back = int(np.argmin(np.abs(case.times - before)))
-    if not case.was_beside(changer, back):
+    if not case.was_off_path(changer, back):
         return None  # it was ahead, and left
     gap = case.gap_m(changer, back)
     safe = safe_gap_m(float(case.way(other).speeds[back]), float(case.way(changer).speeds[back]))
@@ -155,11 +162,16 @@ def _cut_in(case: Case, changer: str, before: float, source: str) -> Finding | N
         return None
     if before > _AT_ONCE_S and case.slowed(other, before - _RESPONSE_S) < _BRAKES:
         return None  # who drove behind had the time, and did not use it
-    return Finding("lane change", _who(case, changer), f"{words}; {safe:.1f} m would have been safe (RSS)", source)
+    return Finding(
+        rule="lane change",
+        blames=_who(case, changer),
+        words=f"{words}; {safe:.1f} m would have been safe (RSS)",
+        source=source,
+    )
 
 
 def _rear_end(case: Case) -> Finding | None:
-    """Who drove into the back of somebody who had been ahead for long."""
+    """Blame the follower that drove into the back of a vehicle that had been ahead for long."""
     follower = case.follower
     if not follower or is_person(case.partner(follower)):
         return None
@@ -174,11 +186,16 @@ def _rear_end(case: Case) -> Finding | None:
     gap, safe = max(0.0, case.gap_m(leader, back)), safe_gap_m(float(follow.speeds[back]), float(lead.speeds[back]))
     words = f"{follower} drove into the back of {leader}, which had been ahead of it for at least {_FOLLOWS_S:g} s"
     words += f"; {case.times[back]:.1f} s before, the gap was {gap:.1f} m, and {safe:.1f} m is safe (RSS)"
-    return Finding("rear end", _who(case, follower), words, "Vienna, article 13 (5); StVO § 4 (1); RSS, definition 1")
+    return Finding(
+        rule="rear end",
+        blames=_who(case, follower),
+        words=words,
+        source="Vienna, article 13 (5); StVO § 4 (1); RSS, definition 1",
+    )
 
 
 def _turns_off(case: Case) -> Finding | None:
-    """Who drove straight on into the back of somebody who had been ahead for long, and was turning off."""
+    """Blame the follower that drove straight on into a vehicle that had been ahead for long and was turning off."""
     if _rear_end(case) is not None:
         return None  # it says the same
     for leader in (case.agent, case.other):
@@ -193,12 +210,14 @@ def _turns_off(case: Case) -> Finding | None:
             continue
         words = f"{follower} drove straight on into {leader}, which had been ahead of it until {left_s:.1f} s before"
         words += " and was turning off"
-        return Finding("rear end", _who(case, follower), words, "Vienna, article 13 (5); StVO § 4 (1)")
+        return Finding(
+            rule="rear end", blames=_who(case, follower), words=words, source="Vienna, article 13 (5); StVO § 4 (1)"
+        )
     return None
 
 
 def _steps_out(case: Case) -> Finding | None:
-    """A person who came onto the road so late that nobody could have stopped; not at junctions and their crossings."""
+    """Blame a person that stepped onto the road too late for any driver to stop, except at junctions and crossings."""
     person, driver = (case.agent, case.other) if is_person(case.agent) else (case.other, case.agent)
     if not is_person(person) or is_person(driver) or not case.is_between_junctions(person, driver):
         return None
@@ -206,18 +225,20 @@ def _steps_out(case: Case) -> Finding | None:
     way, reach = case.way(driver), case.way(driver).width / 2 + _STEP_M
     inside = next((back for back in range(len(asides) - 1, -1, -1) if asides[back] > reach), -1) + 1
     if not 0 < inside < len(asides) or max(asides[:inside]) < _OFF_M or case.times[inside] > _AT_ONCE_S:
-        return None  # it was there all the time, walked along the edge of the road, or is beside still
+        return None  # the person was there all the time, walked along the edge of the road, or is still off the road
     speed, gap = float(way.speeds[inside]), case.gap_m(person, inside)
     stops = speed * _RESPONSE_S + speed * speed / (2 * _BRAKES_HARD)
     if gap >= stops or speed < _WALKS or float(np.max(case.times[:inside], initial=0.0)) < _STANDS_S:
         return None
     words = f"{person} came onto the road {case.times[inside]:.1f} s before, {max(0.0, gap):.1f} m ahead of {driver}"
     words += f", which needs {stops:.1f} m to stop"
-    return Finding("steps out", _who(case, person), words, "Vienna, article 20 (6); StVO § 25 (3)")
+    return Finding(
+        rule="steps out", blames=_who(case, person), words=words, source="Vienna, article 20 (6); StVO § 25 (3)"
+    )
 
 
 def _standing(case: Case) -> Finding | None:
-    """Who drove into somebody who had stood for longer than stopping takes."""
+    """Blame the party that drove into an actor that had stood still for longer than stopping takes."""
     for actor in (case.agent, case.other):
         mover = case.partner(actor)
         own, its = case.way(actor), case.way(mover)
@@ -226,7 +247,9 @@ def _standing(case: Case) -> Finding | None:
         stood = case.times[0] if bool((own.speeds < _STANDS).all()) else 0.0
         if stood >= needs and bool((its.speeds > _STANDS).all()) and not is_person(mover):
             words = f"{mover} drove into {actor}, which had stood for at least {stood:.1f} s"
-            return Finding("standing", _who(case, mover), words, "Vienna, article 13 (1); StVO § 3 (1)")
+            return Finding(
+                rule="standing", blames=_who(case, mover), words=words, source="Vienna, article 13 (1); StVO § 3 (1)"
+            )
     return None
 
 
@@ -251,16 +274,21 @@ def _right_of_way(case: Case) -> Finding | None:
     if float(case.way(yields).speeds[case.times <= _CLEARS_S].max(initial=0.0)) < _STANDS:
         return None  # who has stood there for so long could be seen
     if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKS:
-        return None  # who starts off while somebody is in the junction has to let it out
+        return None  # a vehicle that starts off must let the vehicle inside the junction clear it first
     words = f"{yields} had to give way to {goes} at the junction {links[0].junction}"
-    return Finding("right of way", _who(case, yields), words, "the map of the scenario; Vienna, article 18; StVO § 8")
+    return Finding(
+        rule="right of way",
+        blames=_who(case, yields),
+        words=words,
+        source="the map of the scenario; Vienna, article 18; StVO § 8",
+    )
 
 
 RULES: tuple[Callable[[Case], Finding | None], ...] = (
     _red_light, _wrong_way, _lane_change, _rear_end, _turns_off, _steps_out, _standing, _right_of_way,
 )  # fmt: skip
-"""All rules. Where two of them blame different parties, nobody can tell, but that a red light and the wrong way come
-before the right of way."""
+"""All rules. If two rules blame different parties, the fault is undecided. As an exception, a red light and the wrong
+way take precedence over the right of way."""
 
 
 Verdict = Literal["ego", "the other", "both", "nobody can tell"]
@@ -275,7 +303,7 @@ class Fault:
 
     Args:
         verdict: ``ego`` is the controlled vehicle that it happened to.
-        findings: of the rules that said something; they may contradict each other where nobody can tell.
+        findings: The findings of the rules; they may contradict each other if the fault is undecided.
     """
 
     verdict: Verdict
@@ -311,10 +339,15 @@ def fault_of(bundle: Bundle, recording: Recording | None = None) -> Fault:
     hit = result.collision
     if result.outcome is Outcome.AGENT_ERROR:
         words = "the code of the agent failed"
-        return Fault("ego", (Finding("agent error", "ego", words, "whoever drives answers for it"),))
+        return Fault(
+            "ego", (Finding(rule="agent error", blames="ego", words=words, source="whoever drives answers for it"),)
+        )
     if result.outcome is Outcome.OFF_ROAD and hit is not None and not hit.other:
         words = "it left the road, and nobody touched it"
-        return Fault("ego", (Finding("off the road", "ego", words, "Vienna, article 13 (1); StVO § 3 (1)"),))
+        return Fault(
+            "ego",
+            (Finding(rule="off the road", blames="ego", words=words, source="Vienna, article 13 (1); StVO § 3 (1)"),),
+        )
     if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
         return Fault("nobody can tell")
     from crashhunt.recording import read_lanes  # MCAP takes longer than a list of software faults
@@ -334,14 +367,14 @@ def fault_of(bundle: Bundle, recording: Recording | None = None) -> Fault:
     time_s = hit.time_s if end_s - found.prologue.step_length_s <= hit.time_s <= end_s else end_s
     return fault_in(
         Case(
-            hit.agent,
-            hit.other,
-            scenes,
-            time_s,
-            scenes[0].time_s,
-            lanes,
-            events,
-            _right_of_way_of(bundle),
+            agent=hit.agent,
+            other=hit.other,
+            scenes=scenes,
+            time_s=time_s,
+            began_s=scenes[0].time_s,
+            lanes=lanes,
+            events=events,
+            right_of_way=_right_of_way_of(bundle),
             lane=hit.lane,
         )
     )

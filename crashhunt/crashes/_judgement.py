@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 
-# What a collision hangs on, as runs have shown in which one thing each was left out.
+# The causes of a collision, found by runs that each omit one candidate cause.
 
 Without = Literal["same", "other", "none", "unclear"]
 """What became of the collision: the same two again, another crash, none, or something that does not say it."""
@@ -46,9 +46,9 @@ class LeftOut(Serializable):
     """One run.
 
     Args:
-        given: of an argument or a seed its other value, of everything else the step after which it was left out.
-        ending: what became of the collision.
-        into: whom a vehicle that was held to its speed drove into itself; empty for nobody.
+        given: The other value of an argument or seed; for every other cause, the step after which it was suppressed.
+        ending: The result of the run.
+        into: The actor into which a vehicle with held speed drove itself; empty if there was none.
     """
 
     given: Value
@@ -61,7 +61,7 @@ class Factor(Serializable):
     """Something that may be why, and the runs without it.
 
     Args:
-        kind: ``argument``, ``seed``, ``disturbance``, ``other`` (something that somebody else did) or ``agent``.
+        kind: ``argument``, ``seed``, ``disturbance``, ``other`` (a manoeuvre of another actor) or ``agent``.
         name: of the argument, or who.
         what: of an argument ``default`` or ``drawn``; of a disturbance its kind; of the others ``braked``, ``sped up``,
             ``changed lanes``, and ``there`` for that it was there at all.
@@ -86,7 +86,7 @@ class Factor(Serializable):
 
     @property
     def crashed(self) -> int:
-        """How many of these crashed all the same, in whatever way."""
+        """Number of these runs that crashed, in any way."""
         return sum(run.ending in ("same", "other") for run in self.runs)
 
     @property
@@ -141,12 +141,12 @@ def why_from(data: Any) -> Why | None:
         return None
     factors = [
         Factor(
-            str(each["kind"]), str(each["name"]), str(each["what"]), each["step"], each["was"],
-            tuple(LeftOut(run["given"], run["ending"], str(run["into"])) for run in each["runs"]),
+            kind=str(each["kind"]), name=str(each["name"]), what=str(each["what"]), step=each["step"], was=each["was"],
+            runs=tuple(LeftOut(run["given"], run["ending"], str(run["into"])) for run in each["runs"]),
         )
         for each in data["factors"]
     ]  # fmt: skip
-    return Why(tuple(factors), int(data["steps"]), int(data["left"]), str(data["why_not"]))
+    return Why(factors=tuple(factors), steps=int(data["steps"]), left=int(data["left"]), why_not=str(data["why_not"]))
 
 
 def wilson(found: int, of: int) -> tuple[float, float]:
@@ -168,13 +168,15 @@ def wilson(found: int, of: int) -> tuple[float, float]:
 
 
 INTERRUPTED = "it was interrupted"
-"""Why there is no whole answer where somebody has stopped it."""
+"""The reason for an incomplete answer if the user has stopped the analysis."""
 
 _KEY = "judged"
 
 JudgementVerdict = Literal["avoidable", "too late when visible", "invalid", "unknown"]
-"""It could be avoided when the agent could see the other one, or not any more, or never: then the agent was put into
-it, and the trial says nothing about it. Unknown is what the runs do not settle."""
+"""Whether the crash could be avoided once the agent could see the collision partner.
+
+The verdict ``too late when visible`` means that it was then too late. The verdict ``invalid`` means that it was never
+avoidable, so the trial says nothing about the agent. The verdict ``unknown`` means that the runs do not decide it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,8 +237,8 @@ class Judgement:
     Args:
         attempts: a manoeuvre each.
         why_not: why there is no answer, or not a whole one; empty where there is.
-        why: what the collision hangs on; None where nobody asked.
-        visible_step: after which the agent was first shown the other one; None where nobody knows.
+        why: The causes of the collision; None if they were not examined.
+        visible_step: The step after which an observation first had the collision partner; None if it is unknown.
     """
 
     attempts: tuple[Attempt, ...] = ()
@@ -258,7 +260,7 @@ class Judgement:
 
     @property
     def is_interrupted(self) -> bool:
-        """Whether somebody broke it off, so that more could be known."""
+        """Whether the user interrupted the analysis, so that another run may add results."""
         return INTERRUPTED in (self.why_not, self.why.why_not if self.why is not None else "")
 
     @property
@@ -274,7 +276,7 @@ class Judgement:
 
     @property
     def avoidable(self) -> bool | None:
-        """Whether a run avoided it; False where none did, from the first step on neither; None where nobody knows."""
+        """Whether a run avoided the crash; False if no run did, even from the first step; None if it is unknown."""
         if self.best is not None:
             return True
         from_the_first = [attempt.endings.get(0) in ("hit", "other") for attempt in self.attempts]
@@ -307,10 +309,22 @@ def judgement_of(bundle: Bundle) -> Judgement | None:
         for each in data["attempts"]:
             typed(each, {"manoeuvre": str, "endings": dict[str, str], "deceleration": float | None})
             endings: dict[int, Ending] = {int(step): ending for step, ending in each["endings"].items()}
-            attempts.append(Attempt(each["manoeuvre"], bundle.result.steps, endings, each["deceleration"]))
+            attempts.append(
+                Attempt(
+                    manoeuvre=each["manoeuvre"],
+                    end=bundle.result.steps,
+                    endings=endings,
+                    deceleration=each["deceleration"],
+                )
+            )
         visible = data.get("visible_step")
         seen = int(visible) if visible is not None else None
-        return Judgement(tuple(attempts), str(data.get("why_not", "")), why_from(data.get("why")), seen)
+        return Judgement(
+            attempts=tuple(attempts),
+            why_not=str(data.get("why_not", "")),
+            why=why_from(data.get("why")),
+            visible_step=seen,
+        )
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
 

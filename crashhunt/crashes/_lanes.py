@@ -64,14 +64,14 @@ class Case:
 
     Args:
         agent: the controlled vehicle.
-        other: whom it collided with.
+        other: The collision partner.
         scenes: to the end of the step in which they touched.
         time_s: of the first contact.
         began_s: when the episode began.
         lanes: around the place.
         events: of the last seconds, each with its simulation time.
         right_of_way: of the map, where it says.
-        lane: where the agent was in the end; empty where nobody knows.
+        lane: The lane of the agent at the end; empty if it is unknown.
     """
 
     agent: str
@@ -121,12 +121,12 @@ class Case:
         scene, row = rows[-1]
         known = scene.roster.actors[row]
         return Way(
-            actor,
-            np.array([scene.points[row] for scene, row in rows]),
-            np.unwrap(np.array([scene.headings[row] for scene, row in rows])),
-            np.array([scene.speeds[row] for scene, row in rows]),
-            known.length,
-            known.width,
+            id=actor,
+            points=np.array([scene.points[row] for scene, row in rows]),
+            headings=np.unwrap(np.array([scene.headings[row] for scene, row in rows])),
+            speeds=np.array([scene.speeds[row] for scene, row in rows]),
+            length=known.length,
+            width=known.width,
         )
 
     def partner(self, actor: str) -> str:
@@ -169,7 +169,7 @@ class Case:
 
     @cached_property
     def follower(self) -> str:
-        """Who was behind the other when they touched, along one path; empty where nobody was, or they were abreast."""
+        """The actor that was behind when they touched, on the same path; empty if there was none or side by side."""
         for leader in (self.agent, self.other):
             follower = self.partner(leader)
             own, its = self.way(leader), self.way(follower)
@@ -235,8 +235,8 @@ class Case:
         lately = [abs(self.aside_m(actor, back)) for back, time_s in enumerate(self.times) if time_s <= _LATELY_S]
         return max(lately, default=0.0) - abs(float(aside)) > _SIDEWAYS_M
 
-    def was_beside(self, actor: str, back: int) -> bool:
-        """Whether an actor was beside the way of the other just before a scene."""
+    def was_off_path(self, actor: str, back: int) -> bool:
+        """Whether an actor was off the path of the other actor just before a scene."""
         return any(
             abs(self.aside_m(actor, place)) > _BESIDE_M
             for place in range(back + 1)
@@ -267,7 +267,7 @@ class Case:
         return bool(lanes) and lanes[-1].startswith(":")
 
     def is_past(self, event: Event, time_s: float) -> bool:
-        """Whether whoever an event happened to at a junction had gone on from there to somewhere else.
+        """Whether the actor of an event at a junction had already left the junction.
 
         Args:
             event: on the first of the junction's lanes.
@@ -361,7 +361,12 @@ class _Lane:
         aside = float(dx * offset[nearest, 1] - dy * offset[nearest, 0])
         driven = float(self._starts[nearest] + along[nearest])
         inside = _END_M < driven < self._starts[-1] - _END_M
-        return _Place(math.copysign(float(away[nearest]), aside), driven, math.atan2(dy, dx), inside)
+        return _Place(
+            aside_m=math.copysign(float(away[nearest]), aside),
+            along_m=driven,
+            heading=math.atan2(dy, dx),
+            inside=inside,
+        )
 
 
 class LaneMap:
@@ -404,9 +409,9 @@ class LaneMap:
         )
 
     def leaves_sideways(self, scenes: Sequence[Scene], actor: str) -> bool:
-        """Whether an actor leaves a lane over its side, and goes on beside it.
+        """Whether an actor leaves a lane over its side, and continues next to it.
 
-        Who drives on where its lane ends, or turns off from it, does not.
+        An actor that drives over the end of its lane, or turns off, does not count.
         """
         return self.left_sideways(scenes, actor) is not None
 
@@ -444,7 +449,7 @@ class LaneMap:
         return places[begin]
 
     def reaches_over(self, scenes: Sequence[Scene], actor: str) -> bool:
-        """Whether an actor in the end reaches into the lane beside its own, having moved towards it."""
+        """Whether an actor at the end reaches into a neighbouring lane after moving towards it."""
         poses = _poses(scenes, actor)
         if not poses:
             return False
@@ -464,7 +469,7 @@ class LaneMap:
             edge = point + math.copysign(half_width, end.aside_m) * np.array(
                 [-math.sin(end.heading), math.cos(end.heading)]
             )
-            return self._is_beside(lane, edge, end.heading)
+            return self._is_in_parallel_lane(lane, edge, end.heading)
         return False
 
     def _driven(self, pose: tuple[NDArray[np.float64], float]) -> _Lane | None:
@@ -486,15 +491,15 @@ class LaneMap:
             return False
         if abs(math.remainder(place.heading - heading, math.tau)) >= _ALONG:
             return False  # it turns off
-        return self._is_beside(lane, point, place.heading)
+        return self._is_in_parallel_lane(lane, point, place.heading)
 
-    def _is_beside(self, lane: _Lane, point: NDArray[np.float64], heading: float) -> bool:
+    def _is_in_parallel_lane(self, lane: _Lane, point: NDArray[np.float64], heading: float) -> bool:
         """Whether a point lies in another lane that leads the same way."""
         return any(
-            abs(other.aside_m) <= beside.half_width and abs(math.remainder(other.heading - heading, math.tau)) < _ALONG
-            for beside in self._lanes
-            if beside is not lane
-            for other in (beside.place(point),)
+            abs(other.aside_m) <= near.half_width and abs(math.remainder(other.heading - heading, math.tau)) < _ALONG
+            for near in self._lanes
+            if near is not lane
+            for other in (near.place(point),)
         )
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["Frame", "Signature", "own_frames", "signature_of", "signature_of_fault"]
 
 
-# Where in somebody's code a software fault was: the calls of a traceback, or of a stack that was written down.
+# The place of a software fault in the user's code: the calls of a traceback or of a recorded stack.
 
 _CALLERS = (
     ("crashhunt", "episode", "_fast_path.py"),
@@ -94,9 +94,9 @@ class Signature(Serializable):
     Args:
         outcome: how the trial ended.
         role: the agent's: ``collider``, ``victim``, ``alone``; empty where it is no collision.
-        manner: ``rear end``, ``side swipe``, ``crossing from the left`` (that is where the other one came from),
-            ``crossing from the right``, ``head-on``, ``pedestrian``, ``off road``; what kind of event; the exception,
-            signal or exit code of a software fault.
+        manner: The manner of a collision: ``rear end``, ``side swipe``, ``crossing from the left`` (the side of the
+            collision partner), ``crossing from the right``, ``head-on``, ``pedestrian`` or ``off road``. For a traffic
+            event, its type. For a software fault, the exception, signal or exit code.
         lane_change: who was changing lanes: ``agent``, ``other``, ``both`` or empty.
         place: ``crossing`` where lanes of different directions lie over each other, ``road`` elsewhere; empty where
             the map is not known, or it is no matter of place.
@@ -164,7 +164,7 @@ def _of_a_collision(
             lanes.reaches_over(scenes, actor) or lanes.reaches_over(late, actor) for actor in (hit.agent, hit.other)
         ]
     lane_change = "both" if all(changes) else "agent" if changes[0] else "other" if changes[1] else ""
-    return Signature(outcome, hit.role, manner, lane_change, place)
+    return Signature(outcome=outcome, role=hit.role, manner=manner, lane_change=lane_change, place=place)
 
 
 def _manner(recording: Recording, hit: Collision) -> str:

@@ -16,12 +16,12 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.git import tracked_files, work_tree
-from crashhunt.base.integrity import authentication_code, is_authentic, parse_object, state_folders, user_key
+from crashhunt.base.integrity import parse_object, state_folders, user_key
 from crashhunt.base.plugins import registered
+from crashhunt.crashes._bundle import is_bundle_made_here, snapshot_of
 from crashhunt.oracles import oracle_name
 from crashhunt.plans import read_settings, with_settings
 from crashhunt.scenario import backend_of
-from crashhunt.snapshots import Snapshot
 from crashhunt.trial import Choice, Constant
 
 if TYPE_CHECKING:
@@ -31,15 +31,14 @@ if TYPE_CHECKING:
     from crashhunt.crashes._bundle import ArchiveIndex, Bundle
     from crashhunt.plans import HuntSettings
     from crashhunt.scenario import Scenario
+    from crashhunt.snapshots import Snapshot
     from crashhunt.trial import Distribution, TrialSpec
 
 
 __all__ = [
     "TrustedOrigin",
     "add_trusted",
-    "authenticate_bundle",
     "describe_code",
-    "is_bundle_made_here",
     "is_bundle_trusted",
     "is_fingerprint_trusted",
     "is_hunt_trusted",
@@ -50,7 +49,6 @@ __all__ = [
     "refuse_untrusted",
     "remove_trusted",
     "signature",
-    "snapshot_of",
     "trust_snapshot",
 ]
 
@@ -96,7 +94,7 @@ def add_trusted(fingerprint: str, *, path: str, runs: str) -> TrustedOrigin:
         HuntDirectoryError: no folder can keep the entry.
     """
     now = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
-    origin = TrustedOrigin(fingerprint, path, runs, now)
+    origin = TrustedOrigin(fingerprint=fingerprint, path=path, runs=runs, trusted_at=now)
     error: Exception | None = None
     for folder in _folders():
         try:
@@ -168,35 +166,6 @@ def _folders() -> list[Path]:
     return [folder / _FOLDER for folder in state_folders()]
 
 
-_PURPOSE = "crash bundle"
-
-
-def snapshot_of(bundle: Bundle) -> Snapshot:
-    """Return the snapshot of the code that a bundle ran."""
-    return Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot)
-
-
-def authenticate_bundle(bundle: Bundle) -> str:
-    """Return the authentication code of a bundle that this process makes; empty where its code is not of this user.
-
-    Without that condition, a crash that was minimized or confirmed in a stranger's hunt would pass for one made here.
-    """
-    try:
-        made_here = snapshot_of(bundle).is_made_here
-    except CrashhuntError:  # there is none, as of a candidate of a minimization
-        return ""
-    return authentication_code(_PURPOSE, _statement(bundle)) if made_here else ""
-
-
-def is_bundle_made_here(bundle: Bundle) -> bool:
-    """Return whether this user made a bundle and its snapshot on this machine; files of the snapshot are not read.
-
-    Raises:
-        BundleError: the manifest of the snapshot is missing or damaged.
-    """
-    return snapshot_of(bundle).is_made_here and is_authentic(_PURPOSE, _statement(bundle), bundle.authentication_code)
-
-
 def is_bundle_trusted(bundle: Bundle, *, faults: Sequence[str] | None = None) -> bool:
     """Return whether the code of a crash may run without asking.
 
@@ -209,7 +178,7 @@ def is_bundle_trusted(bundle: Bundle, *, faults: Sequence[str] | None = None) ->
         settings = read_settings(bundle.hunt / layout.HUNT)
         if snapshot.faults() if faults is None else faults:
             return False
-        # The settings beside the crash say what is imported, and only those in the snapshot are authenticated.
+        # The hunt's settings name the imports, but only the settings in the snapshot are authenticated.
         if not _unknown_names(settings, snapshot):
             if is_bundle_made_here(bundle):
                 return True
@@ -328,23 +297,6 @@ def _first_change(settings: HuntSettings, snapshot: Snapshot) -> str:
     return ""
 
 
-def _statement(bundle: Bundle) -> dict[str, object]:
-    """Everything of a bundle that determines what runs, and the digest of what was recorded."""
-    spec = bundle.result.spec.to_json()
-    return {
-        "number": spec["number"],
-        "seed": spec["seed"],
-        "max_steps": spec["max_steps"],
-        "arguments": spec["arguments"],
-        "scenario_arguments": spec["scenario_arguments"],
-        "disturbances": spec.get("disturbances") or [],
-        "only": spec.get("only"),
-        "script": spec.get("script"),
-        "digest": bundle.result.digest,
-        "snapshot": bundle.snapshot,
-    }
-
-
 def _has_known_texts(spec: TrialSpec, settings: HuntSettings, snapshot: Snapshot) -> bool:
     """Whether every text among the arguments of a trial is one that its hunt or its scenario names."""
     scenario = with_settings(snapshot.scenario(), settings)
@@ -422,7 +374,7 @@ def signature(index: ArchiveIndex) -> str:
 
 
 def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapping[str, Any]) -> None:
-    """Refuse a scenario that does anything but simulate, as far as is known; what nobody knows is refused.
+    """Refuse a scenario with known side effects, and a scenario whose side effects are unknown.
 
     Args:
         scenario: of the crash.
@@ -441,7 +393,7 @@ def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapp
         raise _refusal(f"it would import {module!r}")
     backend = backend_of(scenario.simulator)
     if backend is None or backend.side_effect is None:
-        raise _refusal(f"nobody knows what the simulator {scenario.simulator!r} does besides simulating")
+        raise _refusal(f"the side effects of the simulator {scenario.simulator!r} are unknown")
     asked = [spec.spec for spec in settings.scenario_arguments.values() if spec.kind == "str"]
     effect = backend.side_effect(scenario, values, asked)
     if effect:

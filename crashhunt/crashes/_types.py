@@ -87,7 +87,7 @@ class Groups:
 
     Args:
         groups: the largest first.
-        left_out: why a crash belongs to none: its log is missing or damaged.
+        left_out: The crashes without a type, each with the reason, such as a missing or damaged log.
     """
 
     groups: tuple[Group, ...]
@@ -101,7 +101,7 @@ def group_crashes(bundles: Iterable[Bundle], dropped: Mapping[str, int] | None =
         bundles: of one hunt or several; the log of each is read.
         dropped: of each kind, in words, how many more there were.
     """
-    signed, left_out = [], []
+    signed, unsigned = [], []
     faults: dict[Path, Verdict] = {}
     for bundle in bundles:
         try:
@@ -109,12 +109,12 @@ def group_crashes(bundles: Iterable[Bundle], dropped: Mapping[str, int] | None =
             signed.append((signature_of(bundle, recording), bundle))
             faults[bundle.path] = fault_of(bundle, recording).verdict
         except BundleError as error:
-            left_out.append(str(error))
+            unsigned.append(str(error))
     groups = (
         replace(group, faults=tuple(faults[bundle.path] for bundle in group.bundles))
         for group in groups_of(signed, dropped)
     )
-    return Groups(tuple(groups), tuple(left_out))
+    return Groups(tuple(groups), tuple(unsigned))
 
 
 def _avoidable(bundle: Bundle) -> bool | None:

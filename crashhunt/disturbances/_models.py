@@ -75,65 +75,91 @@ class Choices:
 
 def brake() -> Choices:
     """The vehicle ahead brakes hard for a while."""
-    return Choices("brake", {"ahead": 1.0}, {2.0: 3.0, 4.0: 2.0, 6.0: 1.0}, {1.0: 1.0, 2.0: 2.0, 3.0: 1.0})
+    return Choices(
+        what="brake",
+        who={"ahead": 1.0},
+        how_strong={2.0: 3.0, 4.0: 2.0, 6.0: 1.0},
+        how_long={1.0: 1.0, 2.0: 2.0, 3.0: 1.0},
+    )
 
 
 def stop() -> Choices:
     """The vehicle ahead stops in the middle of the road, and continues later."""
-    return Choices("stop", {"ahead": 1.0}, {3.0: 1.0, 6.0: 1.0}, {8.0: 1.0, 15.0: 1.0})
+    return Choices(what="stop", who={"ahead": 1.0}, how_strong={3.0: 1.0, 6.0: 1.0}, how_long={8.0: 1.0, 15.0: 1.0})
 
 
 def dawdle() -> Choices:
     """The vehicle ahead drives much slower for a while."""
-    return Choices("dawdle", {"ahead": 1.0}, {0.3: 2.0, 0.5: 1.0}, {10.0: 1.0, 20.0: 1.0})
+    return Choices(what="dawdle", who={"ahead": 1.0}, how_strong={0.3: 2.0, 0.5: 1.0}, how_long={10.0: 1.0, 20.0: 1.0})
 
 
 def speed() -> Choices:
     """The vehicle behind drives faster than allowed."""
     places = {"behind": 2.0, "left behind": 1.0, "right behind": 1.0}
-    return Choices("speed", places, {0.2: 2.0, 0.5: 1.0}, {10.0: 1.0, 20.0: 1.0})
+    return Choices(what="speed", who=places, how_strong={0.2: 2.0, 0.5: 1.0}, how_long={10.0: 1.0, 20.0: 1.0})
 
 
 def cut_in() -> Choices:
     """A vehicle changes from a neighbouring lane to the agent's, even into a small gap, and may brake there."""
-    return Choices("cut_in", _AROUND, {0.0: 2.0, 2.0: 1.0, 4.0: 1.0}, {2.0: 1.0, 4.0: 1.0})
+    return Choices(what="cut_in", who=_AROUND, how_strong={0.0: 2.0, 2.0: 1.0, 4.0: 1.0}, how_long={2.0: 1.0, 4.0: 1.0})
 
 
 def late_merge() -> Choices:
     """A vehicle next to or ahead of the agent merges at the very end of its lane, even into a small gap."""
-    return Choices("late_merge", _AROUND, {5.0: 1.0, 15.0: 1.0, 30.0: 1.0}, {10.0: 1.0, 20.0: 1.0})
+    return Choices(
+        what="late_merge", who=_AROUND, how_strong={5.0: 1.0, 15.0: 1.0, 30.0: 1.0}, how_long={10.0: 1.0, 20.0: 1.0}
+    )
 
 
 def step_out() -> Choices:
     """A person at the roadside steps onto the road, and turns back in the middle of the agent's way."""
     places = {"right ahead": 2.0, "left ahead": 1.0}
-    return Choices("step_out", places, {0.8: 1.0, 1.4: 2.0, 2.0: 1.0}, {6.0: 1.0, 10.0: 1.0})
+    return Choices(
+        what="step_out", who=places, how_strong={0.8: 1.0, 1.4: 2.0, 2.0: 1.0}, how_long={6.0: 1.0, 10.0: 1.0}
+    )
 
 
 def ignore_priority() -> Choices:
     """A vehicle from another approach ignores the lights and the right of way at the junction."""
     places = {"left ahead": 2.0, "right ahead": 2.0, "left": 1.0, "right": 1.0}
-    return Choices("ignore_priority", places, {1.0: 1.0}, {5.0: 1.0, 10.0: 1.0})
+    return Choices(what="ignore_priority", who=places, how_strong={1.0: 1.0}, how_long={5.0: 1.0, 10.0: 1.0})
 
 
 def late_observation() -> Choices:
     """The agent sees everything late."""
-    return Choices("late_observation", {"itself": 1.0}, {0.2: 2.0, 0.5: 1.0, 1.0: 1.0}, {1.0: 1.0, 3.0: 1.0})
+    return Choices(
+        what="late_observation",
+        who={"itself": 1.0},
+        how_strong={0.2: 2.0, 0.5: 1.0, 1.0: 1.0},
+        how_long={1.0: 1.0, 3.0: 1.0},
+    )
 
 
 def noisy_observation() -> Choices:
     """Every number that the agent sees is off by some share of itself."""
-    return Choices("noisy_observation", {"itself": 1.0}, {0.05: 2.0, 0.1: 1.0, 0.2: 1.0}, {1.0: 1.0, 3.0: 1.0})
+    return Choices(
+        what="noisy_observation",
+        who={"itself": 1.0},
+        how_strong={0.05: 2.0, 0.1: 1.0, 0.2: 1.0},
+        how_long={1.0: 1.0, 3.0: 1.0},
+    )
 
 
 def unseen() -> Choices:
     """The agent does not see another actor."""
-    return Choices("unseen", {"ahead": 2.0, **_AROUND}, {1.0: 1.0}, {1.0: 2.0, 2.0: 1.0, 4.0: 1.0})
+    return Choices(
+        what="unseen", who={"ahead": 2.0, **_AROUND}, how_strong={1.0: 1.0}, how_long={1.0: 2.0, 2.0: 1.0, 4.0: 1.0}
+    )
 
 
 def late_action() -> Choices:
     """What the agent decides takes effect late."""
-    return Choices("late_action", {"itself": 1.0}, {0.2: 2.0, 0.5: 1.0, 1.0: 1.0}, {1.0: 1.0, 3.0: 1.0})
+    return Choices(
+        what="late_action",
+        who={"itself": 1.0},
+        how_strong={0.2: 2.0, 0.5: 1.0, 1.0: 1.0},
+        how_long={1.0: 1.0, 3.0: 1.0},
+    )
 
 
 def _log_share(weights: Mapping[T, float], value: T) -> float:

@@ -176,11 +176,11 @@ class FirstOnsets:
             for drawn, share in model.possibilities():
                 key = cell_of(name, drawn.how_strong)
                 asked = Drawn(drawn.who, 1.0, 1.0) if by_place else drawn
-                cells.setdefault(asked, []).append(_Cell(key, drawn, share, ratios.get(key, 1.0)))
+                cells.setdefault(asked, []).append(_Cell(key=key, drawn=drawn, share=share, ratio=ratios.get(key, 1.0)))
         else:  # every draw counts, whether it finds a vehicle or not
-            cells[_ANY] = [_Cell(cell_of(name), _ANY, 1.0, ratios.get(name, 1.0))]
+            cells[_ANY] = [_Cell(key=cell_of(name), drawn=_ANY, share=1.0, ratio=ratios.get(name, 1.0))]
         frozen = {asked: tuple(some) for asked, some in cells.items()}
-        return _Place(agent, name, model.what, self._sampler.chance(name), frozen)
+        return _Place(agent=agent, name=name, what=model.what, chance=self._sampler.chance(name), cells=frozen)
 
     def _propose(self, place: _Place, cells: Sequence[_Cell]) -> list[tuple[_Cell, int]]:
         """Return the cells at the points that fall on a place in a step, with their numbers, and move past it."""
@@ -229,11 +229,18 @@ class FirstOnsets:
             planned += [] if excluded is not None and _ANY in excluded else begun
         for other in (*self._of_agent, *self._traffic):
             planned += sampler.draw_between(step, last, other.name, other.agent, rng)
-        return Onset(cell.key, self._forcing.spacing / cell.ratio, step, in_turn(planned))
+        return Onset(cell=cell.key, weight=self._forcing.spacing / cell.ratio, step=step, planned=in_turn(planned))
 
 
 def _disturbance(place: _Place, drawn: Drawn, step: int) -> Disturbance:
-    return Disturbance(step, drawn.who, place.what, float(drawn.how_strong), float(drawn.how_long), place.agent)
+    return Disturbance(
+        step=step,
+        who=drawn.who,
+        what=place.what,
+        how_strong=float(drawn.how_strong),
+        how_long=float(drawn.how_long),
+        agent=place.agent,
+    )
 
 
 def _drawn(one: Disturbance) -> Drawn:

@@ -78,7 +78,9 @@ def _parsed(word: str, agents: Sequence[str], shown: str) -> Disturbance:
     who = parts[0].replace("_", " ")
     if who not in CELLS:
         raise UsageError(f"{shown} {word}: {parts[0]!r} is no place around an agent", fix=one_of(who, CELLS))
-    one = Disturbance(int(step), who, what, _number(parts[1]), _number(parts[2]), agent)
+    one = Disturbance(
+        step=int(step), who=who, what=what, how_strong=_number(parts[1]), how_long=_number(parts[2]), agent=agent
+    )
     if reason := why_not(one):
         raise UsageError(f"{shown} {word}: {reason[0]}", fix=reason[1])
     return one
@@ -187,7 +189,9 @@ def disturber_of(
             fix = one_of(one.what, sorted({*KINDS, *(known or ())}))
             raise UsageError(f"{_SHOWN}: there is no kind of disturbance {one.what!r}", fix=fix)
         _refuse_what_it_cannot(f"{one.what}@{one.step}", one.what, known, simulator)
-    return DisturbanceSampler(models, dict(rates), tuple(agents), step_length_s, tuple(fixed))
+    return DisturbanceSampler(
+        models=models, rates=dict(rates), agents=tuple(agents), step_length_s=step_length_s, fixed=tuple(fixed)
+    )
 
 
 def _refuse_what_it_cannot(name: str, what: str, known: Sequence[str] | None, simulator: str) -> None:
@@ -332,7 +336,9 @@ class DisturbanceSampler:
         """Return a disturbance that a model begins around an agent in a step."""
         drawn = _drawn(name, self.models[name], rng)
         strong, long = float(drawn.how_strong), float(drawn.how_long)
-        one = Disturbance(step, drawn.who, self.models[name].what, strong, long, agent)
+        one = Disturbance(
+            step=step, who=drawn.who, what=self.models[name].what, how_strong=strong, how_long=long, agent=agent
+        )
         reason = why_not(one) if one.what in KINDS else None  # only built-in kinds can be checked
         if reason is not None:
             raise PluginError(f"the disturbance {name!r} has drawn {drawn}: {reason[0]}", fix=reason[1])

@@ -1,4 +1,4 @@
-"""What is behind the Gymnasium environment: SUMO, the reward, the end of an episode, the picture."""
+"""The episodes of the Gymnasium environment on SUMO: observation, reward, termination and rendered picture."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ if TYPE_CHECKING:
 
 __all__ = ["Episodes"]
 
-_SIZE = (960, 540)  # of the picture, in pixels
-_TRAIL_S = 4.0  # of where the agent has been
+_SIZE = (960, 540)  # width and height of the picture, in pixels
+_TRAIL_S = 4.0  # how long the picture shows the agent's past path, in s
 _OTHERS_SPEED = 10.0  # m/s
 
 
 class Episodes:
-    """Episodes of one controlled vehicle; those of others keep their lane.
+    """Episodes of one controlled vehicle. The scenario's other agents keep lane and speed.
 
     Args:
-        scenario: a shipped name, or a path.
-        agent: the controlled vehicle; the scenario's first where empty.
+        scenario: Name of a shipped scenario, or a path.
+        agent: The controlled vehicle; if empty, the first agent of the scenario.
         action: ``continuous``, ``meta``, or empty for the scenario's own choice.
-        disturb: how often what happens, as ``brake=0.02``.
-        max_steps: how long an episode is at most; 0 for no bound, and then nothing may disturb.
+        disturb: Rates of disturbances, such as ``brake=0.02``.
+        max_steps: The longest episode in steps; 0 for no limit. Disturbances need a limit.
 
     Attributes:
-        observation_space: of the vehicle.
-        action_space: of the vehicle.
-        step_length_s: simulation time of a step, in s.
-        agent: the controlled vehicle.
+        observation_space: The observation space of the vehicle.
+        action_space: The action space of the vehicle.
+        step_length_s: Simulation time of a step, in s.
+        agent: The controlled vehicle.
 
     Raises:
-        CrashhuntError: the scenario, the agent or a disturbance does not exist, or a bound is missing that is needed.
+        CrashhuntError: The scenario, the agent or a disturbance does not exist, or disturbances lack a limit.
     """
 
     def __init__(
@@ -89,20 +89,27 @@ class Episodes:
             self._episode.close()
         given = {**self._arguments, **arguments}
         disturbances = self._disturber.draw(seed, self._max_steps) if self._disturber is not None else ()
-        # Whoever steps the environment decides how long an episode is.
-        spec = TrialSpec(0, seed, {}, given, max_steps=sys.maxsize, disturbances=disturbances)
+        # The caller of the environment decides when an episode ends.
+        spec = TrialSpec(
+            number=0,
+            seed=seed,
+            arguments={},
+            scenario_arguments=given,
+            max_steps=sys.maxsize,
+            disturbances=disturbances,
+        )
         self._episode = Episode(spec, simulator=self._simulator, make_agent=_make_agent, observers=(self._trail,))
         self._episode.start()
         _raise_error(self._episode)
         self._crash_step, self._borders = -1, None
         info: dict[str, object] = {"sim_time_s": self._trail.scenes[-1].time_s}
         if self._trail.disturbances:
-            info["disturbances"] = [one.words for one in self._trail.disturbances]
+            info["disturbances"] = [disturbance.words for disturbance in self._trail.disturbances]
         return self._episode.observations[self.agent], info
 
     def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, dict[str, object]]:
         """Advance one control step; return observation, reward, whether it has ended, and the info."""
-        encoded = self._form.encode(action)  # here, where it is an error of the caller's, and the episode goes on
+        encoded = self._form.encode(action)  # a wrong action is an error of the caller, so it does not end the episode
         episode = self._episode
         if episode is None:
             raise SimulatorError("no episode has begun", fix="call reset")
@@ -121,10 +128,28 @@ class Episodes:
         if scene.events:
             info["events"] = [f"{event.kind}: {event.what}" for event in scene.events]
         if len(self._trail.disturbances) > before:
-            info["disturbances"] = [one.words for one in self._trail.disturbances[before:]]
+            info["disturbances"] = [disturbance.words for disturbance in self._trail.disturbances[before:]]
         if terminated:
             info["outcome"] = str(finding.outcome) if finding is not None else "finished"
         return episode.observations[self.agent], episode.rewards[self.agent], terminated, info
+
+    def require_branch(self, *, reseeded: bool) -> None:
+        """Check that there can be copies of the running episode.
+
+        Raises:
+            SimulatorError: no episode runs.
+            UsageError: the copies are to be re-seeded, and the simulator does not support that.
+        """
+        if self._episode is None or self._episode.result is not None or self.agent not in self._simulator.agents:
+            raise SimulatorError("no episode is running, so there is nothing to branch", fix="call reset")
+        _raise_error(self._episode)
+        if reseeded and self._simulator.why_no_reseeding:
+            raise UsageError(f"branch cannot re-seed: {self._simulator.why_no_reseeding}", fix="leave seed out")
+
+    def reseed(self, seed: int) -> None:
+        """Give SUMO's random generators another seed from the next step on."""
+        assert self._episode is not None
+        self._episode.reseed(seed)
 
     def picture(self) -> NDArray[np.generic]:
         """Return the scene from above, uint8, shape (540, 960, 3)."""
@@ -140,7 +165,7 @@ class Episodes:
             actors=scenes[-1].roster.actors,
             prologue=SimpleNamespace(step_length_s=self.step_length_s),
             disturbances=tuple(self._trail.disturbances),
-            # A trail that is longer than what is remembered ends there.
+            # Steps before the first remembered scene show that scene.
             scene=lambda step: scenes[max(0, step - first)],
         )
         view: Any = SceneView
@@ -159,10 +184,10 @@ class Episodes:
 
 
 class _Trail(Observer):
-    """Remembers the last scenes, for the picture, and what has disturbed the episode.
+    """Remembers the last scenes for the picture, and the disturbances of the episode.
 
     Args:
-        length: how many.
+        length: Number of scenes.
     """
 
     def __init__(self, length: int) -> None:
@@ -173,7 +198,7 @@ class _Trail(Observer):
         self.disturbances.clear()
 
     def disturbance(self, disturbance: Disturbance) -> None:
-        if disturbance.vehicle:  # somebody was there
+        if disturbance.vehicle:  # empty if no vehicle was at the place
             self.disturbances.append(disturbance)
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
@@ -185,12 +210,12 @@ class _Trail(Observer):
 def _disturber(scenario: Scenario, agent: str, disturb: Sequence[str], max_steps: int) -> DisturbanceSampler | None:
     made = disturber(scenario, disturb, (agent,))
     if made is not None and max_steps < 1:
-        raise UsageError("disturb needs to know how long an episode is", fix="give max_steps")
+        raise UsageError("disturb needs a limit of the episode's length", fix="give max_steps")
     return made
 
 
 def _make_agent(agent: str, simulator: Simulator, _arguments: Mapping[str, Value]) -> KeepLaneWithSpeed:
-    """Who drives where nobody else does; that of the environment's own vehicle is never asked."""
+    """Return the agent for the scenario's other controlled vehicles; the caller drives the environment's vehicle."""
     return KeepLaneWithSpeed(_OTHERS_SPEED, simulator.actions[agent].space)
 
 

@@ -1,56 +1,71 @@
-"""Episodes in a process of their own: libsumo has one simulation per process."""
+"""Episodes in a process of their own: libsumo has one simulation per process.
+
+Such a process can be forked between two steps (`RemoteEpisodes.branch`). SUMO's `loadState` does not continue as the
+original run did, and a fork does: it has all of SUMO's memory. The copy serves a connection of its own, so that the
+user's program steps it as it steps the original. The user's program itself is never forked: it may have threads, which
+have no copy.
+
+Invariant: a process ends when its connection is closed, and when the user's program ends.
+"""
 
 from __future__ import annotations
 
 import os
+import select
+import signal
 import subprocess
 import sys
 import weakref
 from contextlib import suppress
 from multiprocessing.connection import Connection, Pipe
+from multiprocessing.reduction import recv_handle, send_handle
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from crashhunt.base.errors import SimulatorError
+from crashhunt.base.forks import CannotForkError, fork, held
+from crashhunt.base.processes import outlive_parent
+from crashhunt.executors import worker_environment
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     import numpy as np
     from gymnasium import Space
     from numpy.typing import NDArray
 
+    from crashhunt.envs._episodes import Episodes
     from crashhunt.trial import Value
 
 __all__ = ["RemoteEpisodes"]
 
 Ours: TypeAlias = "Connection[Any, Any]"
-"""A pipe between the two processes, which send each other what the methods of `Episodes` take and return."""
+"""A pipe between the two processes, which carries the arguments and results of the methods of `Episodes`."""
 
-_LOOK_EVERY_S = 1.0  # whether whoever asks is still there
-_GOOD_BYE_S = 5.0  # for SUMO to close; then it is killed
+_LOOK_EVERY_S = 1.0  # time between two checks whether the parent process still exists
+_GOOD_BYE_S = 5.0  # time for SUMO to close before the process is killed
 
 
 class RemoteEpisodes:
-    """The same as `Episodes`, in a process that ends with this object, and with this process.
+    """`Episodes` in a child process, which ends with this object and with this process.
 
-    What it raises comes through. The arguments are those of `Episodes`.
+    The arguments are those of `Episodes`. Exceptions of the child process are raised here.
     """
 
     def __init__(
         self, scenario: str | Path, agent: str, action: str, disturb: Sequence[str] = (), max_steps: int = 0
     ) -> None:
         here, there = Pipe()
-        # A program of its own rather than a child of multiprocessing's: those of an AsyncVectorEnv may not have one.
-        self._process = subprocess.Popen(
+        # Not a child of multiprocessing: the daemonic workers of an AsyncVectorEnv may not have one.
+        self._process: subprocess.Popen[bytes] | _Fork = subprocess.Popen(
             [sys.executable, "-P", "-m", "crashhunt.envs._process", str(there.fileno()), str(os.getpid())],
             pass_fds=(there.fileno(),),
             stdin=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            start_new_session=True,  # Ctrl-C is for whoever asks
+            env={**os.environ, **worker_environment(), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            start_new_session=True,  # Ctrl-C must reach the user's program only
         )
         there.close()
-        self._pipe = here
+        self._pipe, self._name, self.pid = here, "the environment", self._process.pid
         self._end = weakref.finalize(self, _end, self._process, here, os.getpid())
         found = self._ask("made", str(scenario), agent, action, tuple(disturb), max_steps)
         self.observation_space: Space[object] = found["observation_space"]
@@ -68,6 +83,44 @@ class RemoteEpisodes:
         found: tuple[NDArray[np.generic], float, bool, dict[str, object]] = self._ask("step", action)
         return found
 
+    def branch(self, seeds: Sequence[int | None]) -> list[RemoteEpisodes]:
+        """Return copies of the running episode, each in a fork of its process.
+
+        Args:
+            seeds: for each copy, that of SUMO's random generators from its next step on; None to keep their state.
+
+        Raises:
+            SimulatorError: no episode is running, or the process cannot be forked.
+            UsageError: the generators cannot be re-seeded.
+        """
+        copies: list[RemoteEpisodes] = []
+        try:
+            for number, seed in enumerate(seeds, 1):
+                copies.append(self._branch(f"copy {number} of {len(seeds)} of {self._name}", seed))
+        except BaseException:
+            for copy in copies:
+                copy.close()
+            raise
+        return copies
+
+    def _branch(self, name: str, seed: int | None) -> RemoteEpisodes:
+        here, there = Pipe()
+        with there:
+            try:
+                pid, problem = self._ask("branch", seed, os.getpid(), passes=there.fileno())
+                if problem:
+                    raise SimulatorError(f"{self._name} cannot be copied: {problem}", fix="make a new environment")
+            except BaseException:
+                here.close()
+                raise
+        copy: RemoteEpisodes = object.__new__(RemoteEpisodes)
+        copy.__dict__.update(self.__dict__)
+        copy._process = _Fork(pid)
+        copy._pipe, copy._name, copy.pid = here, f"{name} (process {pid})", pid
+        copy._end = weakref.finalize(copy, _end, copy._process, here, os.getpid())
+        copy._ask("agent_name")  # it has begun to serve
+        return copy
+
     def picture(self) -> NDArray[np.generic]:
         """Return the scene from above."""
         found: NDArray[np.generic] = self._ask("picture")
@@ -77,24 +130,59 @@ class RemoteEpisodes:
         """End the process."""
         self._end()
 
-    def _ask(self, name: str, *words: object) -> Any:
+    def _ask(self, name: str, *words: object, passes: int = -1) -> Any:
         if self._pipe.closed:
-            raise SimulatorError("the environment has been closed", fix="make a new one")
+            raise SimulatorError("the environment has been closed", fix="make a new environment")
         try:
             self._pipe.send((name, words))
+            if passes >= 0:
+                send_handle(self._pipe, passes, None)
             fine, answer = self._pipe.recv()
         except (EOFError, ConnectionError) as error:
             self._end()
             code = self._process.returncode
-            how = f"by signal {-code}" if code is not None and code < 0 else f"with exit code {code}"
-            raise SimulatorError(f"the process of the environment ended {how}", fix="make a new one") from error
+            how = "" if code is None else f" by signal {-code}" if code < 0 else f" with exit code {code}"
+            what = f"the process of {self._name}" if isinstance(self._process, subprocess.Popen) else self._name
+            raise SimulatorError(f"{what} ended{how}", fix="make a new environment") from error
         if not fine:
             raise answer
         return answer
 
 
-def _end(process: subprocess.Popen[bytes], pipe: Ours, owner: int) -> None:
-    """Have a process end; a copy of its owner, made by forking, has no say in that."""
+class _Fork:
+    """A fork that another process has made, as far as a `subprocess.Popen` is used here.
+
+    Args:
+        pid: of the fork, which is alive.
+    """
+
+    returncode: int | None = None  # only its parent learns that
+
+    def __init__(self, pid: int) -> None:
+        self._ends = os.pidfd_open(pid)
+
+    def wait(self, timeout: float | None = None) -> None:
+        """Wait for the end of the process.
+
+        Raises:
+            subprocess.TimeoutExpired: it runs on.
+        """
+        if self._ends < 0:
+            return
+        if not select.select([self._ends], [], [], timeout)[0]:
+            raise subprocess.TimeoutExpired("fork", timeout or 0.0)
+        os.close(self._ends)
+        self._ends = -1
+
+    def kill(self) -> None:
+        """Kill the process."""
+        if self._ends >= 0:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._ends, signal.SIGKILL)
+
+
+def _end(process: subprocess.Popen[bytes] | _Fork, pipe: Ours, owner: int) -> None:
+    """End a process; in a fork of the owner, only close the pipe."""
     pipe.close()
     if os.getpid() != owner:
         return
@@ -106,18 +194,24 @@ def _end(process: subprocess.Popen[bytes], pipe: Ours, owner: int) -> None:
 
 
 def main() -> None:
-    """Answer until whoever asks is gone."""
+    """Answer until the user's program is gone."""
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps copies that end
+    parent = int(sys.argv[2])
+    episodes = _serve(Connection(int(sys.argv[1])), lambda: os.getppid() != parent, None)
+    if episodes is not None:
+        episodes.close()
+
+
+def _serve(pipe: Ours, is_orphan: Callable[[], bool], episodes: Episodes | None) -> Episodes | None:
+    """Answer requests until the connection is closed, or the user's program is gone."""
     from crashhunt.envs._episodes import Episodes
 
-    pipe: Ours = Connection(int(sys.argv[1]))
-    parent = int(sys.argv[2])
-    episodes: Episodes | None = None
     with suppress(EOFError, ConnectionError):
         while True:
-            # Copies of the parent hold the other end open as well, so that its end is no sign of the parent's.
+            # Forks of the user's program hold the other end open as well, so its end does not close the connection.
             while not pipe.poll(_LOOK_EVERY_S):
-                if os.getppid() != parent:
-                    return
+                if is_orphan():
+                    return episodes
             name, words = pipe.recv()
             answer: object
             try:
@@ -125,20 +219,50 @@ def main() -> None:
                     episodes = Episodes(*words)
                     names = ("observation_space", "action_space", "step_length_s", "agent")
                     answer = {name: getattr(episodes, name) for name in names}
+                elif name == "branch":
+                    answer = _fork(pipe, episodes, *words)
+                elif name == "agent_name":
+                    answer = episodes.agent
                 else:
                     answer = getattr(episodes, name)(*words)
             except Exception as error:
                 _fail(pipe, error)
             else:
                 pipe.send((True, answer))
-    if episodes is not None:
-        episodes.close()
+    return episodes
+
+
+def _fork(pipe: Ours, episodes: Episodes, seed: int | None, owner: int) -> tuple[int, str]:
+    """Fork this process; return the id of the fork, and why there is none.
+
+    Args:
+        pipe: from which the connection of the fork is received.
+        episodes: with the episode.
+        seed: of the random generators in the fork; None to keep their state.
+        owner: the process of the user's program.
+    """
+    end = recv_handle(pipe)
+
+    def serve() -> None:
+        outlive_parent()  # the user may close the original first
+        alive = os.pidfd_open(owner)
+        if seed is not None:
+            episodes.reseed(seed)
+        _serve(Connection(end), lambda: bool(select.select([alive], [], [], 0.0)[0]), episodes)
+
+    try:
+        episodes.require_branch(reseeded=seed is not None)
+        return fork(serve, held(), keeps=(end,)), ""
+    except CannotForkError as error:
+        return 0, error.message
+    finally:
+        os.close(end)
 
 
 def _fail(pipe: Ours, error: Exception) -> None:
     try:
         pipe.send((False, error))
-    except Exception:  # it cannot be pickled
+    except Exception:  # the error cannot be pickled
         pipe.send((False, SimulatorError(f"{type(error).__name__}: {error}")))
 
 

@@ -1,13 +1,15 @@
-"""SUMO as a Gymnasium environment: one controlled vehicle, for whoever trains or tries an agent."""
+"""SUMO as a Gymnasium environment with one controlled vehicle, for training and testing an agent."""
 
 from __future__ import annotations
 
+import copy
 import importlib.util
 import os
 import weakref
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
+import numpy as np
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_of
@@ -17,13 +19,12 @@ from crashhunt.envs._process import RemoteEpisodes
 if TYPE_CHECKING:
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
 __all__ = ["SumoEnv"]
 
-# Which environment has this process's one simulation, and in which process that was said: a copy, made by forking, has
-# none. Weakly, so that one that is forgotten need not be closed.
+# The environment that owns this process's simulation, and the id of this process: a fork owns no simulation. The
+# reference is weak, so that an environment without `close` is still collected.
 _here: weakref.WeakSet[Episodes] = weakref.WeakSet()
 _process: list[int] = []
 
@@ -32,25 +33,25 @@ class SumoEnv(gymnasium.Env[Any, Any]):
     """``gymnasium.make("crashhunt:crashhunt/SUMO-v0")``.
 
     The observation has the layout of highway-env's Kinematics: float32, shape (vehicles, features). The reward is the
-    distance driven in a step, in m. An episode is terminated by arrival and by a crash, and ``info["outcome"]`` says
-    which; it is truncated after ``max_steps``.
+    distance driven in a step, in m. An episode terminates when the vehicle arrives or crashes, and ``info["outcome"]``
+    says which. An episode is truncated after ``max_steps``.
 
     Args:
-        scenario: a shipped name, or a path.
-        agent: the controlled vehicle; the scenario's first by default. The others keep their lane.
-        action: ``continuous`` is (target speed in m/s, lane change), ``meta`` highway-env's DiscreteMetaAction; the
-            scenario's own choice by default.
-        max_steps: None for no bound.
+        scenario: Name of a shipped scenario, or a path.
+        agent: The controlled vehicle; by default the first agent of the scenario. The other agents keep their lane.
+        action: ``continuous`` is (target speed in m/s, lane change). ``meta`` is highway-env's DiscreteMetaAction. The
+            default is the scenario's own choice.
+        max_steps: The longest episode in steps; None for no limit.
         render_mode: None, or ``rgb_array``: `render` returns the scene from above, uint8, shape (540, 960, 3).
-        process: whether it runs in a process of its own, which costs up to a millisecond a step. libsumo is one
-            simulation per process, so that by default the first environment of a process runs in it, and the others in
-            one of their own each.
-        disturb: how often a second which mistake of others begins, as ``--disturb`` has it: ``brake=0.02,cut_in=0.01``.
-            They follow from the seed of the episode, and need ``max_steps``; ``info["disturbances"]`` says in words
-            what has begun in a step, and what begins with the observation that it returns.
+        process: Whether the environment runs in a process of its own, which costs up to a millisecond per step. libsumo
+            has one simulation per process. So by default the first environment runs in the caller's process, and each
+            further environment in a process of its own.
+        disturb: Rates of disturbances per second, as in ``--disturb``: ``brake=0.02,cut_in=0.01``. Disturbances need
+            ``max_steps``, and the seed of the episode determines them. ``info["disturbances"]`` describes the
+            disturbances that began in the step, and those that begin with the returned observation.
 
     Raises:
-        CrashhuntError: the scenario, the agent or a disturbance does not exist, or SUMO cannot do it.
+        CrashhuntError: The scenario, the agent or a disturbance does not exist, or SUMO does not support it.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's base class declares it so
@@ -88,7 +89,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         self.action_space = self._episodes.action_space
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._episodes.step_length_s))}
-        self._steps = -1
+        self._steps, self._is_copy = -1, False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -96,9 +97,13 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         """Begin an episode.
 
         Args:
-            seed: of this episode and, through the environment's generator, of those that follow.
-            options: ``{"arguments": {name: value}}``, scenario arguments that differ from their defaults.
+            seed: Seed of the environment's generator, which draws the seeds of this and of all later episodes.
+            options: ``{"arguments": {name: value}}``: scenario arguments that differ from their defaults.
         """
+        if self._is_copy:
+            raise UsageError(
+                "a copy of an episode cannot be reset", fix="reset the original, or make a new environment"
+            )
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**31))
         self._steps = 0
@@ -108,19 +113,51 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         """Advance one control step.
 
         Raises:
-            ActionError: the action is not in the space.
-            SimulatorError: SUMO gave up, its process ended, or another simulation has begun in this process.
+            ActionError: The action is not in the space.
+            SimulatorError: SUMO failed, its process ended, or another simulation has begun in this process.
         """
         observation, reward, terminated, info = self._episodes.step(action)
         self._steps += 1
         truncated = not terminated and self._max_steps is not None and self._steps >= self._max_steps
         return observation, reward, terminated, truncated, info
 
-    def render(self) -> NDArray[np.generic] | None:
-        """Return the scene from above, where ``render_mode`` asks for it.
+    def branch(self, n: int, *, seed: int | None = None) -> list[SumoEnv]:
+        """Return independent copies of the running episode, each in a fork of the process of this environment.
+
+        Each copy continues where this environment is. With the same actions, copies without a ``seed`` return
+        bit-identical observations. Copies may be branched again, and outlive this environment. Close each of them.
+
+        Args:
+            n: how many, at least 1.
+            seed: from which each copy gets another seed for SUMO's random generators, so that drivers behave
+                differently; when vehicles depart stays as planned. None to keep the state of the generators.
 
         Raises:
-            UsageError: no episode has begun.
+            UsageError: this environment runs in the user's process, or SUMO's generators cannot be re-seeded.
+            SimulatorError: no episode is running, or its process cannot be forked.
+        """
+        if n < 1:
+            raise UsageError(f"n is {n}", fix="branch at least 1 copy")
+        if seed is not None and seed < 0:
+            raise UsageError(f"seed is {seed}", fix="give 0 or more")
+        if not isinstance(self._episodes, RemoteEpisodes):
+            message = "only an environment with a process of its own can be branched"
+            raise UsageError(message, fix="make it with process=True")
+        seeds: list[int | None] = [None] * n
+        if seed is not None:
+            seeds = [int(one) >> 1 for one in np.random.SeedSequence(seed).generate_state(n)]
+        found = []
+        for episodes in self._episodes.branch(seeds):
+            env = copy.copy(self)
+            env._episodes, env._is_copy = episodes, True
+            found.append(env)
+        return found
+
+    def render(self) -> NDArray[np.generic] | None:
+        """Return the scene from above if ``render_mode`` is ``rgb_array``; otherwise None.
+
+        Raises:
+            UsageError: No episode has begun.
         """
         if self.render_mode is None:
             return None
@@ -129,7 +166,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         return self._episodes.picture()
 
     def close(self) -> None:
-        """End the simulation and remove its files; may be called twice."""
+        """End the simulation and remove its files; a second call does nothing."""
         self._episodes.close()
         if isinstance(self._episodes, Episodes):
             _here.discard(self._episodes)

@@ -58,7 +58,7 @@ class Braking:
     def __init__(self, driver: Agent, simulator: Simulator, agent: str, after: int, manoeuvre: str = "brake") -> None:
         braking = simulator.full_braking(agent) if supports(simulator, BrakesFully) else None
         if braking is None:
-            raise InvalidEpisodeError(f"nobody knows how {agent} brakes as hard as it can")
+            raise InvalidEpisodeError(f"{agent} cannot be made to brake fully: its simulator has no action for it")
         self._driver, self._after = driver, after
         self._action = braking.action
         self._first = braking.action if manoeuvre == "brake" else _lane_change(simulator, agent, manoeuvre)
@@ -93,14 +93,14 @@ class Keeping:
         keeps: ``lane`` keeps it from changing lanes, ``speed`` holds its speed.
 
     Raises:
-        InvalidEpisodeError: nobody knows what its actions say about lanes and speeds.
+        InvalidEpisodeError: The action form has no known lanes and speeds.
     """
 
     def __init__(self, driver: Agent, simulator: Simulator, agent: str, after: int, keeps: str) -> None:
         form = simulator.actions[agent]
         self._idle = _idle(form)
         if self._idle is None and tuple(form.names) != ("target_speed", "lane_change"):
-            raise InvalidEpisodeError(f"nobody knows what the actions of {agent} say about lanes and speeds")
+            raise InvalidEpisodeError(f"{agent} cannot be held: its actions have no known lanes and speeds")
         self._driver, self._simulator, self._agent, self._form = driver, simulator, agent, form
         self._after, self._stays = after, keeps == "lane"
         self._step, self._speed = 0, 0.0
@@ -190,4 +190,6 @@ def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
     name = f"LANE_{side.upper()}"
     if supports(form.space, HasMeanings) and name in form.space.meanings:
         return tuple(form.space.meanings).index(name)
-    raise InvalidEpisodeError(f"nobody knows how {agent} changes lanes to the {side}")
+    raise InvalidEpisodeError(
+        f"{agent} cannot be made to change to the {side} lane: its actions have no known lane change"
+    )

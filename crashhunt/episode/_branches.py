@@ -1,11 +1,12 @@
-"""Branches: where somebody is near, copies of an episode go on with other disturbances.
+"""Branches: near other actors, forks of an episode continue with other disturbances.
 
-Every second of simulation in which somebody is near, a copy is left asleep. Now and then it is asked at once to go on
-with everything that may happen, as strong as it may be: what survives that mostly survives whatever is milder, so that
-one question does for many. Only where it crashes, one disturbance after another is left out, as long as it still does.
+In every second of simulation with a near actor, the episode leaves a suspended fork. At intervals the fork runs at once
+with all possible disturbances at their greatest strength. A moment that survives them mostly survives milder ones as
+well, so one branch answers many questions. If the branch crashes, disturbances are removed one by one while it still
+crashes.
 
-How near to a crash a moment was is only known some seconds later, when it is seen what has become of it: then copies
-from that moment, and from some seconds before, go on with disturbances that are drawn as ever.
+The criticality of a moment is known only some seconds later. Then the forks of a critical moment, and of some seconds
+before, run with disturbances from the usual distributions.
 """
 
 from __future__ import annotations
@@ -44,19 +45,19 @@ __all__ = ["BRANCHED", "Brancher"]
 
 BRANCHED: Final = 4
 """Steps that branches may take for each step of their trial."""
-_DRAWN = 1  # of them, those that are drawn as ever
-_STRONGEST_S = 2  # between two questions for everything at once
-_AT_ONCE_S = 1.0  # in which all of that begins
-_NEAR = 0.2  # danger: 1.9 s behind somebody, or 2.4 m/s² needed of a blind agent; see `crashhunt guide probes`
-_KEPT = 8  # copies asleep, one a second, and none that has been so for longer
-_SEEN_S = 3  # of simulation time, after which it is seen how near a moment was
-_BEFORE_S = (0, 1, 3)  # before that moment, from where copies go on
-_REST_S = 3  # at least, between such moments
-_SOON_S = 2.0  # in which the first disturbance of a branch begins
-_HORIZON_S = 6.0  # for which a branch is followed
-_WINDOW_S = 10  # of scenes, by which a moment is judged
-_PATIENCE_S = 30.0  # of wall time, for a copy
-_BEGINS = 2  # steps on, at the earliest: what an agent sees late is noticed a step before
+_DRAWN = 1  # of these steps, the part for branches with drawn disturbances
+_STRONGEST_S = 2  # time between two branches with all disturbances
+_AT_ONCE_S = 1.0  # all disturbances of such a branch begin within this time
+_NEAR = 0.2  # criticality: 1.9 s behind a vehicle, or 2.4 m/s² needed; see `crashhunt guide probes`
+_KEPT = 8  # number of suspended forks, one per second; the oldest is discarded
+_SEEN_S = 3  # simulation time after which the criticality of a moment is known
+_BEFORE_S = (0, 1, 3)  # branches start at these times before a critical moment
+_REST_S = 3  # shortest time between two such moments
+_SOON_S = 2.0  # the first disturbance of a branch begins within this time
+_HORIZON_S = 6.0  # length of a branch
+_WINDOW_S = 10  # length of the scenes that determine the criticality of a moment
+_PATIENCE_S = 30.0  # wall-time limit of a branch
+_BEGINS = 2  # steps until the first disturbance: a late observation takes effect one step earlier
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,13 +86,13 @@ class _Crashed:
 
 
 class Brancher(Observer):
-    """Has copies of one episode after another go on with other disturbances.
+    """Runs branches of one episode after another.
 
     Args:
-        words: how often what disturbs, ``NAME=RATE`` each, or what does in which step.
-        crash_on: what counts as a crash.
-        delay: called with the wall time that copies have taken, in s.
-        tell: called with what people should know.
+        words: The rates of disturbances, ``NAME=RATE`` each, or disturbances in given steps.
+        crash_on: The outcomes that count as a crash.
+        delay: Called with the wall time that branches have taken, in s.
+        tell: Called with notices for the user.
     """
 
     def __init__(
@@ -142,11 +143,11 @@ class Brancher(Observer):
         self._frames.append(scene.frame)
 
     def is_due(self, episode: Episode) -> bool:
-        """Whether a copy is to be left asleep after the step that has just been taken."""
+        """Whether to leave a suspended fork after the last step."""
         return episode.steps % self._second == 0
 
     def ask(self, episode: Episode) -> None:
-        """Leave a copy asleep where somebody is near, and ask it, and those of some seconds ago."""
+        """Leave a suspended fork if an actor is near, and run the due branches of this fork and of older ones."""
         began = time.monotonic()
         try:
             self._ask(episode)
@@ -169,16 +170,16 @@ class Brancher(Observer):
             self._tell(f"less than {FREE:.0%} of the memory is free: trials branch less than they might")
             self._questions.skip(f"less than {FREE:.0%} of the memory was free")
         else:
-            sleeper = self._leave_asleep(episode) if near else None
+            sleeper = self._suspend_fork(episode) if near else None
             if sleeper is not None and episode.steps >= self._strongest_at:
                 self._ask_for_everything(episode, sleeper)
         if not self._questions.is_over:
             self._look(episode, episode.steps)
 
-    def _leave_asleep(self, episode: Episode) -> _Sleeper | None:
-        """Leave a copy asleep after the step that has just been taken; None where there can be none now."""
+    def _suspend_fork(self, episode: Episode) -> _Sleeper | None:
+        """Leave a suspended fork after the last step; return None if that is impossible now."""
         try:
-            self._asleep.append(_Sleeper(episode.steps, episode.suspend_fork(self._go_on)))
+            self._asleep.append(_Sleeper(episode.steps, episode.suspend_fork(self._run_branch)))
         except NoProcessError as error:
             self._questions.miss(NoAnswer(f"could not be made: {error.message}", is_from_outside=True))
             return None
@@ -192,7 +193,7 @@ class Brancher(Observer):
     def result(self, result: TrialResult) -> TrialResult:
         """Return the result of the trial with what has been found out."""
         if not self._any:
-            return result  # nobody could be asked, which says nothing
+            return result  # no branch could run, so there is no result
         if str(result.outcome) in self._crashes:
             return replace(result, branches=replace(self._branches, crashes=()))  # it needed no other
         asked = self._questions
@@ -224,7 +225,7 @@ class Brancher(Observer):
         return True
 
     def _ask_for_everything(self, episode: Episode, sleeper: _Sleeper) -> None:
-        """Have a copy go on with everything at once; while it crashes, with one disturbance less."""
+        """Run a branch with all disturbances at once; while it crashes, run it with one disturbance less."""
         self._strongest_at = episode.steps + _STRONGEST_S * self._second
         if self._is_spent(episode):
             return
@@ -276,7 +277,7 @@ class Brancher(Observer):
                 return
 
     def _draw(self, episode: Episode, sleeper: _Sleeper) -> None:
-        """Have a copy go on with disturbances that are drawn as ever."""
+        """Run a branch with disturbances from the usual distributions."""
         begins, until = self._span(sleeper)
         soon, before = round(_SOON_S * self._second), self._branches.steps
         drawn = self._draws_of(episode).draw_another(episode.spec.seed, self._draws, begins, soon, until)
@@ -293,7 +294,7 @@ class Brancher(Observer):
     def _branch(
         self, episode: Episode, sleeper: _Sleeper, choices: Sequence[Sequence[Disturbance]], until: int
     ) -> _Crashed | None:
-        """Have a copy go on with other disturbances, of each choice the first for which somebody is there.
+        """Run a branch with other disturbances: of each choice, the first one with a target vehicle.
 
         Returns:
             None where it has not crashed, or no copy has answered.
@@ -314,32 +315,44 @@ class Brancher(Observer):
             return None
         there = cast("list[JsonObject]", answer["there"])
         likely = cast("float | None", answer["log_likelihood"])
-        return _Crashed(tuple(map(Disturbance.from_json, there)), sleeper.step, outcome, step, likely)
+        return _Crashed(
+            took_place=tuple(map(Disturbance.from_json, there)),
+            branched=sleeper.step,
+            outcome=outcome,
+            step=step,
+            log_likelihood=likely,
+        )
 
     def _usable(self, episode: Episode, sleeper: _Sleeper) -> SuspendedFork:
-        """Return the copy of a step that is asleep; one that was killed is replaced while the trial is at that step."""
+        """Return the suspended fork of a step; a killed fork is replaced if the trial is still at that step."""
         copy = next((one.copy for one in self._asleep if one.step == sleeper.step), sleeper.copy)
         if copy.is_usable or sleeper.step != episode.steps:
             return copy
         copy.end()
         self._asleep = deque(one for one in self._asleep if one.copy is not copy)
-        self._asleep.append(_Sleeper(sleeper.step, episode.suspend_fork(self._go_on)))
+        self._asleep.append(_Sleeper(sleeper.step, episode.suspend_fork(self._run_branch)))
         return self._asleep[-1].copy
 
     def _take(self, episode: Episode, found: _Crashed) -> None:
         """Take a crash in, as a specification from the start."""
         begun = [one for one in episode.spec.disturbances if one.step <= found.branched + _BEGINS - 1]
         planned = in_turn([*begun, *found.took_place])
-        branch = Branch(planned, found.branched, found.outcome, found.step, found.log_likelihood)
+        branch = Branch(
+            disturbances=planned,
+            branched=found.branched,
+            outcome=found.outcome,
+            step=found.step,
+            log_likelihood=found.log_likelihood,
+        )
         self._branches = replace(self._branches, crashes=(*self._branches.crashes, branch))
 
-    def _go_on(self, copy: Episode, job: Plain) -> Plain:
+    def _run_branch(self, copy: Episode, job: Plain) -> Plain:
         choices = cast("list[list[JsonObject]]", job["choices"])
         until, began = cast(int, job["until"]), copy.steps
         chosen = [_choice(copy, list(map(Disturbance.from_json, some))) for some in choices]
         planned = in_turn(one for one in chosen if one is not None)
         copy.replan(planned)
-        fixed = self._draws_of(copy).fixed  # these take place in the trial as well, so they are no reason to go on
+        fixed = self._draws_of(copy).fixed  # these also take place in the trial, so they do not justify a branch
         other = [one for one in planned if one not in fixed]
         first = min((one.step for one in other), default=until)
         soon = [one for one in other if one.step <= first + self._second]
@@ -348,7 +361,7 @@ class Brancher(Observer):
         while copy.result is None and copy.steps < until:
             copy.step()
             if soon and copy.steps == soon[-1].step and not any(map(copy.takes_place, soon)):
-                break  # nobody was there
+                break  # no vehicle was at the place
         outcome, likely = "", None
         if copy.result is not None:
             outcome, found = str(copy.result.outcome), self._draws_of(copy).log_likelihood_of(copy.result)
@@ -361,7 +374,7 @@ class Brancher(Observer):
 
 
 def _choice(copy: Episode, some: Sequence[Disturbance]) -> Disturbance | None:
-    """The first one for which somebody is there; where there is only one, that."""
+    """Return the first disturbance with a target vehicle; a single disturbance is returned unchecked."""
     simulator = copy.simulator
     if len(some) == 1 or not supports(simulator, SupportsDisturbances):
         return some[0]

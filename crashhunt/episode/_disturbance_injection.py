@@ -1,8 +1,7 @@
-"""Lets the disturbances of a trial take place: it stands between the agents and the simulator.
+"""Injects the disturbances of a trial between the agents and the simulator.
 
-A vehicle errs from the step in which its disturbance begins; who is meant is found out just before. What an agent sees
-late or wrongly in a step is what it is shown in that step, and is recorded so; what it does late is recorded when it
-decides.
+The target vehicle of a disturbance is determined just before the step in which the disturbance begins. Late or noisy
+observations are recorded as the agent receives them. Late actions are recorded when the agent decides.
 """
 
 from __future__ import annotations
@@ -37,46 +36,48 @@ _EXACT = ("presence", "kind", "heading", "cos_h", "sin_h")  # columns that noise
 
 
 class _Filter(Protocol):
-    """What becomes of what an agent is shown, or answers, in each step of its disturbance."""
+    """Changes an agent's observation or action in each step of its disturbance."""
 
     def __call__(self, array: Array) -> Array: ...
 
 
 @dataclass(slots=True)
 class _Going:
-    """A disturbance that is going on.
+    """An active disturbance.
 
     Args:
-        last: the last step in which it does.
-        vehicle: who errs; the agent, where it is its own eyes or hands.
-        what: the kind.
-        errs: the vehicle's; None of the agent's own.
-        filters: what the agent is shown or does; None of a vehicle.
+        last: The last step of the disturbance.
+        vehicle: The disturbed vehicle, or the agent if its observations or actions are disturbed.
+        what: The type.
+        active: The simulator's disturbance of a vehicle; None if the agent itself is disturbed.
+        filters: Changes the agent's observations or actions; None if a vehicle is disturbed.
     """
 
     last: int
     vehicle: str
     what: str
-    errs: ActiveDisturbance | None = None
+    active: ActiveDisturbance | None = None
     filters: _Filter | None = None
 
 
 class DisturbanceInjector:
-    """Takes a simulator's steps, with the disturbances of a trial.
+    """Runs a simulator's steps with the disturbances of a trial.
 
     Args:
-        spec: of the trial.
-        simulator: which has been reset.
-        tells: called with each disturbance as it takes place; whoever adds to this list is told.
+        spec: The specification of the trial.
+        simulator: The simulator, after its reset.
+        callbacks: Called with each disturbance that takes place; the caller may extend this list later.
 
     Raises:
-        InvalidEpisodeError: the simulator cannot do one of the kinds.
+        InvalidEpisodeError: The simulator does not support a type of disturbance.
     """
 
-    def __init__(self, spec: TrialSpec, simulator: Simulator, tells: Sequence[Callable[[Disturbance], None]]) -> None:
+    def __init__(
+        self, spec: TrialSpec, simulator: Simulator, callbacks: Sequence[Callable[[Disturbance], None]]
+    ) -> None:
         self._seed = spec.seed
         self._simulator = simulator
-        self._tells = tells
+        self._callbacks = callbacks
         self._dt = simulator.step_length_s
         self._traffic = simulator if supports(simulator, SupportsDisturbances) else None
         self._holding = simulator if supports(simulator, HoldsBack) else None
@@ -92,9 +93,9 @@ class DisturbanceInjector:
         self._traffic_waits = [one for one in waiting if one.what not in OF_AGENT]
         self._agent_waits = [one for one in waiting if one.what in OF_AGENT]
         self._going: list[_Going] = []
-        self._told: list[Disturbance] = []
+        self._reported: list[Disturbance] = []
         self._step = 0
-        self._next = 0  # the next step in which anything begins, goes on or ends
+        self._next = 0  # the next step with a disturbance
         self._before: Mapping[str, Array] = {}
 
     def add(self, disturbance: Disturbance) -> None:
@@ -112,10 +113,10 @@ class DisturbanceInjector:
             self.add(one)
 
     def took_place(self, planned: Disturbance) -> bool:
-        """Whether somebody was there for a disturbance that has begun."""
+        """Whether a disturbance that has begun had a target vehicle."""
         return any(
             one.vehicle and (one.step, one.agent, one.what) == (planned.step, planned.agent, planned.what)
-            for one in self._told
+            for one in self._reported
         )
 
     def first(self, observations: Observations) -> Observations:
@@ -123,15 +124,15 @@ class DisturbanceInjector:
         return self._shown(observations)
 
     def step(self, actions: Mapping[str, Array]) -> StepResult:
-        """Take the simulator's next step, with whatever goes on in it."""
+        """Run the simulator's next step with the active disturbances."""
         self._step = step = self._step + 1
         if not self._going and not self._is_due(step):
             self._before = actions
             return self._simulator.step(actions)
         self._end_before(step)
         for going in self._going:
-            if going.errs is not None:
-                going.errs.keep()
+            if going.active is not None:
+                going.active.keep()
         while self._traffic_waits and self._traffic_waits[-1].step <= step:
             self._begin(self._traffic_waits.pop())
         given, self._before = self._late(actions), actions
@@ -140,7 +141,7 @@ class DisturbanceInjector:
 
     def end(self, result: TrialResult) -> TrialResult:
         """Return the result with what took place."""
-        return in_effect(result, self._told)
+        return in_effect(result, self._reported)
 
     def _is_due(self, step: int) -> bool:
         """Whether a vehicle begins to err in this step, or an agent in the next, before which it is shown something."""
@@ -152,8 +153,8 @@ class DisturbanceInjector:
         if over:
             self._going = [going for going in self._going if going.last >= step]
             for going in over:
-                if going.errs is not None:
-                    going.errs.end()
+                if going.active is not None:
+                    going.active.end()
 
     def _steps(self, seconds: float) -> int:
         return steps_of(seconds, self._dt)
@@ -161,23 +162,23 @@ class DisturbanceInjector:
     def _begin(self, planned: Disturbance) -> None:
         """Have a vehicle err from this step on, where there is one that can."""
         last = self._step + self._steps(planned.how_long) - 1
-        vehicle = self._whom(planned)
-        errs = None
+        vehicle = self._target(planned)
+        active = None
         if vehicle and all(going.vehicle != vehicle for going in self._going):  # one at a time
-            errs = self._erring(vehicle, planned)
-        if errs is None:
+            active = self._disturb(vehicle, planned)
+        if active is None:
             self._tell(replace(planned, vehicle=""))
             return
-        self._going.append(_Going(last, vehicle, planned.what, errs))
-        self._tell(planned.took_place(vehicle, errs.how_strong, self._dt))
+        self._going.append(_Going(last=last, vehicle=vehicle, what=planned.what, active=active))
+        self._tell(planned.took_place(vehicle, active.how_strong, self._dt))
 
-    def _whom(self, planned: Disturbance) -> str:
+    def _target(self, planned: Disturbance) -> str:
         if planned.what in HELD:
             return planned.vehicle
         assert self._traffic is not None
         return self._traffic.resolve_target(planned) if planned.agent in self._simulator.agents else ""
 
-    def _erring(self, vehicle: str, planned: Disturbance) -> ActiveDisturbance | None:
+    def _disturb(self, vehicle: str, planned: Disturbance) -> ActiveDisturbance | None:
         if planned.what in HELD:
             assert self._holding is not None
             return self._holding.hold(vehicle, planned.what)
@@ -185,8 +186,8 @@ class DisturbanceInjector:
         return self._traffic.disturb(vehicle, planned)
 
     def _tell(self, disturbance: Disturbance) -> None:
-        self._told.append(disturbance)
-        for tell in self._tells:
+        self._reported.append(disturbance)
+        for tell in self._callbacks:
             tell(disturbance)
 
     def _late(self, actions: Mapping[str, Array]) -> Mapping[str, Array]:
@@ -239,11 +240,11 @@ class DisturbanceInjector:
 
 
 class _Late:
-    """Hands on what it was given so many steps ago; until it has something, the first, or what somebody holds.
+    """Returns the value of an earlier step; before that, a value derived from the first one.
 
     Args:
-        delay: in steps.
-        held: returns what stands for the time in which nothing has come yet, from the first that is given.
+        delay: The delay in steps.
+        held: Returns the value for the first steps, from the first value.
     """
 
     def __init__(self, delay: int, held: Callable[[Array], Array] = lambda first: first) -> None:
@@ -260,11 +261,11 @@ class _Late:
 
 
 class _Held:
-    """What a vehicle goes on doing while no decision reaches it: the same speed, and no further change of lanes.
+    """Returns the action of a vehicle while no decision reaches it: the same speed, and no lane change.
 
     Args:
-        form: of its actions.
-        before: the action of the step before; None at the beginning.
+        form: The vehicle's action form.
+        before: The action of the previous step; None at the beginning.
     """
 
     def __init__(self, form: ActionForm, before: Array | None) -> None:
@@ -285,11 +286,11 @@ class _Noisy:
     """Makes every number wrong by up to a share of itself, within the bounds of the space.
 
     Args:
-        share: the most by which it is wrong.
-        names: what the columns are, where somebody knows; directions and what says who it is stay as they are.
-        low: the least of each number.
-        high: the greatest.
-        rng: of its own.
+        share: The largest relative error.
+        names: The names of the columns, if known; directions, presence and class stay exact.
+        low: The lower bound of each number.
+        high: The upper bound of each number.
+        rng: A random generator of its own.
     """
 
     def __init__(self, share: float, names: Sequence[str], low: Array, high: Array, rng: np.random.Generator) -> None:

@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 __all__ = ["Episode", "Forkable", "MakeAgent", "Reset", "Whereabouts"]
 
 
-# What can be looked at between two steps of an episode, whoever has taken them.
+# The state between two steps of an episode, for steps of Python and of the compiled core.
 
 
 class Whereabouts:
-    """The part of an `Episode` that says where it is. Where the core has gone ahead, it is asked when somebody asks."""
+    """The part of an `Episode` with its current state; reads the state from the core if the core has run steps."""
 
     simulator: Simulator
 
@@ -54,7 +54,7 @@ class Whereabouts:
         self._scene: Scene | None = None
         self._ahead: FastPath | None = None
         self._take: Callable[[Mapping[str, Agent]], int] | None = None
-        self._is_behind = False  # the core has taken steps of which nothing is known here but their number
+        self._is_behind = False  # the core has run steps whose state is not read yet
 
     @property
     def observations(self) -> Observations:
@@ -81,70 +81,70 @@ class Whereabouts:
         return self._scene
 
     def _catch_up(self) -> None:
-        """Be where the core has come to."""
+        """Read the state of the core."""
         if self._is_behind and self._ahead is not None:
             self._is_behind = False
             self._observations, self._rewards, self._terminations, *_ = self._ahead.at_once.catch_up()
             self._scene = self.simulator.scene()
 
 
-# Copies of an episode that goes on: those of its process.
+# Forks of a running episode, which are forks of its process.
 
 C = TypeVar("C")
 
 
 class Forkable:
-    """The part of an `Episode` that copies are made by."""
+    """The part of an `Episode` that forks it."""
 
     def __init__(self) -> None:
         super().__init__()
         self._held = Held()
         self._on_copied: list[Callable[[], None]] = []
 
-    def _goes_on(self) -> bool:
+    def _is_running(self) -> bool:
         raise NotImplementedError
 
     def _look_away(self) -> None:
         raise NotImplementedError
 
     def fork(self, work: Callable[[Self], Plain], *, observed: bool = True) -> Copy:
-        """Copy this process with the episode in it, between two steps; the copy goes on exactly as this one does.
+        """Fork this process between two steps; the fork continues exactly as the original would.
 
         Args:
-            work: what is done in the copy, which then is over; it may fork again. What it returns is its answer.
-            observed: whether its observers go on being told. What they record goes elsewhere.
+            work: Runs in the fork, which then ends; it may fork again. Its return value is the answer of the fork.
+            observed: Whether observers are still called in the fork. Their recordings go to other files.
 
         Raises:
-            CannotForkError: the agents, or whoever has begun before them, have something that has no copy.
+            CannotForkError: The process has something that a fork cannot copy, such as threads.
         """
         return self._copied(Copy, work, observed=observed)
 
     def suspend_fork(self, work: Callable[..., Plain]) -> SuspendedFork:
-        """Leave a copy asleep here; whenever it is asked, a copy of that one goes on from here, told of to nobody.
+        """Leave a suspended fork; for each request, a fork of it resumes from here, without observers.
 
         Args:
-            work: what is done with that copy, and with what is asked.
+            work: Runs in the resumed fork, with the request.
 
         Raises:
-            CannotForkError: as of `fork`.
+            CannotForkError: As for `fork`.
         """
         return self._copied(SuspendedFork, work, observed=False)
 
     def _copied(
         self, make: Callable[[Callable[..., Plain], Held], C], work: Callable[..., Plain], *, observed: bool
     ) -> C:
-        if not self._goes_on():
-            raise RuntimeError("an episode has copies only while it goes on")
+        if not self._is_running():
+            raise RuntimeError("only a running episode can be forked")
 
-        def go_on(*asked: Plain) -> Plain:
+        def run_copy(*asked: Plain) -> Plain:
             for tell in self._on_copied if observed else ():
                 tell()
             if not observed:
                 self._look_away()
             return work(self, *asked)
 
-        copy = make(go_on, self._held)
-        self._held = replace(self._held, shared=None)  # looking takes as long as all else, so once has to do
+        copy = make(run_copy, self._held)
+        self._held = replace(self._held, shared=None)  # the check is expensive, so it runs only once
         return copy
 
 
@@ -153,7 +153,7 @@ MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 Reset = Callable[..., "tuple[Observations, Info]"]
 """What `Simulator.reset` is: called with ``seed`` and ``options``."""
 
-_ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # nobody writes to it
+_ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # never written to
 
 
 class Episode(Forkable, Ending, Whereabouts):
@@ -167,9 +167,9 @@ class Episode(Forkable, Ending, Whereabouts):
         simulator: where.
         make_agent: called with agent id, simulator and arguments; returns the agent at the wheel.
         oracles: what decides whether a step is a crash.
-        crash_on: what ends the episode; a traffic crash or event of another kind is passed over, and it goes on.
-        observers: told of everything that happens, in this order.
-        forks: whether copies of it may be made: then it notes what is open before the agents are made, as not theirs.
+        crash_on: The outcomes that end the episode; after other traffic crashes and events, the episode continues.
+        observers: Observers, called in this order.
+        forks: Whether the episode may be forked; it then notes the open files before the agents are made.
         reset: what resets the simulator, where it is not the simulator itself.
 
     Attributes:
@@ -179,7 +179,7 @@ class Episode(Forkable, Ending, Whereabouts):
         agents: by name; one that is replaced between two steps is asked from the next one on.
         acting: the numbers of those that act in the next step.
         steps: how many are complete.
-        result: None while it goes on.
+        result: The result; None while the episode runs.
         error: the exception that ended it, where one did; until it is closed.
         setup_s: wall time that `start` took, in s.
         setup_steps: how many steps were simulated before the first one; None where the simulator does not say.
@@ -219,7 +219,7 @@ class Episode(Forkable, Ending, Whereabouts):
         self._nothing: tuple[float, ...] = ()
         self._encoders: list[Callable[[object], NDArray[np.generic]]] = []
         self._unflatten: dict[str, Callable[[NDArray[np.generic]], object]] = {}
-        # Only those that want to be told are called: this is done several times a step.
+        # Call only observers that override a hook, because hooks run several times per step.
         self._on_begin: list[Callable[[Episode], None]] = callbacks_for(observers, "begin")
         self._on_making: list[Callable[[int], None]] = callbacks_for(observers, "making")
         self._on_observation: list[Callable[[int, NDArray[np.generic]], None]] = callbacks_for(observers, "observation")
@@ -270,7 +270,7 @@ class Episode(Forkable, Ending, Whereabouts):
         except BaseException as error:
             return self._fail_at_once(error)
         if come:
-            return self._go_on_from(come)
+            return self._finish_core_step(come)
         self._is_behind = True
         self.steps += 1
         return None
@@ -289,7 +289,7 @@ class Episode(Forkable, Ending, Whereabouts):
             given: as of `step`.
             actions: where agents have been asked already, what they answered.
             advance: what is left for the simulator to do with that; None where it is all of it.
-            untold: whether nobody has been told of these answers.
+            untold: Whether observers have not been called for these actions yet.
         """
         self._catch_up()
         if self.result is not None or self._scene is None:
@@ -344,8 +344,8 @@ class Episode(Forkable, Ending, Whereabouts):
         except BaseException as error:
             return self._break(error)
 
-    def _go_on_from(self, come: int) -> TrialResult | None:
-        """Do what the core has left of a step in which something has happened."""
+    def _finish_core_step(self, come: int) -> TrialResult | None:
+        """Complete a step that the core has left because of an event."""
         ahead = self._ahead
         assert ahead is not None
         try:
@@ -390,7 +390,7 @@ class Episode(Forkable, Ending, Whereabouts):
             RuntimeError: the episode was not made for it, with ``forks``.
         """
         if self._disturbed is None:
-            raise RuntimeError("only an episode of which there may be copies is disturbed while it goes on")
+            raise RuntimeError("only an episode that may be forked can get disturbances while it runs")
         self._disturbed.add(disturbance)
 
     def replan(self, disturbances: Sequence[Disturbance]) -> None:
@@ -414,17 +414,17 @@ class Episode(Forkable, Ending, Whereabouts):
         return None
 
     def takes_place(self, disturbance: Disturbance) -> bool:
-        """Whether somebody was there for a disturbance that has begun."""
+        """Whether a disturbance that has begun had a target vehicle."""
         return self._disturbed is not None and self._disturbed.took_place(disturbance)
 
-    def _goes_on(self) -> bool:
+    def _is_running(self) -> bool:
         return self._scene is not None and self.result is None
 
     def _look_away(self) -> None:
-        """Tell nobody of anything from now on."""
+        """Stop calling observers."""
         self._take = None
-        tells = (self._on_begin, self._on_observation, self._on_action, self._on_scene, self._on_disturbance)
-        for listening in (*tells, self._on_copied, self._on_end):
+        callbacks = (self._on_begin, self._on_observation, self._on_action, self._on_scene, self._on_disturbance)
+        for listening in (*callbacks, self._on_copied, self._on_end):
             listening.clear()
         if self._disturbed is not None:
             self._on_end.append(self._disturbed.end)
@@ -499,7 +499,7 @@ class Episode(Forkable, Ending, Whereabouts):
     def _judge(
         self, finding: Finding | None, actions: Mapping[str, object], truncations: Mapping[str, bool]
     ) -> TrialResult | None:
-        """Say whether a step was the last one, and note who goes on."""
+        """Return the result if a step was the last one; otherwise note the remaining agents."""
         if finding is not None:
             return self._end(finding.outcome, collision=finding.collision, event=finding.event)
         if len(self.simulator.agents) != len(self.acting) or True in truncations.values():

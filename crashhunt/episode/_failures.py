@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 
-# What is told of an exception, however it is made: an agent's may be of any class and any size.
+# The text of an exception. An agent's exception may be of any class and any size.
 
 _MIN_RECURSION_LIMIT: Final = 1000
 _KINDS: tuple[tuple[type[BaseException], str], ...] = (
@@ -59,12 +59,12 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "") -> Failure:
     """Return what a result says about an exception.
 
     Args:
-        error: the exception. Message and traceback are cut where they are longer than anybody reads, and say so.
-        agent: whose it is; empty for nobody's.
-        cause: why it was raised, where its message does not say so, as a clause; empty where it does.
+        error: The exception. A long message or traceback is cut, with a note.
+        agent: The agent whose code failed; empty if it was no agent's code.
+        cause: Why the exception was raised, as a clause; empty if its message says so.
     """
     with blocked_signals(), _deep_enough():
-        # A message of our own says everything; where in our code it was raised is nobody's business.
+        # crashhunt's own messages are complete, so they need no traceback.
         text = "" if issubclass(type(error), InvalidEpisodeError) else format_error(error)
         words = message_of_error(error)
         # A class of a user's may have a metaclass of any kind, so nothing is looked up by it.
@@ -74,7 +74,12 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "") -> Failure:
         message = f"{message} ({limit})" if message else limit
     if not cause and is_emptied():
         cause = "somebody has emptied sys.modules"
-    return Failure(kind, f"{cause}, upon which this fails: {message}" if cause else message, text, agent)
+    return Failure(
+        kind=kind,
+        message=f"{cause}, upon which this fails: {message}" if cause else message,
+        traceback=text,
+        agent=agent,
+    )
 
 
 @contextmanager
@@ -90,9 +95,9 @@ def _deep_enough() -> Iterator[None]:
 
 
 def is_emptied() -> bool:
-    """Whether somebody has removed from ``sys.modules`` what Python had imported.
+    """Whether imported modules have been removed from ``sys.modules``.
 
-    No simulator does that. What fails next is whatever imports something next, such as NumPy itself.
+    No simulator does that. The next import then fails, such as an import inside NumPy.
     """
     return __name__ not in sys.modules
 
@@ -177,7 +182,15 @@ def record_originals() -> None:
             if isinstance(value, type) and value.__module__ == name and value not in classes:
                 classes[value] = {key: one for key, one in vars(value).items() if callable(one)}
     limits = {name: resource.getrlimit(number)[0] for name, number in _LIMITS.items()}
-    _originals[:] = [_Originals(packages, functions, classes, sys.getrecursionlimit(), limits)]
+    _originals[:] = [
+        _Originals(
+            packages=packages,
+            functions=functions,
+            classes=classes,
+            recursion_limit=sys.getrecursionlimit(),
+            limits=limits,
+        )
+    ]
 
 
 def _packages_of_simulators() -> frozenset[str]:
@@ -398,7 +411,7 @@ def _lowered_limit(error: BaseException) -> str:
     return ""
 
 
-# How an episode ends, whoever is to blame.
+# The end of an episode with an error.
 
 
 class Ending:
@@ -464,7 +477,7 @@ class Ending:
         return result
 
     def _break(self, error: BaseException) -> TrialResult:
-        """End where it cannot go on, and neither agent nor simulator has said why.
+        """End an episode that cannot continue for a reason that is neither the agent's nor the simulator's.
 
         An oracle has failed, an observer, or something that the agent has damaged, such as our own files.
 

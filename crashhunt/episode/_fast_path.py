@@ -36,11 +36,11 @@ __all__ = ["FastPath", "make_fast_path"]
 
 
 _FIND_NOTHING = (ReportedCollision, OffRoad, TrafficEvents, RedLight, WrongWay, OffRoute, Teleport)
-"""Oracles that find nothing where the simulator tells of nothing; whoever inherits from one is none of them."""
+"""Oracles that find nothing in steps without a simulator event; subclasses of these do not count."""
 
 
 class FastPath:
-    """Goes on where the core has left something of a step, as long as nothing has happened that Python looks into.
+    """Completes steps that the core has left, as long as no event needs Python code.
 
     Args:
         at_once: the simulator's.
@@ -61,13 +61,13 @@ class FastPath:
         at_once.core.listen(at_once.enter, self._record_roster)
 
     def resume_after(self, come: int, agents: dict[str, Agent]) -> tuple[int, dict[str, NDArray[np.generic]] | None]:
-        """Return what a step has come to in the end, and what the agent answered; None where it was not asked.
+        """Return the final status of a step, and the agent's action; None if the agent has not acted.
 
-        Where it ends with `ANSWERED`, nobody has been told of the answer yet.
+        With the status `ANSWERED`, observers have not been called for the action yet.
 
         Args:
-            come: what it has come to so far.
-            agents: by name.
+            come: The status that the core has returned.
+            agents: The agents by name.
         """
         core = self.at_once.core
         if come == REFUSED and self._resume():
@@ -80,7 +80,7 @@ class FastPath:
         return come, {self._agent: action}
 
     def _resume(self) -> bool:
-        """Have the core go on from where the simulator is; False where that has to wait."""
+        """Let the core continue from the simulator's state; return False if that is not possible yet."""
         if self.at_once.resume() is None:
             return False
         self._record_roster()
@@ -100,7 +100,7 @@ def make_fast_path(
     max_steps: int,
     encoders: Sequence[Callable[[object], NDArray[np.generic]]],
 ) -> FastPath | None:
-    """Return what takes steps at once; None where somebody has to be told of each part of each step.
+    """Return the fast path; None if an observer needs each part of each step.
 
     Args:
         simulator: which has been reset.

@@ -105,9 +105,14 @@ class OnsetForcer:
         if onsets is None:
             return result
         forced = Forced(
-            onsets.survival, dict(sorted(onsets.masses.items())), copies, steps, asked.unanswered,
-            asked.why_unanswered, asked.may_be_answered,
-        )  # fmt: skip
+            survival=onsets.survival,
+            masses=dict(sorted(onsets.masses.items())),
+            copies=copies,
+            steps=steps,
+            unanswered=asked.unanswered,
+            why_unanswered=asked.why_unanswered,
+            may_be_asked_again=asked.may_be_answered,
+        )
         asked.begin_trial()
         return replace(result, forced=forced)
 
@@ -149,10 +154,16 @@ class OnsetForcer:
         planned = cast("list[JsonObject]", answer["planned"])
         self._copies.append(
             ForcedCopy(
-                onset.cell, onset.step, onset.weight, episode.steps, outcome if crashed else "", step,
-                bool(answer["disturbed"]), tuple(map(Disturbance.from_json, planned)) if crashed else (),
+                cell=onset.cell,
+                onset=onset.step,
+                weight=onset.weight,
+                branched=episode.steps,
+                crash=outcome if crashed else "",
+                step=step,
+                disturbed=bool(answer["disturbed"]),
+                disturbances=tuple(map(Disturbance.from_json, planned)) if crashed else (),
             )
-        )  # fmt: skip
+        )
 
 
 def _has_target(episode: Episode, planned: Disturbance) -> bool:

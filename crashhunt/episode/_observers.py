@@ -32,7 +32,7 @@ from crashhunt.recording import (
 )
 from crashhunt.simulators import LeavesOut, NamesDanger, NamesObservations, PlaysPaths, TellsEvents
 from crashhunt.trial import Outcome
-from crashhunt.world import ApproachMeter, DangerMeter
+from crashhunt.world import ApproachMeter, DangerMeter, DrivenMeter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -60,14 +60,14 @@ __all__ = [
 ]
 
 
-# What looks on while an episode runs: it is told of everything, and changes nothing.
+# Observers of a running episode, which never change it.
 
 
 class Observer:
-    """Is told what happens in an episode; override what you want to be told. What is not overridden costs nothing.
+    """Observes an episode; override the hooks that you need. Hooks that are not overridden cost nothing.
 
-    Observers are told in their order, and of the end in the opposite one. Whatever one raises ends the episode, as
-    everything does that is neither the agent's nor the simulator's.
+    Observers are called in their order, and at the end in reverse order. An exception of an observer ends the episode,
+    like every error that is neither the agent's nor the simulator's.
     """
 
     def begin(self, episode: Episode) -> None:
@@ -97,7 +97,7 @@ class Observer:
         """
 
     def disturbance(self, disturbance: Disturbance) -> None:
-        """A disturbance takes place; told before the step in which it begins, or that follows.
+        """Called for a disturbance that takes place, before the step in which it begins or the step after.
 
         Args:
             disturbance: as it takes place, with who is meant; a vehicle that is not there is empty.
@@ -118,7 +118,7 @@ class Observer:
     def end(self, result: TrialResult) -> TrialResult:
         """The episode is over; return its result, with what this observer has found out about it.
 
-        It is told again, with another result, where an observer has failed at the end.
+        The hook is called again, with another result, if an observer has failed at the end.
         """
         return result
 
@@ -157,12 +157,12 @@ def observation_restorer(space: Space[object]) -> Callable[[NDArray[np.generic]]
 
 
 def callbacks_for(observers: Sequence[Observer], name: str) -> Any:
-    """Return what is called to tell observers of something; those that do not want to be told are left out."""
+    """Return the hooks of this name of all observers that override it."""
     return [getattr(one, name) for one in observers if overrides_hook(one, name)]
 
 
 def overrides_hook(observer: Observer, name: str) -> bool:
-    """Whether an observer wants to be told of something."""
+    """Whether an observer overrides a hook."""
     return getattr(type(observer), name) is not getattr(Observer, name)
 
 
@@ -172,7 +172,7 @@ _AT_ONCE = 2048  # scenes
 
 
 class Nearness(Observer):
-    """Measures the closest approach and the danger, and adds them to the result.
+    """Measures the closest approach, the criticality and the driven distance, and adds them to the result.
 
     Args:
         take_frames: returns the scenes since it was last called, such as `BlackBox.take_frames`: there they lie as
@@ -186,6 +186,7 @@ class Nearness(Observer):
         self._take_frames = take_frames
         self._meter = ApproachMeter(())
         self._dangers = DangerMeter((), 1.0)
+        self._driven = DrivenMeter((), 1.0)
         self._simulator: object = None
         self._waiting: list[Frame] = []  # for the closest approach, of which so many at a time cost least
 
@@ -201,6 +202,7 @@ class Nearness(Observer):
         self._meter = ApproachMeter(episode.names)
         self._simulator = episode.simulator
         self._dangers = DangerMeter(episode.names, episode.simulator.step_length_s)
+        self._driven = DrivenMeter(episode.names, episode.simulator.step_length_s)
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Take in what there is, now and then."""
@@ -210,7 +212,7 @@ class Nearness(Observer):
                 self._measure()
 
     def end(self, result: TrialResult) -> TrialResult:
-        """Add the closest approach and the danger."""
+        """Add the closest approach, the criticality and the driven distance."""
         closest = self.closest
         if result.collision is not None and "overlap" in result.collision.seen_by:
             closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
@@ -222,12 +224,17 @@ class Nearness(Observer):
         if danger is None and supports(self._simulator, NamesDanger):
             named = self._simulator.named_danger
             danger = None if named is None or math.isnan(named) else min(max(named, 0.0), 1.0)
-        return replace(result, closest=closest, danger=danger)
+        driven = self._driven
+        return replace(
+            result, closest=closest, danger=danger, driven_m=driven.driven_m, driven_s=driven.driven_s,
+            step_length_s=driven.step_length_s,
+        )  # fmt: skip
 
     def _take_in(self) -> None:
         frames = self._take_frames()
         self._waiting += frames
         self._dangers.add(frames)
+        self._driven.add(frames)
 
     def _measure(self) -> None:
         waiting, self._waiting = self._waiting, []
@@ -253,7 +260,7 @@ class Recorder(Observer):
         self._same: dict[int, int] = {}
         self._kept: list[Actor] = []
         self._roster: Roster | None = None
-        # Where nobody looks for events, none having happened says nothing.
+        # Without detection of events, a count of 0 would be misleading.
         self._events: Counter[str] | None = Counter() if supports(simulator, TellsEvents) else None
         # Called in every step: without a call in between.
         self.observation = box.observation  # type: ignore[assignment, method-assign]
@@ -322,7 +329,7 @@ class Recorder(Observer):
                 if number is None:
                     actor, free = actors[row], len(known)
                     numbers[row] = self._same[id(actor)] = known.setdefault(actor, free)
-                    self._kept.append(actor)  # so that nobody else gets its identity
+                    self._kept.append(actor)  # so that no other actor gets its id()
                     if len(known) > free:
                         fresh.append(actor)
             if fresh:

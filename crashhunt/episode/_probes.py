@@ -1,7 +1,7 @@
-"""Probes: every so often, copies of a running episode are asked how little it would take for it to crash.
+"""Robustness probes: at intervals, forks of a running episode search the minimal disturbance that causes a crash.
 
-Each copy goes on with a disturbance, and is over after some seconds. Only what is milder than the mildest that has made
-the trial crash so far is asked for, so that most questions need one copy.
+Each fork continues with one disturbance and ends after some seconds. Only disturbances milder than the mildest known
+crash are tried, so most questions need one fork.
 """
 
 from __future__ import annotations
@@ -82,30 +82,30 @@ class Probed:
         Args:
             share: how much of it, from 0 to 1.
             who: which of the places.
-            agent: around whom.
+            agent: The agent at the centre of the grid.
             step: in which it begins.
         """
         strong = self.least + share * (self.most - self.least) if self.grade == "strength" else self.most
         long = share * self.how_long if self.grade == "length" else self.how_long
         strong, long = round(strong, _DIGITS), round(long, _DIGITS)  # of 3 steps of 0.1 s, 0.3 s
-        return Disturbance(step, who, self.what, strong, long, agent)
+        return Disturbance(step=step, who=who, what=self.what, how_strong=strong, how_long=long, agent=agent)
 
 
 _ANY_SIDE = ("left ahead", "right ahead", "left", "right")
 
 PROBED: Final = (
-    Probed("brake", ("ahead",), 6.0, 3.0),
-    Probed("stop", ("ahead",), 6.0, 8.0),
-    Probed("late_action", ("itself",), 1.0, 3.0),
-    Probed("late_observation", ("itself",), 1.0, 3.0),
-    Probed("noisy_observation", ("itself",), 0.2, 3.0),
-    Probed("cut_in", _ANY_SIDE, 0.0, 4.0, grade="whether"),
-    Probed("unseen", ("ahead", *_ANY_SIDE), 1.0, 4.0, grade="length"),
-    Probed("ignore_priority", _ANY_SIDE, 1.0, 5.0, grade="length"),
-    Probed("late_merge", _ANY_SIDE, 5.0, 10.0, least=50.0),
-    Probed("step_out", ("right ahead", "left ahead"), 1.4, 6.0, grade="whether"),
-    Probed("dawdle", ("ahead",), 0.5, 10.0),
-    Probed("speed", ("behind",), 0.5, 10.0),
+    Probed(what="brake", who=("ahead",), most=6.0, how_long=3.0),
+    Probed(what="stop", who=("ahead",), most=6.0, how_long=8.0),
+    Probed(what="late_action", who=("itself",), most=1.0, how_long=3.0),
+    Probed(what="late_observation", who=("itself",), most=1.0, how_long=3.0),
+    Probed(what="noisy_observation", who=("itself",), most=0.2, how_long=3.0),
+    Probed(what="cut_in", who=_ANY_SIDE, most=0.0, how_long=4.0, grade="whether"),
+    Probed(what="unseen", who=("ahead", *_ANY_SIDE), most=1.0, how_long=4.0, grade="length"),
+    Probed(what="ignore_priority", who=_ANY_SIDE, most=1.0, how_long=5.0, grade="length"),
+    Probed(what="late_merge", who=_ANY_SIDE, most=5.0, how_long=10.0, least=50.0),
+    Probed(what="step_out", who=("right ahead", "left ahead"), most=1.4, how_long=6.0, grade="whether"),
+    Probed(what="dawdle", who=("ahead",), most=0.5, how_long=10.0),
+    Probed(what="speed", who=("behind",), most=0.5, how_long=10.0),
 )
 """All that come with crashhunt, as strong and as long as the models draw them at most."""
 
@@ -175,7 +175,7 @@ class Prober:
             return
         try:
             asked = self._questions_at(episode)
-            turn = self._moment % max(1, len(asked))  # where the budget does not last, others are left out each time
+            turn = self._moment % max(1, len(asked))  # if the budget is too small, each moment skips other questions
             self._moment += 1
             for question in asked[turn:] + asked[:turn]:
                 if self._questions.is_over:
@@ -198,7 +198,7 @@ class Prober:
         return self._stress.steps >= self._budget * episode.steps
 
     def _questions_at(self, episode: Episode) -> list[_Question]:
-        """What there is to ask: where somebody is who might err. That is looked up in a copy, too."""
+        """Return the questions with a target vehicle, which is looked up in a fork as well."""
         simulator = episode.simulator
         kinds = simulator.disturbing_kinds if supports(simulator, SupportsDisturbances) else ()
         every = [
@@ -240,7 +240,7 @@ class Prober:
                 may_be_asked_again=may_be_answered,
             )
         elif not stress.probes:
-            return result  # nobody was asked, which says nothing
+            return result  # no probe could run, so there is no result
         return replace(result, stress=stress)
 
     def _mildest(self, episode: Episode, question: _Question) -> bool:
@@ -282,7 +282,7 @@ class Prober:
             while copy.result is None and copy.steps < began + horizon:
                 copy.step()
                 if disturbance is not None and copy.steps == disturbance.step and not copy.takes_place(disturbance):
-                    break  # nobody was there
+                    break  # no vehicle was at the place
             outcome = str(copy.result.outcome) if copy.result is not None else ""
             return {"steps": copy.steps - began, "step": copy.steps, "outcome": outcome}
 

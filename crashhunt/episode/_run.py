@@ -81,13 +81,13 @@ def run_episode(
         make_agent: called with agent id, simulator and arguments; returns the agent at the wheel.
         box: what records it; `BlackBox.begin` has been called.
         oracles: what decides whether a step is a crash.
-        crash_on: what ends the episode; a traffic crash or event of another kind is recorded, and the episode goes on.
-        observers: who else is told; after the recorder.
+        crash_on: The outcomes that end the episode; other traffic crashes and events are only recorded.
+        observers: Further observers, called after the recorder.
         reset: what resets the simulator, where it is not the simulator itself.
         prober: asks copies of it how little it would take for a crash.
         first_copy: sees at once whether there can be copies.
-        brancher: has copies of it go on with other disturbances where somebody is near.
-        forcer: makes copies with a forced first onset, where the trial is a root.
+        brancher: Runs forks with other disturbances where another actor is near.
+        forcer: Makes forks with a forced first onset; None if the trial is not a root.
 
     Returns:
         The result. Whatever agent or simulator raise is in it.
@@ -153,7 +153,7 @@ def generators() -> tuple[Any, ...]:
 
 
 def set_generators(state: tuple[Any, ...]) -> None:
-    """Have the generators of the process go on where they were."""
+    """Restore the state of the process's random generators."""
     random.setstate(state[0])
     np.random.set_state(state[1])  # noqa: NPY002
     if state[2] is not None:
@@ -201,7 +201,7 @@ class Parts:
         self._oracles = [parse_oracle(text) for text in settings.oracles]
 
     def oracles(self) -> list[Oracle]:
-        """Make the oracles of a trial; what one remembers of a trial is nobody's business in the next."""
+        """Return new oracles for a trial, because oracles may keep state."""
         return [choice.make() for choice in self._oracles]
 
     def load(self, report: Callable[[str], None] = lambda _: None) -> None:
@@ -211,8 +211,8 @@ class Parts:
         first episode: so it holds in every one of them, whichever comes first.
 
         Args:
-            report: called before each import with the error if it does not return, as "the module 'm' cannot be
-                imported": an import that hangs or ends the process cannot report that itself.
+            report: Called before each import with the error to show if the import does not return, such as "the module
+                'm' cannot be imported". An import that hangs or ends the process cannot report that itself.
 
         Raises:
             CrashhuntError: something cannot be imported.
@@ -290,7 +290,7 @@ def seal(settings: WorkerSettings) -> None:
         return
     home = settings.scratch / "home"
     home.mkdir(exist_ok=True)
-    os.chdir(home)  # where SUMO writes what nobody has said where to write
+    os.chdir(home)  # SUMO writes files with relative paths to the working directory
     os.environ |= {"HOME": str(home), "TMPDIR": str(home)}
     confine(settings.scratch, [settings.scenario.folder, *settings.sealed])
 

@@ -42,7 +42,7 @@ class WorkerSettings:
         crash_on: the outcomes that end a trial as a crash.
         scratch: the folder in which workers keep black boxes and output while trials run.
         code: folders whose modules win over installed ones, the first one first: the snapshot. Empty for none.
-        argument_files: the value of an argument that names a file, to the file of the snapshot that stands for it.
+        argument_files: The file of the snapshot for each argument value that names a file.
         timeout_s: wall-clock limit of a trial, in s.
         keep_trials: whether the scratch folder of every trial is kept, not of crashes only.
         sealed: of a stranger's crash, what the process may read besides what is installed and its scratch folder,
@@ -54,10 +54,8 @@ class WorkerSettings:
         warm_copies: for how many traffics a worker of a pool keeps a warmed-up copy of itself; 0 for none.
         probe_s: how often copies of a trial are asked how little it would take for a crash, in s of simulation time; 0
             for never.
-        branch: how often what disturbs copies that go on otherwise where somebody is near, ``NAME=RATE``
-            each; empty for no such copies.
-        force: the rates of disturbances of copies with a forced first onset, ``NAME=RATE`` each; empty for no such
-            copies.
+        branch: The rates of disturbances in branches, ``NAME=RATE`` each; empty for no branches.
+        force: The rates of disturbances of forks with a forced first onset, ``NAME=RATE`` each; empty for none.
     """
 
     scenario: Scenario
@@ -121,7 +119,7 @@ class WorkerSettings:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> WorkerSettings:
-        """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default.
+        """Return the settings from the data of `to_json` of any version; unknown keys are ignored.
 
         Raises:
             CrashhuntError: a crashhunt of another version wrote it, and it needs what this one does not know.

@@ -46,8 +46,8 @@ class HuntFigures:
         median_time_to_collision_s: of the trials without a crash, the least of each; infinite where most never were
             on a collision course.
         outcomes: how many trials ended how, invalid ones too; of all trials.
-        counted: the origin of the trials that all other figures are of, where the hunt guided the rest of them: only
-            of these does it say something how often they crash. Empty where it is all trials.
+        counted: the origin of the trials that all other figures are of, if the hunt guided the rest of its trials. Only
+            unguided trials show a crash rate. Empty if all trials count.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
     """
 
@@ -77,7 +77,7 @@ class Pair:
         only_first: pairs in which only the first crashed.
         only_second: pairs in which only the second did.
         both: in which both did.
-        p_value: that neither crashes more often; 1 where nothing tells them apart.
+        p_value: that neither crashes more often; 1 where they do not differ.
         caution: why the answer may mean something else; empty for nothing.
         test: which test it is of: ``mcnemar``, the exact one over pairs; ``fisher``, the exact one over all trials of
             each; empty where there is none.
@@ -219,19 +219,19 @@ def _figures(hunt: HuntResults, table: NDArray[np.void]) -> HuntFigures:
         found = binomtest(crashes, len(valid)).proportion_ci(_CONFIDENCE, "exact")
         interval = (float(found.low), float(found.high))
     return HuntFigures(
-        str(hunt.directory),
-        hunt.state.state,
-        {agent: chosen.agent for agent, chosen in hunt.settings.agents.items()},
-        len(valid),
-        crashes,
-        crashes / len(valid) if len(valid) else float("nan"),
-        interval,
-        why_not if len(valid) else "there is no valid trial",
-        float(np.median(crashed["steps"])) if crashes else float("nan"),
-        float(np.median(fine["ttc"])) if len(fine) else float("nan"),
-        hunt.state.outcomes,
-        hunt.plain_origin,
-        _disturbed(hunt, set(crashed["number"].tolist())) if hunt.settings.disturb else None,
+        dir=str(hunt.directory),
+        state=hunt.state.state,
+        agents={agent: chosen.agent for agent, chosen in hunt.settings.agents.items()},
+        trials=len(valid),
+        crashes=crashes,
+        crash_rate=crashes / len(valid) if len(valid) else float("nan"),
+        interval=interval,
+        why_not=why_not if len(valid) else "there is no valid trial",
+        median_steps_to_crash=float(np.median(crashed["steps"])) if crashes else float("nan"),
+        median_time_to_collision_s=float(np.median(fine["ttc"])) if len(fine) else float("nan"),
+        outcomes=hunt.state.outcomes,
+        counted=hunt.plain_origin,
+        disturbed=_disturbed(hunt, set(crashed["number"].tolist())) if hunt.settings.disturb else None,
     )
 
 
@@ -274,17 +274,17 @@ def _pair(first: HuntResults, left: NDArray[np.void], second: HuntResults, right
 
         p_value = float(binomtest(only_first, only_first + only_second).pvalue)
     return Pair(
-        str(first.directory),
-        str(second.directory),
-        int(same.sum()),
-        only_first,
-        only_second,
-        int((a & b).sum()),
-        p_value,
-        _caution(first, second),
-        test,
-        why_not,
-        totals,
+        first=str(first.directory),
+        second=str(second.directory),
+        trials=int(same.sum()),
+        only_first=only_first,
+        only_second=only_second,
+        both=int((a & b).sum()),
+        p_value=p_value,
+        caution=_caution(first, second),
+        test=test,
+        why_unpaired=why_not,
+        counts=totals,
     )
 
 

@@ -15,6 +15,7 @@ from ._protocol import (
     NodeFigures as NodeFigures,
     SizesItself as SizesItself,
     make_executor as make_executor,
+    run_trials as run_trials,
 )
 from ._supervisor import Supervisor as Supervisor
 from ._trial_process import LEFT_OUT as LEFT_OUT

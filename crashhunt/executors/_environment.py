@@ -21,8 +21,8 @@ _KEPT_SNAPSHOTS = 16  # of which compiled code is kept; some 3 MB each
 def worker_environment() -> dict[str, str]:
     """Return the environment variables that make a worker's results depend on its trial alone.
 
-    Hashes of strings are fixed, and every library that would start a thread a core keeps to one: with a worker on
-    every core, more would only get in each other's way, and sums in parallel are not reproducible to the bit.
+    Hashes of strings are fixed, and libraries use a single thread. With a worker on every core, more threads would
+    compete for the cores. Parallel sums are also not bit-identical from run to run.
     """
     names = (
         "OMP_NUM_THREADS",

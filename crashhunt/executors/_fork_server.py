@@ -309,5 +309,5 @@ def _ignore_signals() -> None:
 
 
 def _send(control: socket.socket, message: FromForkServer | ErrorData) -> None:
-    with suppress(OSError):  # nobody is there any more, which is seen elsewhere
+    with suppress(OSError):  # the receiver has ended, which is detected elsewhere
         control.send(json.dumps(message).encode())

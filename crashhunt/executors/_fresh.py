@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.errors import CrashhuntError, WorkerError
 from crashhunt.base.processes import children_of
 from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import describe_death, is_sent_from_outside
@@ -27,7 +27,7 @@ from crashhunt.executors._environment import has_fork_server, snapshot_environme
 from crashhunt.executors._fork_server import fork_zygote
 from crashhunt.executors._pool import PoolExecutor
 from crashhunt.executors._postmortem import Attempt, damaged, hung, result_of_death, where_it_is
-from crashhunt.executors._protocol import Notes
+from crashhunt.executors._protocol import Notes, run_trials
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError, with_escape
 from crashhunt.executors._time_limits import START_UP_S, ImportKilledError, has_hung, import_died
 from crashhunt.trial import TrialResult, TrialSpec
@@ -90,7 +90,7 @@ class FreshProcessExecutor:
             time.sleep(_LOOK_EVERY_S)
 
     def cancel(self, *, above: int = -1) -> None:
-        """Give up all trials whose number is greater than ``above``, at once."""
+        """Cancel all trials whose number is greater than ``above``, at once."""
         self._waiting = deque(attempt for attempt in self._waiting if attempt.spec.number <= above)
         for number in [number for number in self._running if number > above]:
             self._running.pop(number).kept.end()
@@ -101,7 +101,7 @@ class FreshProcessExecutor:
         return {number: header for number, header in found.items() if header is not None}
 
     def notes(self) -> list[str]:
-        """Return what people should be told that has not been returned before."""
+        """Return new notices for the user."""
         return self._notes.fresh()
 
     def close(self) -> None:
@@ -134,7 +134,7 @@ class FreshProcessExecutor:
                     stdout=subprocess.DEVNULL,
                     stderr=log,
                 )
-            self._running[number] = _Running(attempt, kept, answer, time.monotonic())
+            self._running[number] = _Running(attempt=attempt, kept=kept, answer=answer, began=time.monotonic())
 
     def _look(self, number: int) -> TrialResult | None:
         running = self._running[number]
@@ -168,7 +168,7 @@ class FreshProcessExecutor:
             if exit_code > 0 and where_it_is(scratch, spec.number) is None:
                 log = self._log(spec.number)
                 lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-                raise CrashhuntError(
+                raise WorkerError(
                     f"the process of trial {spec.number} could not start: {lines[-1] if lines else exit_code}",
                     fix="read the whole message there",
                     where=str(log),
@@ -187,7 +187,7 @@ class FreshProcessExecutor:
         for file in (running.answer, self._job(spec.number), self._log(spec.number)):
             file.unlink(missing_ok=True)  # a hunt has a million trials
         if "error" in answer:
-            raise CrashhuntError.from_json(answer)
+            raise WorkerError.from_json(answer)
         if "lost" in answer:
             return self._again(running, answer["lost"], answer.get("importing", ""))
         result = TrialResult.from_json(answer["result"])
@@ -272,7 +272,7 @@ _STOP_CHECK_INTERVAL_S = 0.1  # how late a request to stop may be
 def snapshot_executor(settings: WorkerSettings, *, parallel: int = 1) -> Executor:
     """Return an executor that runs trials with the code of a snapshot, crashhunt itself included.
 
-    Snapshots of crashhunt 0.1.0 and before have no fork server: with them, every trial starts Python anew.
+    Snapshots of crashhunt 0.1.0 and before have no fork server: with them, every trial starts a new Python process.
     """
     if has_fork_server(settings):
         return PoolExecutor(settings, parallel=parallel, snapshot=True)
@@ -288,12 +288,8 @@ def run_alone(
         CrashhuntError: it cannot be run.
     """
     with closing(FreshProcessExecutor(settings)) as executor:
-        executor.submit(spec)
-        while True:
-            for result in executor.completed(_STOP_CHECK_INTERVAL_S):
-                return result
-            if stopped():
-                return None
+        runs = run_trials(executor, [spec], stopped=stopped, check_every_s=_STOP_CHECK_INTERVAL_S)
+        return next((result for _, result in runs), None)
 
 
 class SharedExecutors:
@@ -340,8 +336,8 @@ class SharedExecutors:
 class _Shared:
     """An executor of which each thread waits for its own trial.
 
-    A trial that was stopped may still be running when the same one is asked for again, so that each run gets a number
-    of its own, by which its folder is called.
+    A cancelled trial may still run when the same trial is submitted again. Therefore each run has its own number,
+    which is the name of its folder.
     """
 
     def __init__(self, executor: Executor, scratch: Path) -> None:

@@ -40,7 +40,7 @@ __all__ = ["ForkServerLink", "PoolExecutor"]
 # The pool's end of its fork server: how it is started, asked for supervisors, and listened to.
 
 _MESSAGE = 1 << 16  # bytes, as in _fork_server
-_DEATHS = 3  # in a row, without a trial between them, before the pool gives up
+_DEATHS = 3  # in a row, without a trial between them, before the pool stops
 _END_S = 5.0  # for the template to say why it ended
 _FROM_OUTSIDE = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL)
 _numbers = itertools.count()
@@ -122,8 +122,8 @@ class ForkServerLink:
             self.unfit = self.unfit or "unfit" in message
             self._importing = message.get("importing", self._importing)
 
-    def anew(self) -> ForkServerLink:
-        """Start another one in its place, after its end.
+    def restart(self) -> ForkServerLink:
+        """Start a new one in its place, after its end.
 
         Raises:
             CrashhuntError: it has ended by itself, or too often.
@@ -233,7 +233,7 @@ class PoolExecutor:
                 found = self._done.get_nowait()
 
     def cancel(self, *, above: int = -1) -> None:
-        """Give up all trials whose number is greater than ``above``, at once."""
+        """Cancel all trials whose number is greater than ``above``, at once."""
         with self._lock:
             self._waiting = deque(attempt for attempt in self._waiting if attempt.spec.number <= above)
             for worker in self._workers.values():
@@ -259,7 +259,7 @@ class PoolExecutor:
         return {number: header for number, header in found.items() if header is not None}
 
     def notes(self) -> list[str]:
-        """Return what people should be told that has not been returned before."""
+        """Return new notices for the user."""
         return self._notes.fresh()
 
     def close(self) -> None:
@@ -362,7 +362,7 @@ class PoolExecutor:
         """Account for what a supervisor says about its trial."""
         attempt = worker.attempt
         if attempt is None:
-            return  # it was given up meanwhile
+            return  # it was cancelled meanwhile
         answer: Answer = json.loads(line)
         if "error" in answer:
             raise CrashhuntError.from_json(answer)
@@ -405,7 +405,7 @@ class PoolExecutor:
         self._selector.unregister(self._link.control)
         if not self._link.unfit:
             self._notes.add("the process that starts the workers was killed from outside, and was started again")
-        self._link = self._link.anew()
+        self._link = self._link.restart()
         self._selector.register(self._link.control, selectors.EVENT_READ)
 
     def _ended(self, slot: int, exit_code: int) -> None:
@@ -414,7 +414,7 @@ class PoolExecutor:
             return
         self._hear(worker)  # what it said before it ended
         self._discard(worker)
-        if worker.attempt is not None:  # an agent has killed it, or somebody from outside
+        if worker.attempt is not None:  # an agent or another process has killed it
             self._end_attempt(worker.attempt, exit_code if exit_code < 0 else -signal.SIGKILL)
 
     def _end_attempt(self, attempt: Attempt, exit_code: int) -> None:

@@ -19,7 +19,7 @@ from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import scratch_of
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, Tag, digest_of, read_black_box, read_header
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, in_effect
-from crashhunt.world import ClosestApproach, DangerMeter, Lane, closest_approach
+from crashhunt.world import ClosestApproach, DangerMeter, DrivenMeter, Lane, closest_approach
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -188,6 +188,7 @@ def _result(
     stack = read_tail(folder / layout.STACK)
     steps, sim_time_s, digest, closest = 0, 0.0, "", ClosestApproach()
     danger: float | None = None
+    driven = DrivenMeter((), 1.0)
     phase = header.phase if header is not None else Phase.SETUP
     try:
         recording = Recording(read_black_box(folder / layout.BLACK_BOX)) if header is not None else None
@@ -206,8 +207,11 @@ def _result(
         steps, sim_time_s, digest = recording.steps, scenes[-1].time_s, recording.digest
         closest = closest_approach(scenes, recording.agents)
         meter = DangerMeter(recording.agents, recording.prologue.step_length_s)
-        meter.add([scene.frame for scene in scenes])
+        frames = [scene.frame for scene in scenes]
+        meter.add(frames)
         danger = meter.danger
+        driven = DrivenMeter(recording.agents, recording.prologue.step_length_s)
+        driven.add(frames)
         if outcome is Outcome.AGENT_ERROR:
             agent = recording.agents[0] if len(recording.agents) == 1 else ""
         elif header is not None and phase == Phase.ACT:
@@ -220,7 +224,7 @@ def _result(
             agent = agent_in_stack(stack, agents or {})
             whose = f"{agent}'s code" if agent else "the simulator"
             message = f"{message} in {whose} at step {steps + 1}"
-    failure = Failure(kind, message, stack, agent, exit_code, output)
+    failure = Failure(kind=kind, message=message, traceback=stack, agent=agent, exit_code=exit_code, last_output=output)
     wall_s = time.monotonic() - header.started if header is not None else 0.0
     result = TrialResult(
         spec,
@@ -235,6 +239,9 @@ def _result(
         worker=header.pid if header is not None else 0,
         kept=folder.is_dir(),
         setup_steps=(header.setup_steps or None) if header is not None else None,
+        driven_m=driven.driven_m,
+        driven_s=driven.driven_s,
+        step_length_s=recording.prologue.step_length_s if recording is not None and scenes else None,
     )
     return in_effect(result, recording.disturbances if recording is not None else ())
 

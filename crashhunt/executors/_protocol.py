@@ -13,7 +13,7 @@ from crashhunt.base.json_types import ErrorData, ErrorWords
 from crashhunt.plans import SizesItself, executor_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
@@ -39,6 +39,7 @@ __all__ = [
     "SizesItself",
     "ToForkServer",
     "make_executor",
+    "run_trials",
 ]
 
 
@@ -49,17 +50,17 @@ class Executor(Protocol):
     that dies or hangs costs exactly its own trial. Trials begin in the order in which they were submitted. A trial
     whose process was killed from outside is run again, alone; after three kills at different steps it is invalid.
 
-    What a trial has written is wanted only where its result says ``kept``: then, before the result comes back, the
-    folder ``scratch_of(settings.scratch, number)`` of this machine has its black box and output, and it or
-    ``settings.scratch`` the map, where the simulator has one. Whoever runs trials on another machine brings nothing
-    else back.
+    The files of a trial are needed only if its result has ``kept``. Then, before the result is returned, the folder
+    ``scratch_of(settings.scratch, number)`` of this machine must have its black box and output. That folder or
+    ``settings.scratch`` must have the map, if the simulator has a map. An executor on another machine returns no other
+    files.
     """
 
     @property
     def capacity(self) -> int:
         """How many trials run at a time, now. The hunt hands over more than that, so that no worker waits for it.
 
-        It may change, and is 1 at least: where nobody runs any for a while, the hunt waits for what it has handed over.
+        It may change, and is at least 1: if no machine is available for a while, the hunt waits for submitted trials.
         """
 
     def submit(self, spec: TrialSpec) -> None:
@@ -73,13 +74,13 @@ class Executor(Protocol):
         """
 
     def cancel(self, *, above: int = -1) -> None:
-        """Give up all trials whose number is greater than ``above``, running or not, at once."""
+        """Cancel all trials whose number is greater than ``above``, running or not, at once."""
 
     def where(self) -> Mapping[int, BlackBoxHeader]:
-        """Return how far running trials are, by number, for people who watch; empty where nobody knows."""
+        """Return the progress of running trials, by number, for the status screen; empty where it is unknown."""
 
     def notes(self) -> list[str]:
-        """Return what people should be told of how trials were run, and has not been returned before."""
+        """Return new notices for the user on how trials were run."""
 
     def close(self) -> None:
         """Stop every process, whatever it is doing. May be called twice."""
@@ -110,7 +111,7 @@ class HasNodes(Protocol):
 
 
 class ExecutorFactory(Protocol):
-    """What ``--executor NAME`` stands for: makes an executor of a hunt.
+    """The factory of ``--executor NAME``: makes the executor of a hunt.
 
     With ``--executor NAME:ARG``, it is called with ``argument=ARG`` as well; one that takes none may leave that out.
     It raises a `CrashhuntError` with the fix where no trial could run, before it has started anything. See also
@@ -214,7 +215,7 @@ class FromZygote(TypedDict, total=False):
     notices: list[str]
 
 
-# What people should be told of how trials were run: each thing once.
+# Notices for the user on how trials were run: each notice once.
 
 
 class Notes:
@@ -230,14 +231,14 @@ class Notes:
         self._told = 0
 
     def add(self, note: str) -> None:
-        """Have something told, unless it was before."""
+        """Add a notice, unless it was added before."""
         self._all[note] = None
 
     def fresh(self) -> list[str]:
         """Return what has not been returned before."""
         with suppress(OSError):
-            told = self._file.read_text(encoding="utf-8", errors="replace")
-            self._all |= dict.fromkeys(told.splitlines())
+            text = self._file.read_text(encoding="utf-8", errors="replace")
+            self._all |= dict.fromkeys(text.splitlines())
         fresh = list(self._all)[self._told :]
         self._told += len(fresh)
         return fresh
@@ -258,6 +259,53 @@ def make_executor(word: str, settings: WorkerSettings, *, parallel: int, recycle
         made: Executor = factory(settings, parallel=parallel, recycle_after=recycle_after)
     except CrashhuntError:
         raise
-    except Exception as error:  # somebody's own
+    except Exception as error:  # code of the user
         raise blamed(f"the executor {word!r} cannot be made", error) from error
     return made
+
+
+# Trials of one caller, from the first to the last.
+
+_STOP_CHECK_INTERVAL_S = 0.5
+
+
+def run_trials(
+    executor: Executor,
+    specs: Sequence[TrialSpec],
+    *,
+    stopped: Callable[[], bool] = lambda: False,
+    needed: Callable[[int], bool] = lambda _: True,
+    check_every_s: float = _STOP_CHECK_INTERVAL_S,
+) -> Iterator[tuple[int, TrialResult]]:
+    """Yield the place among the specifications and the result of each trial, as the trials end.
+
+    Trials that have not ended when the caller stops asking are cancelled.
+
+    Args:
+        executor: runs the trials, and no others meanwhile.
+        specs: of the trials, in ascending order of their numbers.
+        stopped: called before each wait for results, so at least once; True ends the loop, and it may raise.
+        needed: whether the trial at a place is still needed, asked after each result. Where a trial is not, the trials
+            after it are not either.
+        check_every_s: the longest time between two calls of ``stopped``, in s of wall time.
+
+    Raises:
+        CrashhuntError: no trial can be run, for a reason that has nothing to do with it.
+    """
+    places = {spec.number: place for place, spec in enumerate(specs)}
+    try:
+        for spec in specs:
+            executor.submit(spec)
+        while places and not stopped():
+            for result in list(executor.completed(check_every_s)):
+                place = places.pop(result.spec.number, None)
+                if place is None:
+                    continue  # cancelled, here or by an earlier caller
+                yield place, result
+                needless = [number for number, other in places.items() if not needed(other)]
+                if needless:
+                    executor.cancel(above=min(needless) - 1)
+                    places = {number: other for number, other in places.items() if number < min(needless)}
+    finally:
+        if places:
+            executor.cancel()

@@ -394,7 +394,7 @@ _FIRST_NUMBER = 1 << 40  # beyond the numbers of a hunt's trials: each trial has
 
 
 def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) -> TrialResult:
-    """Return the result of a trial with its last escape, where the settings ask for that and it can be told.
+    """Return the result of a trial with its last escape, if the settings request it and it can be determined.
 
     Args:
         supervisor: which has run the trial.

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 __all__ = ["LEFT_OUT", "Job", "TrialProcess", "loaded"]
 
 LEFT_OUT = " are left out: "
-"""Stands in a notice between probes or branches, and why there are none of them."""
+"""Text of a notice between "probes" or "branches" and the reason why they are disabled."""
 _FROM_HERE_ON = " are left out from here on: "
 
 # Bound here, before any agent is imported that could replace them.
@@ -62,7 +62,7 @@ _dumps, _leave, _open, _dup2, _close = json.dumps, os._exit, os.open, os.dup2, o
 class Job(TypedDict):
     """What the process of a trial is given.
 
-    ``folder`` is that of the trial, whose black box has ``reserved`` bytes; ``key`` is for its report, in hexadecimal.
+    ``folder`` is that of the trial. Its black box has ``reserved`` bytes. ``key`` is for its report, in hexadecimal.
     ``wants_map`` asks for the map in any case, ``tries_copy`` for whether the trial can be copied.
     """
 
@@ -126,7 +126,7 @@ class TrialProcess:
         """Record which files and memory the processes of trials need to have their own.
 
         Returns:
-            What they have in common all the same, in words; empty for nothing.
+            The resources that they share nevertheless, in words; empty for nothing.
         """
         self._shared = SharedState(known={0, 1, 2, self._stack.fileno()})
         return self._shared.remaining
@@ -191,7 +191,7 @@ class TrialProcess:
             box.announce_no_room()
             return 0
         finally:
-            if os.getpid() != self._pid:  # an agent has forked, and this is the copy, which has come to its end
+            if os.getpid() != self._pid:  # this is a fork that an agent made, and it has ended
                 _leave(0)
         block_signals()  # whose handlers are those of agents, and the episode is over
         for asks, what in self._asking:

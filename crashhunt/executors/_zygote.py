@@ -145,7 +145,7 @@ class WarmTraffics:
         finally:
             os.close(wakes)
             os.close(says)
-        made = self._suspended[key] = _Suspended(pid, ours, theirs, self._trials)
+        made = self._suspended[key] = _Suspended(pid=pid, asks=ours, says=theirs, used=self._trials)
         said = made.ask(b"", wait)
         if said is not None and said.get("took_s", 0.0) >= self._worth_s:
             return made

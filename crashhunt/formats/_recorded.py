@@ -65,12 +65,12 @@ class Way:
         half = self.path.actor.length / 2
         return [
             Pose(
-                step,
-                state.x - half * math.cos(state.heading),
-                state.y - half * math.sin(state.heading),
-                state.z - half * state.grade,
-                math.remainder(state.heading, math.tau) if abs(state.heading) > math.pi else state.heading,
-                state.speed,
+                step=step,
+                x=state.x - half * math.cos(state.heading),
+                y=state.y - half * math.sin(state.heading),
+                z=state.z - half * state.grade,
+                heading=math.remainder(state.heading, math.tau) if abs(state.heading) > math.pi else state.heading,
+                speed=state.speed,
             )
             for step, state in enumerate(self.path.states, self.path.first)
         ]
@@ -156,13 +156,13 @@ def recorded_of(bundle: Bundle) -> Recorded:
     ways = [Way(path, name) for path, name in zip((*paths.agents, *paths.others), names, strict=True)]
     spec, count = bundle.result.spec, len(paths.agents)
     return Recorded(
-        f"{bundle.id}, trial {spec.number} with seed {spec.seed}: {bundle.result.outcome}",
-        spec.number,
-        recording.prologue.step_length_s,
-        paths.steps,
-        tuple(ways[:count]),
-        tuple(ways[count:]),
-        _roads(lanes),
+        title=f"{bundle.id}, trial {spec.number} with seed {spec.seed}: {bundle.result.outcome}",
+        number=spec.number,
+        step_length_s=recording.prologue.step_length_s,
+        steps=paths.steps,
+        agents=tuple(ways[:count]),
+        others=tuple(ways[count:]),
+        roads=_roads(lanes),
     )
 
 

@@ -16,13 +16,20 @@ if TYPE_CHECKING:
 
 __all__ = ["SECTIONS", "Page", "completed", "find_page", "for_terminal", "list_pages", "pages_folder"]
 
-SECTIONS = {"tutorials": "Tutorials", "howto": "How to", "reference": "Reference", "": "More"}
+SECTIONS = {
+    "tutorials": "Tutorials",
+    "howto": "How to",
+    "reference": "Reference",
+    "reference/evaluation": "Evaluation",
+    "": "More",
+}
 """The folders of the guide with their titles, in reading order."""
 
 _ORDER = [
     "first-hunt", "your-town", "highway-env", "gymnasium", "ci",
-    "agent", "scenario", "searching", "look-into-a-crash", "kinds-of-crashes", "judge", "fault", "film", "hand-over",
-    "suites", "cluster", "compare", "train",
+    "agent", "scenario", "searching", "disturbances", "probes", "branches", "look-into-a-crash", "kinds-of-crashes",
+    "fault", "judge", "causes", "what-if", "shrink", "film", "near-misses", "hand-over", "corpus", "suites", "warm-up",
+    "cluster", "rate", "compare", "train",
     "commands", "api", "toml", "outcomes", "files", "json", "determinism", "security",
     "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
@@ -70,7 +77,9 @@ def list_pages() -> list[Page]:
     found = []
     for section in SECTIONS:
         files = [file for file in (pages_folder() / section).glob("*.md") if file.stem != "index"]
-        found += [Page(file.stem, section, _title(file), file) for file in sorted(files, key=_place)]
+        found += [
+            Page(topic=file.stem, section=section, title=_title(file), file=file) for file in sorted(files, key=_place)
+        ]
     return found
 
 

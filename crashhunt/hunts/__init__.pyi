@@ -3,11 +3,11 @@ from ._hunt import Hunt as Hunt
 from ._next_trials import Trials as Trials, spec_of as spec_of
 from ._preflight import Preflight as Preflight, TrafficSurveyor as TrafficSurveyor
 from ._progress import (
-    HuntReport as HuntReport,
     HuntStatus as HuntStatus,
     SearchStatus as SearchStatus,
     StrategyStatus as StrategyStatus,
 )
+from ._reports import HuntReport as HuntReport
 from ._results import (
     FACTS as FACTS,
     Cell as Cell,

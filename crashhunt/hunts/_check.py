@@ -137,9 +137,11 @@ def _check_file(path: Path) -> Checked:
             found.crashes, found.damaged_crashes = inside.crashes, inside.damaged_crashes
             found.findings += inside.findings
             if not inside.crashes and not inside.damaged_crashes:
-                found.findings.append(Finding(str(path), "there is no crash in it", "the crash", "export it again"))
+                found.findings.append(
+                    Finding(where=str(path), what="there is no crash in it", lost="the crash", fix="export it again")
+                )
     except BundleError as error:
-        found.findings.append(Finding(str(path), error.message, "the crash", error.fix))
+        found.findings.append(Finding(where=str(path), what=error.message, lost="the crash", fix=error.fix))
     return found
 
 
@@ -160,7 +162,7 @@ def _check_settings(found: Checked, hunt: Path) -> HuntSettings | None:
     except HuntDirectoryError as error:
         lost = "what the hunt was asked"
         fix = "copy the hunt.toml of a snapshot there"
-        found.findings.append(Finding(str(hunt / layout.HUNT), error.message, lost, fix))
+        found.findings.append(Finding(where=str(hunt / layout.HUNT), what=error.message, lost=lost, fix=fix))
     for snapshot in intact_snapshots(hunt):
         with suppress(CrashhuntError):
             return snapshot.settings()
@@ -176,7 +178,9 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
     path = _ledger(hunt)
     if not has_begun(path):
         if (hunt / layout.CRASHES).is_dir() and not (hunt / layout.CASE).is_file():
-            found.findings.append(Finding(str(path), "is missing", "all trials but the crashes", _GO_ON))
+            found.findings.append(
+                Finding(where=str(path), what="is missing", lost="all trials but the crashes", fix=_GO_ON)
+            )
         return None
     try:
         with closing(Ledger(path)) as ledger:
@@ -185,7 +189,7 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
                 note = "an earlier crashhunt wrote it, and its rows have no digests: not every change would be seen"
                 found.findings.append(Finding(str(path), note, damaged=False))
             elif not ledger.sealed and hunt_state(hunt).state != "running":
-                note = "whoever wrote it was killed; a trial that is missing would not be seen"
+                note = "its writer was killed; a missing trial would not be detected"
                 found.findings.append(Finding(str(path), note, damaged=False))
             try:
                 _read_everything(ledger)
@@ -200,11 +204,13 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
                     crashes[number] = row[10]
             return {number: TrialResult.from_json(json.loads(text)) for number, text in crashes.items()}
     except HuntDirectoryError as error:
-        found.findings.append(Finding(str(path), error.message, "all trials but the crashes", _GO_ON))
+        found.findings.append(
+            Finding(where=str(path), what=error.message, lost="all trials but the crashes", fix=_GO_ON)
+        )
         return None
 
 
-_GO_ON = "crashhunt check --salvage TO copies what is whole, and the same hunt goes on there"
+_GO_ON = "crashhunt check --salvage TO copies the intact part, and the same hunt resumes there"
 
 
 def _read_everything(ledger: Ledger) -> None:
@@ -225,7 +231,9 @@ def _count_rows(found: Checked, ledger: Ledger, settings: HuntSettings | None, e
     shown = ", ".join(str(number) for number in sorted(found.damaged_trials)[:_SHOWN])
     more = len(found.damaged_trials) - _SHOWN
     lost = f"trials {shown}{f' and {more} more' if more > 0 else ''}" if shown else ""
-    found.findings.append(Finding(error.where, error.message.removeprefix("the ledger is damaged: "), lost, _GO_ON))
+    found.findings.append(
+        Finding(where=error.where, what=error.message.removeprefix("the ledger is damaged: "), lost=lost, fix=_GO_ON)
+    )
 
 
 def _check_parts(found: Checked, hunt: Path) -> dict[str, Bundle]:
@@ -235,8 +243,8 @@ def _check_parts(found: Checked, hunt: Path) -> dict[str, Bundle]:
         bundle = _check_bundle(found, folder)
         if bundle is not None:
             bundles[folder.name] = bundle
-    beside = _check_beside(found, hunt)
-    needed = {bundle.snapshot: bundle.id for bundle in (*beside, *reversed(bundles.values()))}
+    other = _check_other_bundles(found, hunt)
+    needed = {bundle.snapshot: bundle.id for bundle in (*other, *reversed(bundles.values()))}
     there = {path.name for path in (hunt / layout.SNAPSHOTS).glob(layout.SHOWN)}
     for name in sorted(there | needed.keys()):
         _check_snapshot(found, hunt / layout.SNAPSHOTS / name, needed.get(name, ""))
@@ -252,7 +260,9 @@ def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
         faults = bundle.faults()
         bundle.recording()
     except CrashhuntError as error:
-        found.findings.append(Finding(error.where or str(folder), error.message, f"the crash {folder.name}", _AGAIN))
+        found.findings.append(
+            Finding(where=error.where or str(folder), what=error.message, lost=f"the crash {folder.name}", fix=_AGAIN)
+        )
         found.damaged_crashes.append(folder.name)
         return None
     if not bundle.files:
@@ -268,8 +278,8 @@ def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
     return bundle
 
 
-def _check_beside(found: Checked, hunt: Path) -> list[Bundle]:
-    """Near misses, and what probes and branches have found, where they are whole; the ledger has what makes them."""
+def _check_other_bundles(found: Checked, hunt: Path) -> list[Bundle]:
+    """Return the intact bundles of near misses, probes and branches; the ledger can make the damaged ones again."""
     whole = []
     options = {layout.NEAR_MISSES: "--near-misses", layout.PROBES: "--probe", layout.BRANCHES: "--branch"}
     for place, option in options.items():
@@ -301,20 +311,24 @@ def _check_snapshot(found: Checked, path: Path, crash: str) -> None:
     lost = f"replays of {crash} and others by the code that ran" if crash else "the code that ran"
     fix = "get a copy of it from elsewhere; replay --from-log and --code current may do without"
     if not path.is_dir():
-        found.findings.append(Finding(str(path), "is missing", lost, "get a copy of it from elsewhere"))
+        found.findings.append(
+            Finding(where=str(path), what="is missing", lost=lost, fix="get a copy of it from elsewhere")
+        )
         return
     snapshot = Snapshot(path)
     try:
         faults = _snapshot_faults(snapshot)
         for name in snapshot.additions():
-            note = f"{name} was not there; no module, so that it is run by nobody"
+            note = f"{name} was added; it is no module, so it never runs"
             found.findings.append(Finding(str(path), note, damaged=False))
     except CrashhuntError as error:
         faults = [error.message]
     for fault in faults[:_SHOWN]:
-        found.findings.append(Finding(str(path), fault, lost, fix))
+        found.findings.append(Finding(where=str(path), what=fault, lost=lost, fix=fix))
     if len(faults) > _SHOWN:
-        found.findings.append(Finding(str(path), f"and {len(faults) - _SHOWN} more of its files", lost, fix))
+        found.findings.append(
+            Finding(where=str(path), what=f"and {len(faults) - _SHOWN} more of its files", lost=lost, fix=fix)
+        )
 
 
 def _compare(
@@ -329,17 +343,23 @@ def _compare(
         where = str(bundle.path)
         if settings is not None and bundle.hunt_seed != settings.seed:
             what = f"it is of a hunt with seed {bundle.hunt_seed}, and this one has {settings.seed}"
-            found.findings.append(Finding(where, what, "", "put it back to where it is from"))
+            found.findings.append(Finding(where=where, what=what, lost="", fix="put it back to where it is from"))
         elif number not in rows:
             if number not in found.damaged_trials:
                 what = "the ledger has no crash of its trial"
-                found.findings.append(Finding(where, what, "", "run the same command again: the hunt goes on with it"))
+                found.findings.append(
+                    Finding(where=where, what=what, lost="", fix="run the same command again: the hunt resumes with it")
+                )
         elif rows[number].digest != bundle.result.digest or rows[number].outcome is not bundle.result.outcome:
-            found.findings.append(Finding(where, "the ledger says something else about its trial", "", _AGAIN))
+            found.findings.append(
+                Finding(where=where, what="the ledger says something else about its trial", lost="", fix=_AGAIN)
+            )
     for number in sorted(rows.keys() - by_trial.keys() - damaged - found.dropped):
         if hunt_state(found.dir).state != "running":
             what = f"trial {number} crashed, and its bundle is missing"
-            found.findings.append(Finding(str(found.dir / layout.CRASHES), what, "its log and evidence", _AGAIN))
+            found.findings.append(
+                Finding(where=str(found.dir / layout.CRASHES), what=what, lost="its log and evidence", fix=_AGAIN)
+            )
 
 
 def _find_leftovers(found: Checked, hunt: Path) -> None:
@@ -357,7 +377,7 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
         if owner is not None and not has_ended(owner) and not path.name.startswith(_SCRATCH):
             continue  # shrink may be writing it, here or on another host
         remembers = path.name.endswith(f"{layout.SMALL}.jsonl")
-        why = "shrink goes on from it" if remembers else "somebody was killed while writing it"
+        why = "shrink resumes from it" if remembers else "its writer was killed"
         what = f"{why}; it may be removed"
         found.findings.append(Finding(str(path), what, damaged=False))
 
@@ -366,9 +386,9 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
 
 
 def salvage(found: Checked, to: Path) -> dict[str, int]:
-    """Copy what is whole of a hunt, so that it goes on there; return how many trials and crashes that were.
+    """Copy the intact part of a hunt, so that it can resume there; return the number of trials and crashes.
 
-    A crash of which the bundle is damaged is left out with its row, and so its trial runs again.
+    A crash with a damaged bundle is skipped together with its row, so its trial runs again.
 
     Args:
         found: the hunt, as it was found.

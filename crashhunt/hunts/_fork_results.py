@@ -1,13 +1,18 @@
-"""What the branches of trials have found in a hunt, and the likeliest of it run from the start."""
+"""Results of copies: the branches and probes of all trials are summed up, and their crashes run from the start.
+
+A copy shows what may happen. Only a run from the start is a crash, because a bundle of it replays.
+"""
 
 from __future__ import annotations
 
 import math
-import statistics
-from dataclasses import dataclass, replace
+from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.hunts._rare import PrecisionRule, crashed_copies, greatest_weight
+from crashhunt.hunts._reports import BranchReport, ProbeReport, RareReport
 from crashhunt.hunts._state import BRANCHES, PROBES
 from crashhunt.hunts._verification import Found
 from crashhunt.trial import Branches, Stress, in_turn
@@ -15,100 +20,55 @@ from crashhunt.trial import Branches, Stress, in_turn
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from crashhunt.base.codec import JsonObject
-    from crashhunt.crashes import Bundle
     from crashhunt.hunts._next_trials import Trials
     from crashhunt.hunts._progress import Progress
     from crashhunt.hunts._verification import VerificationRuns
-    from crashhunt.trial import Branch, Disturbance, TrialResult
+    from crashhunt.trial import Branch, Disturbance, ForcedCopy, TrialResult
 
 
 __all__ = [
-    "BranchReport",
     "CopiedCrashes",
-    "ProbeReport",
     "likeliest",
     "mildest",
     "verify_branches",
     "verify_fork_results",
     "verify_probes",
+    "verify_rare",
 ]
 
 
 _LIKELIEST = 10  # trials; each takes two processes of its own
 
 
-@dataclass(frozen=True, slots=True)
-class BranchReport:
-    """What came of the branches of a hunt.
-
-    Args:
-        trials: of how many trials there might have been some.
-        moments: from how many copies went on.
-        branches: how many there were.
-        steps: how many steps they took.
-        left_out: how many were left out, because branches had taken enough steps.
-        crashed: how many crashed.
-        crashed_trials: in how many trials.
-        not_fully_asked: of how many of the trials a branch has no answer.
-        why_unanswered: the reason for the first of them; empty where there is none.
-        run_again: how many of these were run from the start: of each trial the likeliest.
-        not_finished: how many of these could not be run to their end, as when they are killed from outside.
-        crashes: those of them that crashed in the same way at the same step, and once more to the bit.
-    """
-
-    trials: int
-    moments: int
-    branches: int
-    steps: int
-    left_out: int
-    crashed: int
-    crashed_trials: int
-    not_fully_asked: int
-    why_unanswered: str
-    run_again: int
-    not_finished: int
-    crashes: tuple[Bundle, ...]
-
-    def to_json(self) -> JsonObject:
-        """Return the shape that ``run --json`` prints."""
-        return {
-            "trials": self.trials,
-            "moments": self.moments,
-            "branches": self.branches,
-            "steps": self.steps,
-            "left_out": self.left_out,
-            "crashed": self.crashed,
-            "crashed_trials": self.crashed_trials,
-            "not_fully_asked": self.not_fully_asked,
-            "run_again": self.run_again,
-            "not_finished": self.not_finished,
-            "confirmed": len(self.crashes),
-            "crashes": [bundle.summary() for bundle in self.crashes],
-        }
-
-
 def verify_branches(copies: VerificationRuns) -> BranchReport | None:
-    """Sum up what branches came to, and run the likeliest that crashed from the start, in fresh processes.
+    """Sum up the branches of all trials, and run the likeliest that crashed again from the start in new processes.
 
     Args:
-        copies: runs from the start what they have found.
+        copies: runs crashes of copies again.
 
     Returns:
-        None where there were to be none.
+        The report; None for a hunt without branches.
     """
     ledger = copies.again.ledger
     if not copies.again.settings.branch:
         return None
-    sums, why_unanswered = [0] * 7, ""
-    found: list[tuple[int, Branch]] = []  # of each trial the likeliest; there may be a million trials
+    sums: Counter[str] = Counter()
+    why_unanswered = ""
+    found: list[tuple[int, Branch]] = []  # the likeliest of each trial only: a hunt may have a million trials
     for plain in ledger.plain_results():
         if not (data := plain.get("branches")):
             continue
         one = Branches.from_json(data)
-        counts = (1, one.moments, one.asked, one.steps, one.left_out, len(one.crashes), one.unanswered > 0)
+        sums.update(
+            trials=1,
+            moments=one.moments,
+            branches=one.asked,
+            steps=one.steps,
+            skipped=one.left_out,
+            crashed=len(one.crashes),
+            not_fully_asked=one.unanswered > 0,
+        )
         why_unanswered = why_unanswered or one.why_unanswered
-        sums = [sum(pair) for pair in zip(sums, counts, strict=True)]
         if one.crashes:
             found.append((plain["spec"]["number"], max(one.crashes, key=_likely)))
     kept = copies.kept.get(layout.BRANCHES, {})
@@ -118,20 +78,19 @@ def verify_branches(copies: VerificationRuns) -> BranchReport | None:
         if (result := ledger.result(number)) is not None
     ]
     crashes, not_finished = copies.crashes(specs, layout.BRANCHES)
-    trials, moments, branches, steps, left_out, crashed, not_fully_asked = sums
     return BranchReport(
-        trials,
-        moments,
-        branches,
-        steps,
-        left_out,
-        crashed,
-        len(found),
-        not_fully_asked,
-        why_unanswered,
-        0 if copies.is_stopped else len(specs),
-        not_finished,
-        crashes,
+        trials=sums["trials"],
+        moments=sums["moments"],
+        branches=sums["branches"],
+        steps=sums["steps"],
+        skipped=sums["skipped"],
+        crashed=sums["crashed"],
+        crashed_trials=len(found),
+        not_fully_asked=sums["not_fully_asked"],
+        why_unanswered=why_unanswered,
+        run_again=0 if copies.is_stopped else len(specs),
+        not_finished=not_finished,
+        crashes=crashes,
     )
 
 
@@ -156,66 +115,21 @@ def _likely(branch: Branch) -> float:
 _MILDEST = 3  # trials; each takes two processes of its own
 
 
-@dataclass(frozen=True, slots=True)
-class ProbeReport:
-    """What came of the probes of a hunt.
-
-    Args:
-        margins: the stress margin of each trial of which all was asked that was to be asked.
-        not_fully_asked: of how many further trials a question has no answer.
-        why_unasked: the reason for the first of them; empty where there is none.
-        probes: how many copies were asked.
-        steps: how many steps they took.
-        left_out: how many questions were left out, because copies had taken enough steps.
-        run_again: how many of the mildest were run from the start.
-        not_finished: how many of these could not be run to their end, as when they are killed from outside.
-        crashes: those of them that crashed in the same way at the same step, and once more to the bit.
-        by: what each of these was probed with, as it took place; others may have been drawn besides.
-    """
-
-    margins: tuple[float, ...]
-    not_fully_asked: int
-    why_unasked: str
-    probes: int
-    steps: int
-    left_out: int
-    run_again: int
-    not_finished: int
-    crashes: tuple[Bundle, ...]
-    by: tuple[Disturbance, ...]
-
-    def to_json(self) -> JsonObject:
-        """Return the shape that ``run --json`` prints."""
-        return {
-            "trials": len(self.margins),
-            "not_fully_asked": self.not_fully_asked,
-            "least": min(self.margins, default=None),
-            "median": statistics.median(self.margins) if self.margins else None,
-            "probes": self.probes,
-            "steps": self.steps,
-            "left_out": self.left_out,
-            "run_again": self.run_again,
-            "not_finished": self.not_finished,
-            "confirmed": len(self.crashes),
-            "crashes": [bundle.summary() for bundle in self.crashes],
-        }
-
-
 def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
-    """Sum up what copies were asked, and run the mildest that made a trial crash from the start, in fresh processes.
+    """Sum up the probes of all trials, and run the mildest that crashed again from the start in new processes.
 
     Args:
-        copies: runs from the start what they have found.
+        copies: runs crashes of copies again.
 
     Returns:
-        None where nobody has asked.
+        The report; None for a hunt without probes.
     """
     ledger = copies.again.ledger
     if not copies.again.settings.probe:
         return None
     margins: list[float] = []
-    not_fully_asked, why_unasked = 0, ""
-    sums = [0] * 3
+    sums: Counter[str] = Counter()
+    why_unasked = ""
     found: list[tuple[float, int]] = []
     for plain in ledger.plain_results():
         if not (data := plain.get("stress")):
@@ -224,8 +138,9 @@ def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
         if stress.margin is not None:
             margins.append(stress.margin)
         else:
-            not_fully_asked, why_unasked = not_fully_asked + 1, why_unasked or stress.why_unasked
-        sums = [sum(pair) for pair in zip(sums, (stress.probes, stress.steps, stress.left_out), strict=True)]
+            sums["not_fully_asked"] += 1
+            why_unasked = why_unasked or stress.why_unasked
+        sums.update(probes=stress.probes, steps=stress.steps, skipped=stress.left_out)
         if stress.disturbance is not None:
             found.append((stress.least, plain["spec"]["number"]))
     kept = copies.kept.get(layout.PROBES, {})
@@ -237,19 +152,17 @@ def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
     specs = [one for result in results if (one := mildest(result)) is not None]
     crashes, not_finished = copies.crashes(specs, layout.PROBES)
     asked = {result.spec.number: result.stress for result in results}
-    by = tuple(_as_it_took_place(asked[bundle.result.spec.number], bundle.result) for bundle in crashes)
-    probes, steps, left_out = sums
     return ProbeReport(
-        tuple(margins),
-        not_fully_asked,
-        why_unasked,
-        probes,
-        steps,
-        left_out,
-        0 if copies.is_stopped else len(specs),
-        not_finished,
-        crashes,
-        by,
+        margins=tuple(margins),
+        not_fully_asked=sums["not_fully_asked"],
+        why_unasked=why_unasked,
+        probes=sums["probes"],
+        steps=sums["steps"],
+        skipped=sums["skipped"],
+        run_again=0 if copies.is_stopped else len(specs),
+        not_finished=not_finished,
+        crashes=crashes,
+        by=tuple(_as_it_took_place(asked[bundle.result.spec.number], bundle.result) for bundle in crashes),
     )
 
 
@@ -369,3 +282,46 @@ def verify_fork_results(copies: VerificationRuns) -> tuple[ProbeReport | None, B
     if confirmed:
         copies.again.ledger.note(confirmed=confirmed)
     return probes, branches
+
+
+# Rare mode: the weightiest crashes of forks are run from the start.
+
+_WEIGHTIEST = 5  # roots; a crash of a copy is a crash only where it comes again from the start
+
+
+def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport | None:
+    """Estimate the rate, and run the weightiest crashes of copies from the start, in fresh processes.
+
+    Args:
+        copies: runs them.
+        differences: how many trials of the audit were not the same again.
+
+    Returns:
+        None where the hunt is not in rare mode.
+    """
+    again = copies.again
+    if not again.settings.rare or copies.disturber is None:
+        return None
+    rule = PrecisionRule(again.settings, again.ledger, copies.disturber)
+    rule.read()
+    found = [
+        _crash_of_copy(result, max(crashed_copies(result), key=lambda copy: copy.weight))
+        for result in sorted(rule.results, key=greatest_weight, reverse=True)[:_WEIGHTIEST]
+    ]
+    crashes, not_finished = copies.crashes(found, layout.BRANCHES)
+    verified = 0 if copies.is_stopped else len(found)
+    estimate = rule.estimate()
+    why = f"{differences} trials of the audit were not the same again" if differences else ""
+    if len(crashes) < verified - not_finished:
+        why = f"{verified - not_finished - len(crashes)} of {verified} crashes did not come again from the start"
+    if why:
+        estimate = replace(
+            estimate, estimate=None, estimated=None, estimated_disturbed=None, why_not=why, why_not_disturbed=why,
+            more_roots=None,
+        )  # fmt: skip
+    return RareReport(estimate=estimate, verified=verified, not_finished=not_finished, crashes=crashes)
+
+
+def _crash_of_copy(result: TrialResult, copy: ForcedCopy) -> Found:
+    spec = replace(result.spec, disturbances=copy.disturbances, forcing=None, origin="rare")
+    return Found(spec, copy.crash, copy.step)

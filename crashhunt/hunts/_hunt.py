@@ -15,16 +15,18 @@ from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
 from crashhunt.executors import SharedExecutors, make_executor, read_map
-from crashhunt.hunts._fork_results import CopiedCrashes, verify_fork_results
+from crashhunt.hunts._fork_results import CopiedCrashes, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import LAG, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
-from crashhunt.hunts._progress import HuntReport, HuntStatus, Progress, StoppedBecause
-from crashhunt.hunts._rare import Forcings, PrecisionRule, verify_rare
+from crashhunt.hunts._progress import HuntStatus, Progress
+from crashhunt.hunts._rare import Forcings, PrecisionRule
+from crashhunt.hunts._reports import HuntReport, StoppedBecause
 from crashhunt.hunts._retention import keep_near_misses, prune_bundles
 from crashhunt.hunts._state import HEARTBEAT_S, HuntDirectory, copies_to_come, draws_independently, ledger_owner
 from crashhunt.hunts._verification import Audit, AuditsLeft, Confirmation, TrialReruns, VerificationRuns
 from crashhunt.ledger import Ledger
-from crashhunt.plans import core_of, disturber, parallel_here, sampler_of
+from crashhunt.plans import core_of, disturber, parallel_here, rate_of, sampler_of
+from crashhunt.rates import BarWatch, CountingRule, make_rate
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
 
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from crashhunt.executors import Executor
     from crashhunt.ledger import Facts
     from crashhunt.plans import HuntSettings
+    from crashhunt.rates import CrashRate
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.scenario import Scenario
 
@@ -50,14 +53,14 @@ _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker wa
 class Hunt:
     """One hunt in one directory.
 
-    The same hunt on the same directory goes on where it was; with settings that make other trials it refuses.
+    The same hunt on the same directory resumes. With settings that make other trials, it refuses.
 
     Args:
         directory: made where it does not exist.
         scenario: where the trials take place.
         settings: what was asked.
         command: the command line, as a comment in ``hunt.toml``.
-        overwrite: begin anew, whatever is there.
+        overwrite: begin again, and replace an existing hunt.
         seed_given: whether the seed was asked for; if not, a resumed hunt keeps its own.
         snapshot: what the snapshot of the code takes in.
     """
@@ -142,6 +145,7 @@ class Hunt:
         progress.nearest = ledger.nearest_miss()
         before = ledger.facts()
         progress.resume(list_bundles(self.directory), settings.run, before)
+        progress.rate = _bar_watch(settings, ledger)
         lag, alike = self._lag(before), not finished or draws_independently(before, settings)
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
         self._audits_left = AuditsLeft(ledger, before, worker_settings)
@@ -173,12 +177,19 @@ class Hunt:
             copies=copies_to_come(settings),
             audits_left=self._audits_left.numbers or before.get("audits_left"),
             lag=lag if sampler.learns and settings.run.deterministic else None,
+            until_rate=None if progress.rate is None else progress.rate.noted(),
         )
         runs_again = TrialReruns(
-            self._place, ledger, settings, self._parallel_here, progress.notes, progress.failed, self._stops,
-            SharedExecutors(self._place.scratch / "confirmations", parallel=self._parallel_here),
+            place=self._place,
+            ledger=ledger,
+            settings=settings,
+            parallel=self._parallel_here,
+            notes=progress.notes,
+            failed=progress.failed,
+            stops=self._stops,
+            executors=SharedExecutors(self._place.scratch / "confirmations", parallel=self._parallel_here),
             taken=snapshot.digest,
-        )  # fmt: skip
+        )
         try:
             return self._run_with(runs_again, ledger, trials, snapshot, progress, finished, watch)
         finally:
@@ -198,7 +209,7 @@ class Hunt:
         copies = VerificationRuns(runs_again, self._disturber)
         self._copied = CopiedCrashes(copies, progress, trials)
         self._copied.resume()
-        stopped: StoppedBecause = "distinct" if settings.run.keep_going else "crash"
+        stopped: StoppedBecause = progress.why_stopped(keep_going=settings.run.keep_going)
         if not progress.is_done:
             stopped = self._hunt(runs_again, ledger, trials, snapshot, progress, finished, watch)
         prune_bundles(ledger, progress, settings.run)
@@ -216,14 +227,30 @@ class Hunt:
         # A suite and a rerun resume what was interrupted; otherwise crashes would stay unconfirmed for good.
         ledger.enter("interrupted" if self._stops else stopped, reason, **progress.noted())
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
-        unanswered = 0 if stopped in ("crash", "distinct") else len(self._unanswered)
+        unanswered = 0 if stopped in ("crash", "distinct", "rate") else len(self._unanswered)
         return HuntReport(
-            self.directory, settings, stopped, ledger.outcomes(), ledger.trial_steps(), ledger.steps_total(),
-            time.monotonic() - progress.began, tuple(crashes), reason, tuple(progress.notes), ledger.traffic_events(),
-            progress.audit, progress.about_kinds()[0], near, probes,
-            progress.kinds.at_fault if progress.kinds is not None else None, branches, progress.ended_by_copy,
-            unanswered, rare,
-        )  # fmt: skip
+            directory=self.directory,
+            settings=settings,
+            stopped_because=stopped,
+            outcomes=ledger.outcomes(),
+            trial_steps=ledger.trial_steps(),
+            steps_total=ledger.steps_total(),
+            wall_s=time.monotonic() - progress.began,
+            crashes=tuple(crashes),
+            reason=reason,
+            notes=tuple(progress.notes),
+            events=ledger.traffic_events(),
+            audit=progress.audit,
+            kinds=progress.about_kinds()[0],
+            near_misses=near,
+            probes=probes,
+            at_fault=progress.kinds.at_fault if progress.kinds is not None else None,
+            branches=branches,
+            copied=progress.ended_by_copy,
+            unanswered=unanswered,
+            rare=rare,
+            rate=_rate_of(self.directory, progress.rate, stopped),
+        )
 
     def _rare(self, ledger: Ledger, make: Callable[[HuntSettings, Ledger, DisturbanceSampler], T]) -> T | None:
         """Return a part of rare mode; None in any other hunt."""
@@ -300,8 +327,8 @@ class Hunt:
                 watch(self._status(progress, "auditing"))
                 self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
             if progress.last_wanted is not None:
-                return "distinct" if run.keep_going else "crash"
-        except CrashhuntError as error:  # of which file is for somebody who wants to mend it
+                return progress.why_stopped(keep_going=run.keep_going)
+        except CrashhuntError as error:  # name the file that the user can correct
             mine, theirs = worker_settings.scenario.origin, self.scenario.origin
             if mine not in error.where:
                 raise
@@ -327,7 +354,7 @@ class Hunt:
         return {number for number in in_flight if number <= above}
 
     def _lag(self, before: Facts) -> int:
-        """By how many trials a sampler that learns is told late."""
+        """Return by how many trials the results for a sampler that learns are delayed."""
         under_way = _under_way(self.settings.run.parallel or self._parallel_here)
         return int(before.get("lag") or max(LAG, under_way)) if self.settings.run.deterministic else under_way
 
@@ -345,7 +372,7 @@ class Hunt:
             self._audits_left.note(audit, progress)
 
     def _restore_ledger(self, ledger: Ledger, progress: Progress) -> None:
-        """Write the ledger anew where somebody has removed it; what was recorded is still at hand.
+        """Write the ledger again if its file was removed while the hunt ran.
 
         Raises:
             HuntDirectoryError: another file is in its place, or the directory is gone.
@@ -367,6 +394,8 @@ class Hunt:
             return
         crashed = result.outcome in settings.crash_on
         progress.count(result, crashed=crashed)
+        if progress.rate is not None:
+            progress.rate.add(result)
         if crashed:
             if progress.kinds is not None:
                 self._save(result, ledger, snapshot, progress)
@@ -405,25 +434,53 @@ class Hunt:
         self, progress: Progress, phase: str, workers: Mapping[int, BlackBoxHeader] | None = None
     ) -> HuntStatus:
         elapsed = time.monotonic() - progress.began
+        kinds, newest_s, newest_trials = progress.about_kinds()
         return HuntStatus(
-            phase,
-            self.settings.trials,
-            sum(progress.outcomes.values()),
-            dict(progress.outcomes),
-            progress.ended_here / elapsed if elapsed > 0 else 0.0,
-            elapsed,
-            progress.nearest,
-            dict(workers or {}),
-            len(progress.crashes) + (progress.unsaved is not None),
-            progress.nodes,
-            *progress.about_kinds(),
-            progress.time_left_s,
-            progress.disturbed if self._disturber is not None else None,
-            progress.stressed,
-            progress.branched,
-            progress.not_fully_asked,
-            progress.searching.status(),
+            phase=phase,
+            planned=self.settings.trials,
+            done=sum(progress.outcomes.values()),
+            outcomes=dict(progress.outcomes),
+            rate_per_s=progress.ended_here / elapsed if elapsed > 0 else 0.0,
+            elapsed_s=elapsed,
+            nearest=progress.nearest,
+            workers=dict(workers or {}),
+            crashes=len(progress.crashes) + (progress.unsaved is not None),
+            nodes=progress.nodes,
+            kinds=kinds,
+            newest_kind_s=newest_s,
+            newest_kind_trials=newest_trials,
+            time_left_s=progress.time_left_s,
+            disturbed=progress.disturbed if self._disturber is not None else None,
+            stressed=progress.stressed,
+            branched=progress.branched,
+            not_fully_asked=progress.not_fully_asked,
+            search=progress.searching.status(),
+            rate=progress.rate,
         )
+
+
+def _bar_watch(settings: HuntSettings, ledger: Ledger) -> BarWatch | None:
+    """Return what watches the rate, with the trials that ended in earlier runs; None where there is no bar."""
+    if not settings.run.until_rate:
+        return None
+    bar, per = rate_of(settings.run.until_rate)
+    rule = CountingRule(max_steps=settings.max_steps, agents=max(1, len(settings.agents)), planned=settings.trials)
+    watch = BarWatch(rule, bar, per, settings.crash_on)
+    for data in ledger.plain_results():
+        watch.add(data)
+    return watch
+
+
+def _rate_of(directory: Path, watch: BarWatch | None, stopped: StoppedBecause) -> CrashRate | None:
+    """Return the rate that a hunt with a bar ends with."""
+    if watch is None:
+        return None
+    why_not = "" if stopped in ("rate", "all_trials") else "the number of trials was not fixed ahead"
+    found = make_rate(
+        str(directory), watch.per, watch.counter, watch.sequence, confidence=100 * (1 - watch.alpha),
+        why_no_estimate=why_not, bar=watch.bar,
+    )  # fmt: skip
+    return replace(found, verdict=watch.verdict)
 
 
 def _under_way(parallel: int) -> int:

@@ -1,4 +1,4 @@
-"""The specification of each trial of a hunt, which is in the ledger before it starts where nothing else tells it."""
+"""The specification of each trial of a hunt. If a trial does not follow from the seed, the ledger has it in advance."""
 
 from __future__ import annotations
 
@@ -34,15 +34,16 @@ __all__ = ["LAG", "Trials", "Unanswered", "find_unanswered", "settings_again", "
 
 _TRAFFIC = 0x74726166  # apart from what else is drawn of the hunt's seed
 LAG = 32
-"""By how many trials a deterministic hunt tells late: a constant, so that 1 and 16 workers run the same trials."""
+"""Delay of results for a sampler in a deterministic hunt, in trials. It is constant, so that 1 and 16 workers run the
+same trials."""
 
 
 class Trials:
     """Hands out the trials of a hunt that are still to run, in order of their numbers.
 
-    Of a sampler that does not learn, a trial follows from the hunt's seed and its number. What one that learns proposes
-    is in the ledger, with the results that it was told before, when it is handed out; `crashhunt.samplers.Sampler` has
-    the rule by which they are told.
+    If the sampler does not learn, a trial follows from the hunt's seed and its number. If it learns, the ledger has
+    each proposal before its trial starts, with the results that the sampler had received. `crashhunt.samplers.Sampler`
+    defines when it receives results.
 
     Args:
         settings: of the hunt.
@@ -50,8 +51,8 @@ class Trials:
         ledger: of the hunt.
         finished: the numbers of the trials that have ended.
         unanswered: those of them that run again, in order of their numbers: something outside of them kept answers from
-            it. The sampler has been or is told what the ledger has, and not what comes of the second run, so that a
-            resumed hunt proposes the same trials.
+            it. The sampler receives the result in the ledger, and not that of the second run, so that a resumed hunt
+            proposes the same trials.
         lag: how many trials the hunt has under way at once; where it is deterministic, how many it may.
         disturber: what draws their disturbances; None where they have none.
         forcings: the forcing of each trial, in rare mode; None in any other hunt.
@@ -151,11 +152,11 @@ class Trials:
             heappush(self._untold, number)
 
     def _must_wait(self, number: int) -> bool:
-        """Whether a result that is to be told before this proposal is not there yet."""
+        """Whether a result that the sampler must receive before this proposal is missing."""
         return self._settings.run.deterministic and min(self._open, default=number) <= number - self._lag
 
     def _tell(self, last: int) -> tuple[int, ...]:
-        """Tell what has ended, up to some number; return the numbers."""
+        """Pass finished results up to a number to the sampler; return their numbers."""
         told = []
         while self._untold and self._untold[0] <= last:
             number = heappop(self._untold)
@@ -166,12 +167,12 @@ class Trials:
         return tuple(told)
 
     def _resume(self, finished: set[int]) -> None:
-        """Tell what was told before, in the same order, and find what was proposed and has not ended."""
+        """Pass earlier results to the sampler in the same order, and find the proposals that have not finished."""
         told = set()
         for turn in self._ledger.turns():
             for number in turn.told:
                 result = self._ledger.result(number) if number in finished else None
-                if result is not None:  # else it is to run again, and is told then
+                if result is not None:  # otherwise it runs again, and the sampler receives that result
                     self._sampler.tell(result)
                     told.add(number)
             if turn.spec.number not in finished:
@@ -188,8 +189,8 @@ def spec_of(
 ) -> TrialSpec:
     """Return a trial as a sampler proposes it, with the disturbances that follow from its seed.
 
-    Where the hunt has so many traffics and no more, trials have them in turns: the seed, and what an independent
-    sampler draws for the scenario; what another one proposes for that stays.
+    With `--seeds`, trials use the traffics in turns. A traffic fixes the seed and, with an independent sampler, the
+    scenario's arguments. Other samplers propose these arguments themselves.
 
     With a forcing the trial is a root, in which nothing is drawn from the step on in which a first onset can be forced.
 
@@ -213,10 +214,10 @@ def spec_of(
     if proposal.seed is not None:
         seed = proposal.seed
     return TrialSpec(
-        number,
-        seed,
-        arguments,
-        scenario_arguments,
+        number=number,
+        seed=seed,
+        arguments=arguments,
+        scenario_arguments=scenario_arguments,
         max_steps=settings.max_steps,
         parent=proposal.parent,
         origin=proposal.origin,
@@ -234,9 +235,9 @@ def _drawn(disturber: DisturbanceSampler, seed: int, steps: int, forcing: Forcin
 
 
 def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
-    """Return what workers of a hunt are told.
+    """Return the settings for workers of a hunt.
 
-    The trials run from the snapshot: what is saved is what ran, even if somebody edits the code meanwhile.
+    Trials run from the snapshot: the saved code is the code that ran, even if the user edits the originals.
     """
     run = settings.run
     return replace(
@@ -252,7 +253,7 @@ def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Pat
 
 
 def settings_again(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
-    """Return what processes are told that run single trials of a hunt again, for their recordings."""
+    """Return the settings for processes that run single trials of a hunt again, to record them."""
     return replace(_settings(settings, snapshot, scratch), keep_trials=True)
 
 

@@ -1,4 +1,4 @@
-"""Agents that do not start are told once, instead of as so many trials that could not be set up."""
+"""Checks before the first trial: report an agent that cannot start once, not as many invalid trials."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ class Heard:
 
         Raises:
             UsageError: trials cannot be copied, as the first ones have shown after their first step. Once any has
-                ended, the hunt goes on without copies.
+                ended, the hunt continues without copies.
         """
         for note in executor.notes():
             what, left_out, why = note.partition(LEFT_OUT)
@@ -247,7 +247,7 @@ class TrafficSurveyor:
         try:
             answer = _survey_despite_kills(scenario, _runs(settings, drawn))
         except (SimulatorError, OSError) as error:
-            # The hunt goes on: where SUMO refuses its input, the first trial reports which file and line.
+            # The hunt continues: if SUMO refuses its input, the first trial reports file and line.
             why = f"the survey cannot run: {error}" if isinstance(error, OSError) else str(error)
             note = f"warning: candidates are the vehicles that the route files list, entering or not: {why}"
             return replace(scenario, notes=(scenario.notes[0], note, *scenario.notes[1:]))

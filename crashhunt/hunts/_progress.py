@@ -6,53 +6,38 @@ import math
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import BundleError
 from crashhunt.crashes import Group, fault_of, groups_of, signature_of
 from crashhunt.executors import HasNodes
+from crashhunt.hunts._reports import kind_data
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
-    from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, Signature
     from crashhunt.executors import Executor, NodeFigures
-    from crashhunt.hunts._fork_results import BranchReport, ProbeReport
-    from crashhunt.hunts._rare import RareReport
-    from crashhunt.hunts._verification import AuditReport
-    from crashhunt.ledger import Facts, KindData, Noted
-    from crashhunt.plans import HuntSettings, RunSettings
+    from crashhunt.hunts._reports import AuditReport, StoppedBecause
+    from crashhunt.ledger import Facts, Noted
+    from crashhunt.plans import RunSettings
+    from crashhunt.rates import BarWatch
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialResult
 
 
 __all__ = [
-    "HuntReport",
     "HuntStatus",
     "Kinds",
     "Progress",
     "SearchStatus",
     "Searching",
-    "StoppedBecause",
     "StrategyStatus",
-    "kind_data",
 ]
 
 
 # Which kinds of crashes a hunt has found, while it runs.
-
-
-def kind_data(group: Group) -> KindData:
-    """Return a group in few words, with the ids of its crashes."""
-    return {
-        "words": str(group.signature),
-        "count": group.count,
-        "first": group.first.id,
-        "shortest": group.shortest.id,
-    }
 
 
 class Kinds:
@@ -61,7 +46,7 @@ class Kinds:
     Args:
         wanted: how many kinds are enough; 0 for never.
         crashes: that were saved before.
-        newest: when the last new kind came, in s since the epoch; None where nobody knows.
+        newest: when the last new kind came, in s since the epoch; None where that is unknown.
         only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
         dropped: of each kind, in words, the trials whose bundles were given up before.
     """
@@ -109,7 +94,7 @@ class Kinds:
         return self._groups
 
     def surplus(self, keep: int) -> list[Bundle]:
-        """Return the crashes of which there are so many of the same kind that are shorter, and give them up.
+        """Return the crashes beyond the `keep` shortest of each crash type, and forget them.
 
         They count on, and are no members any more.
         """
@@ -159,7 +144,7 @@ class Kinds:
             if self._only_at_fault and fault_of(bundle, recording).is_egos:
                 self._at_fault.add(number)
         except BundleError:
-            return False  # it is of no kind, and crashhunt check tells of it
+            return False  # it has no crash type, and crashhunt check reports it
         is_new = signature not in self._seen
         self._seen.add(signature)
         self._signed[number] = signature, bundle
@@ -243,11 +228,11 @@ class Searching:
         """Return how it is going."""
         strategies = [
             StrategyStatus(
-                name,
-                tally.trials,
-                tally.trials / self.ended,
-                tally.danger / tally.measured if tally.measured else None,
-                tally.crashes,
+                name=name,
+                trials=tally.trials,
+                share=tally.trials / self.ended,
+                danger=tally.danger / tally.measured if tally.measured else None,
+                crashes=tally.crashes,
             )
             for name, tally in sorted(self._tallies.items(), key=lambda entry: (-entry[1].trials, entry[0]))
         ]
@@ -273,15 +258,15 @@ class HuntStatus:
         crashes: found so far; all but the last are saved.
         nodes: the machines that take part now; None where there is this one only.
         kinds: of crashes, the most frequent first; None where the first crash ends the hunt.
-        newest_kind_s: how long ago the last new one came, in s; None where nobody knows.
+        newest_kind_s: how long ago the last new one came, in s; None where that is unknown.
         newest_kind_trials: how many trials have ended since; None where it came in an earlier run of the hunt.
-        time_left_s: until no more trials begin, in s of wall time; infinite where nobody has limited it.
+        time_left_s: until no more trials begin, in s of wall time; infinite without a limit.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
-        stressed: the trial of this run for whose crash it would have taken the least, as far as copies were asked;
-            None where no copy was asked, or nothing plausible made one crash.
+        stressed: the trial of this run with the least stress margin; None if no copy was asked, or if no copy crashed.
         branched: how many branches of trials of this run have crashed.
         not_fully_asked: of how many trials of this run a question to their copies has no answer.
         search: which strategies have had trials in this run, and when the greatest danger grew.
+        rate: that is watched until it is certainly on one side of a bar; None where there is no bar.
     """
 
     phase: str
@@ -303,6 +288,7 @@ class HuntStatus:
     branched: int = 0
     not_fully_asked: int = 0
     search: SearchStatus = field(default_factory=SearchStatus)
+    rate: BarWatch | None = None
 
     @property
     def seconds_left(self) -> float:
@@ -342,6 +328,7 @@ class Progress:
     nodes: tuple[NodeFigures, ...] | None = None
     kinds: Kinds | None = None
     searching: Searching = field(default_factory=Searching)
+    rate: BarWatch | None = None
 
     def resume(self, crashes: list[Bundle], run: RunSettings, before: Facts) -> None:
         """Take in what was saved before."""
@@ -387,7 +374,9 @@ class Progress:
 
     @property
     def last_wanted(self) -> int | None:
-        """The number of the trial with which the hunt has found what it is after; None where it goes on."""
+        """The number of the trial with which the hunt has found what it is after; None where the hunt continues."""
+        if self.rate is not None and self.rate.decided_at is not None:
+            return self.rate.decided_at
         found = self.found.keys() | self.copied.keys()
         return min(found) if found else self.kinds.until if self.kinds is not None else None
 
@@ -399,7 +388,15 @@ class Progress:
     @property
     def is_done(self) -> bool:
         """Whether the hunt had found what it is after before it began."""
+        if self.rate is not None:
+            return self.rate.decided_at is not None
         return bool(self.crashes or self.copied) if self.kinds is None else self.kinds.until is not None
+
+    def why_stopped(self, *, keep_going: bool) -> StoppedBecause:
+        """Why a hunt stops that has found what it is after."""
+        if self.rate is not None:
+            return "rate"
+        return "distinct" if keep_going else "crash"
 
     @property
     def unsaved(self) -> TrialResult | None:
@@ -417,7 +414,7 @@ class Progress:
 
     @property
     def time_left_s(self) -> float:
-        """Until no more trials begin; infinite where nobody has limited it."""
+        """Until no more trials begin; infinite without a limit."""
         return max(0.0, self.until - time.monotonic())
 
     def look_at(self, executor: Executor) -> None:
@@ -433,7 +430,8 @@ class Progress:
         failed = self.failed_steps + sum(result.steps + result.other_steps for result in self.failed)
         in_vain: Noted = {"failed_steps": failed} if failed else {}
         audits: Noted = {} if self.audit is None else {"audits_left": self.audits_left or None}
-        return {"heartbeat": time.time(), **audits, **nodes, **kinds, **in_vain}
+        bar: Noted = {} if self.rate is None else {"until_rate": self.rate.noted()}
+        return {"heartbeat": time.time(), **audits, **nodes, **kinds, **in_vain, **bar}
 
     def about_kinds(self) -> tuple[tuple[Group, ...] | None, float | None, int | None]:
         """Return the last three of `HuntStatus`."""
@@ -442,91 +440,3 @@ class Progress:
         newest, trial = self.kinds.newest, self.kinds.newest_trial
         since = None if newest is None else max(0.0, time.time() - newest)
         return self.kinds.groups(), since, None if trial is None else self.ended_here - trial
-
-
-# What came of a hunt: what `Hunt.run` returns, and ``run --json`` prints.
-
-StoppedBecause = Literal["crash", "distinct", "all_trials", "interrupted", "no_valid_trial", "time", "precise"]
-
-
-@dataclass(frozen=True, slots=True)
-class HuntReport:
-    """What came of a hunt.
-
-    Args:
-        directory: of the hunt.
-        settings: what was asked.
-        stopped_because: why it ended.
-        outcomes: how the trials ended.
-        trial_steps: how many steps trials have taken.
-        steps_total: how many were simulated in all: theirs, those before their first, such as of traffic that warms up,
-            those of their copies, and those of runs that were to confirm something and ended otherwise.
-        wall_s: wall time of this run.
-        crashes: what was found, the one with the fewest steps first.
-        reason: in words, where not one trial was valid.
-        notes: what people should know about how it went, such as trials that were run again.
-        events: traffic events of all trials: kind to how many, and in how many trials.
-        audit: what came of running trials without a crash again; None where nobody asked for it.
-        kinds: of crashes, the most frequent first; None where the first crash ended the hunt.
-        near_misses: that were kept, the most dangerous first.
-        probes: what came of asking copies of trials; None where nobody did.
-        at_fault: the trials whose crashes are the agent's own fault; None where that was not asked.
-        branches: what came of copies that went on with other disturbances; None where there were to be none.
-        copied: what a copy found, where that ended the hunt: it came again from the start.
-        unanswered: how many trials the same command runs again, as they or copies of them were killed from outside.
-        rare: what came of rare mode; None without it.
-    """
-
-    directory: Path
-    settings: HuntSettings
-    stopped_because: StoppedBecause
-    outcomes: dict[str, int]
-    trial_steps: int
-    steps_total: int
-    wall_s: float
-    crashes: tuple[Bundle, ...]
-    reason: str = ""
-    notes: tuple[str, ...] = ()
-    events: dict[str, tuple[int, int]] = field(default_factory=dict)
-    audit: AuditReport | None = None
-    kinds: tuple[Group, ...] | None = None
-    near_misses: tuple[Bundle, ...] = ()
-    probes: ProbeReport | None = None
-    at_fault: tuple[int, ...] | None = None
-    branches: BranchReport | None = None
-    copied: Bundle | None = None
-    unanswered: int = 0
-    rare: RareReport | None = None
-
-    def to_json(self) -> JsonObject:
-        """Return the shape that ``run --json`` prints."""
-        found: JsonObject = {
-            "dir": str(self.directory),
-            "hunt_seed": self.settings.seed,
-            "trials_planned": self.settings.trials,
-            "trials_run": sum(self.outcomes.values()),
-            "outcomes": self.outcomes,
-            "stopped_because": self.stopped_because,
-            "wall_s": round(self.wall_s, 3),
-            "steps_total": self.steps_total,
-            "events": {kind: {"count": count, "trials": trials} for kind, (count, trials) in self.events.items()},
-            "crashes": [bundle.summary() for bundle in self.crashes],
-            "notes": list(self.notes),
-            "audit": self.audit.to_json() if self.audit is not None else None,
-            "unanswered": self.unanswered,
-        }
-        if self.probes is not None:
-            found["probes"] = self.probes.to_json()
-        if self.rare is not None:
-            found["rare"] = self.rare.to_json()
-        if self.branches is not None:
-            found["branches"] = self.branches.to_json()
-        if self.kinds is not None:
-            found["kinds"] = list(map(kind_data, self.kinds))
-        if self.settings.run.near_misses:
-            found["near_misses"] = [bundle.summary() for bundle in self.near_misses]
-        if self.at_fault is not None:
-            found["at_fault"] = list(self.at_fault)
-        if self.copied is not None:
-            found["copied"] = str(self.copied.path)
-        return found

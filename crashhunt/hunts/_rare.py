@@ -10,28 +10,22 @@ may have ended by then. They do not count, because that they have ended depends 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from crashhunt.base import layout
 from crashhunt.disturbances import first_forcing
-from crashhunt.hunts._verification import Found
 from crashhunt.plans import share_of
 from crashhunt.rates import BLOCK, learn_forcing, rare_estimate, root_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from crashhunt.base.codec import JsonObject
-    from crashhunt.crashes import Bundle
     from crashhunt.disturbances import DisturbanceSampler
-    from crashhunt.hunts._verification import VerificationRuns
     from crashhunt.ledger import Ledger
     from crashhunt.plans import HuntSettings
     from crashhunt.rates import RareEstimate, Root
     from crashhunt.trial import Forced, ForcedCopy, Forcing, TrialResult
 
-__all__ = ["Forcings", "PrecisionRule", "RareReport", "verify_rare"]
+__all__ = ["Forcings", "PrecisionRule", "crashed_copies", "greatest_weight"]
 
 _WEIGHTIEST: Final = 5  # roots; a crash of a copy is a crash only where it comes again from the start
 
@@ -120,109 +114,11 @@ class PrecisionRule:
         return rare_estimate(self.roots, excluded=self.excluded)
 
 
-@dataclass(frozen=True, slots=True)
-class RareReport:
-    """What came of a hunt in rare mode.
-
-    Args:
-        estimate: of the crash probability per trial.
-        verified: how many of the weightiest crashes of copies were run from the start.
-        not_finished: how many of these could not be run to their end.
-        crashes: those of them that crashed in the same way at the same step, and once more bit-identically.
-    """
-
-    estimate: RareEstimate
-    verified: int
-    not_finished: int
-    crashes: tuple[Bundle, ...]
-
-    @property
-    def is_verified(self) -> bool:
-        """Whether every crash that was run to its end from the start came again."""
-        return len(self.crashes) == self.verified - self.not_finished
-
-    def to_json(self) -> JsonObject:
-        """Return the shape that ``run --json`` prints."""
-        return {
-            **self.estimate.to_json(),
-            "run_again": self.verified,
-            "not_finished": self.not_finished,
-            "confirmed": len(self.crashes),
-            "crashes": [bundle.summary() for bundle in self.crashes],
-        }
-
-    @property
-    def lines(self) -> list[str]:
-        """The answer, its evidence and what is missing, for the user."""
-        found = self.estimate
-        if found.estimate is None:
-            return [f"rare: no estimate: {found.why_not or 'no root has ended'}"]
-        answer = f"rare: {found.estimate:.2g} per trial"
-        if found.estimated is not None:
-            one = found.estimated
-            answer += (
-                f" ({one.low:.2g} to {one.high:.2g}, estimated from {found.roots} roots; "
-                f"effective sample size {one.effective:.0f})"
-            )
-        lines = [answer]
-        if found.estimated is None:
-            more = f"; about {found.more_roots} more roots are needed" if found.more_roots is not None else ""
-            lines.append(f"  no interval from {found.roots} roots: {found.why_not}{more}")
-        shares = [
-            f"{cell} {part:.2g} ({part / found.disturbed:.0%})" for cell, part in found.parts.items() if found.disturbed
-        ]
-        lines.append("  " + "; ".join([f"undisturbed {found.undisturbed_crashes} of {found.roots}", *shares[:5]]))
-        if found.plain_equivalent_steps is not None:
-            lines.append(
-                f"  {found.steps} steps; plain trials need about {found.plain_equivalent_steps:.2g} for the same error"
-            )
-        if self.verified:
-            lines.append(f"  of the {self.verified} weightiest crashes, {len(self.crashes)} came again from the start")
-        lines.append("  an estimate says nothing about failures that no copy has met")
-        return lines
-
-
-def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport | None:
-    """Estimate the rate, and run the weightiest crashes of copies from the start, in fresh processes.
-
-    Args:
-        copies: runs them.
-        differences: how many trials of the audit were not the same again.
-
-    Returns:
-        None where the hunt is not in rare mode.
-    """
-    again = copies.again
-    if not again.settings.rare or copies.disturber is None:
-        return None
-    rule = PrecisionRule(again.settings, again.ledger, copies.disturber)
-    rule.read()
-    found = [
-        _found(result, max(_crashed(result), key=lambda copy: copy.weight))
-        for result in sorted(rule.results, key=_greatest_weight, reverse=True)[:_WEIGHTIEST]
-    ]
-    crashes, not_finished = copies.crashes(found, layout.BRANCHES)
-    verified = 0 if copies.is_stopped else len(found)
-    estimate = rule.estimate()
-    why = f"{differences} trials of the audit were not the same again" if differences else ""
-    if len(crashes) < verified - not_finished:
-        why = f"{verified - not_finished - len(crashes)} of {verified} crashes did not come again from the start"
-    if why:
-        estimate = replace(
-            estimate, estimate=None, estimated=None, estimated_disturbed=None, why_not=why, why_not_disturbed=why,
-            more_roots=None,
-        )  # fmt: skip
-    return RareReport(estimate, verified, not_finished, crashes)
-
-
-def _crashed(result: TrialResult) -> Iterator[ForcedCopy]:
+def crashed_copies(result: TrialResult) -> Iterator[ForcedCopy]:
+    """Return the copies of a root that crashed."""
     return (copy for copy in result.forced.copies if copy.crash) if result.forced is not None else iter(())
 
 
-def _greatest_weight(result: TrialResult) -> float:
-    return max(copy.weight for copy in _crashed(result))
-
-
-def _found(result: TrialResult, copy: ForcedCopy) -> Found:
-    spec = replace(result.spec, disturbances=copy.disturbances, forcing=None, origin="rare")
-    return Found(spec, copy.crash, copy.step)
+def greatest_weight(result: TrialResult) -> float:
+    """Return the greatest weight among the crashed copies of a root that has some."""
+    return max(copy.weight for copy in crashed_copies(result))

@@ -58,7 +58,7 @@ __all__ = [
 ]
 
 
-# What is told of a trial wherever trials are listed: the one projection of a result that tables and pages share.
+# The columns of a trial: the projection of a result that tables and pages share.
 
 FACTS = (
     "number", "seed", "outcome", "steps", "sim_time_s", "danger", "time_to_collision_s", "gap_m",
@@ -73,8 +73,8 @@ DISTURBANCES = ("disturbances", "log_likelihood")
 """Further ones, of hunts with disturbances: how many took place, and how likely all of it was."""
 
 STRESS = ("stress_margin", "stress_asked", "stress_margin_upper_bound")
-"""Further ones, of hunts with probes: how little it would have taken, 0 to 1; at how many moments that was asked; and
-what the margin is at most where that was not all of them."""
+"""Further columns of hunts with probes: the stress margin, 0 to 1, the number of moments that were asked, and the
+upper bound of the margin if that was not all of them."""
 
 BRANCHES = ("branches", "branch_crashes", "branches_asked")
 """Further ones, of hunts with branches: how many there were, how many crashed, and how many of all have an answer."""
@@ -113,7 +113,7 @@ class TrialRow:
 
     @property
     def danger(self) -> float | None:
-        """How near to a crash it came, 0 to 1; None where nobody measured it."""
+        """Criticality, 0 to 1; None where it was not measured."""
         return self.data.get("danger")
 
     @property
@@ -189,7 +189,7 @@ class TrialRow:
                 "branch_crashes": len(branches.get("crashes", ())),
                 "branches_asked": Branches.from_json(branches).extent,
             }
-        if events is not None:  # somebody has looked for them
+        if events is not None:  # the simulator reports events
             found |= dict.fromkeys(EVENTS, 0)
             found |= events
         for agent, given in self.arguments.items():
@@ -432,7 +432,7 @@ def _column(values: list[Cell]) -> NDArray[np.generic]:
 
 # Trials as tables in files: CSV, JSON, JSON lines and Parquet, written row by row.
 
-_LOOKED_AT = 1000  # rows, to find out the type of an argument of which nobody says it
+_LOOKED_AT = 1000  # rows, to infer the type of an argument without a declared type
 
 
 def write_text(hunt: HuntResults, out: IO[str], form: str, *, outcomes: Sequence[str] = ()) -> int:

@@ -1,6 +1,6 @@
 """``--keep N``: of each kind of crash the bundles of the shortest few stay, and of the others the rows of the ledger.
 
-The ledger is told first, for good, so that a bundle that is not there has either been given up or is missing.
+The deletion is written to the ledger first, so `check` can distinguish a deleted bundle from a missing one.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
             if now.was_killed_from_outside:
                 what = f"trial {now.spec.number}, a near miss, was {now.summary}"
                 again.notes.append(f"{what}: it has no bundle until the same command is run again")
-            elif (was.outcome, was.digest) == (now.outcome, now.digest):
+            elif was.is_identical_run(now):
                 one.write(was, confirmed=True)
             else:
                 again.failed.append(now)

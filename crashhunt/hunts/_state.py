@@ -69,9 +69,9 @@ class ProbeSums(TypedDict):
         trial: the number of the trial that has it.
         probes: how many copies were asked.
         steps: how many steps they took.
-        left_out: how many questions were left out, because copies had taken enough steps.
+        left_out: how many questions were skipped, because copies had taken enough steps.
         crashed_trials: how many trials a probe made crash that did not crash by themselves.
-        run_again: how many of the mildest were run from the start; None until the hunt has come to that.
+        run_again: how many of the mildest were run from the start; None before that.
         confirmed: how many of these crashed there as well.
     """
 
@@ -95,11 +95,11 @@ class BranchSums(TypedDict):
         moments: from how many copies went on.
         branches: how many there were.
         steps: how many steps they took.
-        left_out: how many were left out, because branches had taken enough steps.
+        left_out: how many were skipped, because branches had taken enough steps.
         crashed: how many crashed.
         crashed_trials: of how many trials.
         not_fully_asked: of how many of the trials a branch has no answer.
-        run_again: how many of the likeliest were run from the start; None until the hunt has come to that.
+        run_again: how many of the likeliest were run from the start; None before that.
         confirmed: how many of these crashed there as well.
     """
 
@@ -175,7 +175,8 @@ HEARTBEAT_S = 1.0  # every so often a hunt says in its ledger that it is alive
 _SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
 _ENDED: dict[str, State] = {
     "crash": "crashed", "distinct": "crashed", "all_trials": "finished", "no_valid_trial": "error",
-    "interrupted": "interrupted", "time": "finished", "precise": "finished", "error": "error", "queued": "queued",
+    "rate": "finished", "interrupted": "interrupted", "time": "finished", "precise": "finished",
+    "error": "error", "queued": "queued",
 }  # fmt: skip
 
 
@@ -203,7 +204,7 @@ class HuntState(Serializable):
         core: whether the simulator's compiled core is used; None where it has none.
         nodes: the machines on which it runs, or ran last: fields of `NodeFigures`; None where it was this one only.
         kinds: of crashes, the most frequent first: fields of `KindData`; None where the first crash ends the hunt.
-        newest_kind_s: how long ago the last new one came, in s; None where nobody knows.
+        newest_kind_s: how long ago the last new one came, in s; None where that is unknown.
     """
 
     dir: str
@@ -305,17 +306,17 @@ def _state(directory: Path, facts: Facts, outcomes: dict[str, int], last: float 
     here = run - int(facts.get("done_before", 0))
     rate = here / (until - began) if until > began and here > 0 else 0.0
     return HuntState(
-        str(directory),
-        state,
-        "its process is gone" if state == "killed" else str(facts.get("detail") or ""),
-        planned,
-        run,
-        outcomes,
-        crashes,
-        sum(n for name, n in outcomes.items() if name == Outcome.INVALID or Outcome(name).is_software_fault),
-        rate,
-        _seconds_left(facts, planned - run, rate) if state == "running" else None,
-        alive,
+        dir=str(directory),
+        state=state,
+        detail="its process is gone" if state == "killed" else str(facts.get("detail") or ""),
+        trials_planned=planned,
+        trials_run=run,
+        outcomes=outcomes,
+        crashes=crashes,
+        errors=sum(n for name, n in outcomes.items() if name == Outcome.INVALID or Outcome(name).is_software_fault),
+        rate_per_s=rate,
+        seconds_left=_seconds_left(facts, planned - run, rate) if state == "running" else None,
+        owner_alive=alive,
         disturbed=_disturbed(directory) if facts.get("disturb") else None,
         core=facts.get("core"),
         nodes=facts.get("nodes"),
@@ -334,7 +335,7 @@ def _seconds_left(facts: Facts, trials: int, rate: float) -> float | None:
 
 
 def _disturbed(directory: Path) -> int:
-    """How many crashes had disturbances; one that cannot be read is left to whoever reads it."""
+    """How many crashes had disturbances; unreadable bundles are not counted."""
     count = 0
     for path in (directory / layout.CRASHES).glob(f"{layout.SHOWN}/{layout.CRASH}"):
         with suppress(OSError, ValueError):
@@ -355,7 +356,7 @@ def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
 
 
 def ledger_owner() -> Owner:
-    """Return what tells this process from every other, so that anybody can see later whether it is still there."""
+    """Return a description that identifies this process, to check later whether it still runs."""
     return {"host": socket.gethostname(), "pid": os.getpid(), "started": _started(os.getpid())}
 
 
@@ -373,7 +374,7 @@ def _is_alive(owner: Owner, heartbeat: float) -> bool:
 
 
 def _started(pid: int) -> int:
-    """When a process began, in ticks since the machine did; 0 where it is not there, -1 where nobody can say."""
+    """When a process began, in ticks since the machine did; 0 where it is not there, -1 where that is unknown."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
     except OSError:
@@ -394,7 +395,7 @@ def _in_order(path: Path) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in path.parts)
 
 
-# The directory of a hunt: whose it is, and that nobody else hunts in it meanwhile.
+# The directory of a hunt: its owner, and the lock against a second hunt in it.
 
 _DIFFERENCES_SHOWN = 4
 # What a hunt writes, `hunt.toml` last: without it the folder is not a hunt's.
@@ -439,7 +440,7 @@ class HuntDirectory:
         """
         try:
             self.path.mkdir(exist_ok=True)
-            if not (self.path / ".lock").exists():  # nothing is left behind in a folder of somebody else's
+            if not (self.path / ".lock").exists():  # leave no file in a foreign folder
                 self._refuse_foreign()
             lock = (self.path / ".lock").open("a+")
         except OSError as error:
@@ -467,7 +468,7 @@ class HuntDirectory:
         Args:
             settings: what was asked.
             command: the command line, as a comment in ``hunt.toml``.
-            overwrite: begin anew, whatever is there.
+            overwrite: begin again, and replace an existing hunt.
             seed_given: whether the seed was asked for; if not, a resumed hunt keeps its own.
 
         Raises:
@@ -490,7 +491,7 @@ class HuntDirectory:
                 shown = "; ".join(differences[:_DIFFERENCES_SHOWN]) + (f"; and {more} more" if more > 0 else "")
                 raise HuntDirectoryError(
                     f"another hunt is there: {shown}",
-                    fix="give the same settings to go on with it, another directory, or --overwrite to begin anew",
+                    fix="give the same settings to resume it, another directory, or --overwrite to begin again",
                     where=str(self.path),
                 )
         for left in self.path.glob(f"{_SCRATCH}*"):  # with the lock of the hunt, no other hunt uses it
@@ -599,7 +600,7 @@ class LogReader:
                 yield f"{title}{kind}{changed}", text
 
     def _as_written(self, path: Path) -> bool:
-        """Whether a file beside a crash is what that says; those of a hunt itself, and of early ones, nobody says."""
+        """Whether a file has the digest that its crash records. Files of hunts and of early crashes have none."""
         if path.parent not in self._files:
             self._files[path.parent] = files_of(path.parent)
         entry = self._files[path.parent].get(path.name)

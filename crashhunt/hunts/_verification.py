@@ -1,4 +1,4 @@
-"""Confirmation while a hunt goes on: each crash that it saves is run again, on one of the hunt's own slots."""
+"""Confirmation during a hunt: each saved crash is run again, on one of the hunt's own slots."""
 
 from __future__ import annotations
 
@@ -8,16 +8,24 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError
 from crashhunt.base.temporary import remove_at_once, remove_scratch
 from crashhunt.crashes import is_bundle_made_here, is_snapshot_trusted, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
-from crashhunt.executors import FreshProcessExecutor, PoolExecutor, SharedExecutors, read_map, snapshot_executor
+from crashhunt.executors import (
+    FreshProcessExecutor,
+    PoolExecutor,
+    SharedExecutors,
+    read_map,
+    run_trials,
+    snapshot_executor,
+)
 from crashhunt.hunts._next_trials import settings_again
+from crashhunt.hunts._reports import AuditReport, Difference
 from crashhunt.recording import Recording, first_divergence, read_black_box
 from crashhunt.replays import confirm
 from crashhunt.snapshots import Snapshot
@@ -39,10 +47,8 @@ if TYPE_CHECKING:
 __all__ = [
     "Again",
     "Audit",
-    "AuditReport",
     "AuditsLeft",
     "Confirmation",
-    "Difference",
     "Found",
     "TrialReruns",
     "VerificationRuns",
@@ -50,9 +56,9 @@ __all__ = [
 
 
 class Confirmation:
-    """Confirms crashes one at a time, beside the thread of the hunt. Meanwhile, the hunt has one slot less.
+    """Confirms crashes one at a time, in a thread of its own. Meanwhile, the hunt has one slot less.
 
-    Crashes that it has not come to when the hunt is over are confirmed then.
+    Crashes that are not confirmed at the end of the hunt are confirmed then.
 
     Args:
         again: runs them.
@@ -85,7 +91,7 @@ class Confirmation:
                 progress.replace([found if found.id == crash.id else crash for crash in progress.crashes])
 
     def close(self, progress: Progress) -> None:
-        """Give up what runs, so that no stop waits for it."""
+        """Cancel the running confirmation, so that no stop waits for it."""
         self._over.set()
         if self._thread is not None:
             self._asked.put(None)
@@ -111,7 +117,7 @@ class Confirmation:
 
 # Trials of a hunt that are run again in fresh processes, by the code that they ran with, for their recordings.
 
-_LOOK_EVERY_S = 0.1  # how late Ctrl-C may be
+_STOP_CHECK_S = 0.1  # how late Ctrl-C may be
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +131,7 @@ class TrialReruns:
         parallel: how many run at a time.
         notes: gets a line for whatever went wrong.
         failed: gets what was to confirm something, and ended otherwise.
-        stops: has something in it as soon as somebody wants to stop.
+        stops: non-empty as soon as a stop is requested.
         executors: which run crashes again.
         taken: the digest of the snapshot that this process has taken; without it, each snapshot has to be trusted.
     """
@@ -141,7 +147,7 @@ class TrialReruns:
     taken: str = ""
 
     def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
-        """Yield each trial as it ends, until somebody wants to stop.
+        """Yield each trial as it ends, until a stop is requested.
 
         Args:
             specs: of different trials of the hunt; what else they say may have been changed.
@@ -167,13 +173,9 @@ class TrialReruns:
             try:
                 again = settings_again(self.settings, snapshot, scratch)
                 with closing(snapshot_executor(again, parallel=self.parallel)) as executor:
-                    waiting = len(group)
-                    for spec in group:
-                        executor.submit(spec)
-                    while waiting and not len(self.stops):
-                        for result in executor.completed(_LOOK_EVERY_S):
-                            waiting -= 1
-                            yield Again(result, self, digest, scratch, folder)
+                    stopped = partial(bool, self.stops)
+                    for _, result in run_trials(executor, group, stopped=stopped, check_every_s=_STOP_CHECK_S):
+                        yield Again(result=result, runs=self, snapshot=digest, scratch=scratch, folder=folder)
             finally:
                 remove_scratch(scratch)
 
@@ -187,7 +189,7 @@ class TrialReruns:
 
         Args:
             bundle: the crash.
-            stopped: asked now and then whether to give up.
+            stopped: called regularly; true to cancel.
         """
         is_settled = bundle.confirmed is not None and not bundle.result.why_no_escape
         if is_settled or len(self.stops) or stopped():
@@ -276,18 +278,18 @@ class VerificationRuns:
 
     @property
     def is_stopped(self) -> bool:
-        """Whether somebody wants to stop: what was found may not have been run from the start then."""
+        """Whether a stop is requested: crashes of copies may then not have been run from the start."""
         return bool(len(self.again.stops))
 
     def crashes(self, found: Sequence[Found], folder: str) -> tuple[tuple[Bundle, ...], int]:
-        """Return those that crashed in the same way at the same step, and once more to the bit, in their order.
+        """Return those that reproduce at the same step, and once more bit-identically, in their order.
 
         The second value is how many could not be run to their end, so that nothing is known about them.
 
         Args:
             found: of different trials.
-            folder: of the hunt, for the bundles; what it had before is gone, but for what is kept. Where somebody wants
-                to stop, it stays.
+            folder: of the hunt, for the bundles; what it had before is gone, but for what is kept. If a stop is
+                requested, it stays.
         """
         if self.is_stopped:
             return (), 0
@@ -300,7 +302,7 @@ class VerificationRuns:
         return tuple(crashed[one.spec.number] for one in found if one.spec.number in crashed), len(unanswered)
 
     def crash(self, found: Found, folder: str) -> Bundle | None:
-        """Return one that crashed in the same way at the same step, and once more to the bit; it is kept.
+        """Return the bundle of a crash that reproduces at the same step, and once more bit-identically; it is kept.
 
         Args:
             found: how a copy crashed.
@@ -348,60 +350,14 @@ class VerificationRuns:
         return found
 
 
-# The audit: a sample of trials that did not crash is run again, and has to be the same to the bit.
+# The audit: a sample of trials that did not crash is run again, and must be bit-identical.
 #
 # A crash is confirmed in a fresh process anyway. A trial without one that depends on the trials before it in its
 # worker, on a thread or on the clock would go unnoticed, and with it the crash that it did not have.
 
 
-@dataclass(frozen=True, slots=True)
-class Difference(Serializable):
-    """Where a trial went another way in a fresh process.
-
-    Args:
-        trial: its number.
-        step: the first that differs; None where there was no recording to compare, and only the digest differs.
-        agent: the agent or actor; empty where it is about neither.
-        field: what of it.
-        recorded: what it was in the hunt.
-        replayed: what it was in the fresh process.
-    """
-
-    trial: int
-    step: int | None
-    agent: str
-    field: str
-    recorded: object
-    replayed: object
-
-    def __str__(self) -> str:
-        whose = f" of {self.agent}" if self.agent else ""
-        where = "" if self.step is None else f"at step {self.step}, "
-        return (
-            f"trial {self.trial} is another one in a fresh process: {where}{self.field}{whose} was "
-            f"{self.recorded} and is {self.replayed}"
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class AuditReport(Serializable):
-    """What came of an audit.
-
-    Args:
-        trials: how many trials were run again.
-        differences: of those that were not the same.
-        not_finished: how many more were to be run again, and were not run to the end.
-    """
-
-    trials: int = 0
-    differences: tuple[Difference, ...] = ()
-    not_finished: int = 0
-
-    json_keys = ("trials", "not_finished", "differences")
-
-
 class Audit:
-    """Runs the sample again while the hunt goes on, one trial at a time.
+    """Runs the sample again during the hunt, one trial at a time.
 
     Args:
         settings: of the hunt; they say which trials.
@@ -445,7 +401,7 @@ class Audit:
         self._executor.capacity = parallel
 
     def add(self, result: TrialResult) -> TrialResult:
-        """Take over the recording of a trial of the sample; return the trial as the hunt goes on with it."""
+        """Take over the recording of a trial of the sample; return the trial as the hunt continues with it."""
         if not self._settings.is_audited(result):
             return result
         number = result.spec.number
@@ -479,7 +435,7 @@ class Audit:
         return found
 
     def close(self) -> None:
-        """Give up what has not been run again."""
+        """Cancel the trials that have not been run again."""
         self._executor.close()
 
     def _compare(self, was: TrialResult, now: TrialResult) -> Difference | None:
@@ -493,9 +449,23 @@ class Audit:
         finally:
             self._clean_up(number)
         if found is not None:
-            return Difference(number, found.step, found.agent, found.field, found.recorded, found.replayed)
-        if (was.outcome, was.digest) != (now.outcome, now.digest):
-            return Difference(number, now.steps, "", "the outcome", str(was.outcome), str(now.outcome))
+            return Difference(
+                trial=number,
+                step=found.step,
+                agent=found.agent,
+                field=found.field,
+                recorded=found.recorded,
+                replayed=found.replayed,
+            )
+        if not was.is_identical_run(now):
+            return Difference(
+                trial=number,
+                step=now.steps,
+                agent="",
+                field="the outcome",
+                recorded=str(was.outcome),
+                replayed=str(now.outcome),
+            )
         return None
 
     def _folders(self, number: int) -> tuple[Path, Path]:
@@ -566,8 +536,15 @@ def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, li
             if now.was_killed_from_outside:
                 continue
             left.discard(now.spec.number)
-            if (was.outcome, was.digest) != (now.outcome, now.digest):
-                difference = Difference(now.spec.number, None, "", "the digest", was.digest, now.digest)
+            if not was.is_identical_run(now):
+                difference = Difference(
+                    trial=now.spec.number,
+                    step=None,
+                    agent="",
+                    field="the digest",
+                    recorded=was.digest,
+                    replayed=now.digest,
+                )
                 ledger.remark(f"audit: {difference}")
                 differences.append(difference)
                 again.failed.append(now)

@@ -6,7 +6,7 @@ import json
 import os
 import sqlite3
 from contextlib import closing
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.files import whole_file
@@ -17,11 +17,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.ledger._reader import Row
 
 
-__all__ = ["checked", "damaged", "explained", "opened", "plain_trial", "removed", "rewrite"]
+__all__ = ["Row", "checked", "damaged", "explained", "opened", "plain_trial", "removed", "rewrite"]
 
+
+Row: TypeAlias = tuple[Any, ...]
+"""A row as SQLite returns it. The caller's query names its columns."""
 
 _CHECK = "crashhunt check {} says what can be saved"
 
@@ -107,7 +109,7 @@ def removed(path: Path, was: os.stat_result) -> bool:
         return True
     raise HuntDirectoryError(
         "another file was put in the place of the ledger while the hunt ran",
-        fix="run the hunt again, in a directory that nobody else writes to",
+        fix="run the hunt again, in a directory that no other process writes to",
         where=str(path),
     )
 
@@ -126,6 +128,6 @@ def rewrite(database: sqlite3.Connection, path: Path) -> None:
     except sqlite3.Error as error:
         raise explained(path, error) from error
     except OSError as error:
-        message = f"the ledger was removed while the hunt ran, and cannot be written anew: {error.strerror}"
-        fix = "run the hunt again, in a directory that nobody else writes to"
+        message = f"the ledger was removed while the hunt ran, and cannot be written again: {error.strerror}"
+        fix = "run the hunt again, in a directory that no other process writes to"
         raise HuntDirectoryError(message, fix=fix, where=str(path)) from error

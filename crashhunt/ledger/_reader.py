@@ -1,4 +1,4 @@
-"""What a ledger says; whoever reads a row checks that it is as it was written."""
+"""Reader of a ledger. Every row that is read is checked against its digest."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import json
 import re
 import sqlite3
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NotRequired, TypeAlias, TypedDict, cast
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, cast
 
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.ledger._file import checked, damaged, explained, plain_trial
+from crashhunt.ledger._file import Row, checked, damaged, explained, plain_trial
 from crashhunt.ledger._schema import OWN_FACTS, SEAL, WITH_EVENTS
 from crashhunt.trial import TrialResult, TrialSpec
 
@@ -23,13 +23,10 @@ if TYPE_CHECKING:
     from crashhunt.ledger._schema import Shape
 
 
-__all__ = ["Facts", "KindData", "LedgerReader", "Noted", "Owner", "Row", "Seal", "Turn"]
+__all__ = ["Facts", "KindData", "LedgerReader", "Noted", "Owner", "Seal", "Turn", "UntilRate"]
 
 
 # The shapes of what a ledger says besides trials.
-
-Row: TypeAlias = tuple[Any, ...]
-"""As SQLite returns one; whoever asks for it knows which columns there are."""
 
 
 class KindData(TypedDict):
@@ -42,18 +39,26 @@ class KindData(TypedDict):
 
 
 class Owner(TypedDict):
-    """What tells a process from every other: ``started`` is in ticks since its machine did."""
+    """Identifies a process: ``started`` is in ticks since the start of its machine."""
 
     host: str
     pid: int
     started: int
 
 
+class UntilRate(TypedDict):
+    """Where a hunt with ``--until-rate`` stands; ``decided_at`` is the number of a trial, or None."""
+
+    bar: str
+    decided_at: int | None
+    verdict: str
+
+
 class Noted(TypedDict, total=False):
     """What is noted of a hunt besides its state; None where something no longer holds.
 
     Args:
-        owner: who runs it, while somebody does.
+        owner: the process that runs it, while it runs.
         began: when it was begun or resumed, in s since the epoch.
         heartbeat: when it was there last, likewise.
         done_before: how many trials had ended when it began.
@@ -62,7 +67,7 @@ class Noted(TypedDict, total=False):
         hunt_seed: what its trials are drawn from.
         independent: whether they were drawn independently of each other.
         plain_origin: of the trials that were, where its sampler keeps some apart that it does not guide; else None.
-        lag: by how many trials a sampler that learns is told late.
+        lag: by how many trials the results for a sampler that learns are delayed.
         origins: whether its sampler says where trials come from.
         core: whether the simulator's compiled core is used; None where it has none.
         disturb: how often what disturbs its trials; None where nothing does.
@@ -71,9 +76,11 @@ class Noted(TypedDict, total=False):
         nodes: the machines on which it ran last, where there were several: fields of `NodeFigures`.
         kinds: of crashes, the most frequent first, where it collects them all.
         dropped: of each kind, in words, the trials whose crashes are in the ledger only, as shorter ones were kept.
-        newest_kind: when the last new one came, in s since the epoch; None where there was none, or nobody knows.
+        newest_kind: when the last new one came, in s since the epoch; None if none or unknown.
         audits_left: the trials that were to be run again for the audit, and have not been; None where there is none.
         failed_steps: how many steps were simulated to confirm something that was not confirmed.
+        until_rate: ``bar``, as it was given, ``decided_at``, the number of the trial that decided, and ``verdict``;
+            None where the hunt has no bar.
     """
 
     owner: Owner | None
@@ -97,6 +104,7 @@ class Noted(TypedDict, total=False):
     audits_left: list[int] | None
     failed_steps: int
     dropped: dict[str, list[int]]
+    until_rate: UntilRate | None
 
 
 class Facts(Noted, total=False):
@@ -138,7 +146,7 @@ class Turn:
     """One turn with a sampler that learns.
 
     Args:
-        told: the numbers of the trials whose results it was told, in that order, after its turn before.
+        told: the numbers of the trials whose results it received since its last turn, in that order.
         spec: the trial that it proposed then.
     """
 
@@ -167,7 +175,7 @@ class LedgerReader:
 
     @property
     def sealed(self) -> bool:
-        """Whether whoever wrote last has closed it."""
+        """Whether the last writer has closed it."""
         return self._seal() is not None
 
     def events(self) -> list[tuple[float, str, str]]:
@@ -242,7 +250,7 @@ class LedgerReader:
         return {kind: (count, trials) for kind, count, trials in rows}
 
     def summed(self, what: str, of: str) -> list[Row]:
-        """Return sums over all trials, rows whose data cannot be read left out.
+        """Return sums over all trials, without rows whose data cannot be read.
 
         Args:
             what: is selected of them.
@@ -262,8 +270,8 @@ class LedgerReader:
     def steps_total(self) -> int:
         """Return how many steps were simulated in all.
 
-        Those of trials, those before their first, those of their copies, and those of runs that were to confirm
-        something and ended otherwise; what a ledger of before does not say is not in it.
+        They include the steps of trials, of their warm-up and of their copies, and those of confirmations that ended
+        differently. Steps that an older ledger does not record are missing.
         """
         seal = self._seal()
         other = self._other_steps()
@@ -356,7 +364,7 @@ class LedgerReader:
     def most_dangerous(self, count: int) -> list[int]:
         """Return the numbers of the trials without a crash that were the most dangerous, the greatest danger first.
 
-        Of several that are equal, the first. Those without any, or of which nobody measured it, are none.
+        Of several that are equal, the first. Trials without this value are skipped.
         """
         if "danger" not in self._shape.columns["trials"]:
             return []
@@ -375,7 +383,7 @@ class LedgerReader:
         """Yield number, seed, outcome, steps and least time to collision of every trial, in no particular order.
 
         Raises:
-            HuntDirectoryError: they are not as they were written; they were yielded all the same.
+            HuntDirectoryError: they are not as they were written; they were yielded nevertheless.
         """
         seal = self._seal()
         if seal is None:  # without one, only the whole rows say whether they are as they were written

@@ -43,7 +43,7 @@ _READER = 3  # the least version of a crashhunt that reads what this one writes
 _PROTECTED = 2  # the first version in which every row has a digest of its content
 _PROPOSING = 3  # the first version that has proposals
 SEAL, _READER_FACT = "seal", "reader"
-OWN_FACTS = (SEAL, _READER_FACT)  # what the ledger says of itself, beside the facts of the hunt
+OWN_FACTS = (SEAL, _READER_FACT)  # on the ledger itself, in addition to the facts of the hunt
 
 PROPOSALS = """
 CREATE TABLE IF NOT EXISTS proposals (
@@ -135,7 +135,7 @@ def columns_of_trials() -> tuple[str, ...]:
 
 
 def create(path: Path) -> None:
-    """Make an empty ledger, as a whole: whoever sees the file can read it."""
+    """Make an empty ledger, atomically: a visible file is always readable."""
     path.with_name(f"{path.name}-wal").unlink(missing_ok=True)  # SQLite would take that of an earlier one for its own
     with whole_file(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as database:
         database.execute("PRAGMA synchronous = OFF")  # the whole file is synced at once
@@ -200,12 +200,12 @@ def _refuse_unreadable(database: sqlite3.Connection, path: Path, version: int) -
         pass
     raise HuntDirectoryError(
         f"a ledger of version {version}, and this crashhunt reads the versions up to {VERSION}",
-        fix="use the crashhunt that made it, or run with --overwrite to begin anew",
+        fix="use the crashhunt that made it, or run with --overwrite to begin again",
         where=str(path),
     )
 
 
-# Ledgers of earlier versions become ledgers of this one, a version at a time, when somebody goes on with them.
+# Migrations: when a hunt resumes, its ledger is migrated to this version, one version at a time.
 
 
 def _add_digests(database: sqlite3.Connection) -> None:
@@ -223,7 +223,7 @@ def _add_proposals(database: sqlite3.Connection) -> None:
 
 
 def _add_danger(database: sqlite3.Connection) -> None:
-    """Nobody measured the danger of what is there; a row that is not as it was written keeps a digest that says so."""
+    """Add an empty criticality to existing rows; a damaged row keeps a digest that shows the damage."""
     database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
     database.execute("ALTER TABLE trials ADD COLUMN danger REAL")
     was = ", ".join(FIRST["trials"])
@@ -232,7 +232,7 @@ def _add_danger(database: sqlite3.Connection) -> None:
 
 
 def _add_other_steps(database: sqlite3.Connection) -> None:
-    """Of what is there, copies said how many steps they took; warm-ups did not, and nobody knows."""
+    """Of what is there, copies said how many steps they took; the steps of warm-ups are unknown."""
     database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
     database.execute("ALTER TABLE trials ADD COLUMN other_steps INTEGER")
     was = ", ".join((*FIRST["trials"], "danger"))
@@ -254,7 +254,7 @@ MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {
 
 A version may add tables, and columns at the end of a table, each with a value for the rows that are there. The digest
 of a row is over all columns in the order of the table, so that versions before can check rows that have columns which
-they do not know. A version that those before would read wrongly raises what it asks of whoever reads it.
+they do not know. A version that older readers would misread raises the version that it requires of readers.
 """
 
 

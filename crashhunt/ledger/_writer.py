@@ -1,8 +1,8 @@
 """The ledger: facts about trials in one SQLite file; one writer, any number of readers, also while the hunt runs.
 
-Every row has a digest of its content, which whoever reads the row checks. A writer that closes the file *seals* it: it
-writes down how many trials ended how and a digest over what counts and ranks them, so that those who read no whole rows
-see a change too, and that a row that is gone is missed. While a hunt runs, and after it was killed, there is no seal.
+Every row has a digest of its content, and every reader checks it. A writer that closes the file *seals* it. The seal
+has the number of trials of each outcome and a digest over the columns that count and rank them. So readers of single
+columns detect a change, too, and a missing row is detected. During a hunt, and after a kill, there is no seal.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from crashhunt.ledger._reader import Facts, Noted, Row
+    from crashhunt.ledger._file import Row
+    from crashhunt.ledger._reader import Facts, Noted
     from crashhunt.trial import TrialResult
 
 
@@ -38,7 +39,7 @@ _TOGETHER_S = 0.5  # a kill loses no more than this of what was recorded togethe
 
 
 def has_begun(path: Path) -> bool:
-    """Whether there is a ledger; an empty file, which whoever looks with SQLite leaves behind, is none."""
+    """Whether there is a ledger; an empty file, which SQLite creates on opening, is none."""
     return path.exists() and path.stat().st_size > 0
 
 
@@ -102,8 +103,8 @@ class Ledger(LedgerReader):
     def together(self) -> Iterator[None]:
         """Write what is recorded meanwhile at once: thousands of trials a second can be recorded so.
 
-        What was recorded is written half a second later at the latest, with the next trial: whoever records may wait
-        for trials in between. Nobody else sees it before, and a kill loses it: those trials run again.
+        What was recorded is written half a second later at the latest, with the next trial: the caller may wait
+        for trials in between. Other processes do not see it before, and a kill loses it: those trials run again.
 
         Raises:
             HuntDirectoryError: the disk is full.
@@ -126,7 +127,7 @@ class Ledger(LedgerReader):
         self._insert((*row, *(None,) * count)[:count])
 
     def propose(self, turns: Sequence[Turn]) -> None:
-        """Add what a sampler that learns has proposed, all or nothing, and what it was told before.
+        """Add the proposals of a sampler that learns, all or nothing, and the results that it received before.
 
         When this returns, a kill changes nothing about it any more. If the power goes, the last second may be
         lost; then what depended on it, the trials and their results, is lost with it.
@@ -193,7 +194,7 @@ class Ledger(LedgerReader):
         return gone
 
     def restore(self) -> bool:
-        """Write the file anew where somebody has removed it; its content is there as long as it is open.
+        """Write the file again if it was removed; its content exists as long as it is open.
 
         Returns:
             Whether it was gone.
@@ -251,11 +252,11 @@ class Ledger(LedgerReader):
         Raises:
             HuntDirectoryError: it is not, or it is of a newer version.
         """
-        if self._shape.version > VERSION:  # which has what nobody here can fill in
+        if self._shape.version > VERSION:  # its columns are unknown here
             raise HuntDirectoryError(
                 f"a ledger of version {self._shape.version}, and this crashhunt writes version {VERSION}: it can be "
                 "read, and no trial can be added",
-                fix="go on with the crashhunt that made it, or run with --overwrite to begin anew",
+                fix="resume with the crashhunt that made it, or run with --overwrite to begin again",
                 where=str(self._path),
             )
         self._prepare()

@@ -1,4 +1,4 @@
-"""The compiled parts: the core, which is optional and never another bit, and the fixed order of SUMO's links."""
+"""The compiled parts: the optional core, whose results are bit-identical, and the fixed order of SUMO's links."""
 
 import lazy_loader
 

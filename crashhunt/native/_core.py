@@ -1,4 +1,4 @@
-"""Whether the compiled core can be used, and what it offers."""
+"""The interface of the compiled core, and the check whether the installed core can be used."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ __all__ = [
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
 _INTERFACE = 8
-"""Raised whenever a function of the core changes; a core of another one is not used. scripts/build_core.py reads it."""
+"""Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED = ("1.28.0",)
-"""The versions of libsumo of whose functions the core knows how they are called."""
+"""The versions of libsumo whose functions the core can call."""
 
 DONE, ASK, REFUSED, ANSWERED, SIMULATED = range(5)
 """Results of `UsualSteps.take`, in this order:
@@ -50,7 +50,7 @@ class Columns(Protocol):
     """The numbers of one scene, as they are recorded."""
 
     points: Points
-    """x and y (m), as new lists, as the others are."""
+    """x and y (m), as a new list, like the other attributes."""
     headings: list[float]
     """In rad."""
     speeds: list[float]
@@ -61,25 +61,26 @@ class Columns(Protocol):
 
 
 class Vehicles(Protocol):
-    """Some vehicles of the running simulation, and the sizes of all who are with them in a scene."""
+    """Some vehicles of the running simulation, and the sizes of all actors of the same scene."""
 
     def read(self) -> Columns | None:
-        """Return their positions; None where libsumo refuses, as its getters will."""
+        """Return the state of the vehicles; None if libsumo fails, as its getters then do."""
 
     def look(self, controlled: Vehicles, squared: float, /) -> Columns | tuple[str, ...] | None:
-        """Return their positions; None where a vehicle has entered, left or collided, or a person is present.
+        """Return the state of the vehicles; None if a vehicle has entered, left or collided, or a person is present.
 
         Args:
-            controlled: the vehicles in the centre of this group.
-            squared: a distance, squared, in m². If it is not 0 and other vehicles are nearer, their ids are returned.
+            controlled: The vehicles around which this group was selected.
+            squared: A squared distance, in m². If it is not 0 and the group of nearer vehicles differs from this group,
+                the method returns the ids of the nearer vehicles.
         """
 
 
 class UsualSteps(Protocol):
-    """Steps of an episode with one agent and without any event, each in one call.
+    """Runs steps of an episode with one agent and without any event, each in one call.
 
-    A step does the same as `Episode.step` does with a recorder, SUMO and crashhunt's own oracles, in the same order.
-    After the first event it takes no more steps.
+    A step does the same as `Episode.step` with a recorder, SUMO and crashhunt's own oracles, in the same order. After
+    the first event, this object runs no more steps.
     """
 
     answer: object
@@ -118,11 +119,11 @@ class UsualSteps(Protocol):
         """Set the conditions under which oracles evaluate a step.
 
         Args:
-            overlaps: whether the oracle ``overlap`` may find a contact.
-            hardest: upper bound of braking, in m/s².
-            always: every step.
-            last: and all steps from this one on.
-            now_and_then: and one of so many steps.
+            overlaps: Whether the oracle ``overlap`` may find a contact.
+            hardest: Upper bound of braking, in m/s².
+            always: Whether oracles evaluate every step.
+            last: Oracles evaluate all steps from this step on.
+            now_and_then: Oracles evaluate every n-th step, with this n.
         """
 
     def resume(
@@ -140,21 +141,21 @@ class UsualSteps(Protocol):
         """Resume after a complete step.
 
         Args:
-            who: the vehicles of its scene, their ids, the row of the agent, the controlled vehicles.
-            observation: the next observation of the agent.
-            columns: of the scene.
-            time_s: of the scene.
-            lanes: of all vehicles in it, one per line, or an empty text.
-            where: the agent's edge, the number of its lane, the name of that, how far from the left this is (m).
-            follower: the vehicle behind the agent.
-            step: its number.
+            who: The vehicles of the scene, their ids, the row of the agent, the controlled vehicles.
+            observation: The next observation of the agent.
+            columns: The numbers of the scene.
+            time_s: The time of the scene, in s.
+            lanes: The lanes of all vehicles in the scene, one per line, or an empty text.
+            where: The agent's edge, the number and the name of its lane, and the lane's distance from the leftmost (m).
+            follower: The vehicle behind the agent.
+            step: The number of the step.
         """
 
     def borrow(self, tape: object, offset: int, reserved: int, tags: tuple[int, int, int, int], /) -> None:
         """Record into a buffer, with the tags of observation, action, step and lanes."""
 
     def give_back(self) -> tuple[int, int, list[int]]:
-        """Record no more; return where the records end, which step is complete, where the numbers of each begin."""
+        """Stop recording; return the end of the records, the last complete step, and the offsets of all steps."""
 
     def pause(self) -> None:
         """Take no steps and report nothing until `resume`, while other code takes a step."""
@@ -165,16 +166,21 @@ class UsualSteps(Protocol):
     def told(
         self,
     ) -> tuple[int, object, float, str, tuple[_Vehicles, float, str], tuple[_Vehicles, float, str]] | None:
-        """Return step, observation, reward, follower; of this scene and the one before vehicles, time (s), lanes."""
+        """Return the state after the last complete step; None if there is none.
+
+        Returns:
+            The step, the observation, the reward, the follower, and for this scene and the previous scene: the
+            vehicles, the time in s, the lanes.
+        """
 
     def columns(self, back: bool, /) -> Columns | None:
-        """Return the numbers of the scene, or of the one before."""
+        """Return the numbers of the last scene, or of the previous scene if ``back`` is true."""
 
     def reads(self, vehicles: _Vehicles, /) -> tuple[object, ...] | None:
-        """Return what is read here and nowhere else, to be compared with libsumo's getters."""
+        """Return the values that only this object reads, for a comparison with libsumo's getters."""
 
 
-_Vehicles = Vehicles  # the core has something of the same name
+_Vehicles = Vehicles  # `Core` has methods with the names of these classes
 _UsualSteps = UsualSteps
 
 
@@ -184,10 +190,10 @@ class Core(Protocol):
     INTERFACE: int
 
     def bind(self, library: str) -> None:
-        """Find libsumo's functions in its library, which is loaded.
+        """Find libsumo's functions in its loaded library.
 
         Raises:
-            OSError: one is not there.
+            OSError: The library lacks a function.
         """
 
     def Vehicles(  # noqa: N802 - a class
@@ -208,30 +214,30 @@ class Core(Protocol):
         start_m: float,
         /,
     ) -> _UsualSteps:
-        """Return the usual steps of an episode.
+        """Return the object that runs the uneventful steps of an episode.
 
         Args:
-            agent: who acts.
-            libsumo: the module, whose ``simulationStep`` is called.
-            array: what makes an observation, its shape and type.
-            others: how many are in it.
-            step_s: how long a step is, in s.
-            lateral: whether vehicles may be elsewhere than in the middle of a lane.
-            takes_speed: whether actions are a speed and a change of lane.
-            sight: of which vehicles the surroundings are looked at, every how many steps, how far (m, squared).
-            start_m: how far the agent had driven at the start, in m.
+            agent: The agent that acts.
+            libsumo: The module whose ``simulationStep`` is called.
+            array: The class, the shape and the type of an observation.
+            others: Number of other actors in an observation.
+            step_s: Step length, in s.
+            lateral: Whether vehicles may leave the centre line of a lane.
+            takes_speed: Whether actions are a speed and a change of lane.
+            sight: The vehicles around which to look, the steps between two looks, and the squared range (m²).
+            start_m: The distance that the agent had driven at the start, in m.
         """
 
     def columns(
         self, vehicles: _Vehicles, points: Sequence[object], headings: Sequence[float], speeds: Sequence[float], /
     ) -> Columns | None:
-        """Return the numbers of a scene in which others than vehicles are; None where they are no lists of numbers."""
+        """Return the numbers of a scene with persons; None if the arguments are not lists of numbers."""
 
     def is_coming_or_going(self) -> bool | None:
         """Whether a vehicle has entered or left in the last step."""
 
     def in_sight(self, controlled: _Vehicles, squared: float, /) -> tuple[tuple[str, ...], Points] | None:
-        """Return the ids of all vehicles near some, and where these are; None where libsumo refuses.
+        """Return the ids of all vehicles near the controlled vehicles, and the positions of these; None on failure.
 
         Args:
             controlled: the centres; absent vehicles are ignored.
@@ -249,53 +255,53 @@ class Core(Protocol):
         """Return the rows that the oracle ``overlap`` looks at, nearest first.
 
         Args:
-            columns: of a scene.
-            earlier: of the same actors, in the scene before.
-            row: the actor that they may touch.
-            step_s: the time between the two, in s.
+            columns: The numbers of a scene.
+            earlier: The numbers of the same actors in the previous scene.
+            row: The row of the actor that they may touch.
+            step_s: The time between the two scenes, in s.
             hardest: upper bound of braking, in m/s².
         """
 
     def may_be_near(
-        self, parts: list[Part], gap: float, horizon: float, gap_so_far: float, time_so_far: float,
-        braking_so_far: float, only_best: bool, /,
+        self, parts: list[Part], gap: float, horizon: float, known_gap: float, known_time: float,
+        known_braking: float, only_best: bool, /,
     ) -> tuple[bytes, bytes] | None:  # fmt: skip
-        """Return who has a part in the closest approach, and perhaps some who have not.
+        """Return the actors that may take part in the closest approach; the result may contain further actors.
 
-        In each scene that has anybody, the agent comes first.
+        In each scene with such actors, the agent comes first.
 
         Args:
-            parts: of an episode, in order.
-            gap: what is further apart does not count, in m.
-            horizon: what touches later does not count, in s.
-            gap_so_far: pairs further apart may be skipped, in m.
-            time_so_far: pairs that touch later may be skipped, in s,
-            braking_so_far: if that takes less braking than this as well, in m/s².
-            only_best: whether a pair may be skipped that is further apart, touches later and needs less braking
+            parts: The parts of an episode, in order.
+            gap: Pairs further apart do not count, in m.
+            horizon: Pairs that touch later do not count, in s.
+            known_gap: Pairs further apart may be skipped, in m.
+            known_time: Pairs that touch later may be skipped, in s, if they also need less than `known_braking`.
+            known_braking: See `known_time`, in m/s².
+            only_best: Whether a pair may be skipped that is further apart, touches later and needs less braking
                 than another pair.
 
         Returns:
-            Columns one after another, float64 and int64: x, y, heading, speed, half the length, half the width; the
-            number of the scene, and where the agent is among those found.
+            Columns one after another. As float64: x, y, heading, speed, half the length, half the width. As int64: the
+            number of the scene, and the position of the agent among the returned actors.
         """
 
     def tracks(
         self, parts: list[Part], every: int, within: float, ahead: float, behind: float, unknown: float, /
     ) -> tuple[tuple[bytes, bytes], tuple[bytes, bytes]] | None:
-        """Return where an agent was, and who was near it.
+        """Return the path of an agent, and the actors near it.
 
         Args:
-            parts: of an episode, in order.
-            every: of how many scenes one is looked at.
-            within: how near, between fronts and without the lengths of both, in m.
-            ahead: if it is not 0, actors off the agent's way up to this distance are skipped, in m,
-            behind: the same backwards, in m.
-            unknown: how far straight on its way is taken to go at its end, in m.
+            parts: The parts of an episode, in order.
+            every: Every n-th scene is used, with this n.
+            within: The range, between fronts and without the lengths of both actors, in m.
+            ahead: If it is not 0, actors off the agent's path within this distance ahead are skipped, in m.
+            behind: The same behind the agent, in m.
+            unknown: How far the agent's path is continued straight at its end, in m.
 
         Returns:
-            Twice columns one after another, float64 and int64, for the agent and for the others: x, y, heading, half
-            the length, half the width; of the agent the number of each scene, of the others which of these scenes, and
-            whose number.
+            Columns as float64 and as int64, for the agent and for the other actors. As float64: x, y, heading, half the
+            length, half the width. As int64 for the agent: the number of each scene. As int64 for the other actors:
+            the index of the scene, and the number of the actor.
         """
 
     def least_change(self, earlier: Columns, later: Columns, /) -> float | None:
@@ -305,12 +311,12 @@ class Core(Protocol):
         self, buffer: object, offset: int, tag: int, step: int, time_s: float, rewards: tuple[float, ...],
         columns: Columns, phase: int, /,
     ) -> int | None:  # fmt: skip
-        """Write the record of a step, and where the process is; return where the record ends."""
+        """Write the record of a step and the phase of the process; return the end of the record."""
 
     def write_array(
         self, buffer: object, offset: int, tag: int, agent: int, array: object, step: int, phase: int, /
     ) -> int | None:
-        """Write the record of an array, and where the process is; return where the record ends."""
+        """Write the record of an array and the phase of the process; return the end of the record."""
 
 
 @cache
@@ -323,7 +329,7 @@ def _installed() -> Core | None:
 
 
 def why_not(libsumo: str) -> str:
-    """Return why the core is not used with a version of libsumo; empty where it is."""
+    """Return why the core is not used with a version of libsumo; empty if it is used."""
     core = _installed()
     if core is None:
         return "it is not built"
@@ -335,17 +341,17 @@ def why_not(libsumo: str) -> str:
 
 
 def core_for(libsumo: str, library: str) -> Core | None:
-    """Return the core, ready for use; None where it cannot be used.
+    """Return the core, ready for use; None if it cannot be used.
 
     Args:
-        libsumo: its version.
-        library: the path of its library, which is loaded.
+        libsumo: The version of libsumo.
+        library: The path of libsumo's loaded library.
     """
     core = _installed()
     if core is None or why_not(libsumo):
         return None
     try:
         core.bind(library)
-    except OSError:  # such as on a system that looks names up otherwise
+    except OSError:  # libsumo lacks a function, or the system resolves names in another way
         return None
     return core

@@ -1,9 +1,9 @@
-"""Other seeds for SUMO's random generators while a simulation runs, by functions that libsumo exports.
+"""Re-seeds SUMO's random generators in a running simulation, with symbols that libsumo's library exports.
 
-libsumo has no call for that: ``--seed`` is read at load, and ``simulation.loadState`` does not continue as the original
-did (`crashhunt guide sumo`). Its library exports the generators themselves and ``RandHelper::initRand``, by which SUMO
-seeds them at load. Their layout belongs to a version of libsumo, so other versions are refused, and each seed is read
-back after it was written.
+libsumo has no function for that. SUMO reads ``--seed`` at load, and a simulation after ``simulation.loadState``
+deviates from the original (`crashhunt guide sumo`). The library exports the generators and ``RandHelper::initRand``,
+which seeds them at load. The layout of the generators belongs to a version of libsumo. So other versions are refused,
+and each seed is read back after it was written.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ _READ = "_ZN10RandHelper7getSeedEP7SumoRNG"  # RandHelper::getSeed(SumoRNG*)
 
 @cache
 def why_no_reseeding(libsumo: str, library: str) -> str:
-    """Return why the generators cannot be re-seeded with a version of libsumo; empty where they can.
+    """Return why the generators cannot be re-seeded with a version of libsumo; empty if they can.
 
     Args:
-        libsumo: its version.
-        library: the path of its library, which is loaded.
+        libsumo: The version of libsumo.
+        library: The path of libsumo's loaded library.
     """
     if libsumo not in _CHECKED:
         return f"libsumo {libsumo} was not checked for re-seeding (checked: {', '.join(_CHECKED)})"
@@ -53,14 +53,14 @@ def reseed_generators(library: str, seed: int) -> int:
     """Give each generator of the running simulation a seed of its own, drawn from one seed.
 
     Args:
-        library: the path of libsumo's library, for which `why_no_reseeding` returned nothing.
-        seed: from 0 on.
+        library: The path of libsumo's library, for which `why_no_reseeding` returned an empty text.
+        seed: A seed of at least 0.
 
     Returns:
-        How many generators have been re-seeded.
+        The number of re-seeded generators.
 
     Raises:
-        RuntimeError: the generators are not as they are described here; nothing can be said of the simulation then.
+        RuntimeError: The generators have an unknown layout; discard the simulation then.
     """
     loaded = ctypes.CDLL(library)
     first, last, _ = (ctypes.c_void_p * 3).in_dll(loaded, _LANES)
@@ -72,7 +72,7 @@ def reseed_generators(library: str, seed: int) -> int:
     set_seed, get_seed = loaded[_SEED], loaded[_READ]
     set_seed.argtypes, set_seed.restype = (ctypes.c_void_p, ctypes.c_bool, ctypes.c_int), None
     get_seed.argtypes, get_seed.restype = (ctypes.c_void_p,), ctypes.c_int
-    # SUMO seeds all of them alike. A sequence keeps generators of successive seeds from sharing their numbers.
+    # SUMO gives all generators the same seed. A SeedSequence gives each its own seed, also for successive seeds.
     drawn = np.random.SeedSequence(seed).generate_state(len(places)) >> 1
     for place, value in zip(places, drawn.tolist(), strict=True):
         set_seed(place, False, value)

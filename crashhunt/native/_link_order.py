@@ -27,8 +27,8 @@ class LinkOrder:
     """The library, bound to libsumo.
 
     Args:
-        library: the library, loaded.
-        reason: why the order is not fixed; empty where it is.
+        library: The loaded library; None if it cannot be used.
+        reason: Why the order is not fixed; empty if it is fixed.
     """
 
     def __init__(self, library: ctypes.CDLL | None, reason: str) -> None:
@@ -41,7 +41,7 @@ class LinkOrder:
             self._library.crashhunt_link_order_use(use)
 
     def check_load(self) -> str:
-        """Return why the links of the last load are not ordered; empty where they are. Call it once per load."""
+        """Return why the links of the last load are not ordered; empty if they are. Call this method once per load."""
         ordered, unordered = self._counted()
         before, self._loads = self._loads, (ordered, unordered)
         if self.reason or ordered > before[0]:
@@ -58,7 +58,7 @@ class LinkOrder:
 
 
 def why_no_link_order(libsumo: str) -> str:
-    """Return why the order is not fixed with a version of libsumo; empty where it is."""
+    """Return why the order is not fixed with a version of libsumo; empty if it is fixed."""
     path = _installed()
     if path is None:
         return "the library is not built"
@@ -72,11 +72,11 @@ def why_no_link_order(libsumo: str) -> str:
 
 @cache
 def link_order(libsumo: str, library: str) -> LinkOrder:
-    """Return the library, bound to libsumo, whose order then is fixed.
+    """Return the library, bound to libsumo.
 
     Args:
-        libsumo: its version.
-        library: the path of its library, which is loaded.
+        libsumo: The version of libsumo.
+        library: The path of libsumo's loaded library.
     """
     if reason := why_no_link_order(libsumo):
         return LinkOrder(None, reason)
@@ -90,14 +90,14 @@ def link_order(libsumo: str, library: str) -> LinkOrder:
 
 @cache
 def _installed() -> str | None:
-    """Return the path of the library; None where there is none."""
+    """Return the path of the library; None if it is not installed."""
     found = importlib.util.find_spec(_LIBRARY)
     return found.origin if found is not None else None
 
 
 @cache
 def _interface() -> int:
-    """Return the interface of the library that is installed; 0 where it has none."""
+    """Return the interface version of the installed library; 0 if it has none."""
     try:
         return int(ctypes.CDLL(str(_installed())).crashhunt_link_order_interface())
     except (OSError, AttributeError):  # a damaged file, or a foreign library

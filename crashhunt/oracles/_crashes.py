@@ -49,18 +49,18 @@ class ReportedCollision:
             if touch is not None:
                 return _touching(self.name, agent, other, touch, contact.kind, contact.lane or lane)
         return Collision(
-            agent,
-            "alone" if not contact.victim else "collider" if agent == contact.collider else "victim",
-            contact.collider,
-            contact.victim,
-            (self.name,),
-            contact.kind,
-            x,
-            y,
-            contact.lane or lane,
-            contact.collider_speed,
-            contact.victim_speed,
-            scene.time_s,
+            agent=agent,
+            role="alone" if not contact.victim else "collider" if agent == contact.collider else "victim",
+            collider=contact.collider,
+            victim=contact.victim,
+            seen_by=(self.name,),
+            kind=contact.kind,
+            x=x,
+            y=y,
+            lane=contact.lane or lane,
+            collider_speed=contact.collider_speed,
+            victim_speed=contact.victim_speed,
+            time_s=scene.time_s,
         )
 
 
@@ -105,7 +105,17 @@ class OffRoad:
                 row = scene.roster.index.get(agent)
                 speed = scene.speeds[row] if row is not None else float("nan")
                 collision = Collision(
-                    agent, "alone", agent, "", (self.name,), "off_road", x, y, lane, speed, time_s=scene.time_s
+                    agent=agent,
+                    role="alone",
+                    collider=agent,
+                    victim="",
+                    seen_by=(self.name,),
+                    kind="off_road",
+                    x=x,
+                    y=y,
+                    lane=lane,
+                    collider_speed=speed,
+                    time_s=scene.time_s,
                 )
                 findings.append(Finding(Outcome.OFF_ROAD, collision))
         return findings

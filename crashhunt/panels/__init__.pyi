@@ -1,5 +1,6 @@
-from ._painting import FAINT as FAINT, INK as INK, as_array as as_array, font as font
 from ._panels import (
+    FAINT as FAINT,
+    INK as INK,
     Action as Action,
     ActionDistribution as ActionDistribution,
     Bar as Bar,
@@ -10,6 +11,8 @@ from ._panels import (
     Panel as Panel,
     Picture as Picture,
     Text as Text,
+    as_array as as_array,
+    font as font,
     labelled as labelled,
     scope as scope,
 )

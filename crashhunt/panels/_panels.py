@@ -1,20 +1,30 @@
-"""Panels: views of an agent's internal state, shown next to the scene. They are plain data, drawn on request."""
+"""Panels: views of an agent's internal state, shown next to the scene. They are plain data, drawn on request.
+
+An agent makes panels in every step, also where nothing draws them. Pillow is therefore imported by the first drawing.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from functools import lru_cache, singledispatch
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+import numpy as np
 
-    import numpy as np
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from numpy.typing import ArrayLike, NDArray
+    from PIL import Image, ImageFont
 
 
 __all__ = [
+    "FAINT",
+    "INK",
     "Action",
     "ActionDistribution",
     "Bar",
@@ -25,7 +35,8 @@ __all__ = [
     "Panel",
     "Picture",
     "Text",
-    "current_scope",
+    "as_array",
+    "font",
     "labelled",
     "scope",
 ]
@@ -106,8 +117,6 @@ class Panel:
             TypeError: it is of a class of your own, which then has to have this method.
             ValueError: what it shows has the wrong shape.
         """
-        from crashhunt.panels._painting import painted
-
         return painted(self, width, height, label or self.title)
 
 
@@ -246,3 +255,418 @@ class Picture(Panel):
     """
 
     image: ArrayLike
+
+
+# What all pictures share: fonts, colours, axes.
+
+PAPER, INK, FAINT, GRID = (255, 255, 255), (27, 36, 48), (93, 107, 125), (217, 223, 231)
+# Okabe and Ito's palette, which the colour-blind can tell apart.
+COLORS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (90, 90, 90))
+_LONGEST = 80  # characters of a name
+_NEAREST = 1e-100  # what is closer is one place
+# Nine points of viridis (S. van der Walt, N. Smith), between which is interpolated.
+_VIRIDIS = (
+    (68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141), (39, 173, 129), (92, 200, 99),
+    (170, 220, 50), (253, 231, 37),
+)  # fmt: skip
+
+
+@lru_cache(maxsize=16)
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Return a font; Pillow brings it along."""
+    from PIL import ImageFont
+
+    return ImageFont.load_default(size)
+
+
+@lru_cache(maxsize=1)
+def color_map() -> NDArray[np.uint8]:
+    """Return 256 colours from low to high, shape (256, 3)."""
+    places = np.linspace(0, 255, len(_VIRIDIS))
+    columns = [np.interp(np.arange(256), places, [color[part] for color in _VIRIDIS]) for part in range(3)]
+    return np.stack(columns, axis=1).round().astype(np.uint8)
+
+
+def map_colors(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.uint8]:
+    """Return the colours of values, shape (*values.shape, 3); grey where a value is not finite."""
+    finite = np.isfinite(values)
+    share = (np.where(finite, values, low) - low) / span_of(low, high)
+    colors = color_map()[np.clip(share * 255, 0, 255).astype(np.uint8)]
+    colors[~finite] = 200
+    return colors
+
+
+def span_of(low: float, high: float) -> float:
+    """Return how far apart two limits are; 1 where they are not."""
+    return high - low if high - low > _NEAREST else 1.0
+
+
+def number(value: float) -> str:
+    """Return a number for a label."""
+    return f"{value:.3g}" if math.isfinite(value) else "-"
+
+
+@lru_cache(maxsize=256)
+def ticks(low: float, high: float, most: int = 4) -> tuple[float, ...]:
+    """Return round numbers between two limits."""
+    if not high - low > max(_NEAREST, abs(low) * 1e-12, abs(high) * 1e-12):  # as far as floats can tell
+        return (low,)
+    raw = (high - low) / most
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw * 0.999)
+    first = math.ceil(low / step - 1e-9)
+    return tuple(place * step for place in range(first, math.floor(high / step + 1e-9) + 1))
+
+
+@lru_cache(maxsize=512)
+def _background(width: int, height: int, title: str) -> Image.Image:
+    from PIL import Image, ImageDraw
+
+    image = Image.new("RGB", (width, height), PAPER)
+    draw = ImageDraw.Draw(image)
+    draw.rectangle((0, 0, width - 1, height - 1), outline=GRID)
+    draw.text((width // 2, 3), title, INK, font(12), anchor="ma")
+    return image
+
+
+class Canvas:
+    """An empty panel with its title, to draw on.
+
+    Args:
+        width: in pixels.
+        height: in pixels.
+        title: above it.
+
+    Attributes:
+        image: what is drawn.
+        draw: what draws.
+    """
+
+    def __init__(self, width: int, height: int, title: str) -> None:
+        from PIL import ImageDraw
+
+        self.width, self.height = width, height
+        self.image = _background(width, height, _line(title)).copy()
+        self.draw = ImageDraw.Draw(self.image)
+
+    def text(
+        self, at: tuple[float, float], text: str, color: tuple[int, int, int], size: int, anchor: str = "la"
+    ) -> None:
+        """Write one line."""
+        self.draw.text(at, _line(text), color, font(size), anchor=anchor)
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """Return it as uint8, shape (height, width, 3)."""
+        return as_array(self.image)
+
+
+def as_array(image: Image.Image) -> NDArray[np.uint8]:
+    """Return an image as uint8, shape (height, width, 3)."""
+    return np.asarray(image.convert("RGB") if image.mode != "RGB" else image)
+
+
+def _line(text: object) -> str:
+    """A name on one line, and no longer than anybody could read."""
+    return " ".join(str(text)[:_LONGEST].split())
+
+
+_TOP, _LEFT, _BOTTOM, _RIGHT = 20, 38, 18, 10  # room for title and labels, in pixels
+_SHORT = 12  # characters of a name that are written large
+_HUGE = 1e100  # beyond it, the difference of two numbers may overflow; drawn as missing
+
+
+def painted(panel: Panel, width: int, height: int, label: str) -> NDArray[np.uint8]:
+    """Return a panel as uint8, shape (height, width, 3).
+
+    Raises:
+        TypeError: the panel has no known type.
+        ValueError: what it shows has the wrong shape.
+    """
+    canvas = Canvas(width, height, label)
+    with np.errstate(all="ignore"):  # agents show what they have
+        _paint(panel, canvas)
+    return canvas.pixels()
+
+
+@singledispatch
+def _paint(panel: Panel, _canvas: Canvas) -> None:
+    raise TypeError(f"{type(panel).__name__} does not say how it is drawn")
+
+
+@_paint.register(Heatmap)
+def _paint_heatmap(panel: Heatmap, canvas: Canvas) -> None:
+    values = _matrix_of(panel.values)
+    low, high = _limits(values, panel.low, panel.high)
+    colors = map_colors(values, low, high)
+    box = _paste_map(canvas, colors, smooth=False)
+    if panel.annotate:
+        cell = ((box[2] - box[0]) / values.shape[1], (box[3] - box[1]) / values.shape[0])
+        for row in range(values.shape[0]):
+            for column in range(values.shape[1]):
+                at = (box[0] + (column + 0.5) * cell[0], box[1] + (row + 0.5) * cell[1])
+                ink = (0, 0, 0) if colors[row, column].mean() > 120 else (255, 255, 255)
+                canvas.text(at, number(values[row, column]), ink, 10, anchor="mm")
+    _color_bar(canvas, low, high)
+
+
+@_paint.register(Contour)
+def _paint_contour(panel: Contour, canvas: Canvas) -> None:
+    values, levels = _matrix_of(panel.values), max(1, panel.levels)
+    low, high = _limits(values, panel.low, panel.high)
+    fine = _bilinear(values, 120, 180)
+    there = np.isfinite(fine)
+    share = (np.where(there, fine, low) - low) / span_of(low, high)
+    level = np.clip((share * levels).astype(int), 0, levels - 1)
+    colors = map_colors(np.where(there, (level + 0.5) / levels, np.nan), 0.0, 1.0)
+    edge = np.zeros(level.shape, bool)
+    edge[:, 1:] |= level[:, 1:] != level[:, :-1]
+    edge[1:] |= level[1:] != level[:-1]
+    colors[edge & there] //= 2
+    _paste_map(canvas, colors, smooth=True)
+    _color_bar(canvas, low, high)
+
+
+@_paint.register(Curve)
+def _paint_curve(panel: Curve, canvas: Canvas) -> None:
+    named = panel.series if isinstance(panel.series, Mapping) else {"": panel.series}
+    series = {str(name): _numbers(values).ravel() for name, values in named.items()}
+    longest = max((len(values) for values in series.values()), default=0)
+    x = np.arange(longest) if panel.x is None else _numbers(panel.x).ravel()
+    everything = np.concatenate(list(series.values())) if series else np.zeros(0)
+    low, high = _limits(everything, panel.low, panel.high)
+    frame = _Axes(canvas, *_limits(x, None, None), low, high)
+    for place, (name, values) in enumerate(series.items()):
+        count = min(len(x), len(values))
+        for part in _finite_runs(x[:count], values[:count]):
+            frame.line(part, COLORS[place % len(COLORS)])
+        _key(canvas, place, name)
+    if panel.cursor is not None:
+        at = frame.x(panel.cursor)
+        canvas.draw.line((at, _TOP, at, canvas.height - _BOTTOM), FAINT)
+
+
+@_paint.register(Curve3D)
+def _paint_curve_3d(panel: Curve3D, canvas: Canvas) -> None:
+    points = _numbers(panel.points).reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return
+    low, high = points.min(axis=0), points.max(axis=0)
+    span = np.where(high > low, high - low, 1.0)
+    turn = math.radians(panel.azimuth)
+    size = 0.55 * min(canvas.width, canvas.height - _TOP)
+
+    def place(where: NDArray[np.float64]) -> NDArray[np.float64]:
+        unit = (where - low) / span - 0.5
+        across = unit[:, 0] * math.cos(turn) - unit[:, 1] * math.sin(turn)
+        away = unit[:, 0] * math.sin(turn) + unit[:, 1] * math.cos(turn)
+        return np.stack(
+            (canvas.width / 2 + across * size, (canvas.height + _TOP) / 2 - (0.4 * away + 0.75 * unit[:, 2]) * size), 1
+        )
+
+    corner = place(np.array([low, [high[0], low[1], low[2]], [low[0], high[1], low[2]], [low[0], low[1], high[2]]]))
+    for name, end in zip("xyz", corner[1:], strict=True):
+        canvas.draw.line((*corner[0], *end), FAINT)
+        canvas.text(tuple(end), name, FAINT, 10)
+    path = place(points)
+    shades = color_map()[np.linspace(0, 255, max(1, len(path) - 1)).astype(int)]
+    for begin, end, shade in zip(path, path[1:], shades, strict=False):
+        canvas.draw.line((*begin, *end), tuple(map(int, shade)), 2)
+
+
+@_paint.register(Bar)
+def _paint_bar(panel: Bar, canvas: Canvas) -> None:
+    named = panel.values
+    if not isinstance(named, Mapping):
+        named = {str(place): float(value) for place, value in enumerate(_numbers(named).ravel())}
+    values = _numbers([*named.values(), 0.0])  # bars stand on zero
+    _bars(canvas, list(named), values[:-1], *_limits(values, panel.low, panel.high))
+
+
+@_paint.register(Text)
+def _paint_text(panel: Text, canvas: Canvas) -> None:
+    canvas.draw.multiline_text((8, _TOP + 2), str(panel.text), INK, font(12), spacing=3)
+
+
+@_paint.register(Action)
+def _paint_action(panel: Action, canvas: Canvas) -> None:
+    values = np.asarray(panel.value)
+    if values.ndim == 0 and np.issubdtype(values.dtype, np.integer):
+        name = panel.names[int(values)] if 0 <= int(values) < len(panel.names) else ""
+        middle, size = (canvas.width / 2, canvas.height / 2), 26 if len(name) <= _SHORT else 14
+        canvas.text(middle, name or str(int(values)), COLORS[0], size if name else 36, anchor="mm")
+        if name:
+            canvas.text((middle[0], middle[1] + 32), f"action {int(values)}", INK, 12, anchor="mm")
+        return
+    parts = _numbers(values).ravel()
+    low = np.broadcast_to(_numbers(-1.0 if panel.low is None else panel.low), parts.shape)
+    high = np.broadcast_to(_numbers(1.0 if panel.high is None else panel.high), parts.shape)
+    row = min(34.0, (canvas.height - _TOP - 6) / max(1, len(parts)))
+    left, right = 8.0, canvas.width - 9.0
+    for place, value in enumerate(parts):
+        top = _TOP + 2 + place * row
+        canvas.text((left, top), f"{_name(panel.names, place)} {number(value)}", INK, 11)
+        at = top + row - 10
+        canvas.draw.rectangle((left, at, right, at + 6), outline=FAINT)
+        if math.isfinite(value):
+            shares = (np.array([0.0, value]) - low[place]) / span_of(low[place], high[place])
+            begin, end = sorted((left + (right - left) * np.clip(shares, 0.0, 1.0)).tolist())
+            canvas.draw.rectangle((begin, at, max(end, begin + 1), at + 6), COLORS[0])
+
+
+@_paint.register(ActionDistribution)
+def _paint_distribution(panel: ActionDistribution, canvas: Canvas) -> None:
+    if panel.probabilities is not None:
+        values = _numbers(panel.probabilities).ravel()
+        _bars(canvas, [_name(panel.names, place) for place in range(len(values))], values, 0.0, 1.0)
+        return
+    if panel.mean is None or panel.std is None:
+        raise ValueError("probabilities are needed, or mean and std")
+    mean, std = _numbers(panel.mean).ravel(), np.maximum(_numbers(panel.std).ravel(), 1e-9)
+    if len(mean) != len(std):
+        raise ValueError(f"mean has {len(mean)} parts, std {len(std)}")
+    there = np.isfinite(mean) & np.isfinite(std)
+    if not there.any():
+        return
+    low, high = float((mean - 3 * std)[there].min()), float((mean + 3 * std)[there].max())
+    x = np.linspace(low, high, 120)
+    density = np.exp(-(((x[None] - mean[:, None]) / std[:, None]) ** 2) / 2) / (std[:, None] * math.sqrt(math.tau))
+    frame = _Axes(canvas, low, high, 0.0, float(density[there].max()))
+    for place, curve in enumerate(density):
+        if there[place]:
+            frame.line(np.stack((x, curve), 1), COLORS[place % len(COLORS)])
+        _key(canvas, place, _name(panel.names, place))
+
+
+@_paint.register(Picture)
+def _paint_picture(panel: Picture, canvas: Canvas) -> None:
+    pixels = np.asarray(panel.image)
+    if pixels.dtype != np.uint8:
+        pixels = (np.clip(np.nan_to_num(_numbers(pixels)), 0, 1) * 255).astype(np.uint8)
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    if pixels.ndim != 3 or 0 in pixels.shape:
+        raise ValueError(f"an image is needed, not shape {pixels.shape}")
+    if pixels.shape[2] < 3:
+        pixels = np.repeat(pixels[:, :, :1], 3, axis=2)
+    scale = min((canvas.width - 12) / pixels.shape[1], (canvas.height - _TOP - 6) / pixels.shape[0])
+    size = max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale))
+    from PIL import Image
+
+    drawn = Image.fromarray(np.ascontiguousarray(pixels[:, :, :3])).resize(size)
+    canvas.image.paste(drawn, ((canvas.width - size[0]) // 2, _TOP + (canvas.height - _TOP - 6 - size[1]) // 2))
+
+
+class _Axes:
+    """A frame with labels, and values to pixels."""
+
+    def __init__(self, canvas: Canvas, left: float, right: float, low: float, high: float) -> None:
+        self._draw = canvas.draw
+        self._left, self._low = left, low
+        self._scale_x = (canvas.width - _LEFT - _RIGHT) / span_of(left, right)
+        self._scale_y = (canvas.height - _TOP - _BOTTOM) / span_of(low, high)
+        self._bottom = canvas.height - _BOTTOM
+        for tick in ticks(low, high):
+            at = self._bottom - (tick - low) * self._scale_y
+            canvas.draw.line((_LEFT, at, canvas.width - _RIGHT, at), GRID)
+            canvas.text((_LEFT - 4, at), number(tick), FAINT, 10, anchor="rm")
+        for tick in ticks(left, right):
+            canvas.text((self.x(tick), canvas.height - _BOTTOM + 3), number(tick), FAINT, 10, anchor="mt")
+        canvas.draw.rectangle((_LEFT, _TOP, canvas.width - _RIGHT, self._bottom), outline=FAINT)
+
+    def x(self, value: float) -> float:
+        return _LEFT + (value - self._left) * self._scale_x
+
+    def line(self, points: NDArray[np.float64], color: tuple[int, int, int]) -> None:
+        placed = np.empty_like(points)
+        placed[:, 0] = _LEFT + (points[:, 0] - self._left) * self._scale_x
+        placed[:, 1] = np.clip(self._bottom - (points[:, 1] - self._low) * self._scale_y, _TOP, self._bottom)
+        if len(placed) == 1:
+            placed = np.repeat(placed, 2, axis=0)
+        self._draw.line(placed.ravel().tolist(), color, 2)
+
+
+def _bars(canvas: Canvas, names: Sequence[str], values: NDArray[np.float64], low: float, high: float) -> None:
+    if not len(values):
+        return
+    room, top, bottom = (canvas.width - 16) / len(values), _TOP + 12, canvas.height - _BOTTOM
+    scale = (bottom - top) / span_of(low, high)
+    zero = bottom - (min(max(0.0, low), high) - low) * scale
+    for place, (name, value) in enumerate(zip(names, values.tolist(), strict=True)):
+        left = 8 + place * room
+        middle = left + room / 2
+        if math.isfinite(value):
+            end = bottom - (min(max(value, low), high) - low) * scale
+            canvas.draw.rectangle((left + room * 0.15, min(end, zero), left + room * 0.85, max(end, zero)), COLORS[0])
+            canvas.text((middle, min(end, zero) - 2), number(value), INK, 10, anchor="mb")
+        canvas.text((middle, bottom + 3), name, FAINT, 10, anchor="mt")
+    canvas.draw.line((8, zero, canvas.width - 8, zero), FAINT)
+
+
+def _matrix_of(values: ArrayLike) -> NDArray[np.float64]:
+    matrix = np.atleast_2d(_numbers(values))
+    if matrix.ndim != 2 or 0 in matrix.shape:
+        raise ValueError(f"a matrix is needed, not shape {matrix.shape}")
+    return matrix
+
+
+def _limits(values: NDArray[np.generic], low: float | None, high: float | None) -> tuple[float, float]:
+    finite = values[np.isfinite(values)]
+    least, most = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    lower, upper = _numbers([least if low is None else low, most if high is None else high]).tolist()
+    lower = lower if math.isfinite(lower) else least
+    return lower, max(lower, upper if math.isfinite(upper) else most)
+
+
+def _numbers(values: ArrayLike) -> NDArray[np.float64]:
+    """Values as floats; what is so large that drawing it would overflow is no number."""
+    found = np.array(values, float)
+    found[~(np.abs(found) < _HUGE)] = np.nan
+    return found
+
+
+def _finite_runs(x: NDArray[np.generic], y: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The stretches of a curve that have values."""
+    there = np.isfinite(y) & np.isfinite(x)
+    if there.all():
+        return [np.stack((x, y), 1).astype(float)] if len(y) else []
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], there.astype(np.int8), [0]))))
+    return [np.stack((x[a:b], y[a:b]), 1).astype(float) for a, b in zip(edges[0::2], edges[1::2], strict=True)]
+
+
+def _bilinear(values: NDArray[np.float64], rows: int, columns: int) -> NDArray[np.float64]:
+    row, column = np.linspace(0, values.shape[0] - 1, rows), np.linspace(0, values.shape[1] - 1, columns)
+    top, left = np.floor(row).astype(int), np.floor(column).astype(int)
+    below, right = np.minimum(top + 1, values.shape[0] - 1), np.minimum(left + 1, values.shape[1] - 1)
+    down, along = (row - top)[:, None], (column - left)[None]
+    upper = values[np.ix_(top, left)] * (1 - along) + values[np.ix_(top, right)] * along
+    lower = values[np.ix_(below, left)] * (1 - along) + values[np.ix_(below, right)] * along
+    fine: NDArray[np.float64] = upper * (1 - down) + lower * down
+    return fine
+
+
+def _paste_map(canvas: Canvas, colors: NDArray[np.uint8], *, smooth: bool) -> tuple[int, int, int, int]:
+    from PIL import Image
+
+    resample = Image.Resampling.BILINEAR if smooth else Image.Resampling.NEAREST
+    """Stretch a picture over the room for it, and say where that is."""
+    box = (_RIGHT, _TOP, canvas.width - 52, canvas.height - 8)
+    canvas.image.paste(Image.fromarray(colors).resize((box[2] - box[0], box[3] - box[1]), resample), box[:2])
+    return box
+
+
+def _color_bar(canvas: Canvas, low: float, high: float) -> None:
+    from PIL import Image
+
+    bar = Image.fromarray(color_map()[::-1][:, None, :]).resize((8, canvas.height - _TOP - 8))
+    canvas.image.paste(bar, (canvas.width - 48, _TOP))
+    canvas.text((canvas.width - 37, _TOP), number(high), FAINT, 10, anchor="lt")
+    canvas.text((canvas.width - 37, canvas.height - 8), number(low), FAINT, 10, anchor="ls")
+
+
+def _key(canvas: Canvas, place: int, name: str) -> None:
+    canvas.text((canvas.width - _RIGHT - 3, _TOP + 2 + 12 * place), name, COLORS[place % len(COLORS)], 10, anchor="rt")
+
+
+def _name(names: Sequence[str], place: int) -> str:
+    return names[place] if place < len(names) else str(place)

@@ -1,4 +1,11 @@
-from ._declaration import Given as Given, HuntOption as HuntOption, seconds_of as seconds_of, share_of as share_of
+from ._declaration import (
+    Given as Given,
+    HuntOption as HuntOption,
+    check_rate as check_rate,
+    rate_of as rate_of,
+    seconds_of as seconds_of,
+    share_of as share_of,
+)
 from ._options import (
     Driver as Driver,
     HuntOptions as HuntOptions,

@@ -23,10 +23,12 @@ __all__ = [
     "at_least",
     "check_duration",
     "check_probe",
+    "check_rate",
     "check_share",
     "declared",
     "declared_options",
     "option",
+    "rate_of",
     "seconds_of",
     "share_of",
     "within",
@@ -39,8 +41,7 @@ Form = Literal["flag", "integer", "number", "text", "list", "table"]
 Check = Callable[[Any], str]  # what to give instead; empty where the value is fine
 
 Given: TypeAlias = Mapping[str, Any]
-"""Options by name, as somebody gives them. Of which types they are the list says, and `HuntOption.checked` sees to it;
-a type checker would need the list a second time."""
+"""Options by name, as the user gives them. The list defines their types, and `HuntOption.checked` checks them."""
 
 _ABOUT = "crashhunt"  # the key of a field's metadata
 
@@ -52,7 +53,7 @@ class About:
     Args:
         meaning: of its value, in words.
         help: the same on the command line, where it has to be said otherwise.
-        unset: what holds where it is not given, in words; left out where that is the default itself.
+        unset: what holds where it is not given, in words; empty where that is the default itself.
         flag: on the command line; empty where it is not there.
         metavar: of its value, on the command line.
         group: of the help of ``crashhunt run``.
@@ -185,7 +186,7 @@ def declared_options(kind: type) -> tuple[HuntOption, ...]:
     """Return the options that a dataclass declares, in its order."""
     hints = get_type_hints(kind)
     return tuple(
-        HuntOption(item.name, _form(hints[item.name]), _default(item), item.metadata[_ABOUT])
+        HuntOption(name=item.name, form=_form(hints[item.name]), default=_default(item), about=item.metadata[_ABOUT])
         for item in fields(kind)
         if _ABOUT in item.metadata
     )
@@ -206,7 +207,7 @@ _FORM_OF: Mapping[object, Form] = {
 }  # fmt: skip
 
 
-# ``--for TIME`` and ``--probe TIME``: how long a hunt may go on, how often something is done.
+# ``--for TIME`` and ``--probe TIME``: time limits and intervals.
 
 _UNITS = (86400.0, 3600.0, 60.0, 1.0)  # days, hours, minutes, seconds
 _TIME = re.compile(r"(?:(\d+(?:\.\d+)?)d)?(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?")
@@ -269,3 +270,37 @@ def check_probe(text: str) -> str:
     if check_duration(text):
         return "give a time above 0, such as 4s, or leave it out"
     return "" if not text or sys.platform == "linux" else "leave it out: processes are copied on Linux only"
+
+
+# ``--until-rate RATE/UNIT`` and ``--bar RATE/UNIT``: how often an agent may crash.
+
+RatePer = Literal["trial", "hour", "1000km"]
+_RATE = re.compile(r"(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)\s*/\s*(trial|hour|1000\s?km)")
+
+
+def rate_of(text: str) -> tuple[float, RatePer]:
+    """Return the rate and what it is per, of ``1e-3/trial``, ``2/hour`` or ``5/1000km``.
+
+    >>> rate_of("2/hour")
+    (2.0, 'hour')
+
+    Raises:
+        ValueError: the text is no such rate, or the rate is not above 0, or not below 1 per trial.
+    """
+    found = _RATE.fullmatch(text.strip())
+    if found is None:
+        raise ValueError(f"{text!r} is no rate")
+    value, per = float(found[1]), cast(RatePer, found[2].replace(" ", ""))
+    if not 0 < value < (1 if per == "trial" else math.inf):
+        raise ValueError(f"{text!r} is out of range")
+    return value, per
+
+
+def check_rate(text: str) -> str:
+    """Return what to give instead of a text that is no rate; empty where it is one, or empty."""
+    try:
+        if text:
+            rate_of(text)
+    except ValueError:
+        return "give a rate above 0, such as 1e-3/trial (below 1), 2/hour or 5/1000km"
+    return ""

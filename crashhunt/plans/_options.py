@@ -1,8 +1,7 @@
 """The one list of hunt options.
 
-The command line, `crashhunt.prepare` and ``run``, ``suite.toml``, ``request.json`` and ``hunt.toml`` are made of it: an
-option is added by adding a field to one of the classes here, and all of them have it. Which class it is says where the
-option is kept:
+The command line, `crashhunt.prepare` and ``run``, ``suite.toml``, ``request.json`` and ``hunt.toml`` are made from it.
+To add an option to all of them, add a field to one of the classes here. The class determines where the option is kept:
 
 - `Subject` is resolved into ``hunt.toml`` by `plan`, which has to learn of it;
 - `TrialOptions` decides what a trial is: a key of ``hunt.toml``, and another value makes another hunt;
@@ -23,6 +22,7 @@ from crashhunt.plans._declaration import (
     at_least,
     check_duration,
     check_probe,
+    check_rate,
     check_share,
     declared,
     declared_options,
@@ -145,9 +145,9 @@ class TrialOptions(_Options):
         "crashes, such as 4s", unset="never", flag="--probe", metavar="TIME", check=check_probe,
     )  # fmt: skip
     branch: bool = option(
-        False, "whether copies of a trial go on with other disturbances where somebody is near",
-        help="where somebody is near, have copies of a trial go on with several disturbances, from then and from "
-        "some seconds before; needs --disturb",
+        False, "whether copies of a trial continue with other disturbances where another actor is near",
+        help="where another actor is near, continue copies of a trial with several disturbances, from then and "
+        "from some seconds before; needs --disturb",
         flag="--branch",
     )  # fmt: skip
     rare: bool = option(
@@ -169,7 +169,7 @@ class RunOptions(_Options):
     """How trials are run; `RunSettings` has them too."""
 
     duration: str = option(
-        "", "how long it goes on at most: ``90s``, ``30m``, ``1h30m``; TRIALS may be 0 then",
+        "", "time limit of the hunt: ``90s``, ``30m``, ``1h30m``; TRIALS may be 0 then",
         help="begin no trial after this time, such as 90s, 30m or 1h30m; TRIALS may be 0 then, for no limit",
         unset="as long as it takes", flag="--for", metavar="TIME", check=check_duration,
     )  # fmt: skip
@@ -177,21 +177,33 @@ class RunOptions(_Options):
         False, "collect all crashes instead of stopping at the first", flag="--keep-going",
     )  # fmt: skip
     distinct: int = option(
-        0, "end once so many kinds of crashes have been found, collecting all until then; 0: never",
-        help="collect all crashes until so many different kinds have been found, as crashhunt crashes tells them "
-        "apart; 0: never stop for that",
+        0, "end after so many crash types, and collect all crashes until then; 0: never",
+        help="collect all crashes until N crash types have been found, as crashhunt crashes groups "
+        "them; 0: never stop for that",
         flag="--distinct", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
+    until_rate: str = option(
+        "", "a rate, such as ``1e-3/trial``, ``2/hour`` or ``5/1000km``: end once the agent certainly crashes less, or "
+        "more, often",
+        help="end once the agent certainly crashes less, or more, often than this, such as 1e-3/trial, 2/hour or "
+        "5/1000km; collects all crashes, and TRIALS may be 0; exit code 0: below, 1: above, 3: undecided",
+        unset="run all trials", flag="--until-rate", metavar="RATE", check=check_rate,
+    )  # fmt: skip
+    most: int = option(
+        0, "with ``until_rate``, how many trials it has at most; 0: as many as TRIALS says",
+        help="with --until-rate: run N trials at most; 0: as many as TRIALS says",
+        flag="--most", metavar="N", check=at_least(0, zero="as many as TRIALS says"),
+    )  # fmt: skip
     keep: int = option(
-        0, "of each kind of crash, how many bundles are kept, those of the shortest crashes; 0: all",
-        help="of each kind of crash, keep the bundles of the N shortest only; of the others the ledger tells. Goes "
-        "with --keep-going or --distinct; 0: keep all",
+        0, "number of bundles to keep of each crash type, those of the shortest crashes; 0: all",
+        help="keep only the N shortest bundles of each crash type; the ledger keeps all crashes. Requires "
+        "--keep-going or --distinct; 0: keep all",
         flag="--keep", metavar="N", check=at_least(0, zero="keep all"),
     )  # fmt: skip
     only_at_fault: bool = option(
-        False, "stop for crashes only that are the agent's own fault; the others are kept, and the hunt goes on",
-        help="hunt for crashes that are the agent's own fault, as rules with names tell it; others, and those of which "
-        "nobody can tell, are kept and do not end the hunt",
+        False, "stop only at crashes that are the agent's own fault; the others are kept, and the hunt continues",
+        help="hunt for crashes that are the agent's own fault, according to the rules; other and undecided crashes "
+        "are kept and do not end the hunt",
         flag="--only-at-fault",
     )  # fmt: skip
     until_error: str = option(
@@ -226,8 +238,8 @@ class RunOptions(_Options):
         flag="--recycle-after", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
     warm_copies: int = option(
-        8, "with ``seeds``, for how many traffics each worker keeps a warmed-up copy of itself asleep; 0: none",
-        help="with --seeds: for how many traffics each worker keeps a warmed-up copy of itself asleep; 0: none",
+        8, "with ``seeds``, the number of warmed-up traffics of which each worker keeps a suspended fork; 0: none",
+        help="with --seeds: the number of warmed-up traffics of which each worker keeps a suspended fork; 0: none",
         flag="--warm-copies", metavar="N", check=at_least(0, zero="none"),
     )  # fmt: skip
     audit: float = option(
@@ -250,16 +262,21 @@ class RunOptions(_Options):
     )  # fmt: skip
 
     def checked(self) -> Self:
-        """Return the same with every option in order; whoever wants several kinds goes on after the first crash.
+        """Return the same options after validation. With `distinct`, the hunt continues after the first crash.
 
         Raises:
             UsageError: one is none.
         """
         found = super().checked()
-        if found.keep and not (found.keep_going or found.distinct or found.only_at_fault):
-            message = f"--keep {found.keep} is for hunts that go on after a crash"
+        if found.most and not found.until_rate:
+            raise UsageError(f"--most is {found.most} without --until-rate", fix="give TRIALS, or --until-rate as well")
+        if found.until_rate and (found.distinct or found.only_at_fault):
+            other = "--distinct" if found.distinct else "--only-at-fault"
+            raise UsageError(f"--until-rate and {other} both end a hunt", fix=f"leave {other} out")
+        if found.keep and not (found.keep_going or found.distinct or found.only_at_fault or found.until_rate):
+            message = f"--keep {found.keep} requires a hunt that continues after a crash"
             raise UsageError(message, fix="give --keep-going or --distinct as well")
-        return replace(found, keep_going=True) if found.distinct else found
+        return replace(found, keep_going=True) if found.distinct or found.until_rate else found
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""From what somebody asks for to a scenario and settings that say everything."""
+"""Resolve the request of a user: find the scenario, check the arguments, and make complete settings."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def load_order_change(scenario: Scenario, recorded: str | None) -> str:
     return f"the order of {order.what} was fixed and is {now}"
 
 
-# ``NAME`` and ``AGENT.NAME``: whose argument is meant, the same wherever somebody may write one.
+# ``NAME`` and ``AGENT.NAME``: the owner of an argument, resolved in the same way in every option and file.
 
 SCENARIO = "scenario"  # before a name that is the scenario's, where an agent has it too
 _ASK_S = 60.0
@@ -140,7 +140,7 @@ class Owners:
 
     ``AGENT.NAME`` is that agent's, and ``scenario.NAME`` the scenario's. A bare ``NAME`` is whose it is where that is
     one only: of the agents that declare it and the scenario, or else of the agents that take any. Where there are
-    several, it is nobody's.
+    several, it belongs to none of them.
 
     Args:
         agents: what each takes.
@@ -151,7 +151,7 @@ class Owners:
     scenario: Collection[str] = field(default=())
 
     def of(self, word: str, *, option: str) -> tuple[str, str] | None:
-        """Return the agent (empty for the scenario) and the name that are meant; None where nobody has it.
+        """Return the agent (empty for the scenario) and the name that are meant; None if no owner has it.
 
         Args:
             word: as it was written.
@@ -199,7 +199,7 @@ class Owners:
         return Owners(agents, self.scenario).of(word, option=option)
 
     def unknown(self, word: str, *, option: str, whose: str) -> ArgumentError:
-        """Return the error for a name that nobody has, with what was probably meant."""
+        """Return the error for an unknown name, with the most similar known name."""
         bare = {name: name for name in self.scenario}
         bare |= {f"{agent}.{name}": name for agent, takes in self.agents.items() for name in takes.names}
         near = (f"did you mean {whole!r}?" for whole, part in bare.items() if did_you_mean(word, [part]))
@@ -232,7 +232,7 @@ def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None)
         folder: from where it is imported otherwise; by default the current one.
 
     Returns:
-        What it takes; anything, where it cannot be asked, as whoever runs it will say why.
+        What it takes; anything, where it cannot be asked, because its first run reports the reason.
     """
     points = registered("agents")
     target = points[locator].value if locator in points else locator
@@ -278,7 +278,7 @@ def _planned(request: Request, scenario: Scenario) -> tuple[Scenario, HuntSettin
     oracles = chosen_oracles(request.oracles)
     brought = outcomes_brought(oracles)
     crash_on, limits = parse_crash_on(request.crash_on, brought)
-    if crash_on == CRASHES:  # nobody has said otherwise
+    if crash_on == CRASHES:  # the default
         crash_on += tuple(outcome for outcome in brought if outcome not in crash_on)
     options = {name: getattr(request, name) for name in fields_of(TrialOptions)}
     options |= {
@@ -314,7 +314,7 @@ def _planned(request: Request, scenario: Scenario) -> tuple[Scenario, HuntSettin
 
 
 def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
-    """Tell whoever hunts what makes the simulator fast, and where that does not know it."""
+    """Return the scenario with notes on the accelerator or compiled core, and on the reason if it is not used."""
     accelerator, core = scenario.backend.accelerator, core_of(scenario, run)
     notes = [accelerator.note(scenario) if accelerator is not None and run.accelerate else ""]
     notes.append(f"the compiled core is {core}" if core is not None else "")
@@ -369,7 +369,7 @@ def disturber(scenario: Scenario, disturb: Sequence[str], agents: Sequence[str])
     Args:
         scenario: in which they take place.
         disturb: how often what happens: ``NAME=RATE`` each; or what happens when.
-        agents: around whom.
+        agents: the agents around which disturbances take place.
 
     Raises:
         CrashhuntError: there is no such disturbance, or the simulator cannot do it.
@@ -401,7 +401,7 @@ def sampler_of(settings: HuntSettings) -> NamedSampler:
 
 @contextmanager
 def _said_by(request: Request, scenario: Scenario) -> Iterator[None]:
-    """Whoever has disturbances from a scenario, and not from the command line, is told so where something is wrong."""
+    """Name the scenario in errors of disturbances that come from it, and not from the command line."""
     try:
         yield
     except CrashhuntError as error:
@@ -429,8 +429,8 @@ def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
 
 def _check_branch(settings: HuntSettings) -> None:
     if settings.branch and not parse_rates(settings.disturb):
-        fix = "say what may happen there, such as --disturb brake=0.02,cut_in=0.02"
-        raise UsageError("--branch has copies of trials go on with other disturbances, and there are none", fix=fix)
+        fix = "give rates, such as --disturb brake=0.02,cut_in=0.02"
+        raise UsageError("--branch needs disturbances, and there are none", fix=fix)
     if settings.branch and sys.platform != "linux":
         raise UsageError("--branch: processes are copied on Linux only", fix="leave it out")
 
@@ -473,17 +473,17 @@ def _check_rare(settings: HuntSettings, scenario: Scenario) -> None:
 
 
 def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
-    """Tell whoever hunts for what this simulator never tells; where that is all, refuse."""
+    """Add a note on events that this simulator never reports; refuse a hunt for such events alone."""
     backend = backend_of(scenario.simulator)
-    told = backend.told_events if backend is not None else None
+    told = backend.reported_events if backend is not None else None
     never = [kind for kind in crash_on if kind in EVENTS and told is not None and kind not in told]
     if not never:
         return scenario
     names = ",".join(never)
     if len(never) == len(crash_on):
-        fix = f"it tells {', '.join(told)}" if told else "leave it out"
-        raise UsageError(f"--crash-on {names}: the simulator {scenario.simulator!r} never tells that", fix=fix)
-    return replace(scenario, notes=(*scenario.notes, f"the simulator {scenario.simulator!r} never tells {names}"))
+        fix = f"it reports {', '.join(told)}" if told else "remove it"
+        raise UsageError(f"--crash-on {names}: the simulator {scenario.simulator!r} never reports that", fix=fix)
+    return replace(scenario, notes=(*scenario.notes, f"the simulator {scenario.simulator!r} never reports {names}"))
 
 
 def parse_crash_on(
@@ -599,7 +599,7 @@ def _owner(name: str, scenario: Scenario, signatures: Mapping[str, Signature]) -
         raise ArgumentError(f"--arg {name}: it is an argument of the scenario", fix=f"write --set {name}=SPEC")
     first = next(iter(scenario.agents))
     signatures[first].check([name], where=f"--arg: {scenario.agents[first].agent}")
-    raise AssertionError(name)  # whoever takes it is its owner
+    raise AssertionError(name)  # the agent that accepts it is its owner
 
 
 def _spec(
@@ -617,7 +617,7 @@ def _spec(
         # The constructor's own default too: it may be another one by the time of a replay.
         if argument is not None and argument.default is not None:
             constant = parse_spec(str(Constant(argument.default)), kind, where=name)
-            # A text such as "a|b" would be read as a choice; it is left to whoever has it as a default.
+            # A text such as "a|b" would be read as a choice; so its owner keeps it as a default.
             return ArgumentSpec(spec=str(constant), kind=kind) if isinstance(constant, Constant) else None
     return None
 

@@ -1,4 +1,4 @@
-"""What somebody asks of a hunt, in Python, on the command line or in a file: before anything is resolved."""
+"""The request of a user for a hunt, from Python, the command line or a file, before it is resolved."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ __all__ = [
 
 @runtime_checkable
 class SizesItself(Protocol):
-    """An executor that finds out itself how many trials PARALLEL 0 stands for, as one of many machines has to.
+    """An executor that decides how many trials PARALLEL 0 means, such as one on many machines.
 
     Elsewhere 0 is one per core of this machine.
     """
@@ -74,13 +74,13 @@ def executor_of(word: str) -> Callable[..., Any]:
 
 
 def sizes_itself(word: str) -> bool:
-    """Whether the executor that is meant finds out itself what PARALLEL 0 stands for."""
+    """Whether the named executor decides what PARALLEL 0 means."""
     factory = locate("executors", _parts(word)[0])
     return isinstance(factory, SizesItself) and factory.sizes_itself
 
 
 def parallel_here(word: str, parallel: int) -> int:
-    """Return how many trials at a time this machine runs beside the executor that is meant, such as confirmations.
+    """Return how many trials, such as confirmations, this machine runs at a time in addition to the executor.
 
     Args:
         word: as for `executor_of`.
@@ -108,7 +108,7 @@ _BOUNDS = {  # the numbers of a hunt that are no options: everybody has to give 
 @clear_constructor
 @dataclass(frozen=True, kw_only=True)
 class Request(TrialOptions, Subject):
-    """What somebody asks of a hunt; everything else is decided by `plan`. Options are those of the list.
+    """The request of a user for a hunt. `plan` decides everything else. Options are those of the list.
 
     Args:
         trials: how many.
@@ -137,10 +137,18 @@ class Request(TrialOptions, Subject):
                 raise UsageError(f"{name} is {value!r}", fix="give a whole number")
             if fix := check(value):
                 raise UsageError(f"{name} is {value}", fix=fix)
-        if not self.trials and not self.run.duration:
+        if not self.trials and not self.run.duration and not self.run.until_rate:
             raise UsageError("TRIALS is 0", fix="give at least 1, or 0 (no limit) and a time with --for")
         checked = super().checked()
-        return replace(checked, run=self.run.checked())
+        run = self.run.checked()
+        if run.until_rate and (checked.sampler != "random" or checked.seeds):
+            option = "--seeds" if checked.seeds else f"--sampler {checked.sampler}"
+            raise UsageError(
+                f"--until-rate needs trials that are drawn independently, and {option} does not draw them so",
+                fix=f"leave {option} out",
+            )
+        limits = [limit for limit in (self.trials, run.most) if limit]
+        return replace(checked, run=run, trials=min(limits, default=0))
 
 
 def request_of(asked: HuntOptions, *, trials: int, max_steps: int, parallel: int = 1) -> Request:

@@ -76,7 +76,7 @@ class RunSettings(RunOptions):
 
     @property
     def duration_s(self) -> float:
-        """How long it goes on at most, in s of wall time."""
+        """Time limit of the hunt, in s of wall time."""
         return seconds_of(self.duration)
 
 
@@ -216,7 +216,7 @@ def read_settings(path: Path) -> HuntSettings:
     except OSError as error:
         raise HuntDirectoryError(f"cannot be read: {error.strerror}", where=str(path)) from None
     known, later = known_part(HuntSettings, data)
-    # What looks like a key that is missing is a slip of somebody's, or damage, and no key of a later version.
+    # A key that resembles a missing one is a typing error or damage, not a key of a later version.
     wrong = {key: later[key] for key in [slip(later, known, HuntSettings)] if key}
     if "run" in later and isinstance(known.get("run"), dict):
         wrong |= {"run": merged(known["run"], later["run"])} if slip(later["run"], known["run"], RunSettings) else {}

@@ -1,4 +1,4 @@
-"""Rates: how often an agent crashes, with intervals."""
+"""How often an agent crashes: intervals that are valid at any time, and the trials that they count."""
 
 import lazy_loader
 

@@ -215,9 +215,15 @@ def root_of(result: TrialResult, crash_on: Sequence[Outcome], hazard: float) -> 
         elif copy.crash:
             undisturbed += copy.weight
     return Root(
-        undisturbed, disturbed, own, by, result.steps + result.other_steps, result.steps + (result.setup_steps or 0),
-        _bound(result.spec.forcing, hazard * result.spec.max_steps), crashed and not result.disturbed,
-    )  # fmt: skip
+        undisturbed=undisturbed,
+        disturbed=disturbed,
+        own=own,
+        by=by,
+        steps=result.steps + result.other_steps,
+        own_steps=result.steps + (result.setup_steps or 0),
+        bound=_bound(result.spec.forcing, hazard * result.spec.max_steps),
+        crashed=crashed and not result.disturbed,
+    )
 
 
 def _bound(forcing: Forcing, hazard: float) -> float:
@@ -346,4 +352,14 @@ def _interval(values: Sequence[float], confidence: float) -> tuple[Estimated | N
         return None, why, max(1, math.ceil(needed - count))
     mean = total / count
     width = float(stdtrit(count - 1, (1.0 + confidence) / 2)) * _standard_error(values)
-    return Estimated(max(0.0, mean - width), mean + width, effective, share, with_crash), "", None
+    return (
+        Estimated(
+            low=max(0.0, mean - width),
+            high=mean + width,
+            effective=effective,
+            largest_share=share,
+            roots_with_crash=with_crash,
+        ),
+        "",
+        None,
+    )

@@ -8,14 +8,17 @@ from ._blackbox import (
     read_black_box as read_black_box,
     read_header as read_header,
 )
-from ._compare import first_divergence as first_divergence, values_around as values_around
+from ._compare import (
+    first_divergence as first_divergence,
+    has_same_scenes as has_same_scenes,
+    values_around as values_around,
+)
 from ._divergence import Divergence as Divergence, DivergenceData as DivergenceData
 from ._foxglove import foxglove_layout as foxglove_layout, lane_borders as lane_borders, read_lanes as read_lanes
 from ._log import read_log as read_log, write_log as write_log
-from ._reading import StepRecord as StepRecord
+from ._reading import AgentChannel as AgentChannel, Prologue as Prologue, StepRecord as StepRecord
 from ._recording import Recording as Recording
 from .records import RECORD_TYPES as RECORD_TYPES, Tag as Tag
-from .records._agents import AgentChannel as AgentChannel, Prologue as Prologue
 from .records._events import (
     encode_disturbance as encode_disturbance,
     encode_events as encode_events,

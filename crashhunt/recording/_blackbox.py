@@ -69,7 +69,7 @@ __all__ = [
 # The digest of a trial: what belongs to it, and how it is computed.
 
 FIRST_ASIDE = 128
-"""Tags from here on are of records that are no evidence: whoever does not know a type knows what the digest is of."""
+"""Tags from here on are of records that are no evidence, so a reader need not know a type to compute the digest."""
 _NOTES = 11  # the only type of the first eleven that is no evidence, from before there was that rule
 
 
@@ -115,7 +115,7 @@ class Phase(IntEnum):
 
 # Attributes of modules, and members of an enum, are looked up at every use; these are used in every step.
 _STEP, _OBSERVATION, _ACTION = STEP.tag, OBSERVATION.tag, ACTION.tag
-_LENT = _OBSERVATION, _ACTION, _STEP, LANES.tag  # what somebody else records
+_LENT = _OBSERVATION, _ACTION, _STEP, LANES.tag  # records of another writer
 _ACT, _SIMULATE = int(Phase.ACT), int(Phase.SIMULATE)
 
 
@@ -127,7 +127,7 @@ class Record(NamedTuple):
     payload: bytes
 
     def encode(self) -> bytes:
-        """Return the bytes that stand for it in the black box; the trace digest runs over these."""
+        """Return its bytes in the black box; the trace digest runs over these."""
         return _HEAD.pack(self.tag, self.aux, len(self.payload)) + self.payload + bytes(-len(self.payload) % 8)
 
 
@@ -366,7 +366,7 @@ class BlackBox:
         HEADER.pack_into(self._map, 0, magic, pid, setup_steps, trial, started + wall_s, *where)
 
     def copy(self) -> None:
-        """Go on in memory of this process's own: it is a copy of the one that records, and goes on recording."""
+        """Continue in private memory: this process is a fork of the recording one, and continues to record."""
         self._take_back()
         data = bytes(memoryview(self._map)[: self._offset])
         self._file = os.memfd_create(MEMORY)
@@ -428,7 +428,16 @@ def decode_header(data: bytes) -> BlackBoxHeader | None:
     _, pid, setup_steps, trial, started, committed, step, phase, agent = HEADER.unpack(data)
     if not Phase.SETUP <= phase <= Phase.DONE:
         return None
-    return BlackBoxHeader(pid, trial, started, committed, step, Phase(phase), agent, setup_steps)
+    return BlackBoxHeader(
+        pid=pid,
+        trial=trial,
+        started=started,
+        committed=committed,
+        step=step,
+        phase=Phase(phase),
+        agent=agent,
+        setup_steps=setup_steps,
+    )
 
 
 def read_black_box(path: Path) -> Iterator[Record]:
@@ -456,7 +465,7 @@ def readable_bytes(found: os.stat_result) -> int:
 
 
 def decode_records(data: bytes | memoryview) -> Iterator[Record]:
-    """Yield the records in ``data``; an incomplete last one is left out."""
+    """Yield the records in ``data``; an incomplete last one is skipped."""
     offset = 0
     while offset + _HEAD.size <= len(data):
         tag, aux, length = _HEAD.unpack_from(data, offset)

@@ -8,20 +8,26 @@ from crashhunt.recording._divergence import Divergence
 from crashhunt.recording.records import RECORD_TYPES
 
 if TYPE_CHECKING:
+    from crashhunt.recording._reading import AgentChannel
     from crashhunt.recording._recording import Recording
-    from crashhunt.recording.records._agents import AgentChannel
     from crashhunt.recording.records._type import Difference
 
-__all__ = ["first_divergence", "values_around"]
+__all__ = ["first_divergence", "has_same_scenes", "values_around"]
 
 
 def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | None:
-    """Return the first difference to the bit, or None where the two are equal.
+    """Return the first difference of bits, or None where the two are bit-identical.
 
     Within a step, observations come before actions and actions before the scene, as in the episode.
     """
     if recorded.prologue != replayed.prologue:
-        return Divergence(0, "", "setup", recorded.prologue.encode().decode(), replayed.prologue.encode().decode())
+        return Divergence(
+            step=0,
+            agent="",
+            field="setup",
+            recorded=recorded.prologue.encode().decode(),
+            replayed=replayed.prologue.encode().decode(),
+        )
     differences = _differences(recorded.prologue.agents)
     for left, right in zip(recorded.all_steps, replayed.all_steps, strict=False):
         for difference, agent in differences:
@@ -30,10 +36,18 @@ def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | N
                 return found
     if len(recorded.all_steps) != len(replayed.all_steps):
         step = min(len(recorded.all_steps), len(replayed.all_steps))
-        return Divergence(step, "", "length", len(recorded.all_steps) - 1, len(replayed.all_steps) - 1)
+        return Divergence(
+            step=step,
+            agent="",
+            field="length",
+            recorded=len(recorded.all_steps) - 1,
+            replayed=len(replayed.all_steps) - 1,
+        )
     if recorded.digest != replayed.digest:
         # Every value of every step agrees, so only the way it was written can differ.
-        return Divergence(recorded.steps, "", "digest", recorded.digest, replayed.digest)
+        return Divergence(
+            step=recorded.steps, agent="", field="digest", recorded=recorded.digest, replayed=replayed.digest
+        )
     return None
 
 
@@ -66,3 +80,20 @@ def _differences(agents: tuple[AgentChannel, ...]) -> list[tuple[Difference, Age
     kinds = [(kind.per_agent, kind.difference) for kind in RECORD_TYPES.values() if kind.difference is not None]
     of_agents = [(difference, agent) for agent in agents for per_agent, difference in kinds if per_agent]
     return [*of_agents, *((difference, None) for per_agent, difference in kinds if not per_agent)]
+
+
+def has_same_scenes(recorded: Recording, rerun: Recording, step: int) -> bool:
+    """Return whether the scenes of a run are bit-identical to the recorded ones up to and including a step.
+
+    Where a change begins after this step, only such a run says something about the recorded trial. Observations and
+    actions are not compared: other versions may record them in another form.
+
+    Args:
+        recorded: the recording of the trial, which reaches the step.
+        rerun: the recording of the run.
+        step: the last step to compare.
+    """
+    return rerun.steps >= step and all(
+        recorded.scene(number).frame[1].tobytes() == rerun.scene(number).frame[1].tobytes()
+        for number in range(step + 1)
+    )

@@ -59,7 +59,7 @@ class Divergence:
 
 
 def first_difference(left: NDArray[np.generic], right: NDArray[np.generic]) -> tuple[int, ...]:
-    """Return the index at which two arrays of one shape first differ to the bit, where they do."""
+    """Return the index at which two arrays of one shape first differ in a bit, where they do."""
     size = left.itemsize
     was, now = left.tobytes(), right.tobytes()
     flat = next(n for n in range(left.size) if was[n * size : (n + 1) * size] != now[n * size : (n + 1) * size])

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["foxglove_layout", "lane_borders", "read_lanes", "write_views"]
 
 _MAP_REACH_M = 300.0  # around where anybody drove; a town's whole map is too much for a viewer
-_HEIGHT_M = 1.5  # of a car, where nobody says
+_HEIGHT_M = 1.5  # of a car of unknown height
 _PERSON_HEIGHT_M = 1.7  # likewise
 _COLORS = {
     "ego": (1.0, 0.8, 0.1, 1.0),
@@ -53,7 +53,7 @@ def write_views(log: LogWriter, recording: Recording, lanes: Sequence[Lane], cra
     Args:
         log: where to.
         recording: what happened.
-        lanes: of the map; those far from every controlled vehicle are left out.
+        lanes: of the map; those far from every controlled vehicle are skipped.
         crash: how it ended.
     """
     scenes = recording.scenes()

@@ -21,9 +21,9 @@ from crashhunt.base.files import whole_file
 from crashhunt.recording._blackbox import Record
 from crashhunt.recording._foxglove import write_views
 from crashhunt.recording._mcap import MESSAGES, NAMESPACE, LogWriter, to_ns
+from crashhunt.recording._reading import Prologue
 from crashhunt.recording._recording import Recording
 from crashhunt.recording.records import RECORD_TYPES
-from crashhunt.recording.records._agents import Prologue
 from crashhunt.recording.records._scene import STEP, time_of
 from crashhunt.recording.records._type import BytesForm, TextForm
 
@@ -56,7 +56,7 @@ def write_log(
     Args:
         path: of the file.
         recording: what happened.
-        lanes: of the map, for whoever looks at it.
+        lanes: of the map, for viewers.
         metadata: further facts.
         crash: how it ended, for the crash marker and the log line.
         views: whether other tools have something to see; without, it is half as large.
@@ -96,7 +96,13 @@ def read_log(path: Path) -> Recording:
                 raise refuse(f"its schema is {version}, not {SCHEMA}", "use the version of crashhunt that wrote it")
             messages = reader.iter_messages(log_time_order=False)
             evidence = [
-                _Message(message.sequence, channel.topic, message.data, schema.name, channel.metadata)
+                _Message(
+                    sequence=message.sequence,
+                    topic=channel.topic,
+                    data=message.data,
+                    schema=schema.name,
+                    metadata=channel.metadata,
+                )
                 for schema, channel, message in messages
                 if schema is not None and schema.name.startswith(NAMESPACE) and message.sequence
             ]
@@ -135,9 +141,9 @@ class _Channel:
 def _channel(tag: int, aux: int, prologue: Prologue) -> _Channel:
     kind = RECORD_TYPES.get(tag)
     if kind is None:  # of a black box that a later version wrote
-        return _Channel(tag, aux, f"/records/{tag}/{aux}", BytesForm())
+        return _Channel(tag=tag, aux=aux, topic=f"/records/{tag}/{aux}", form=BytesForm())
     agent = quote(prologue.agents[aux].id, safe="") if kind.per_agent else ""
-    return _Channel(tag, aux, kind.topic.format(agent=agent), kind.form)
+    return _Channel(tag=tag, aux=aux, topic=kind.topic.format(agent=agent), form=kind.form)
 
 
 def _write_evidence(log: LogWriter, recording: Recording) -> None:
@@ -157,7 +163,9 @@ def _write_evidence(log: LogWriter, recording: Recording) -> None:
 
 
 def _read_evidence(messages: Sequence[_Message]) -> Iterator[Record]:
-    channels = {kind.topic: _Channel(tag, 0, kind.topic, kind.form) for tag, kind in RECORD_TYPES.items()}
+    channels = {
+        kind.topic: _Channel(tag=tag, aux=0, topic=kind.topic, form=kind.form) for tag, kind in RECORD_TYPES.items()
+    }
     prologue: Prologue | None = None
     for expected, message in enumerate(messages, 1):
         if message.sequence != expected:
@@ -185,4 +193,4 @@ def _unknown(message: _Message) -> _Channel:
             f"there are records of a type that this version does not know ({message.topic})",
             fix="use the version that wrote it",
         )
-    return _Channel(tag, int(message.metadata.get("aux", 0)), message.topic, form)
+    return _Channel(tag=tag, aux=int(message.metadata.get("aux", 0)), topic=message.topic, form=form)

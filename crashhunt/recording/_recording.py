@@ -10,9 +10,9 @@ import numpy as np
 from crashhunt.base.errors import BundleError
 from crashhunt.base.text import one_of
 from crashhunt.recording._blackbox import digest_of, is_evidence
-from crashhunt.recording._reading import Reading
+from crashhunt.recording._reading import Prologue, Reading
 from crashhunt.recording.records import RECORD_TYPES
-from crashhunt.recording.records._agents import PROLOGUE, Prologue
+from crashhunt.recording.records._agents import PROLOGUE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.recording._blackbox import Record
-    from crashhunt.recording._reading import StepRecord
-    from crashhunt.recording.records._agents import AgentChannel
+    from crashhunt.recording._reading import AgentChannel, StepRecord
     from crashhunt.trial import Disturbance
     from crashhunt.world import Actor, Scene
 
@@ -95,7 +94,7 @@ class Recording:
 
     @property
     def disturbances(self) -> tuple[Disturbance, ...]:
-        """Those that began, as they took place; of one for which nobody was there, the vehicle is empty."""
+        """Those that began, as they took place; without a target, the vehicle is empty."""
         return tuple(one for step in self.all_steps for one in step.more.get("disturbance", ()))
 
     def _channel(self, agent: str) -> AgentChannel:

@@ -353,7 +353,7 @@ class _Builtin:
             if value.size == 1 and np.issubdtype(value.dtype, np.integer):
                 found.append((_BUILTIN[3], Action(int(value[0]), names=self._shot.meanings)))
             else:
-                found.append((_BUILTIN[3], Action(value, self._low, self._high, self._names)))
+                found.append((_BUILTIN[3], Action(value=value, low=self._low, high=self._high, names=self._names)))
         return found
 
 

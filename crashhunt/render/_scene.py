@@ -154,7 +154,7 @@ class SceneView:
     def _going(self, step: int) -> list[Disturbance]:
         """Return the active disturbances that affect an actor."""
         step_length_s = self._recording.prologue.step_length_s
-        return [one for one in self._recording.disturbances if one.vehicle and one.goes_on(step, step_length_s)]
+        return [one for one in self._recording.disturbances if one.vehicle and one.is_active(step, step_length_s)]
 
     def _ring(self, draw: ImageDraw.ImageDraw, scene: Scene, name: str) -> None:
         """Mark an actor that is disturbed, or that the agent does not see."""

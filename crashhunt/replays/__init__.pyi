@@ -1,14 +1,9 @@
-from ._avoidability import judge as judge
-from ._debugger import Look as Look
 from ._edits import edited_disturbances as edited_disturbances, with_other_words as with_other_words
 from ._prepare import (
     Code as Code,
-    Ended as Ended,
-    NotUnderstoodError as NotUnderstoodError,
+    Look as Look,
     ReplayOptions as ReplayOptions,
     Rerun as Rerun,
-    Reruns as Reruns,
-    StoppedError as StoppedError,
     is_todays as is_todays,
     prepare as prepare,
 )

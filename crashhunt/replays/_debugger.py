@@ -13,7 +13,7 @@ import stat
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, TypedDict, cast, final
 
@@ -45,18 +45,18 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.json_types import ErrorData
     from crashhunt.episode import Episode
-    from crashhunt.replays._prepare import Rerun
+    from crashhunt.replays._prepare import Look, Rerun
     from crashhunt.simulators import Simulator
     from crashhunt.world import Scene
 
 
-__all__ = ["Backwards", "Look", "OneLine", "debug", "main"]
+__all__ = ["Backwards", "OneLine", "debug", "main"]
 
 
-# Backwards in the debugger: before each of the last steps, a copy of the process waits for somebody to come back.
+# Backwards in the debugger: before each of the last steps, a copy of the process waits for the user to go back.
 #
-# The process goes on in a fork, and waits for its end; it has the terminal again when that ends to go back. So whoever
-# goes back finds everything as it was, and nothing of what came after.
+# The debugger continues in a fork while the process waits for its end. If the fork ends in order to go back, the
+# process gets the terminal again. So the user finds the exact earlier state, without effects of later steps.
 
 _MOST = 50  # steps; what has changed since is kept for each
 _BACK = 78  # exit code
@@ -76,7 +76,7 @@ class Backwards(Observer):
         self._stop = stop
         self._last = step
         self._file = folder / _TARGET
-        self._first = 0  # step to which somebody may go back; 0 for none
+        self._first = 0  # the earliest step to which the user may go back; 0 for none
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         if max(1, self._last - _MOST) <= step + 1 < self._last:
@@ -92,7 +92,7 @@ class Backwards(Observer):
         os._exit(_BACK)
 
     def _leave_behind(self, step: int) -> None:
-        """Go on in a copy of this process; come back from here only if somebody goes back to this step."""
+        """Continue in a copy of this process; return in this process only if the user goes back to this step."""
         torch = sys.modules.get("torch")
         if len(threads()) > 1 or (torch is not None and torch.cuda.is_initialized()):
             self._first = 0  # they have no copy, and what was left behind before is not missed by anybody
@@ -101,11 +101,11 @@ class Backwards(Observer):
         sys.stdout.flush()
         pid = os.fork()
         if pid == 0:
-            random.setstate(drawn)  # Python seeds it anew in whatever is forked
+            random.setstate(drawn)  # Python re-seeds the generator in a fork
             die_with(here)
             self._first = self._first or step
             return
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever has the terminal
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C must reach only the process with the terminal
         code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         signal.signal(signal.SIGINT, before)
         if code != _BACK:
@@ -121,7 +121,7 @@ class Backwards(Observer):
 
 
 class OneLine:
-    """Standard input that is read a line at a time, so that the rest is there for whoever has it next."""
+    """Standard input that is read line by line, so that the next process gets the rest."""
 
     encoding = "utf-8"
 
@@ -159,25 +159,6 @@ _MAX_ATTEMPTS = 3  # of a replay that is killed from outside
 
 class _ReplayKilledError(CrashhuntError):
     """Another process, or the kernel, ended the process of a replay."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
-    """What to look at in a replay.
-
-    Args:
-        until: how many steps to run.
-        stop_at: the step in which to drop into the ``act`` of the agent that crashed; 0 for none.
-        to_stderr: whether what is printed goes there.
-        panels: the step from which on to draw the agents' panels, and the folder for them.
-        window: open the simulator's own, with so many s of wall time between two steps; it pauses before the crash.
-    """
-
-    until: int
-    stop_at: int = 0
-    to_stderr: bool = False
-    panels: tuple[int, Path] | None = None
-    window: float | None = None
 
 
 def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
@@ -442,12 +423,14 @@ class _Debugger(pdb.Pdb):
         """Go back by so many steps of the simulation, or one: ``back 5``."""
         steps = int(arg) if arg.strip().isdecimal() else 1
         why_not = (
-            self.backwards.go(self.step - max(1, steps)) if self.backwards is not None else "nobody has left a copy"
+            self.backwards.go(self.step - max(1, steps))
+            if self.backwards is not None
+            else "there is no earlier copy of the process"
         )
         print(f"*** {why_not}", flush=True)
 
     def set_quit(self) -> None:
-        """Leave the process: whoever quits does not want a verdict."""
+        """End the process without a verdict."""
         print(flush=True)
         os._exit(_LEFT)
 

@@ -110,7 +110,7 @@ def with_other_words(
     was, now = parse_fixed(before, agents), parse_fixed(after, agents, shown="hunt.toml, disturb:")
     rates, left = parse_rates(before), parse_rates(after)
     gone = rates.keys() - left.keys()
-    if left:  # a model of somebody's own does not say its kind before it is imported
+    if left:  # a user's own model reports its type only after its import
         gone &= KINDS.keys()
     drawn = [one for one in planned if one not in was]
     kept = [one for one in drawn if (left and one.what not in gone) or not rates]
@@ -126,7 +126,7 @@ def with_other_words(
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """Which of them somebody means.
+    """The disturbances that an edit selects.
 
     Args:
         kind: perhaps with the agent before it; empty for whatever begins there.

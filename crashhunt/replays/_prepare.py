@@ -2,55 +2,63 @@
 
 from __future__ import annotations
 
-import itertools
-import json
 import os
-import shutil
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_constructor
-from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
+from crashhunt.base.errors import UsageError
 from crashhunt.base.sandbox import landlock_version
 from crashhunt.crashes import is_bundle_trusted, refuse_side_effects, refuse_untrusted
-from crashhunt.episode import WorkerSettings, scratch_of
-from crashhunt.executors import FreshProcessExecutor, PoolExecutor
+from crashhunt.episode import WorkerSettings
 from crashhunt.plans import load_order_change, read_settings, with_recorded_load_order, with_settings
-from crashhunt.recording import Recording, read_black_box
 from crashhunt.replays._edits import edited_spec
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.snapshots import Snapshot, environment_changes, processor
 from crashhunt.trial import OF_AGENT
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Mapping
 
     from crashhunt.crashes import Bundle
-    from crashhunt.executors import Executor
     from crashhunt.plans import HuntSettings
-    from crashhunt.replays._debugger import Look
+    from crashhunt.recording import Recording
     from crashhunt.scenario import Scenario
-    from crashhunt.trial import TrialResult, TrialSpec, Value
+    from crashhunt.trial import TrialSpec, Value
 
 
 __all__ = [
     "Code",
-    "Ended",
-    "NotUnderstoodError",
+    "Look",
     "ReplayOptions",
     "Rerun",
-    "Reruns",
-    "StoppedError",
     "is_todays",
     "prepare",
 ]
 
 
 Code = Literal["snapshot", "current", "log"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """What to look at in a replay.
+
+    Args:
+        until: how many steps to run.
+        stop_at: the step in which to drop into the ``act`` of the agent that crashed; 0 for none.
+        to_stderr: whether what is printed goes there.
+        panels: the step from which on to draw the agents' panels, and the folder for them.
+        window: open the simulator's own, with so many s of wall time between two steps; it pauses before the crash.
+    """
+
+    until: int
+    stop_at: int = 0
+    to_stderr: bool = False
+    panels: tuple[int, Path] | None = None
+    window: float | None = None
 
 
 @clear_constructor
@@ -194,14 +202,14 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         sealed=None if code != "log" or trusted else (str(bundle.path.resolve()),),
     )
     return Rerun(
-        bundle,
-        recorded,
-        spec,
-        worker,
-        code,
-        snapshot,
-        edits.all,
-        tuple(warnings),
+        bundle=bundle,
+        recorded=recorded,
+        spec=spec,
+        worker=worker,
+        code=code,
+        snapshot=snapshot,
+        edits=edits.all,
+        warnings=tuple(warnings),
         other_traffic=edits.others,
         elsewhere=bool(options.scenario),
     )
@@ -243,11 +251,8 @@ def _kind_it_cannot_do(scenario: Scenario, spec: TrialSpec) -> str:
     return next(odd, "")
 
 
-# Whether it is the crashhunt of today that runs a crash again: then workers may be kept warm for many runs.
-
-
 def is_todays(rerun: Rerun) -> bool:
-    """Whether the crashhunt that runs is this one, so that it is told of trials as this one tells its own."""
+    """Whether the trials run with this crashhunt, and not with the crashhunt of the snapshot."""
     if not rerun.worker.code:
         return True
     files = rerun.snapshot.manifest["files"]
@@ -261,107 +266,3 @@ def _is_ours(name: str, size: int) -> bool:
         return os.stat(path).st_size == size  # noqa: PTH116
     except OSError:
         return False
-
-
-# Running a crash's trial many times over, each time with a change: on warm workers, where today's code runs it.
-
-_LOOK_EVERY_S = 0.5  # how late Ctrl-C may be
-_WARM_COPIES = 2  # of each worker: most runs begin as the crash did
-
-
-class StoppedError(Exception):
-    """Somebody has asked to give up."""
-
-
-class NotUnderstoodError(CrashhuntError):
-    """What ran the trial has left out what it does not know of it, and so has run another one."""
-
-
-@dataclass(frozen=True, slots=True)
-class Ended:
-    """A trial that has been run.
-
-    Args:
-        place: among those that were asked for.
-        result: of it.
-        recording: of it; None where nobody asked, or its process died before there was any.
-        entered: the ids of all actors that entered, where the specification asked for them (`EVERYBODY`).
-    """
-
-    place: int
-    result: TrialResult
-    recording: Recording | None
-    entered: tuple[str, ...] = ()
-
-
-class Reruns:
-    """Runs trials like that of a crash.
-
-    Args:
-        rerun: the crash.
-        scratch: a folder for the workers.
-        parallel: trials at a time.
-        stopped: asked now and then whether to give up.
-    """
-
-    def __init__(self, rerun: Rerun, scratch: Path, *, parallel: int, stopped: Callable[[], bool]) -> None:
-        self._scratch, self._stopped = scratch, stopped
-        worker = replace(rerun.worker, scratch=scratch, keep_trials=True, warm_copies=_WARM_COPIES)
-        kind = PoolExecutor if is_todays(rerun) else FreshProcessExecutor
-        self._executor: Executor = kind(worker, parallel=parallel)
-        self._numbers = itertools.count(1)  # folders of their own
-
-    def run(self, specs: Sequence[TrialSpec], *, recorded: bool = True) -> Iterator[Ended]:
-        """Yield what comes of trials as they end; what has not ended when nobody asks any more is given up.
-
-        Args:
-            specs: the trials.
-            recorded: whether their recordings are wanted.
-
-        Raises:
-            StoppedError: somebody has asked for it.
-            NotUnderstoodError: the crashhunt that runs them does not know what is asked.
-            CrashhuntError: the trials could not be run.
-        """
-        asked = {number: (place, spec) for (place, spec), number in zip(enumerate(specs), self._numbers, strict=False)}
-        try:
-            for number, (_, spec) in asked.items():
-                self._executor.submit(replace(spec, number=number))
-            while asked:
-                for result in list(self._executor.completed(_LOOK_EVERY_S)):
-                    if result.spec.number in asked:  # else it is of what has been given up
-                        place, spec = asked.pop(result.spec.number)
-                        _see_that_it_was_run(spec, result.spec)
-                        yield self._ended(place, result, recorded=recorded)
-                if asked and self._stopped():
-                    raise StoppedError
-        finally:
-            self._executor.cancel()
-
-    def close(self) -> None:
-        """End every process."""
-        self._executor.close()
-
-    def _ended(self, place: int, result: TrialResult, *, recorded: bool) -> Ended:
-        folder = scratch_of(self._scratch, result.spec.number)
-        recording = None
-        if recorded:
-            with suppress(BundleError):  # its process died
-                recording = Recording(read_black_box(folder / layout.BLACK_BOX))
-        entered: list[str] = []
-        if result.spec.only is not None:
-            with suppress(OSError, ValueError):
-                entered = json.loads((folder / layout.ENTERED).read_text(encoding="utf-8"))
-        shutil.rmtree(folder, ignore_errors=True)
-        return Ended(place, result, recording, tuple(entered))
-
-
-def _see_that_it_was_run(asked: TrialSpec, run: TrialSpec) -> None:
-    """See that what determines a trial came back as it was asked: early versions leave out what they do not know.
-
-    Raises:
-        NotUnderstoodError: something did not.
-    """
-    named = attrgetter("overruled", "disturbances", "only", "handover", "reseeding")
-    if named(asked) != named(run):
-        raise NotUnderstoodError("the crashhunt in its snapshot is too old for that")

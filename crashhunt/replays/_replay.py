@@ -1,4 +1,4 @@
-"""Replay and confirmation: run a crash again, in a fresh process, and say whether it is the same to the bit."""
+"""Replay and confirmation: runs a crash again in a new process, and checks whether the run is bit-identical."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.executors import SharedExecutors
     from crashhunt.recording import AgentChannel, DivergenceData, Prologue
-    from crashhunt.replays._debugger import Look
-    from crashhunt.replays._prepare import Code, Rerun
+    from crashhunt.replays._prepare import Code, Look, Rerun
     from crashhunt.trial import TrialResult
 
 
@@ -35,7 +34,7 @@ __all__ = ["ReplayData", "ReplayReport", "Verdict", "confirm", "judged", "replay
 
 # Whether a replay is the same as what was recorded, and where it first is not.
 
-_AROUND = 2  # steps that are told before and after the first difference
+_AROUND = 2  # steps to report before and after the first difference
 
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]
 
@@ -132,14 +131,24 @@ def judged(
     """
     if rerun.elsewhere:
         if result.outcome in rerun.worker.crash_on:
-            return ReplayReport(rerun, "changed", result, replayed)
-        return ReplayReport(rerun, "not_comparable", result, replayed, reason=_no_fix(rerun))
+            return ReplayReport(rerun=rerun, verdict="changed", replayed=result, recording=replayed)
+        return ReplayReport(
+            rerun=rerun, verdict="not_comparable", replayed=result, recording=replayed, reason=_no_fix(rerun)
+        )
     divergence = first_divergence(recorded, replayed)
     if divergence is None and whole:
         divergence = _end_divergence(rerun.bundle.result, result, rerun.code)
     verdict, reason = _judge(rerun, replayed, result, divergence, whole=whole)
     around = tuple(values_around(recorded, replayed, divergence, reach=_AROUND)) if divergence is not None else ()
-    return ReplayReport(rerun, verdict, result, replayed, divergence, around, reason)
+    return ReplayReport(
+        rerun=rerun,
+        verdict=verdict,
+        replayed=result,
+        recording=replayed,
+        divergence=divergence,
+        around=around,
+        reason=reason,
+    )
 
 
 def _judge(
@@ -158,7 +167,7 @@ def _judge(
         if name in changed:
             return "not_comparable", f"the simulator differs: {name} was {changed[name][0]} and is {changed[name][1]}"
     crashed = result.outcome in rerun.worker.crash_on
-    # Whoever stopped before the crash does not know whether it would have come.
+    # If the replay stopped before the step of the crash, it is unknown whether the crash reproduces.
     if (rerun.code == "current" or rerun.edits) and crashed:
         return "changed", ""
     if rerun.bundle.is_near_miss:  # there is no crash that could be fixed
@@ -191,20 +200,26 @@ def _no_fix(rerun: Rerun) -> str:
 
 
 def _end_divergence(was: TrialResult, now: TrialResult, code: Code) -> Divergence | None:
-    """Where two runs that are equal to the bit ended in another way, such as a hang that did not come again."""
+    """Return where two bit-identical recordings ended differently, such as a hang that did not reproduce."""
     if code == "log" and was.collision is None:  # the record of an agent's fault does not fail
         return None
     if was.outcome is not now.outcome:
-        return Divergence(now.steps, "", "outcome", str(was.outcome), str(now.outcome))
+        return Divergence(
+            step=now.steps, agent="", field="outcome", recorded=str(was.outcome), replayed=str(now.outcome)
+        )
     if was.steps != now.steps:
-        return Divergence(now.steps, "", "steps", was.steps, now.steps)
+        return Divergence(step=now.steps, agent="", field="steps", recorded=was.steps, replayed=now.steps)
     left, right = (dict(hit.to_json()) if hit else {} for hit in (was.collision, now.collision))
-    # Another crashhunt may know more about the same collision, or measure it in another way, but not who hit whom.
+    # Another version may describe the same collision in more detail, but agent, role and actors must be equal.
     for name in {**left, **right}:
         always = name in ("agent", "role", "collider", "victim")
         if (code == "snapshot" or always) and left.get(name) != right.get(name):
             return Divergence(
-                now.steps, str(left.get("agent", "")), f"collision.{name}", left.get(name), right.get(name)
+                step=now.steps,
+                agent=str(left.get("agent", "")),
+                field=f"collision.{name}",
+                recorded=left.get(name),
+                replayed=right.get(name),
             )
     return None
 
@@ -248,14 +263,14 @@ def confirm(
 
     Args:
         bundle: the crash.
-        stopped: asked now and then whether to give up; what a replay does afterwards says nothing about the crash.
+        stopped: Returns whether to stop; called repeatedly. A replay that fails afterwards does not count.
         failed: gets what came of the replay, where that is not the crash.
         executors: which run it; a new Python process where there are none.
         trusted: whether its code may run; None to find out.
 
     Returns:
-        None where it was given up. A replay that cannot be run to its end, as when it is killed from outside again and
-        again, says nothing about the crash: then `confirmed` is None, and `why_unconfirmed` has the reason.
+        The bundle with the result, or None if the confirmation was stopped. If no replay can run to its end, for
+        example because it is killed from outside every time, `confirmed` is None and `why_unconfirmed` has the reason.
 
     Raises:
         UntrustedError: its code is neither made here nor trusted.
@@ -306,7 +321,7 @@ def _run(
         if result.was_killed_from_outside:
             raise CrashhuntError(
                 f"the replay was {message}",
-                fix="run it again; where memory ran out, with less beside it",
+                fix="run it again; if memory ran out, end other processes first",
                 where=rerun.bundle.id,
             )
         try:

@@ -1,4 +1,4 @@
-"""Reports: what people are told."""
+"""Reports: summaries, descriptions, tables and pages for people."""
 
 import lazy_loader
 

@@ -17,6 +17,13 @@ from ._listing import (
     list_scenarios as list_scenarios,
 )
 from ._page import report_data as report_data, write_report as write_report
+from ._rate import (
+    describe_rates as describe_rates,
+    format_interval as format_interval,
+    format_rate as format_rate,
+    rates_page as rates_page,
+    write_rates_csv as write_rates_csv,
+)
 from ._show import Story as Story
 from ._status_screen import Watcher as Watcher, format_arguments as format_arguments, format_seconds as format_seconds
 from ._summary import (

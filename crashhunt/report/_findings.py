@@ -1,4 +1,4 @@
-"""A kind of crashes as something to be told at a place in the agent's code: for reviews, alerts and summaries."""
+"""Crash types as findings at a line of the agent's code: CI annotations, SARIF alerts and Markdown summaries."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A kind of crashes, and where to tell it.
+    """A crash type, and the line of code to which an annotation belongs.
 
     Args:
         rule: the outcome, such as ``collision``.
-        title: of the kind.
-        message: what happened in the shortest example, and how to look at it.
-        file: the agent's, relative to its project; empty where nobody knows.
-        line: of the file, from 1: that of the failure, else the one in which the agent is defined.
-        fingerprint: the same for the same kind, whenever it is found.
-        known: the case of a corpus that is the same; empty for none.
+        title: of the crash type.
+        message: summary of the shortest crash, and the command that shows it.
+        file: the agent's file, relative to its project; empty if unknown.
+        line: line in the file, from 1: of the failure, otherwise of the agent's definition.
+        fingerprint: identifier of the crash type, equal in every hunt.
+        known: the case of a corpus with the same crash type; empty for none.
         group: the crashes.
     """
 
@@ -64,11 +64,11 @@ class Finding:
 
 
 def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> list[Finding]:
-    """Return the kinds of crashes, in the order of their groups; no code of theirs is run.
+    """Return the crash types in the order of their groups. Runs no code of the bundles.
 
     Args:
         groups: of the crashes.
-        known: the cases of a corpus by kind.
+        known: crash type to the case of a corpus.
     """
     found = []
     for group in groups:
@@ -76,13 +76,19 @@ def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None =
         file, line = _place(example)
         count = "1 crash" if group.count == 1 else f"{group.count} crashes"
         fault = f" At fault: {group.fault}." if group.fault not in ("", "nobody can tell") else ""
-        message = f"{example.result.summary}.{fault} {count}; look at it: crashhunt show {example.path}"
+        message = f"{example.result.summary}.{fault} {count}. To look at it: crashhunt show {example.path}"
         found.append(
             Finding(
-                group.signature.outcome, one_line(str(group.signature)), one_line(message), file, line,
-                _fingerprint(group.signature), (known or {}).get(group.signature, ""), group,
+                rule=group.signature.outcome,
+                title=one_line(str(group.signature)),
+                message=one_line(message),
+                file=file,
+                line=line,
+                fingerprint=_fingerprint(group.signature),
+                known=(known or {}).get(group.signature, ""),
+                group=group,
             )
-        )  # fmt: skip
+        )
     return found
 
 
@@ -91,7 +97,7 @@ def _fingerprint(signature: Signature) -> str:
 
 
 def _place(bundle: Bundle) -> tuple[str, int]:
-    """Where in the agent's project to tell of a crash."""
+    """Return file and line of the agent's project to which a crash belongs."""
     failure = bundle.result.failure
     for frame in own_frames(failure) if failure is not None else ():
         if name := _in_project(frame.file):
@@ -101,7 +107,7 @@ def _place(bundle: Bundle) -> tuple[str, int]:
 
 @cache
 def _definition(snapshot: Path, driver: str) -> tuple[str, int]:
-    """Where the class or function is that drives."""
+    """Return file and line of the class or function that drives."""
     kept = Snapshot(snapshot)
     try:
         agents = kept.settings().agents
@@ -126,7 +132,7 @@ def _line_of(file: Path, attribute: str) -> int:
 
 
 def _in_project(file: PurePath) -> str:
-    """The name of a file in the project that it is of: of a snapshot's, where it was; empty where it is of none."""
+    """Return the path of a file relative to its project; empty for a file of no project."""
     parts = file.parts
     for place in range(len(parts) - 1, 2, -1):
         if parts[place - 1] == layout.CODE and parts[place - 3] == layout.SNAPSHOTS:
@@ -137,7 +143,7 @@ def _in_project(file: PurePath) -> str:
     return file.relative_to(here).as_posix() if file.is_relative_to(here) else ""
 
 
-# What hunts and corpora have found, for a CI: a summary in Markdown, and annotations as GitHub's runners read them.
+# Results of hunts and corpora for CI: a summary in Markdown, and annotations in the syntax of GitHub's runners.
 
 _MOST = 10  # annotations of one step that GitHub shows
 _SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|~])")
@@ -145,24 +151,24 @@ _ICONS = {"still": "💥", "changed": "🔀", "fixed": "✅", "cannot_run": "�
 
 
 def crashes_summary(findings: Sequence[Finding], *, compared: bool = False) -> str:
-    """Return the kinds of crashes as Markdown, a row each.
+    """Return the crash types as Markdown, one row each.
 
     Args:
-        findings: the kinds.
-        compared: whether it was looked up which of them a corpus has.
+        findings: one for each crash type.
+        compared: whether they were compared with a corpus.
     """
     if not findings:
         return "### crashhunt: no crash was saved\n"
     crashes, new = sum(finding.group.count for finding in findings), sum(not finding.known for finding in findings)
-    title = f"### crashhunt: {_count(crashes, 'crash', 'crashes')} of {_count(len(findings), 'kind', 'kinds')}"
+    title = f"### crashhunt: {_count(crashes, 'crash', 'crashes')} of {_count(len(findings), 'type', 'types')}"
     lines = [f"{title}, {new} new" if compared else title, ""]
-    names = ["crashes", "kind", "at fault", "shortest", "steps", *(["in the corpus"] if compared else [])]
+    names = ["crashes", "type", "at fault", "shortest", "steps", *(["in the corpus"] if compared else [])]
     lines += [_row(names), _row(["---:", "---", "---", "---", "---:", *(["---"] if compared else [])])]
     for finding in findings:
         group, shortest = finding.group, finding.group.shortest
         cells = [str(group.count), _plain(finding.title), group.fault, f"`{shortest.id}`", str(shortest.result.steps)]
         lines.append(_row([*cells, *([f"`{finding.known}`" if finding.known else "**new**"] if compared else [])]))
-    lines += ["", "The shortest of each kind:", ""]
+    lines += ["", "The shortest crash of each type:", ""]
     for finding in findings:
         place = f" (`{finding.file}`, line {finding.line})" if finding.file else ""
         lines.append(f"- {_plain(finding.group.shortest.result.summary)}{place}")
@@ -170,7 +176,7 @@ def crashes_summary(findings: Sequence[Finding], *, compared: bool = False) -> s
 
 
 def crash_annotations(findings: Sequence[Finding]) -> list[str]:
-    """Return a command of GitHub's for each kind that is new, at its place in the code; of many, the first ten."""
+    """Return a GitHub annotation command for each new crash type, at its line of code; at most ten."""
     return [
         _command("error", finding.title, finding.message, finding.file, finding.line)
         for finding in findings
@@ -179,7 +185,7 @@ def crash_annotations(findings: Sequence[Finding]) -> list[str]:
 
 
 def corpus_summary(reports: Sequence[CaseReport]) -> str:
-    """Return what came of the cases of a corpus as Markdown, those first that are not as expected."""
+    """Return the results of a corpus as Markdown; the cases that are not as expected come first."""
     wrong = sum(not report.ok for report in reports)
     said = f"{_count(wrong, 'is', 'are')} not as expected" if wrong else "all as expected"
     lines = [f"### crashhunt corpus: {_count(len(reports), 'case', 'cases')}, {said}", ""]
@@ -191,13 +197,13 @@ def corpus_summary(reports: Sequence[CaseReport]) -> str:
         lines.append(_row([_ICONS[report.got] if report.ok else "❌", *cells]))
     tighter = [report for report in reports if report.may_be_tightened]
     if tighter:
-        lines += ["", "Fixed, and may be tightened: `expect` may say `fixed` in"]
+        lines += ["", "Fixed cases. Set `expect` to `fixed` in:"]
         lines += ["", *(f"- `{report.path / layout.CASE}`" for report in tighter)]
     return "\n".join([*lines, ""])
 
 
 def corpus_annotations(reports: Sequence[CaseReport]) -> list[str]:
-    """Return a command of GitHub's for each case that is not as expected, or that may be tightened."""
+    """Return a GitHub annotation command for each case that is not as expected, or that is newly fixed."""
     found = []
     for report in sorted(reports, key=lambda report: report.ok):
         file = (report.path / layout.CASE).as_posix()
@@ -205,7 +211,7 @@ def corpus_annotations(reports: Sequence[CaseReport]) -> list[str]:
             title, *words = report.describe().splitlines()
             found.append(_command("error", title, "\n".join(words) or title, file, 1))
         elif report.may_be_tightened:
-            words = ["it does not crash any more: expect may say fixed"]
+            words = ["the crash is fixed. Set expect to fixed"]
             found.append(_command("notice", f"{report.path.name}: may be tightened", words[0], file, 1))
     return found[:_MOST]
 
@@ -219,7 +225,7 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Words as Markdown, in which no character means anything."""
+    """Return text for Markdown with all special characters escaped."""
     return _SPECIAL.sub(r"\\\1", one_line(text))
 
 
@@ -236,24 +242,25 @@ def _value(text: str) -> str:
     return _data(text).replace(":", "%3A").replace(",", "%2C")
 
 
-# Kinds of crashes as SARIF 2.1.0 (OASIS), which GitHub's code scanning and editors read: an alert a kind.
+# Crash types as SARIF 2.1.0 (OASIS), which GitHub code scanning and editors read: one alert for each type.
 
 _HOME = "https://github.com/crashhunt/crashhunt"
 _RULES = {
     "collision": "A controlled vehicle and another actor touched",
     "off_road": "A controlled vehicle left the road",
-    "agent_error": "The agent raised an exception, or gave an action that is none",
-    "simulator_error": "The simulator gave up in the middle of an episode",
+    "agent_error": "The agent raised an exception, or returned an invalid action",
+    "simulator_error": "The simulator failed during an episode",
     "process_died": "The process of a trial died",
     "hang": "A trial took longer than its wall-clock limit",
 }
 
 
 def write_sarif(findings: Sequence[Finding], target: Path) -> None:
-    """Write kinds of crashes, all of it or nothing; what is there is replaced.
+    """Write crash types as a SARIF file. A file that exists is replaced; the file is never incomplete.
 
-    Each is at a place in the agent's code; where nobody knows it, at the settings of its hunt. Its fingerprint is that
-    of the kind, so that whoever compares two such files knows which alerts are new. Kinds that a corpus has are notes.
+    Each alert belongs to a line of the agent's code. If that line is unknown, the alert belongs to the settings of the
+    hunt. The fingerprint identifies the crash type, so that a comparison of two files shows which alerts are new. The
+    alert of a crash type that a corpus contains has the level "note".
 
     Raises:
         HuntDirectoryError: the file cannot be written.
@@ -291,7 +298,7 @@ def _result(finding: Finding, rule: int) -> dict[str, object]:
         "level": "note" if finding.known else "error",
         "message": {"text": f"{finding.title}: {finding.message}"},
         "locations": [{"physicalLocation": place}],
-        # The second one is what GitHub goes by: without it, another line of code would be another alert.
+        # GitHub compares the second fingerprint. Without it, the alert would be new whenever its line number changes.
         "partialFingerprints": {
             "crashhuntKind/v1": finding.fingerprint,
             "primaryLocationLineHash": f"{finding.fingerprint}:1",
@@ -301,6 +308,6 @@ def _result(finding: Finding, rule: int) -> dict[str, object]:
 
 
 def _settings(hunt: Path) -> str:
-    """Where the settings of a hunt are: from here, and as a whole where they are elsewhere."""
+    """Return the settings file of a hunt: relative to the current directory, or as a URI if it lies elsewhere."""
     file, here = (hunt / layout.HUNT).resolve(), Path.cwd().resolve()
     return quote(file.relative_to(here).as_posix()) if file.is_relative_to(here) else file.as_uri()

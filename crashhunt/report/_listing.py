@@ -28,7 +28,7 @@ __all__ = [
 
 
 class ArgumentEntry(TypedDict):
-    """An argument; null for what nobody says."""
+    """An argument; null for unknown values."""
 
     name: str
     kind: Kind | None
@@ -51,7 +51,7 @@ class ListingEntry(TypedDict):
 
 
 def list_agents() -> list[ListingEntry]:
-    """Return the registered agents. One that cannot be imported is listed with a warning: nobody asked for it."""
+    """Return the registered agents. An agent that cannot be imported is listed with a warning."""
     return _list("agents")
 
 

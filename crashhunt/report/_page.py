@@ -44,16 +44,16 @@ if TYPE_CHECKING:
 __all__ = ["UNCHOSEN", "Importance", "importance_of", "lineage_of", "report_data", "values_of", "write_report"]
 
 
-# What the page tells of a search: which arguments danger follows, and which trials a crash was made from.
+# The search on the page: the arguments that criticality depends on, and the trials that a crash was derived from.
 
 UNCHOSEN = ("", "random", "start", "halton")
-"""Origins of trials that nobody chose by what was learned, so that they are everywhere."""
+"""Origins of trials that were chosen without learning, so that they cover the whole space."""
 
 _LEAST, _MOST = 40, 4000  # trials
 _PARTS = 5  # of a range, with as many trials each
 _RESAMPLED = 200
 _INTERVAL = (5.0, 95.0)
-_GENERATIONS = 50  # of a lineage; nobody reads more
+_GENERATIONS = 50  # of a lineage; more are unreadable
 
 
 class Importance(TypedDict):
@@ -78,12 +78,12 @@ def values_of(row: TrialRow) -> dict[str, Value]:
 def importance_of(trials: Sequence[tuple[Mapping[str, Value], float]]) -> list[Importance]:
     """Return what each argument contributes to danger, the most important first.
 
-    It is the correlation ratio of the ranks of danger over five parts of a range, or the words of a choice, without
-    what chance alone would give (Kelley's epsilon squared, 1935): the share of the variance that an argument explains
-    without any other. The interval is of a bootstrap over trials.
+    It is the correlation ratio of the ranks of danger over five parts of a range, or over the words of a choice. The
+    part that chance alone would give is subtracted (Kelley's epsilon squared, 1935). The result is the share of the
+    variance that an argument explains without any other. The interval is of a bootstrap over trials.
 
     Args:
-        trials: arguments and danger, 1 for a crash, of trials that nobody chose by what was learned.
+        trials: arguments and danger, 1 for a crash, of trials that were chosen without learning.
 
     Returns:
         Nothing where there are fewer than 40.
@@ -149,7 +149,7 @@ def lineage_of(number: int, trial: Callable[[int], TrialResult | None]) -> list[
     return found
 
 
-_DOTS = 4000  # trials in a plot; more cannot be told apart
+_DOTS = 4000  # trials in a plot; more cannot be distinguished
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -331,7 +331,7 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
             "snapshot": bundle.snapshot,
             **_disturbances(result),
             "confirmed": {
-                True: "yes, to the bit",
+                True: "yes, bit-identical",
                 False: "no: flaky",
                 None: f"not confirmed: {bundle.why_unconfirmed}" if bundle.why_unconfirmed else "not tried",
             }[bundle.confirmed],

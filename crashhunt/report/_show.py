@@ -36,17 +36,17 @@ if TYPE_CHECKING:
 
 __all__ = ["Story"]
 
-_ROWS = 20  # of the table; longer stretches are thinned out
+_ROWS = 20  # of the table; of more steps, the table shows a selection
 
 
 class Story:
-    """What happened in the last seconds of a crash, or around a near miss; no code of the bundle is run.
+    """The last seconds of a crash, or the seconds around a near miss. Runs no code of the bundle.
 
     Args:
         bundle: the crash or near miss.
-        last_s: how much of it, in s; of a near miss, half of that before it was nearest, and half after.
-        braking: a deceleration, in m/s²; it is calculated until when that would have helped. Without one it is told
-            what the hunt found out by running it.
+        last_s: duration to describe, in s. For a near miss, half of it lies before the nearest moment and half after.
+        braking: a deceleration, in m/s². The story then contains the calculated last step at which it would have
+            avoided the crash. If None, the story contains the result of the hunt's own runs.
     """
 
     def __init__(self, bundle: Bundle, *, last_s: float = 5.0, braking: float | None = None) -> None:
@@ -139,7 +139,7 @@ class Story:
         """Return the last steps as a table."""
         names = self._names()
         hit = self.bundle.result.collision
-        drives_into = hit is not None and hit.role == "collider"  # only then is it for the agent to brake
+        drives_into = hit is not None and hit.role == "collider"  # only a collider can avoid it by braking
         header = ["step", "time s", f"{self.agent} m/s", *names]
         if self.encounter is not None:
             header += [f"{self.other} m/s", "gap to it m", "closing m/s", "TTC to it s"]
@@ -164,7 +164,7 @@ class Story:
         return aligned([header, *rows])
 
     def _mark(self, step: int, moment: Moment | None) -> str:
-        """What is said beside a row of the table."""
+        """Return the remark at the end of a row of the table."""
         if step == self.escape:
             return "<- the last step after which braking helps"
         if self.nearest is not None and step == self.nearest.step:
@@ -177,7 +177,7 @@ class Story:
         return "" if same or math.isnan(own) or math.isnan(its) else f"<- they touched at {own:.1f} and {its:.1f} m/s"
 
     def _speeds_at_contact(self) -> tuple[float, float]:
-        """The agent's and the other's; not a number where nobody knows."""
+        """Return the speeds of the agent and of the other actor, in m/s; NaN where they are unknown."""
         hit = self.bundle.result.collision
         if hit is None:
             return math.nan, math.nan
@@ -187,7 +187,7 @@ class Story:
     def _about_encounter(self, encounter: Encounter) -> list[str]:
         agent, other = encounter.agent, encounter.other
         sentences = []
-        # What is after the contact says nothing about how it came to it.
+        # Moments after the contact do not explain how the crash came about.
         before = [moment for moment in encounter.moments if moment.time_s < self._end_s - 1e-9]
         shown = [moment for moment in before if moment.step >= self._first]
         if shown:
@@ -207,7 +207,7 @@ class Story:
         return [*sentences, *self._about_escape()]
 
     def _about_fault(self) -> list[str]:
-        """Whose fault it was, and by which rule."""
+        """Return the vehicle at fault, and the rule."""
         verdict, found = self.fault.verdict, self.fault.findings
         if verdict == "nobody can tell":
             return [f"At fault: {verdict}{', as rules contradict each other' if found else ''}."]
@@ -216,7 +216,7 @@ class Story:
         return [f"At fault: {who}, {rules}."]
 
     def _about_escape(self) -> list[str]:
-        """Until when braking would have helped; nothing where nobody knows."""
+        """Return until when braking would have avoided the crash; an empty list where that is unknown."""
         tried = self.bundle.result.escape
         if self._braking is not None:
             return [self._calculated(self._braking)]
@@ -224,7 +224,7 @@ class Story:
             return self.about_judgement()
         if tried is None:
             why = self.bundle.result.why_no_escape
-            return [f"Until when braking would have helped is not known: {why}."] if why else []
+            return [f"The last step at which braking would have helped is unknown: {why}."] if why else []
         braking = f"Braking {tried.how}"
         if tried.step is None:
             assert tried.too_late is not None
@@ -235,7 +235,7 @@ class Story:
         return [f"{braking} would have avoided it until {until}; one step later it was too late. Both were run."]
 
     def about_judgement(self) -> list[str]:
-        """Return until when it could have been avoided, as `judge` has found out by running it."""
+        """Return until when the crash could have been avoided, according to the runs of `judge`."""
         if self.judgement is None:
             return []
         why = about_why(self.judgement.why, self._at) if self.judgement.why is not None else []
@@ -243,7 +243,7 @@ class Story:
 
     def _calculated(self, braking: float) -> str:
         if self.escape is None:
-            return f"Until when braking at {braking:g} m/s² would have helped cannot be calculated."
+            return f"The last step at which braking at {braking:g} m/s² would have helped cannot be calculated."
         tried = self.bundle.result.escape
         can = ""
         if tried is not None and tried.braking is not None and braking > 1.01 * tried.braking:
@@ -261,7 +261,7 @@ class Story:
 
     @property
     def _end_s(self) -> float:
-        """Simulation time of the contact; where nobody knows, of the end of the step in which it was."""
+        """Simulation time of the contact, in s; if unknown, the end of the step of the contact."""
         hit = self.bundle.result.collision
         if hit is not None and math.isfinite(hit.time_s):
             return hit.time_s
@@ -290,7 +290,7 @@ class Story:
             names = channel.observation_names or tuple(map(str, range(seen.shape[-1] if seen.ndim else 1)))
             own = seen.reshape(-1, seen.shape[-1])[0].tolist() if seen.ndim else [seen.item()]
             facts = ", ".join(f"{name} {value:.3g}" for name, value in zip(names, own, strict=False))
-            sentences.append(f"The last that it was shown, in step {last.step}: {facts}.")
+            sentences.append(f"Its last observation, in step {last.step}: {facts}.")
         frames = [line.strip() for line in failure.traceback.splitlines() if line.strip()]
         if frames:
             sentences += ["", *frames[-6:]]
@@ -326,7 +326,7 @@ def _cells(moment: Moment) -> list[str]:
 
 
 def _named(moment: Moment, nearest: Mapping[str, TableCell]) -> dict[str, object]:
-    """A moment under names that mean the same everywhere: some are about the nearest one, some about the other one."""
+    """Return a moment under the names of all tables: some columns are on the nearest actor, some on the partner."""
     facts = asdict(moment)
     return {
         **{name: facts[name] for name in ("step", "time_s", "speed", "other_speed", "closing_speed")},
@@ -343,23 +343,23 @@ def _words(action: Sequence[float] | None, names: Sequence[str]) -> str:
 
 
 def _shrunk(bundle: Bundle) -> list[str]:
-    """What it was before somebody made it smaller."""
-    told = bundle.added.get("shrunk")
-    if not isinstance(told, dict):
+    """Return lines on the crash from which `shrink` made this one; an empty list for other crashes."""
+    shrunk = bundle.added.get("shrunk")
+    if not isinstance(shrunk, dict):
         return []
-    gone, changed = (told.get(name) or {} for name in ("removed", "changed"))
-    lines = [f"  {told.get('of')} made smaller: {len(gone)} left out, {len(changed)} arguments plainer"]
+    gone, changed = (shrunk.get(name) or {} for name in ("removed", "changed"))
+    lines = [f"  minimized from {shrunk.get('of')}: {len(gone)} elements removed, {len(changed)} arguments simplified"]
     script = bundle.result.spec.script
     if script is not None:
-        cut = told.get("steps_cut")
+        cut = shrunk.get("steps_cut")
         who = ", ".join(script.names)
-        moved = f"{who} moved along recorded ways, whatever the agent does" if who else "without any traffic"
+        moved = f"{who} moved along recorded paths, independent of the agent" if who else "without any traffic"
         lines.append(f"  scripted: {moved}" + (f"; it begins {cut} steps later" if cut else ""))
     return lines
 
 
 def _thinned(steps: list[StepRecord], rows: int, *, always: int | None) -> list[StepRecord]:
-    """About so many, evenly, the last ones all."""
+    """Return about `rows` of the steps: all of the last ones, and evenly spaced earlier ones."""
     if len(steps) <= rows:
         return steps
     recent = steps[-rows // 2 :]
@@ -370,6 +370,6 @@ def _thinned(steps: list[StepRecord], rows: int, *, always: int | None) -> list[
 
 
 def _around(steps: list[StepRecord], rows: int, middle: int) -> list[StepRecord]:
-    """About so many, evenly, one of them in the middle."""
+    """Return about `rows` evenly spaced steps that contain the middle one."""
     every = math.ceil(len(steps) / rows)
     return [step for step in steps if (step.step - middle) % every == 0]

@@ -1,4 +1,4 @@
-"""What people see while a hunt runs: one status screen on a terminal, else a plain line now and then."""
+"""The progress of a running hunt: a status screen on a terminal, otherwise a plain line every 5 s."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from rich.text import Text
 
 from crashhunt.base.text import one_line
 from crashhunt.recording import Phase
+from crashhunt.report._rate import describe_watch
 from crashhunt.trial import Outcome, without_folder
 
 if TYPE_CHECKING:
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Watcher", "format_arguments", "format_seconds"]
 
-_LINE_EVERY_S = 5.0  # where lines cannot be overwritten, such as in a log of CI
-_LEAST_BAR = 8  # columns; a shorter one says nothing, and the words need the room
+_LINE_EVERY_S = 5.0  # where lines cannot be overwritten, such as in a CI log
+_LEAST_BAR = 8  # columns; a shorter bar is unreadable, and the words need the space
 _STYLES = {
     "traffic crash": "bold red",
     "traffic event": "bold yellow",
@@ -38,12 +39,12 @@ _STYLES = {
 
 
 class Watcher:
-    """Shows how a hunt is going.
+    """Shows the progress of a hunt.
 
     Args:
-        console: where to; a terminal gets the screen, anything else lines.
-        title: on top.
-        notes: what to tell before the first status, when nothing can be refused any more.
+        console: a terminal shows the screen, any other console plain lines.
+        title: first line of the screen.
+        notes: lines to print before the first status, when the hunt can no longer be refused.
     """
 
     def __init__(self, console: Console, title: str, notes: Sequence[str] = ()) -> None:
@@ -74,13 +75,13 @@ class Watcher:
             self._console.print(_line(status), soft_wrap=True, highlight=False)
 
     def tell_notes(self) -> None:
-        """Tell the notes, once."""
+        """Print the notes, once."""
         for note in self._notes:
             self._console.print(one_line(note), markup=False, soft_wrap=True, highlight=False)
         self._notes = ()
 
     def _screen(self, status: HuntStatus) -> RenderableType:
-        """The head in a line, progress, outcomes; then as much of the rest as fits, the workers first."""
+        """Return title, progress and outcomes, then as many other lines as fit, beginning with the workers."""
         width, height = self._console.size
         rows: list[RenderableType] = [self._head(status, width), _bar(status, width)]
         outcomes = Text("  ").join(
@@ -89,12 +90,14 @@ class Watcher:
         )
         if status.disturbed is not None and status.crashes:
             outcomes += Text(f"   {_disturbed(status)}")
-        rows.append(outcomes or Text("no trial has ended yet", style="dim"))
+        rows.append(outcomes or Text("no trial has finished", style="dim"))
+        if status.rate is not None:
+            rows.append(Text(describe_watch(status.rate), no_wrap=True, overflow="ellipsis"))
         if status.kinds:
             kinds = Text(f"{describe_kinds(status)}: ", no_wrap=True, overflow="ellipsis")
             each = "; ".join(f"{kind.count} {kind.signature}" for kind in status.kinds)
             rows.append(kinds + Text(one_line(each), "dim"))
-        # What is below the last line of a terminal is not shown, and the last line belongs to the cursor.
+        # A terminal shows nothing below its last line, and the cursor needs that line.
         left = height - 1 - len(self._console.render_lines(Group(*rows)))
         if status.search.strategies and len(status.workers) < left:
             rows.append(Text(one_line(_strategies(status.search)), no_wrap=True, overflow="ellipsis"))
@@ -110,11 +113,11 @@ class Watcher:
             left -= 1
         if status.not_fully_asked and len(status.workers) < left:
             count = status.not_fully_asked
-            text = f"{count} {'trial was' if count == 1 else 'trials were'} not fully asked: copies of them died"
+            text = f"{count} {'trial was' if count == 1 else 'trials were'} not fully probed: copies of them died"
             rows.append(Text(text, no_wrap=True, overflow="ellipsis"))
             left -= 1
         if status.branched and len(status.workers) < left:
-            rows.append(Text(f"branches that crashed: {status.branched}", no_wrap=True, overflow="ellipsis"))
+            rows.append(Text(f"crashes of branches: {status.branched}", no_wrap=True, overflow="ellipsis"))
             left -= 1
         nodes = _nodes(status, max(1, left // 2))
         return Group(*rows, *nodes, _workers(status, width, max(1, left - len(nodes))))
@@ -138,11 +141,11 @@ def _bar(status: HuntStatus, width: int) -> RenderableType:
 
 
 def _nodes(status: HuntStatus, lines: int) -> list[RenderableType]:
-    """The machines that take part, one a line."""
+    """Return the connected machines, one line each."""
     if status.nodes is None:
         return []
     if not status.nodes:
-        return [Text("no node takes part now; the hunt waits", style="yellow")]
+        return [Text("no node is connected; the hunt waits", style="yellow")]
     found = [
         f"node {one_line(node.name)}   {node.parallel} at a time   {node.trials} trials   {node.rate_per_s:.1f}/s"
         for node in status.nodes
@@ -153,7 +156,7 @@ def _nodes(status: HuntStatus, lines: int) -> list[RenderableType]:
 
 
 def _workers(status: HuntStatus, width: int, lines: int) -> RenderableType:
-    """What each worker is doing: a line each, or side by side where there are too few lines."""
+    """Return the state of each worker: one line each, or several workers a line if the screen is too small."""
     doing = [
         (header.pid, number, {Phase.SETUP: "setting up", Phase.DONE: "done"}.get(header.phase, f"step {header.step}"))
         for number, header in sorted(status.workers.items())
@@ -193,7 +196,7 @@ def _short(value: Value) -> str:
 
 
 def format_seconds(seconds: float) -> str:
-    """Return a duration for people."""
+    """Return a duration as ``M:SS`` or ``H:MM:SS``."""
     if not math.isfinite(seconds):
         return "?"
     minutes, rest = divmod(round(seconds), 60)
@@ -202,15 +205,15 @@ def format_seconds(seconds: float) -> str:
 
 
 def describe_kinds(status: HuntStatus) -> str:
-    """Return how many kinds of crashes there are, and how long ago the last new one came."""
+    """Return the number of crash types, and how long ago the last new type was found."""
     count = len(status.kinds or ())
-    words = f"{count} {'kind' if count == 1 else 'kinds'} of crashes"
+    words = f"{count} crash {'type' if count == 1 else 'types'}"
     if status.newest_kind_s is None:
         return words
-    words += f", the last new one {format_seconds(status.newest_kind_s)} ago"
-    if status.newest_kind_trials is None:
-        return words
-    return f"{words} ({status.newest_kind_trials} {'trial' if status.newest_kind_trials == 1 else 'trials'})"
+    ago, trials = format_seconds(status.newest_kind_s), status.newest_kind_trials
+    if trials is not None:
+        ago = f"{trials} {'trial' if trials == 1 else 'trials'} / {ago}"
+    return f"{words} (last new type: {ago} ago)"
 
 
 def _disturbed(status: HuntStatus) -> str:
@@ -218,8 +221,10 @@ def _disturbed(status: HuntStatus) -> str:
 
 
 def _line(status: HuntStatus) -> str:
-    outcomes = ", ".join(f"{name} {count}" for name, count in sorted(status.outcomes.items())) or "none has ended yet"
-    line = f"{status.phase}: {_count(status)} trials ({outcomes})"
+    outcomes = ", ".join(f"{name} {count}" for name, count in sorted(status.outcomes.items()))
+    phase = "running" if status.phase == "hunting" else status.phase
+    count = f"{status.done} of {status.planned}" if status.planned else str(status.done)
+    line = f"{phase}: {count} trials finished" + (f" ({outcomes})" if outcomes else "")
     if status.phase == "hunting" and status.done:
         line += f", {status.rate_per_s:.1f}/s, {format_seconds(status.seconds_left)} left"
     if status.disturbed is not None and status.crashes:
@@ -227,7 +232,9 @@ def _line(status: HuntStatus) -> str:
     if status.phase == "hunting" and status.kinds:
         line += f"; {describe_kinds(status)}"
     if status.phase == "hunting" and status.nodes is not None:
-        line += f"; nodes that take part: {len(status.nodes)}" if status.nodes else "; no node takes part now"
+        line += f"; connected nodes: {len(status.nodes)}" if status.nodes else "; no node is connected"
+    if status.rate is not None:
+        line += f"; {describe_watch(status.rate)}"
     return line
 
 
@@ -244,17 +251,17 @@ def _stressed(result: TrialResult) -> str:
 
 
 def _strategies(search: SearchStatus) -> str:
-    """What has been tried, with the mean danger of it."""
-    told = []
+    """Return the strategies of the search, with the mean criticality of their trials."""
+    parts = []
     for one in search.strategies:
         came = [] if one.danger is None else [f"danger {one.danger:.2f}"]
         came += [f"{one.crashes} {'crash' if one.crashes == 1 else 'crashes'}"] if one.crashes else []
-        told.append(f"{one.name} {one.share:.0%}" + (f" ({', '.join(came)})" if came else ""))
-    return f"tried: {', '.join(told)}"
+        parts.append(f"{one.name} {one.share:.0%}" + (f" ({', '.join(came)})" if came else ""))
+    return f"tried: {', '.join(parts)}"
 
 
 def _grown(search: SearchStatus) -> str:
-    """How long ago the greatest danger grew."""
+    """Return how long ago the greatest criticality rose."""
     if search.grown_trials is None or search.grown_s is None:
         return ""
     count = search.grown_trials

@@ -1,4 +1,4 @@
-"""What people are told at the end of a hunt and of a replay."""
+"""The report at the end of a hunt and of a replay, as text for a terminal."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.text import in_lines
+from crashhunt.report._rate import describe_rates
 from crashhunt.report._status_screen import format_arguments, format_seconds
 from crashhunt.report._words import (
     by_likelihood,
     describe_branches,
     describe_disturbances,
     describe_probes,
-    told_disturbances,
+    list_disturbances,
 )
 from crashhunt.world import event_counts
 
@@ -31,21 +32,21 @@ if TYPE_CHECKING:
 __all__ = ["describe_groups", "describe_hunt", "describe_replay"]
 
 
-# The table of the kinds of crashes, for people; which are of one kind, and their order, is in `triage`.
+# The table of crash types. `crashhunt.crashes` decides which crashes are of one type, and in which order.
 
 
 def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> str:
-    """Return a line a kind of crash, with the one to look at first.
+    """Return one line for each crash type, with its shortest crash.
 
     Args:
-        groups: the kinds.
-        known: the cases of a corpus by kind; None where nobody has asked.
+        groups: one for each crash type.
+        known: crash type to the case of a corpus; None where no corpus was given.
     """
     if not groups:
         return "No crash was saved."
     hunts = {bundle.hunt for group in groups for bundle in group.bundles}
     faults = any(group.fault for group in groups)
-    rows = [["crashes", "kind", *(["at fault"] if faults else []), "shortest"]]
+    rows = [["crashes", "type", *(["at fault"] if faults else []), "shortest"]]
     rows[0] += [*(["known as"] if known is not None else []), "steps"]
     for group in groups:
         shortest = group.shortest
@@ -61,12 +62,12 @@ def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | No
             ]
         )
     count = sum(group.count for group in groups)
-    words = f"{count} {'crash' if count == 1 else 'crashes'} of {len(groups)} {'kind' if len(groups) == 1 else 'kinds'}"
+    words = f"{count} {'crash' if count == 1 else 'crashes'} of {len(groups)} {'type' if len(groups) == 1 else 'types'}"
     return "\n".join([f"{words}:", "", *_lines(rows)])
 
 
 def _lines(rows: list[list[str]]) -> list[str]:
-    """Numbers to the right, words to the left."""
+    """Return rows with aligned columns: numbers right-aligned, words left-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(
@@ -86,7 +87,7 @@ _WITNESSES = {
 
 
 def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
-    """Return what came of a hunt: what crashed, how, where it is, and how to replay it."""
+    """Return the result of a hunt: each crash, how it came about, its directory, and the command that replays it."""
     ran = sum(report.outcomes.values())
     outcomes = ", ".join(f"{name} {count}" for name, count in report.outcomes.items()) or "none"
     planned = report.settings.trials
@@ -94,27 +95,30 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     count = f"{ran}{f' of {planned}' if planned else ''} trials, {report.trial_steps} steps{total}"
     lines = [f"{count}, {format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"]
     if report.stopped_because == "no_valid_trial":
-        lines.append(f"Not one trial was valid: {report.reason}")
+        lines.append(f"No trial was valid: {report.reason}")
     lines += [f"Note: {note}" for note in report.notes]
     lines += _describe_audit(report)
     if report.stopped_because == "distinct":
         found, wanted = len(report.kinds or ()), report.settings.run.distinct
-        lines.append(f"{found} kinds of crashes were found, and {wanted} were wanted.")
+        lines.append(f"Found {found} crash types (--distinct {wanted}).")
+    if report.rate is not None:
+        lines += describe_rates([report.rate]).splitlines()
     if report.copied is not None:
         number = report.copied.result.spec.number
-        lines.append(f"Trial {number} did not crash; a copy of it did, and from the start it crashed as well.")
+        lines.append(f"Trial {number} did not crash, but a copy of it did. The crash reproduces from the start.")
     if report.unanswered:
         one = report.unanswered == 1
-        who, whom = f"{report.unanswered} {'trial' if one else 'trials'}", "it" if one else "them"
+        trials, them = ("trial has", "it") if one else ("trials have", "them")
         why = "processes were killed from outside"
-        lines.append(f"Answers are missing from {who}: {why}. The same command runs {whom} again.")
+        fix = f"Run the same command to run {them} again."
+        lines.append(f"{report.unanswered} {trials} incomplete answers: {why}. {fix}")
     if report.stopped_because == "interrupted":
-        lines.append("Interrupted; the same command goes on from here.")
+        lines.append("Interrupted. Run the same command to resume.")
     if not report.crashes and report.stopped_because in ("all_trials", "time"):
         lines.append(
             "No crash was found."
             if report.stopped_because == "all_trials"
-            else "No crash was found before the time was up."
+            else "No crash was found within the time limit."
         )
     lines += _describe_events(report)
     lines += describe_probes(report)
@@ -146,10 +150,10 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
 
 
 def _near_misses(report: HuntReport, program: str) -> list[str]:
-    """The near misses that were kept, a line each."""
+    """Return the saved near misses, one line each."""
     if not report.near_misses:
         return []
-    lines = ["", f"Near misses, kept in {report.directory / layout.NEAR_MISSES}:"]
+    lines = ["", f"Near misses, saved in {report.directory / layout.NEAR_MISSES}:"]
     for bundle in report.near_misses[:_SHOWN]:
         result = bundle.result
         lines.append(f"  {bundle.id}  danger {result.danger or 0.0:.2f}  {format_arguments(result)}")
@@ -160,19 +164,19 @@ def _near_misses(report: HuntReport, program: str) -> list[str]:
 
 
 def _describe_events(report: HuntReport) -> list[str]:
-    """What happened in the traffic that the hunt was not after, and how to be after it."""
+    """Return the traffic events that do not count as crashes in this hunt, and the option that makes them count."""
     others = {kind: found for kind, found in report.events.items() if kind not in report.settings.crash_on}
     if not others:
         return []
-    told = ", ".join(
+    counts = ", ".join(
         f"{event_counts({kind: count})} in {trials} {'trial' if trials == 1 else 'trials'}"
         for kind, (count, trials) in others.items()
     )
-    return [f"Also: {told}; --crash-on {','.join(others)} hunts for that."]
+    return [f"Traffic events: {counts}. To hunt for them: --crash-on {','.join(others)}"]
 
 
 def describe_replay(report: ReplayReport) -> str:
-    """Return what came of a replay."""
+    """Return the result of a replay."""
     bundle, rerun = report.bundle, report.rerun
     drivers = {
         "log": "the recorded actions",
@@ -202,9 +206,9 @@ def _verdict(report: ReplayReport) -> list[str]:
     was, now, steps = report.bundle.result, report.replayed, report.rerun.recorded.steps
     count = f"{report.steps_replayed} of {steps} steps, digest {now.digest}"
     if report.verdict == "reproduced":
-        what = "every observation, action and scene is the same to the bit"
+        what = "every observation, action and scene is bit-identical"
         if report.rerun.code == "log":
-            what = "every observation and scene that the recorded actions lead to is the same to the bit"
+            what = "every observation and scene that results from the recorded actions is bit-identical"
         return [f"reproduced: {count}", f"  {what}"]
     if report.rerun.elsewhere and report.verdict == "changed":
         return [f"changed: it crashes there as well; {now.summary}", f"  it was: {was.summary}"]
@@ -243,12 +247,12 @@ def _describe_audit(report: HuntReport) -> list[str]:
     same = found.trials - len(found.differences)
     if found.trials == found.not_finished == 0:
         return ["Audit: no trial without a crash belonged to the sample."]
-    lines = [f"Audit: {found.trials} run again in fresh processes, {same} the same to the bit."]
+    lines = [f"Audit: {found.trials} replayed in new processes, {same} bit-identical."]
     if found.not_finished:
-        lines.append(f"  {found.not_finished} more could not be run again to the end; the same command does it")
+        lines.append(f"  {found.not_finished} more did not finish. Run the same command to replay them")
     lines += [f"  {difference}" for difference in found.differences[:_SHOWN]]
     if len(found.differences) > _SHOWN:
-        lines.append(f"  … and {len(found.differences) - _SHOWN} more; crashhunt logs has them all")
+        lines.append(f"  … and {len(found.differences) - _SHOWN} more; for all of them, run: crashhunt logs")
     return lines
 
 
@@ -260,20 +264,21 @@ def _describe_crash(bundle: Bundle) -> list[str]:
         f"  after {result.steps} steps, simulation time {result.sim_time_s:.1f} s",
         f"  seed {result.spec.seed}, {format_arguments(result)}",
     ]
-    lines += [f"  {line}" for line in (*_evidence(result), *told_disturbances(result))]
+    lines += [f"  {line}" for line in (*_evidence(result), *list_disturbances(result))]
     lines.append(f"  saved in {bundle.path}")
     if bundle.confirmed is not None:
         first: Plain = bundle.divergence or {}
         diverged = f"first difference at step {first.get('step')}, {first.get('agent')} {first.get('field')}"
         lines.append(
-            "  confirmed: a fresh process did the same to the bit"
+            "  confirmed: bit-identical when replayed in a new process"
             if bundle.confirmed
-            else f"  flaky: a fresh process did not do the same ({diverged})"
+            else f"  flaky: the replay in a new process deviates ({diverged})"
         )
     elif bundle.why_unconfirmed:
-        lines.append(f"  not confirmed: {bundle.why_unconfirmed}; the same command tries again")
+        lines.append(f"  not confirmed: {bundle.why_unconfirmed}. Run the same command to try again")
     if result.why_no_escape:
-        lines.append(f"  last avoidable step: not known, as {result.why_no_escape}; the same command tries again")
+        why = result.why_no_escape
+        lines.append(f"  last avoidable step: unknown, because {why}. Run the same command to try again")
     return lines
 
 
@@ -294,7 +299,7 @@ def _evidence(result: TrialResult) -> list[str]:
             lines.append(_WITNESSES.get(hit.seen_by, f"seen by {', '.join(hit.seen_by)}"))
     if failure is not None:
         frames = failure.traceback.strip().splitlines()
-        # Python prints the most recent call last; faulthandler, which speaks for the dead and the stuck, first.
+        # Python prints the most recent call last. faulthandler, for dead and hanging processes, prints it first.
         dumped = [line for line in frames if line.lstrip().startswith("File")]
         lines += dumped[:3] if failure.kind in ("signal", "timeout") else frames[-4:]
         if failure.last_output.strip():

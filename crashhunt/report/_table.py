@@ -41,13 +41,13 @@ TableCell: TypeAlias = "bool | int | float | str | None"
 TableRow: TypeAlias = dict[str, TableCell]
 _SCENE = ("x", "y", "heading", "speed")
 NEAREST = ("time_to_collision_s", "gap_m", "required_deceleration")
-"""What is measured to whoever is the nearest, as of every trial."""
+"""Measures relative to the nearest actor, as in every trial."""
 
 _TO_OTHER = {"gap_to_other_m": "gap_m", "time_to_other_s": "time_to_collision_s", "closing_speed": "closing_speed"}
 
 
 def check_fields(recording: Recording, fields: Sequence[str], agent: str) -> list[str]:
-    """Return the columns that fields stand for, of what an agent of a recording was shown and did.
+    """Return the columns of fields: observations and actions of an agent of a recording.
 
     Raises:
         UsageError: a field does not exist, with those that do.
@@ -72,9 +72,9 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
     Args:
         recording: of the episode.
         fields: ``x``, ``y``, ``heading``, ``speed``, ``reward``, ``time_to_collision_s``, ``gap_m``,
-            ``required_deceleration`` (these three to whoever is the nearest), ``gap_to_other_m``, ``time_to_other_s``,
-            ``closing_speed`` (these three to the other one of the crash), the parts of the action by name,
-            ``observation[ROW,NAME]``; ``action`` for all parts of the action.
+            ``required_deceleration`` (relative to the nearest actor), ``gap_to_other_m``, ``time_to_other_s``,
+            ``closing_speed`` (relative to the collision partner), ``observation[ROW,NAME]``, the parts of the
+            action by name, or ``action`` for all of them.
         agent: whose.
         other: the one that it crashed with.
 

@@ -34,17 +34,17 @@ __all__ = [
     "describe_disturbances",
     "describe_probes",
     "likeliest",
+    "list_disturbances",
     "may_be_disturbed",
     "nearest_to_json",
-    "told_disturbances",
     "traffic_of",
     "window_of",
 ]
 
 
-# How two stood to each other, in words.
+# The positions of two actors relative to each other, in words.
 
-STANDS = 0.05  # m/s; what is less is shown as 0
+STANDS = 0.05  # m/s; a lower speed is shown as 0
 _PLACES = {
     "ahead": "ahead of {agent}",
     "behind": "behind {agent}",
@@ -60,7 +60,7 @@ _WAYS = {
 
 
 def about_gap(encounter: Encounter, moment: Moment) -> str:
-    """Return how far apart the two were, and how fast."""
+    """Return the distance between two actors, and their speeds."""
     return (
         f"they were {moment.gap_m:.1f} m apart, {_closing(moment.closing_speed)}; {encounter.agent} at "
         f"{moment.speed:.1f} m/s, {encounter.other} at {moment.other_speed:.1f} m/s"
@@ -68,7 +68,7 @@ def about_gap(encounter: Encounter, moment: Moment) -> str:
 
 
 def about_place(encounter: Encounter, moment: Moment) -> str:
-    """Return where the other one was, and where it went."""
+    """Return the position of the other actor relative to the agent, and its direction."""
     position = encounter.position(moment.step)
     assert position is not None
     going = _WAYS[position.faces] if abs(moment.other_speed) >= STANDS else "standing"
@@ -86,7 +86,7 @@ COLUMNS = ("danger", "from behind")
 
 
 def window_of(recording: Recording, last_s: float, nearest: DangerousMoment | None) -> tuple[int, int]:
-    """Return the first and the last step to be told: the last seconds of a crash, or those around a near miss."""
+    """Return the first and the last step to describe: the end of a crash, or the surroundings of a near miss."""
     dt, end = recording.prologue.step_length_s, recording.steps
     if nearest is None:
         return end - round(last_s / dt), end
@@ -95,7 +95,7 @@ def window_of(recording: Recording, last_s: float, nearest: DangerousMoment | No
 
 
 def about_nearest(encounter: Encounter, nearest: DangerousMoment) -> list[str]:
-    """Return when a trial without a crash was nearest to one, to whom, and how they stood to each other."""
+    """Return sentences on the most dangerous moment of a trial without a crash: when it was, and the other actor."""
     moment = next((one for one in encounter.moments if one.step == nearest.step), None)
     if moment is None:
         return []
@@ -107,22 +107,22 @@ def about_nearest(encounter: Encounter, nearest: DangerousMoment) -> list[str]:
 
 
 def about_danger(course: DangerCourse) -> str:
-    """Return the greatest danger of both kinds, and what they add up to over the trial."""
+    """Return the greatest criticality of both kinds, and their sums over the trial."""
     parts = []
-    for whose, moment, total, who, nobody in (
-        (f"{course.agent}'s own", course.greatest, course.own_total, "towards", "nobody was seen near"),
+    for whose, moment, total, relation, absent in (
+        (f"{course.agent}'s own", course.greatest, course.own_total, "towards", "no actor was near"),
         (
             "that by those behind it",
             course.greatest_behind,
             course.behind_total,
             "by",
-            "nobody was seen to close in from behind",
+            "no vehicle closed in from behind",
         ),
     ):
         if moment.danger <= 0:
-            parts.append(nobody)
+            parts.append(absent)
             continue
-        most = f"at most {moment.danger:.2f}, after step {moment.step}, {who} {moment.other}"
+        most = f"at most {moment.danger:.2f}, after step {moment.step}, {relation} {moment.other}"
         parts.append(f"{whose} was {most} ({total:.2f} over the trial)")
     return f"Danger: {parts[0]}; {parts[1]}."
 
@@ -134,13 +134,13 @@ def danger_cells(course: DangerCourse, step: int) -> list[str]:
 
 
 def danger_to_json(course: DangerCourse | None, bundle: Bundle, first: int, last: int) -> dict[str, object] | None:
-    """Return the shape under ``danger`` of ``show --json``; None where nobody knows.
+    """Return the object under ``danger`` of ``show --json``; None if the recording has no criticality.
 
     Args:
         course: of the recording.
         bundle: of the trial.
-        first: step of those that are told one by one.
-        last: likewise.
+        first: first step of the table.
+        last: last step of the table.
     """
     if course is None:
         return None
@@ -191,24 +191,24 @@ def about_disturbances(recording: Recording, result: TrialResult, first_step: in
     step_length_s = recording.prologue.step_length_s
     recent = [one for one in result.disturbances if one.step + one.how_long / step_length_s >= first_step]
     earlier = len(result.disturbances) - len(recent)
-    told = [
+    sentences = [
         f"{max(0, recording.steps - one.step + 1) * step_length_s:.1f} s before, from step {one.step} on: {one.words}"
         f"{_where(one)}."
         for one in recent
     ]
     if earlier:
-        told.insert(0, f"{earlier} {'disturbance was' if earlier == 1 else 'disturbances were'} over before that.")
-    return told
+        sentences.insert(0, f"{earlier} {'disturbance was' if earlier == 1 else 'disturbances were'} over before that.")
+    return sentences
 
 
-def told_disturbances(result: TrialResult) -> list[str]:
-    """Return a line for each disturbance of a trial, and one for how likely all of it was."""
+def list_disturbances(result: TrialResult) -> list[str]:
+    """Return one line for each disturbance of a trial, and one line with the log-likelihood of all of them."""
     if not may_be_disturbed(result):
         return []
     lines = [f"disturbed from step {one.step} on: {one.words}{_where(one)}" for one in result.disturbances]
-    lines = lines or ["in undisturbed traffic: nothing that was planned had begun"]
+    lines = lines or ["in undisturbed traffic: no planned disturbance had begun"]
     if result.log_likelihood is not None:
-        lines.append(f"log-likelihood of those that were drawn, and no others: {result.log_likelihood:.2f}")
+        lines.append(f"log-likelihood of exactly these disturbances: {result.log_likelihood:.2f}")
     return lines
 
 
@@ -220,7 +220,7 @@ def describe_disturbances(crashes: Sequence[Bundle]) -> list[str]:
     lines = [f"Crashes: {len(crashes) - len(disturbed)} in undisturbed traffic, {len(disturbed)} with disturbances."]
     first = likeliest(crashes)
     if first is not None:
-        lines.append(f"The likeliest of those with disturbances: {first.id} (log-likelihood {_likely(first):.2f})")
+        lines.append(f"Likeliest crash with disturbances: {first.id} (log-likelihood {_likely(first):.2f})")
     return lines
 
 
@@ -275,10 +275,10 @@ def about_events(recording: Recording, first_step: int, *, besides: Event | None
     Args:
         recording: of the episode.
         first_step: from which on.
-        besides: what ended it, which has been told.
+        besides: the event that ended the trial, which is described elsewhere.
     """
     end = recording.steps * recording.prologue.step_length_s
-    told = [
+    found = [
         (step.step, event)
         for step in recording.all_steps[first_step:]
         if step.scene is not None
@@ -287,11 +287,11 @@ def about_events(recording: Recording, first_step: int, *, besides: Event | None
     ]
     return [
         f"{end - step * recording.prologue.step_length_s:.1f} s before, at step {step}: {event.what}."
-        for step, event in told[-_LAST:]
+        for step, event in found[-_LAST:]
     ]
 
 
-# Whether a collision could have been avoided, in words: only what was run is said.
+# Whether a collision could have been avoided, in words. Every sentence reports runs, not calculations.
 
 _BY = {
     "brake": "by braking",
@@ -301,13 +301,13 @@ _BY = {
 
 
 def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str, other: str) -> list[str]:
-    """Return what was found out, a sentence each.
+    """Return the results of the counterfactual analysis, one sentence each.
 
     Args:
         judgement: of the crash.
-        ago: says when a step was, such as ``0.4 s before, after step 68``.
+        ago: returns the time of a step as words, such as ``0.4 s before, after step 68``.
         agent: the controlled vehicle.
-        other: whom it collided with.
+        other: the collision partner.
     """
     best, runs = judgement.best, f"{judgement.runs} {'run' if judgement.runs == 1 else 'runs'}"
     sentences = []
@@ -321,17 +321,18 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
         if len(judgement.attempts) == 1:
             sentences = [f"None of {runs} avoided it {tried}, from the first step on."]
     elif judgement.runs:
-        sentences = [f"None of {runs} avoided it, and they do not say that nothing could have."]
+        sentences = [f"None of {runs} avoided it, but they do not prove that it was unavoidable."]
     visible = judgement.visible_step
     if judgement.verdict == "invalid":
-        sentences.append(f"{agent} was put into it: that is an invalid trial, and says nothing about it.")
+        sentences.append(f"{agent} started in an unavoidable situation: the trial is invalid.")
     elif visible is not None and judgement.verdict == "too late when visible":
         sentences.append(
-            f"When {agent} was first shown {other}, {ago(visible)}, it could not be avoided any more: it was run from "
-            "each step from then on."
+            f"When {agent} first observed {other}, {ago(visible)}, the crash was already unavoidable: runs from every "
+            "later step crashed."
         )
     elif visible is not None and judgement.runs:
-        sentences.append(f"{agent} was shown {other} {'all the time' if visible == 0 else f'from {ago(visible)}, on'}.")
+        since = "from the start" if visible == 0 else f"from {ago(visible)}, on"
+        sentences.append(f"{agent} observed {other} {since}.")
     if judgement.why_not:
         sentences.append(f"Whether it could have been avoided is not fully known: {judgement.why_not}.")
     return sentences
@@ -350,18 +351,18 @@ def _until(attempt: Attempt, ago: Callable[[int], str]) -> str:
     return f"{words}; that was run."
 
 
-# What a collision hangs on, in words: only what was run is said.
+# The causes of a crash, in words. Every sentence reports runs, not calculations.
 
 _LEFT_OUT = {"braked": "it keeps its speed", "sped up": "it keeps its speed", "changed lanes": "it stays in its lane"}
 _NOUNS = {"braked": "braking", "sped up": "speeding up", "changed lanes": "change of lanes"}
 
 
 def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
-    """Return what was found out, a sentence each: first what it hangs on, then what makes no difference.
+    """Return the causes of a crash, one sentence each, then the elements that make no difference.
 
     Args:
-        why: what was run.
-        when: says when a step was, such as ``61.3 s``.
+        why: the runs.
+        when: returns the time of a step as words, such as ``61.3 s``.
     """
     defaults = {factor.name: factor for factor in why.factors if (factor.kind, factor.what) == ("argument", "default")}
     drawn = {
@@ -378,11 +379,11 @@ def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
         else:
             sentences.append(f"- {'; '.join(_sentence(one, when) for one in each if one.clear)}.")
     if sentences:
-        sentences = [f"What it hangs on, in {why.runs} runs with one thing left out in each:", *sentences]
+        sentences = [f"Causes, from {why.runs} runs that each remove or change one element:", *sentences]
     if alike:
-        sentences.append(f"No difference, in any run without it: {'; '.join(alike)}.")
+        sentences.append(f"No difference in any run: {'; '.join(alike)}.")
     if why.why_not:
-        sentences.append(f"What it hangs on is not fully known: {why.why_not}.")
+        sentences.append(f"The causes are not fully known: {why.why_not}.")
     return sentences
 
 
@@ -444,29 +445,29 @@ def _number(value: Value | None) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-# What is told of the probes and branches of a hunt.
+# The results of the robustness probes and branches of a hunt.
 
 
 def describe_probes(report: HuntReport) -> list[str]:
-    """Return how little it would have taken for trials to crash, and what has been run from the start of it."""
+    """Return the stress margins of trials, and the crashes of copies that reproduce from the start."""
     found = report.probes
     if found is None or not (found.margins or found.not_fully_asked):
         return []
-    steps = f"{found.steps} steps beside {report.trial_steps} of trials"
-    enough = f"; {found.left_out} questions were left out, as that was enough" if found.left_out else ""
-    lines = ["Stress margin: no trial was fully asked."]
+    steps = f"{found.steps} steps, in addition to {report.trial_steps} steps of trials"
+    enough = f"; {found.skipped} questions were skipped, because copies had used their share" if found.skipped else ""
+    lines = ["Stress margin: no trial was fully probed."]
     if found.margins:
         safe = sum(margin == 1.0 for margin in found.margins)
         least, median = min(found.margins), statistics.median(found.margins)
-        said = f"nothing plausible made {safe} of them crash"
+        said = f"{safe} of them crashed under no plausible disturbance"
         many = _many(len(found.margins), "trial")
         lines = [f"Stress margin of {many}: least {least:.2f}, median {median:.2f}; {said}."]
     lines += _not_fully_asked(found.not_fully_asked, found.why_unasked)
-    lines.append(f"  copies were asked {_many(found.probes, 'time')}, with {steps}{enough}")
+    lines.append(f"  {_many(found.probes, 'probe')} of copies took {steps}{enough}")
     if found.run_again:
         lines.append(
-            f"  of the {found.run_again} mildest disturbances with which a trial crashed, {len(found.crashes)} made it "
-            f"crash from the start as well{_not_finished(found.not_finished)}:"
+            f"  of the {found.run_again} mildest disturbances that made a trial crash, {len(found.crashes)} reproduce "
+            f"the crash from the start{_not_finished(found.not_finished)}:"
         )
     for bundle, by in zip(found.crashes, found.by, strict=True):
         lines.append(f"  {bundle.path}: {bundle.result.summary}, {by.words}")
@@ -474,22 +475,22 @@ def describe_probes(report: HuntReport) -> list[str]:
 
 
 def describe_branches(report: HuntReport) -> list[str]:
-    """Return what came of branches, and which of those that crashed have done so from the start as well."""
+    """Return the results of branches, and which of their crashes reproduce from the start."""
     found = report.branches
     if found is None or not found.trials:
         return []
-    enough = f"; {found.left_out} were left out, as that was enough" if found.left_out else ""
+    enough = f"; {found.skipped} were skipped, because copies had used their share" if found.skipped else ""
     moments = f"{_many(found.moments, 'moment')} of {_many(found.trials, 'trial')}"
     crashed = f"{found.crashed} crashed, of {_many(found.crashed_trials, 'trial')}"
     lines = [
-        f"Branches: copies went on with other disturbances {_many(found.branches, 'time')}, from {moments}; {crashed}.",
-        f"  they took {found.steps} steps beside {report.trial_steps} of trials{enough}",
+        f"Branches: {found.branches} runs of copies with other disturbances, from {moments}; {crashed}.",
+        f"  they took {found.steps} steps, in addition to {report.trial_steps} steps of trials{enough}",
         *_not_fully_asked(found.not_fully_asked, found.why_unanswered),
     ]
     if found.run_again:
         unfinished = _not_finished(found.not_finished)
         lines.append(
-            f"  of the {found.run_again} likeliest, {len(found.crashes)} crashed from the start as well{unfinished}:"
+            f"  of the {found.run_again} likeliest crashes, {len(found.crashes)} reproduce from the start{unfinished}:"
         )
     for bundle in found.crashes:
         likely = bundle.result.log_likelihood
@@ -499,14 +500,14 @@ def describe_branches(report: HuntReport) -> list[str]:
 
 
 def _not_fully_asked(count: int, why: str) -> list[str]:
-    """Return the line on trials of which a question has no answer; none where there are none."""
+    """Return a line on the trials with incomplete answers; an empty list where there is no such trial."""
     if not count:
         return []
-    return [f"  {_many(count, 'trial')} {'was' if count == 1 else 'were'} not fully asked: {why}"]
+    return [f"  {_many(count, 'trial')} {'was' if count == 1 else 'were'} not fully probed: {why}"]
 
 
 def _not_finished(count: int) -> str:
-    return f", and {count} could not be run to the end" if count else ""
+    return f", and {count} did not finish" if count else ""
 
 
 def _many(count: int, what: str) -> str:

@@ -100,7 +100,15 @@ def scored_trial(result: TrialResult, cube: Cube, hunt: HuntFacts) -> ScoredTria
         score = min(max(result.danger, 0.0), _NEAREST)
     spec = result.spec
     kind = _kind(result) if score == CRASHED else ""
-    return ScoredTrial(spec.number, cube.point(spec), spec.seed, score, spec.origin, spec.parent, kind)
+    return ScoredTrial(
+        number=spec.number,
+        point=cube.point(spec),
+        seed=spec.seed,
+        score=score,
+        origin=spec.origin,
+        parent=spec.parent,
+        kind=kind,
+    )
 
 
 def _kind(result: TrialResult) -> str:

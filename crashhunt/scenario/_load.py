@@ -16,13 +16,20 @@ from crashhunt.base.plugins import registered
 from crashhunt.base.text import did_you_mean, listed, near_path, one_of
 from crashhunt.base.tolerance import known_part
 from crashhunt.base.validation import validate
-from crashhunt.scenario._backend import backend_names, backend_of, configurations, titles
-from crashhunt.scenario._scenario import AgentSetup, ObservationSetup, Scenario
+from crashhunt.scenario._scenario import (
+    AgentSetup,
+    ObservationSetup,
+    Scenario,
+    backend_names,
+    backend_of,
+    configurations,
+    titles,
+)
 from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain
-    from crashhunt.scenario._backend import Backend, Configuration
+    from crashhunt.scenario._scenario import Backend, Configuration
 
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Running candidates: on warm workers, several at a time, and what came of each is remembered."""
+"""Runs candidates on persistent workers, several at a time, and remembers the result of each."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError
 from crashhunt.base.integrity import digest_of_data
 from crashhunt.crashes import signature_of, write_bundle
-from crashhunt.episode import scratch_of
-from crashhunt.executors import FreshProcessExecutor, PoolExecutor, read_map
-from crashhunt.replays import is_todays
+from crashhunt.executors import read_map
+from crashhunt.whatif import Reruns, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -25,19 +23,13 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Signature
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialResult, TrialSpec
+    from crashhunt.whatif import Ended
 
-__all__ = ["OutOfTimeError", "Ran", "Runs", "StoppedError", "is_same"]
-
-_LOOK_EVERY_S = 0.5  # how late Ctrl-C may be
-_FIRST = 10**6  # the numbers of candidates; no hunt has a trial of such
-
-
-class StoppedError(Exception):
-    """It was given up: the budget is used up, or somebody has asked for it."""
+__all__ = ["OutOfTimeError", "Ran", "Runs", "is_same"]
 
 
 class OutOfTimeError(StoppedError):
-    """It was given up: the time is over."""
+    """The time limit of the user is reached."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +54,11 @@ class Runs:
         rerun: the crash.
         signature: what must stay.
         scratch: a folder for the workers.
-        memory: a file with what came of candidates when it was interrupted; written as it goes on.
+        memory: A file with the results of candidates, for a search that resumes after an interruption.
         parallel: trials at a time.
         budget: how many may be run.
         time_s: how long they may take altogether, in s of wall-clock time; None for as long as it takes.
-        stopped: asked now and then whether to give up.
+        stopped: Returns whether to stop; called repeatedly.
         watch: called with how many have been run, and how many may be.
 
     Attributes:
@@ -91,14 +83,17 @@ class Runs:
         self.count = self.steps = 0
         self.most_steps = max(1, rerun.bundle.result.steps_begun)
         self._rerun, self._signature, self._memory_file = rerun, signature, memory
-        self._budget, self._stopped, self._watch = budget, stopped, watch
-        self._scratch = scratch
-        self._until = None if time_s is None else time.monotonic() + time_s
+        self._budget, self._watch, self._scratch = budget, watch, scratch
         self._memory = _remembered(memory)
-        worker = replace(rerun.worker, scratch=scratch, keep_trials=False)
-        kind = PoolExecutor if is_todays(rerun) else FreshProcessExecutor
-        self._executor = kind(worker, parallel=parallel)
-        self._next = _FIRST
+        until = None if time_s is None else time.monotonic() + time_s
+
+        def is_over() -> bool:
+            if until is not None and not stopped() and time.monotonic() >= until:
+                raise OutOfTimeError
+            return stopped()
+
+        # The traffic of most candidates differs, so a suspended set-up would rarely serve two of them.
+        self._reruns = Reruns(rerun, scratch, parallel=parallel, stopped=is_over, keep_all=False, warm_copies=0)
 
     def first(self, candidates: Sequence[TrialSpec], *, again: bool = False) -> int | None:
         """Return the place of the first candidate that crashes in the same manner; None where none does.
@@ -110,109 +105,75 @@ class Runs:
             again: run even what is known not to do it.
 
         Raises:
-            StoppedError: it was given up before that was known.
+            StoppedError: The search stopped before the answer was known.
             CrashhuntError: no trial can be run at all.
         """
         found: dict[int, Ran] = {}
-        numbers: dict[int, int] = {}
+        places: list[int] = []  # of the candidates that have to be run
         for place, spec in enumerate(candidates):
-            if self.count + len(found) + len(numbers) >= self._budget:
+            if self.count + len(found) + len(places) >= self._budget:
                 break
             known = self._memory.get(self._key(spec))
-            if known is not None and (known.same or not again):
-                found[place] = known
-                if known.same:
-                    break
+            if known is None or (again and not known.same):
+                places.append(place)
                 continue
-            numbers[self._next] = place
-            self._executor.submit(self._numbered(spec))
-            self._next += 1
-        best = min((place for place, ran in found.items() if ran.same), default=len(candidates))
-        try:
-            while any(place < best for place in numbers.values()):
-                for result in self._executor.completed(_LOOK_EVERY_S):
-                    if result.spec.number not in numbers:
-                        continue  # of what has been given up
-                    place = numbers.pop(result.spec.number)
-                    found[place] = ran = self._judged(result)
-                    self._remember(candidates[place], ran)
-                    if ran.same and place < best:
-                        best = place
-                        self._give_up(numbers, best)
-                self._stop_if_asked()
-        finally:
-            self._give_up(numbers, -1)
-        counted = [ran for place, ran in found.items() if place <= best]
+            found[place] = known
+            if known.same:
+                break
+
+        def best() -> int:
+            return min((place for place, ran in found.items() if ran.same), default=len(candidates))
+
+        specs = [self._bounded(candidates[place]) for place in places]
+        for ended in self._reruns.run(specs, recorded=False, needed=lambda number: places[number] < best()):
+            place = places[ended.place]
+            found[place] = ran = self._judged(ended)
+            self._remember(candidates[place], ran)
+        counted = [ran for place, ran in found.items() if place <= best()]
         self.count += len(counted)
         self.steps += sum(ran.steps for ran in counted)
         if self._watch is not None:
             self._watch(min(self.count, self._budget), self._budget)
-        if best < len(candidates):
-            return best
+        if best() < len(candidates):
+            return best()
         if len(found) < len(candidates):
             raise StoppedError
         return None
 
     def entered(self, spec: TrialSpec) -> tuple[str, ...]:
-        """Return who has entered in a candidate of which that was asked; nobody where the simulator does not know.
+        """Return the actors that entered in a trial; empty if the simulator cannot report them.
 
         Raises:
-            StoppedError: it was given up.
+            StoppedError: The search stopped.
         """
-        number = self._next
-        self._executor.submit(self._numbered(spec))
-        self._next += 1
         self.count += 1
-        results: list[TrialResult] = []
         try:
-            while not results:
-                results = [one for one in self._executor.completed(_LOOK_EVERY_S) if one.spec.number == number]
-                self._stop_if_asked()
+            (ended,) = self._reruns.run([self._bounded(spec)], recorded=False)
         except RecorderError:
             raise
         except CrashhuntError:  # some older crashhunts in a snapshot refuse what they do not know
             return ()
-        folder = scratch_of(self._scratch, number)
-        names: list[str] = []
-        self.steps += results[0].steps
-        same = self._judged(results[0], keep=True).digest == self._rerun.bundle.result.digest
-        with suppress(OSError, ValueError):
-            names = json.loads((folder / layout.ENTERED).read_text(encoding="utf-8")) if same else []
-        shutil.rmtree(folder, ignore_errors=True)
-        return tuple(dict.fromkeys(names))
+        self.steps += ended.result.steps
+        same = ended.result.digest == self._rerun.bundle.result.digest
+        return tuple(dict.fromkeys(ended.entered)) if same else ()
 
     def close(self) -> None:
         """End every process."""
-        self._executor.close()
+        self._reruns.close()
 
-    def _stop_if_asked(self) -> None:
-        if self._stopped():
-            raise StoppedError
-        if self._until is not None and time.monotonic() >= self._until:
-            raise OutOfTimeError
+    def _bounded(self, spec: TrialSpec) -> TrialSpec:
+        return replace(spec, max_steps=min(spec.max_steps, self.most_steps))
 
-    def _numbered(self, spec: TrialSpec) -> TrialSpec:
-        return replace(spec, number=self._next, max_steps=min(spec.max_steps, self.most_steps))
-
-    def _give_up(self, numbers: dict[int, int], above: int) -> None:
-        doomed = [number for number, place in numbers.items() if place > above]
-        if doomed:
-            self._executor.cancel(above=min(doomed) - 1)
-            for number in doomed:
-                del numbers[number]
-
-    def _judged(self, result: TrialResult, *, keep: bool = False) -> Ran:
-        """Say whether it is the same; of a collision, only where it may be, as that takes a while."""
-        was, folder = self._rerun.bundle.result, scratch_of(self._scratch, result.spec.number)
+    def _judged(self, ended: Ended) -> Ran:
+        """Return whether a candidate crashed in the same manner; its signature takes a while, so only where it may."""
+        was, result = self._rerun.bundle.result, ended.result
         same = result.outcome is was.outcome
         if was.collision is not None and result.collision is not None:
             same = same and (was.collision.agent, was.collision.role) == (
                 result.collision.agent, result.collision.role,
             )  # fmt: skip
         if same:
-            same = is_same(self._signature_of(result, folder), self._signature, result.spec)
-        if result.kept and not keep:  # else it is the worker's, which goes on in it
-            shutil.rmtree(folder, ignore_errors=True)
+            same = is_same(self._signature_of(result, ended.folder), self._signature, result.spec)
         return Ran(same, result.steps, result.digest)
 
     def _signature_of(self, result: TrialResult, folder: Path) -> Signature | None:
@@ -237,7 +198,7 @@ class Runs:
         key = self._key(spec)
         self._memory[key] = ran
         line = json.dumps({"key": key, "same": ran.same, "steps": ran.steps, "digest": ran.digest})
-        with suppress(OSError), self._memory_file.open("a", encoding="utf-8") as file:  # a full disk is told in the end
+        with suppress(OSError), self._memory_file.open("a", encoding="utf-8") as file:  # `shrink` reports a full disk
             file.write(f"{line}\n")
 
 

@@ -1,4 +1,4 @@
-"""The second form of a crash: the others moved along recorded ways, so that who is left out changes nobody else."""
+"""The scripted form of a crash: other actors follow recorded paths, so removing an actor changes no other actor."""
 
 from __future__ import annotations
 

@@ -61,11 +61,11 @@ def _chunks(items: tuple[T, ...], count: int) -> list[tuple[T, ...]]:
 
 
 def plainest(value: Value, default: Value | None) -> list[Value]:
-    """Return what could stand for a value, the plainest first: its default, then rounder numbers.
+    """Return simpler values to try in place of a value, the simplest first: its default, then rounder numbers.
 
     Args:
-        value: of an argument.
-        default: of the argument; None where nobody knows.
+        value: The value of an argument.
+        default: The default of the argument; None if it is unknown.
     """
     found = list(_plainer(value, default))
     return list(dict.fromkeys(found[: found.index(value)] if value in found else found))

@@ -11,7 +11,7 @@ from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.base.temporary import remove_at_once, temporary_folder
 from crashhunt.crashes import is_bundle_made_here, signature_of, write_bundle
 from crashhunt.episode import scratch_of
-from crashhunt.executors import FreshProcessExecutor, read_map
+from crashhunt.executors import read_map, run_alone
 from crashhunt.replays import ReplayOptions, confirm, prepare
 from crashhunt.shrinking._runs import Runs, is_same
 from crashhunt.shrinking._stages import Ended, Form, Search
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from crashhunt.base.watching import Watch
     from crashhunt.crashes import Bundle, Signature
     from crashhunt.replays import Rerun
-    from crashhunt.trial import TrialResult, TrialSpec, Value
+    from crashhunt.trial import TrialSpec, Value
 
 __all__ = ["Shrunk", "shrink", "shrunk_name"]
 
@@ -112,22 +112,22 @@ def shrink(
     stopped: Callable[[], bool] = lambda: False,
     trusted: bool | None = None,
 ) -> Shrunk:
-    """Make a crash smaller while it stays the same kind of crash, and write what is left as a bundle beside it.
+    """Minimize a crash while its crash type stays the same, and write the minimized crash as a bundle next to it.
 
-    Others are left out, disturbances dropped, and arguments made plainer: towards their defaults, and rounder. Where it
-    takes more than a few others, these are moved along their recorded ways, of which any can be left out, and the
-    beginning is cut off. The result depends on the crash and the budget only, unless time runs out. Interrupted, it
-    leaves the best that it has, and the same call goes on from there.
+    The search removes other actors and disturbances, and simplifies arguments: towards their defaults, or rounder. If
+    the crash needs more than a few other actors, these follow their recorded paths. Then any path can be removed, and
+    the beginning can be cut off. The result depends on the crash and the budget only, unless time runs out. An
+    interrupted search leaves the best result, and the same call resumes from there.
 
     Args:
         bundle: the crash.
         budget: how many trials may be run.
         time_s: how long that may take, in s of wall-clock time; two runs that confirm what is left come on top.
-        form: ``traffic`` where the others are to go on driving, ``scripted`` where they are not; ``either`` where that
-            depends on how few are left.
+        form: ``traffic``: the other actors drive. ``scripted``: they follow recorded paths. ``either``: the form
+            depends on the number of remaining actors.
         parallel: how many at a time; 0 for one per core.
         watch: called with how many have been run, and how many may be.
-        stopped: asked now and then whether to give up.
+        stopped: Returns whether to stop; called repeatedly.
         trusted: whether its code may run; None to find out.
 
     Raises:
@@ -136,8 +136,8 @@ def shrink(
         CrashhuntError: no trial can be run, or the bundle cannot be written.
     """
     if bundle.id.endswith(layout.SMALL):
-        fix = f"give --crash {bundle.id.removesuffix(layout.SMALL)} to begin anew"
-        raise UsageError(f"{bundle.id!r} has been made smaller already", fix=fix)
+        fix = f"give --crash {bundle.id.removesuffix(layout.SMALL)} to minimize the original crash again"
+        raise UsageError(f"{bundle.id!r} is already minimized", fix=fix)
     if bundle.result.outcome in (Outcome.SURVIVED, Outcome.FINISHED):
         raise UsageError(f"{bundle.id!r} is a near miss, and nothing crashes in it", fix="give a crash")
     if budget < 1:
@@ -170,20 +170,44 @@ def shrink(
     if not search.reproduced:
         verdict: Verdict = "not_reproduced" if ended == "done" else "unchanged"
         return Shrunk(
-            bundle, verdict, ended, None, why, search.actors(None), runs.count, runs.steps,
+            bundle=bundle,
+            verdict=verdict,
+            ended=ended,
+            small=None,
+            why=why,
+            actors=search.actors(None),
+            trials=runs.count,
+            steps=runs.steps,
             notes=(*rerun.warnings, *search.notes),
-        )  # fmt: skip
+        )
     if small is None:
         return Shrunk(
-            bundle, "unchanged", ended, None, why, search.actors(None), runs.count, runs.steps,
+            bundle=bundle,
+            verdict="unchanged",
+            ended=ended,
+            small=None,
+            why=why,
+            actors=search.actors(None),
+            trials=runs.count,
+            steps=runs.steps,
             notes=(*rerun.warnings, *search.notes),
-        )  # fmt: skip
+        )
     if ended == "done":
         memory.unlink(missing_ok=True)
     return Shrunk(
-        bundle, "shrunk", ended, small, why, search.actors(small.recording()), runs.count, runs.steps,
-        search.removed(), search.changed(), search.steps_cut, (*rerun.warnings, *search.notes),
-    )  # fmt: skip
+        bundle=bundle,
+        verdict="shrunk",
+        ended=ended,
+        small=small,
+        why=why,
+        actors=search.actors(small.recording()),
+        trials=runs.count,
+        steps=runs.steps,
+        removed=search.removed(),
+        changed=search.changed(),
+        steps_cut=search.steps_cut,
+        notes=(*rerun.warnings, *search.notes),
+    )
 
 
 def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | None:
@@ -197,10 +221,10 @@ def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | Non
         search.best = spec
         small = _run_fresh(rerun, search.best)
         if is_same(signature_of(small), signature, spec):
-            told: dict[str, object] = {"of": bundle.id, "removed": list(search.removed()), "changed": _plain(search)}
+            shrunk: dict[str, object] = {"of": bundle.id, "removed": list(search.removed()), "changed": _plain(search)}
             if search.steps_cut:
-                told["steps_cut"] = search.steps_cut
-            return _kept(replace(small, added={**small.added, "shrunk": told}))
+                shrunk["steps_cut"] = search.steps_cut
+            return _kept(replace(small, added={**small.added, "shrunk": shrunk}))
         remove_at_once(small.path)
     return None
 
@@ -211,7 +235,7 @@ def _kept(small: Bundle) -> Bundle:
         small.write()
         small = confirm(small, trusted=True) or small  # it runs what the whole crash was trusted to run
         small.write()
-    except BaseException:  # else it would pass for a crash of the hunt, or for one that nobody has looked at
+    except BaseException:  # an unconfirmed bundle would look like a crash of the hunt
         remove_at_once(small.path)
         raise
     return small
@@ -220,19 +244,13 @@ def _kept(small: Bundle) -> Bundle:
 def _run_fresh(rerun: Rerun, spec: TrialSpec) -> Bundle:
     bundle = rerun.bundle
     with temporary_folder("shrink") as scratch:
-        executor = FreshProcessExecutor(replace(rerun.worker, scratch=scratch))
-        try:
-            executor.submit(spec)
-            results: list[TrialResult] = []
-            while not results:
-                results = list(executor.completed(1.0))
-        finally:
-            executor.close()
-        if results[0].was_killed_from_outside:
-            raise CrashhuntError(f"a trial was {results[0].summary}", fix="run the same command again", where=bundle.id)
+        result = run_alone(replace(rerun.worker, scratch=scratch), spec)
+        assert result is not None  # it is never stopped
+        if result.was_killed_from_outside:
+            raise CrashhuntError(f"a trial was {result.summary}", fix="run the same command again", where=bundle.id)
         trial = scratch_of(scratch, spec.number)
         return write_bundle(
-            bundle.hunt, results[0], trial, hunt_seed=bundle.hunt_seed, snapshot=bundle.snapshot,
+            bundle.hunt, result, trial, hunt_seed=bundle.hunt_seed, snapshot=bundle.snapshot,
             lanes=read_map(scratch, trial), name=shrunk_name(bundle.id), authenticate=is_bundle_made_here(bundle),
         )  # fmt: skip
 

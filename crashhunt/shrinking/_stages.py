@@ -6,10 +6,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.shrinking._runs import OutOfTimeError, StoppedError
+from crashhunt.shrinking._runs import OutOfTimeError
 from crashhunt.shrinking._scripting import Part, Scripting, can_be_scripted
 from crashhunt.shrinking._search import fewest, plainest
 from crashhunt.trial import EVERYBODY, OF_AGENT
+from crashhunt.whatif import StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,7 +31,7 @@ _SINGLE = 40  # and so many one by one
 _SINGLE_OR_SCRIPTED = 6  # where there is another way
 _PAIRED = 24  # so many that were near in the end are tried together with the other one
 _LONGER_S = 5.0  # simulation time by which it may become longer, besides twice as long, where fewer take part
-_FEW = 3  # actors; with no more of them, the traffic goes on driving by itself
+_FEW = 3  # actors; a crash with at most this number keeps the form in which the other actors drive
 
 
 class Search:
@@ -39,7 +40,7 @@ class Search:
     Args:
         rerun: the crash.
         runs: what runs candidates.
-        form: whether the others go on driving; ``either`` where that leaves few of them.
+        form: Whether the other actors drive; with ``either``, they drive if few of them remain.
 
     Attributes:
         best: the smallest that did it.
@@ -78,8 +79,8 @@ class Search:
             if stopped():
                 return "interrupted", ""
             if isinstance(error, OutOfTimeError):
-                return "time", "give --for more time to go on from here"
-            return "budget", "give a larger --budget to go on from here"
+                return "time", "give --for more time to continue from here"
+            return "budget", "give a larger --budget to continue from here"
         except CrashhuntError as error:
             if not self.reproduced:
                 raise
@@ -91,7 +92,7 @@ class Search:
         self._everybody = self._runs.entered(replace(self.best, only=(EVERYBODY,)))  # of the crash as it was
         self._left_out = bool(self._everybody)
         if not self._left_out and _actors(self._rerun.recorded) > len(self._rerun.recorded.agents):
-            self.notes.append("all others stay: the simulator, or the crashhunt of the snapshot, can leave nobody out")
+            self.notes.append("all others stay: the simulator, or the crashhunt of the snapshot, cannot exclude actors")
         self._plainer_arguments()
         self._until_nothing_helps(self._fewer_others)
 
@@ -152,7 +153,7 @@ class Search:
             fewest(self._everybody, tried)
 
     def _likely(self) -> list[tuple[str, ...]]:
-        """Who may be all that it takes: nobody, the other one, the nearest in the end, any single one of them."""
+        """Return groups of actors to try first: none, the collision partner, the nearest actors, single actors."""
         recording, known = self._rerun.recorded, set(self._everybody)
         near = [name for name in _nearest(recording, self._rerun.bundle.driver) if name in known]
         other = [name for name in self._others_of_the_crash() if name in known]
@@ -171,7 +172,7 @@ class Search:
         best, agents = self.best, self._rerun.recorded.agents
         if self._form == "scripted" or best.only is None or len(agents) > 1:
             return True
-        # Where nobody else is there, the traffic is nothing, and the beginning can be cut off.
+        # Without other actors the scripted form loses nothing, and its beginning can be cut off.
         return not best.only or len(best.only) + len(agents) > _FEW
 
     def _script(self, scripting: Scripting) -> None:
@@ -203,12 +204,12 @@ class Search:
         return not than.only and self.steps_cut > 0
 
     def _fewer_moved(self) -> None:
-        """Leave out whom it does not take any more."""
+        """Remove the actors without which the crash still reproduces."""
         best, script = self.best, self.best.script
         assert script is not None
         hit = self._rerun.bundle.result.collision
         if len(script.agents) == len(script.names) == 1 and hit is not None and hit.other:
-            return  # an agent that is alone drives into nobody
+            return  # without other actors there is no collision
 
         def tried(some: Sequence[tuple[str, ...]]) -> int | None:
             return self._try([replace(best, script=script.only(one)) for one in some])
@@ -216,7 +217,7 @@ class Search:
         fewest(script.names, tried)
 
     def _fewest_moved(self, scripting: Scripting) -> Part | None:
-        """Leave out all of the others that it does not take; None where it does not come again in this form."""
+        """Remove all unnecessary other actors; return None if the crash does not reproduce in this form."""
         whole, about = scripting.whole, self._rerun.bundle.driver
         near = [name for name in _nearest(self._rerun.recorded, about) if name not in whole.agents]
         other = tuple(self._others_of_the_crash())
@@ -239,10 +240,11 @@ class Search:
         return replace(found, others=fewest(found.others, tried))
 
     def _fewer_from_later_on(self, scripting: Scripting, part: Part) -> None:
-        """Leave out more where it begins later: what an agent did for those around it is done with by then.
+        """Remove more actors with a later beginning, because actors that mattered only before are then unnecessary.
 
-        Any single one of the others is tried, and pairs with whom it crashed; then all, of which some are left out
-        again: for an agent that decides by all that it sees, others may do than those whom it took from the start on.
+        The method first tries each other actor alone, and in a pair with the collision partner. Then it starts from all
+        actors again and removes the unnecessary ones: an agent that reacts to all visible actors may need different
+        actors than with the original beginning.
         """
         begins = list(dict.fromkeys((part.begin, *scripting.begins(part.agents), 0)))
         whole = scripting.whole
@@ -266,7 +268,7 @@ class Search:
                 break
 
     def _without_any(self, scripting: Scripting, part: Part) -> Part | None:
-        """Leave out of some all that it does not take; None where it does not come again with them."""
+        """Remove the unnecessary actors of a part; return None if the crash does not reproduce with the part."""
         if self._runs.first([scripting.spec(part)]) is None:
             return None
 

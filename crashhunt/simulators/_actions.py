@@ -1,4 +1,4 @@
-"""How actions are written: continuous, highway-env's meta-actions, and whatever a Gymnasium space allows."""
+"""Action forms: speed and lane change, highway-env's meta-actions, and any Box or Discrete space of Gymnasium."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-__all__ = ["META_ACTIONS", "MetaAction", "SpaceAction", "SpeedAndLaneChange", "cast", "is_masked", "told"]
+__all__ = ["META_ACTIONS", "MetaAction", "SpaceAction", "SpeedAndLaneChange", "cast", "describe_action", "is_masked"]
 
-MAX_TARGET_SPEED = 100.0  # m/s; no vehicle is faster, and a space needs an end
-_LONGEST = 200  # characters of an action in a message
+MAX_TARGET_SPEED = 100.0  # m/s; a Box space needs a finite bound, and no road vehicle is faster
+_MAX_ACTION_CHARACTERS = 200  # of an action in an error message
 META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
-"""In the order of highway-env's DiscreteMetaAction."""
+"""The meta-actions in the order of highway-env's DiscreteMetaAction."""
 
 
 class SpeedAndLaneChange:
-    """``(target_speed, lane_change)``: m/s in [0, 100], and -1, 0 or 1 (1 is to the left); a tuple or an array."""
+    """The action ``(target_speed, lane_change)``, as a tuple or an array.
+
+    ``target_speed`` is in m/s, from 0 to 100. ``lane_change`` is -1 (right), 0 or 1 (left).
+    """
 
     names = ("target_speed", "lane_change")
 
@@ -36,30 +39,30 @@ class SpeedAndLaneChange:
         """Return float64, shape (2,)."""
         try:
             speed, lane_change = action
-            # What most agents return, in every step.
+            # Most agents return this form in every step, so check it first.
             usual = action.__class__ is tuple and speed.__class__ is float and lane_change.__class__ is int
             if usual and 0.0 <= speed <= MAX_TARGET_SPEED and -1 <= lane_change <= 1:
                 return np.array(action)
-            # NaN fails both comparisons, as does what is masked. Of a dictionary it would be the keys.
+            # NaN and masked values fail both comparisons. Unpacking a dictionary would have returned its keys.
             if (
                 not isinstance(action, dict | set | frozenset)
                 and 0.0 <= speed <= MAX_TARGET_SPEED
                 and lane_change in (-1, 0, 1)
             ):
                 array = np.array((speed, lane_change))
-                if array.dtype.kind in "fiubO" and array.shape == (2,):  # complex numbers can be compared as well
+                if array.dtype.kind in "fiubO" and array.shape == (2,):  # refuses complex numbers
                     return array.astype(np.float64, copy=False)
-        except Exception:  # whatever it is that the agent returned, its comparisons are its own
+        except Exception:  # the agent's object may raise anything when it is compared
             pass
         fix = f"return a speed within 0 and {MAX_TARGET_SPEED:g} m/s, and -1, 0 or 1"
-        raise ActionError(f"the action {told(action)} is not (target_speed, lane_change)", fix=fix)
+        raise ActionError(f"the action {describe_action(action)} is not (target_speed, lane_change)", fix=fix)
 
 
 class SpaceAction:
-    """Anything inside a Box or Discrete space.
+    """An action inside a Box, Discrete, MultiDiscrete or MultiBinary space.
 
-    Numbers count by their value: True is 1, and 1.0 of a float64 policy is one of a float32 space. What would have to
-    be changed to fit is refused: 1.7 or 1.0 for a whole number, 300 for eight bits, complex numbers, masked ones.
+    Numbers count by their value: True is 1, and a float64 value is accepted by a float32 space. Refused are values that
+    the type of the space cannot hold: a float for an integer, 300 for eight bits, complex and masked numbers.
     """
 
     names: tuple[str, ...] = ()
@@ -73,10 +76,10 @@ class SpaceAction:
         try:
             array = cast(action, self._dtype)
             inside = self.space.contains(array if self.space.shape else array[()])
-        except Exception:  # whatever it is that the agent returned, turning it into an array runs its code
+        except Exception:  # converting the agent's object runs the agent's code, which may raise anything
             inside = False
         if not inside:
-            raise ActionError(f"the action {told(action)} is not in {self.space}", fix="return one that is")
+            raise ActionError(f"the action {describe_action(action)} is not in {self.space}", fix="return one that is")
         return array
 
 
@@ -84,7 +87,7 @@ class MetaAction(SpaceAction):
     """highway-env's DiscreteMetaAction: 0 LANE_LEFT, 1 IDLE, 2 LANE_RIGHT, 3 FASTER, 4 SLOWER; or fewer of them.
 
     Args:
-        meanings: what the numbers from 0 stand for; the space has them as ``meanings`` too, for agents to look up.
+        meanings: The name of each number, from 0. Agents find the names in the attribute ``meanings`` of the space.
     """
 
     names = ("meta_action",)
@@ -103,35 +106,35 @@ class MetaAction(SpaceAction):
 
 
 def cast(action: object, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
-    """Return an action as an array of a type; an encoded one stays as it is.
+    """Return an action as an array of the given type; an action that is already encoded does not change.
 
     Raises:
-        TypeError, ValueError: that would change it by more than rounding.
+        TypeError, ValueError: The conversion would change the action by more than rounding.
     """
     if is_masked(action):
-        raise ValueError("a part of it is masked")
+        raise ValueError("a part of the action is masked")
     given = np.asarray(action)
     if given.dtype == dtype:
-        return given.copy()  # the agent may go on with its own
-    with np.errstate(over="ignore"):  # what becomes infinite is refused below
+        return given.copy()  # the agent may change its own array afterwards
+    with np.errstate(over="ignore"):  # the comparison below refuses values that became infinite
         array = given.astype(dtype, casting="same_kind")
-    # Whole numbers wrap around silently, and what is too large for a float becomes infinite.
+    # Integers that are too large wrap around silently, and floats that are too large become infinite.
     same = array == given if dtype.kind in "biu" else np.isfinite(array) == np.isfinite(given)
     if not np.all(same):
-        raise ValueError("it does not fit")
+        raise ValueError("the type cannot hold the value")
     return array
 
 
 def is_masked(action: object) -> bool:
-    """Whether a part of an array is not there."""
-    ma = sys.modules.get("numpy.ma")  # NumPy imports it for whoever asks; where nobody has, there is no such array
+    """Whether the value is an array with a masked element."""
+    ma = sys.modules.get("numpy.ma")  # NumPy imports this module on first use, so without it no masked array exists
     return ma is not None and isinstance(action, ma.MaskedArray) and bool(ma.is_masked(action))
 
 
-def told(action: object) -> str:
-    """Return what an agent has returned as errors show it: one line of at most 200 characters."""
+def describe_action(action: object) -> str:
+    """Return the text of an agent's action for an error message: one line of at most 200 characters."""
     try:
         text = " ".join(repr(action).split())
     except Exception as error:
         text = f"of class {type(action).__name__}, whose repr raises {type(error).__name__},"
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
+    return text if len(text) <= _MAX_ACTION_CHARACTERS else f"{text[: _MAX_ACTION_CHARACTERS - 1]}…"

@@ -1,4 +1,4 @@
-"""Observations and actions of any Gymnasium space as arrays of one shape, which is what is recorded."""
+"""Observations and actions of any Gymnasium space as arrays of a fixed shape, which recordings can hold."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from crashhunt.base.errors import ActionError, ScenarioError
-from crashhunt.simulators._actions import SpaceAction, cast, is_masked, told
+from crashhunt.simulators._actions import SpaceAction, cast, describe_action, is_masked
 
 if TYPE_CHECKING:
     from gymnasium import Space
@@ -29,13 +29,13 @@ _ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary
 
 
 class ObservationForm:
-    """Turns what an environment shows into arrays, and back into what its agent is shown.
+    """Converts the observations of an environment into arrays of a fixed shape.
 
     Args:
-        space: of the environment. Arrays and numbers stay as they are; a Dict or Tuple is flattened.
+        space: The environment's observation space. Observations of a Dict or Tuple space are flattened.
 
     Raises:
-        ScenarioError: the space has no fixed size.
+        ScenarioError: The space has no fixed size.
     """
 
     def __init__(self, space: Space[object]) -> None:
@@ -49,17 +49,17 @@ class ObservationForm:
         self._dtype = np.dtype(self.space.dtype)
 
     def encode(self, observation: object) -> NDArray[np.generic]:
-        """Return an array of its own, of the type and shape of `space`."""
+        """Return a new array with the type and shape of `space`."""
         if self.flattened:
             observation = spaces.flatten(self.original, observation)
         return np.array(observation, self._dtype).reshape(self.space.shape or ())
 
 
 class FlatAction:
-    """A Dict or Tuple action, recorded flattened.
+    """A Dict or Tuple action, which is recorded as a flat array.
 
     Args:
-        space: of the environment.
+        space: The environment's action space.
     """
 
     names: tuple[str, ...] = ()
@@ -71,24 +71,24 @@ class FlatAction:
         self._flat = spaces.flatten_space(space)
 
     def encode(self, action: object) -> NDArray[np.generic]:
-        """Return the flattened action; one that is flattened already stays as it is."""
+        """Return the flattened action; an action that is already flattened does not change."""
         array: NDArray[np.generic] = np.empty(0)
         try:
             if isinstance(action, np.ndarray) and action.shape == self._flat.shape:
                 array = cast(action, np.dtype(self._flat.dtype))
                 structured = spaces.unflatten(self.space, array)
-                # Of two choices at once unflatten would take the first.
+                # A one-hot part may have two ones. `unflatten` would silently use the first, so compare the way back.
                 again = np.asarray(spaces.flatten(self.space, structured))
                 inside = self.space.contains(structured) and np.allclose(again, array, rtol=1e-3, atol=1e-3)
             else:
                 with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # Gymnasium's, that lists are turned into arrays
+                    warnings.simplefilter("ignore")  # Gymnasium warns that it turns lists into arrays
                     inside = not _any_masked(action) and self.space.contains(action)
                     array = np.asarray(spaces.flatten(self.space, action)) if inside else array
-        except Exception:  # whatever it is that the agent returned, looking at it runs its code
+        except Exception:  # reading the agent's object runs the agent's code, which may raise anything
             inside = False
         if not inside:
-            raise ActionError(f"the action {told(action)} is not in {self.space}", fix="return one that is")
+            raise ActionError(f"the action {describe_action(action)} is not in {self.space}", fix="return one that is")
         return array
 
 
@@ -98,22 +98,22 @@ def _any_masked(action: object) -> bool:
 
 
 def action_form(space: Space[object]) -> ActionForm:
-    """Return how the actions of a space are written."""
+    """Return the action form of a Gymnasium space."""
     return SpaceAction(space) if isinstance(space, _ARRAYS) else FlatAction(space)
 
 
 def native(form: ActionForm, action: NDArray[np.generic]) -> object:
-    """Return an encoded action as the environment takes it: a number, an array or a structure."""
+    """Return an encoded action in the form that the environment expects: a number, an array or a structure."""
     if isinstance(form, FlatAction):
         return spaces.unflatten(form.space, action)
     return action.item() if isinstance(form.space, spaces.Discrete) else np.array(action)
 
 
-# Scenario arguments as entries of the configuration of an environment.
+# Scenario arguments set entries in the configuration of an environment.
 
 
 def as_tables(scenario: Scenario, arguments: Mapping[str, Value]) -> list[dict[str, object]]:
-    """Return each argument as a table of its own with the entry that it sets, nested where that is dotted."""
+    """Return a table for each argument, with the entry that it sets; ``a.b`` sets the entry ``b`` of table ``a``."""
     tables = []
     for name, value in arguments.items():
         option = scenario.arguments[name].option or name if name in scenario.arguments else name
@@ -126,7 +126,10 @@ def as_tables(scenario: Scenario, arguments: Mapping[str, Value]) -> list[dict[s
 
 
 def merge(config: dict[str, object], table: Plain) -> None:
-    """Write the entries of a table into a configuration; a table with another ``type`` replaces, others are merged."""
+    """Write the entries of a table into a configuration.
+
+    Tables inside it are merged. A table whose ``type`` differs replaces the existing table.
+    """
     for key, value in table.items():
         old = config.get(key)
         if isinstance(old, dict) and isinstance(value, dict) and value.get("type", old.get("type")) == old.get("type"):
@@ -136,7 +139,7 @@ def merge(config: dict[str, object], table: Plain) -> None:
 
 
 def reseed_in_place(generator: np.random.Generator | np.random.RandomState, seed: int) -> None:
-    """Give a generator the state of a new one with a seed; every object that shares it draws from the new state."""
+    """Set a generator to the state of a new generator with this seed, for all objects that share the generator."""
     if isinstance(generator, np.random.RandomState):
         generator.seed(seed)
         return

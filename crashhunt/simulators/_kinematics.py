@@ -1,4 +1,4 @@
-"""The observation: the controlled vehicle and its nearest actors, in the layout of highway-env's Kinematics."""
+"""The Kinematics observation: the controlled vehicle and its nearest actors, in highway-env's layout."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ __all__ = ["Kinematics", "Unseen"]
 _SINGLE = np.dtype("<f4")
 _ALL = ("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "kind")
 _USUAL = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
-# highway-env's: five and two times its top speed of 40 m/s, and its lane width of 4 m.
+# As in highway-env: 5 times and 2 times its top speed of 40 m/s, and its lane width of 4 m.
 _RANGE_X, _RANGE_V, _LANE_WIDTH = 200.0, 80.0, 4.0
 
-# What `kind` says about an actor, by the simulator's word for it; nobody is 0, and what is not listed a motor vehicle.
+# The value of `kind` by the simulator's name of the actor's class. An empty row has 0. An unlisted class is a motor
+# vehicle.
 _MOTOR, _TWO_WHEELS, _PERSON, _RAIL, _OBSTACLE = 1.0, 2.0, 3.0, 4.0, 5.0
 _KINDS = {
     **dict.fromkeys(("bicycle", "motorcycle", "moped", "scooter"), _TWO_WHEELS),
@@ -43,23 +44,26 @@ _KINDS = {
 class Kinematics:
     """Builds observations: float32, shape (vehicles, features).
 
-    Row 0 is the controlled vehicle: x is the distance that it has driven (m), y how far right of the leftmost lane's
-    centre it is (m), vx and vy its speed along and across the lane (m/s), its heading that in the map. The other rows
-    are the nearest actors, nearest first, as seen from the vehicle: x ahead, y to the right (m), velocity and heading
-    relative to its own. Headings grow clockwise, as y points to the right. Rows without an actor are 0. On a straight
-    road along the x axis this is what highway-env shows. Who is on another level, on a bridge above or a road below, is
-    not shown: it looks like somebody in the way and never is.
+    Row 0 is the controlled vehicle. Its x is the distance driven (m). Its y is the distance to the right of the
+    leftmost lane's centre (m). Its vx and vy are the speeds along and across the lane (m/s). Its heading is that in the
+    map.
 
-    `kind`, which only who asks for is shown, is 1 for a motor vehicle, 2 for a two-wheeler (bicycle, motorcycle), 3
-    for a person on foot, 4 for what runs on rails, 5 for an obstacle; a fifth of that where normalised.
+    The other rows are the nearest actors, the nearest first, relative to the controlled vehicle: x ahead (m), y to the
+    right (m), velocity (m/s) and heading. Headings grow clockwise, because y points to the right. Rows without an actor
+    are 0. On a straight road along the x axis, highway-env shows the same values.
 
-    Scalars go through the C library's sine and cosine: NumPy's own differ between processors in the last bit.
+    Actors on another level, such as a bridge above, are not shown. In two dimensions they would look like obstacles.
+
+    The optional column `kind` gives the class of the actor: 1 motor vehicle, 2 bicycle or motorcycle, 3 person on foot,
+    4 rail vehicle, 5 obstacle. Normalised observations have a fifth of these values.
+
+    Sine and cosine come from the C library, because NumPy's results differ between processors in the last bit.
 
     Args:
-        setup: rows, columns, normalisation.
+        setup: Number of rows, columns, normalisation.
 
     Attributes:
-        hidden: who does not see whom, though it is there; by their ids.
+        hidden: Pairs of identifiers: an agent, and an actor that this agent does not see.
     """
 
     def __init__(self, setup: ObservationSetup) -> None:
@@ -73,18 +77,19 @@ class Kinematics:
             getter if len(indices) > 1 else lambda values: (getter(values),)
         )
         self._pack = struct.Struct(f"<{setup.vehicles * len(self.features)}f").pack
-        self._usual = self.features == _USUAL and not setup.normalize  # spares every row a choice
+        # With the usual columns, `observe` need not select columns in every row.
+        self._usual = self.features == _USUAL and not setup.normalize
         self.hidden: set[tuple[str, str]] = set()
         self._blank = (0.0,) * len(self.features)
 
     @property
     def usual(self) -> bool:
-        """Whether it has the columns that the core knows, as they are."""
+        """Whether the observation has exactly the columns that the compiled core writes, not normalised."""
         return self._usual
 
     @property
     def space(self) -> Space[object]:
-        """The Gymnasium space: highway-env's, with bounds that no simulation reaches instead of infinite ones."""
+        """The Gymnasium space: as in highway-env, but with finite bounds that no simulation reaches."""
         from gymnasium import spaces
 
         limits = dict.fromkeys(_ALL, 1.0) | {"heading": float(np.float32(np.pi))}
@@ -95,21 +100,21 @@ class Kinematics:
         return spaces.Box(low, high, self.shape, np.float32)
 
     def blank(self) -> NDArray[np.float32]:
-        """What an agent is shown that is no longer there."""
+        """Return the observation of an agent that has left the simulation: zeros."""
         return np.zeros(self.shape, np.float32)
 
     def observe(
         self, scene: Scene, row: int, *, distance: float, from_left: float, lateral_speed: float, lanes: int
     ) -> NDArray[np.float32]:
-        """Return what the actor in ``row`` sees.
+        """Return the observation of the actor in ``row``.
 
         Args:
-            scene: the world.
-            row: the actor.
-            distance: driven so far, in m.
-            from_left: how far right of the leftmost lane's centre it is, in m.
-            lateral_speed: to the right, in m/s.
-            lanes: of its edge; the range of y when normalising.
+            scene: The scene after the last step.
+            row: The actor's row in the scene.
+            distance: The distance that the actor has driven, in m.
+            from_left: The distance of the actor to the right of the leftmost lane's centre, in m.
+            lateral_speed: The actor's speed to the right, in m/s.
+            lanes: Number of lanes of the actor's edge, which is the range of y when normalising.
         """
         columns = scene.columns
         if scene.core is not None and columns is not None and self._usual and not scene.heights and not self.hidden:
@@ -168,16 +173,16 @@ class Kinematics:
         return select
 
 
-# A vehicle that an agent does not see for a while; it is left out of the observation, and nothing else changes.
+# The disturbance `unseen`: the observation omits a vehicle for a while, and nothing else changes.
 
 
 class Unseen:
     """Hides one vehicle from one agent, from the next observation on.
 
     Args:
-        kinematics: which makes the observations.
-        agent: who does not see it.
-        vehicle: whom.
+        kinematics: Makes the observations.
+        agent: The agent that does not see the vehicle.
+        vehicle: The identifier of the vehicle.
     """
 
     how_strong = 1.0
@@ -188,8 +193,8 @@ class Unseen:
         self._hidden.add(self._pair)
 
     def keep(self) -> None:
-        """It stays hidden."""
+        """Keep the vehicle hidden, which needs no action."""
 
     def end(self) -> None:
-        """Show it again."""
+        """Show the vehicle again."""
         self._hidden.discard(self._pair)

@@ -50,13 +50,13 @@ __all__ = [
 
 
 class Options(TypedDict, total=False):
-    """What an episode is asked for.
+    """Options of an episode.
 
     Args:
-        arguments: the arguments of the scenario, by name.
-        only: those besides the agents that take part, by the names that scenes have for them; everybody where it is
-            missing. Only given to one that is `LeavesOut`.
-        script: recorded ways along which the others are moved. Only given to one that is `PlaysPaths`.
+        arguments: The scenario arguments by name.
+        only: Identifiers, as in scenes, of the actors that take part in addition to the agents. Without this option all
+            actors take part. Only simulators with `LeavesOut` get this option.
+        script: Recorded paths along which all other actors are moved. Only simulators with `PlaysPaths` get it.
     """
 
     arguments: Mapping[str, Value]
@@ -71,12 +71,12 @@ StepResult = tuple[Observations, Mapping[str, float], Mapping[str, bool], Mappin
 
 @dataclass(frozen=True, slots=True)
 class FullBraking:
-    """How a vehicle brakes as hard as it can without leaving its lane.
+    """The action with which a vehicle brakes as hard as it can without leaving its lane.
 
     Args:
-        action: what the agent answers, in every step.
-        how: in words that follow "Braking …".
-        deceleration: what that amounts to, in m/s², where the simulator says so.
+        action: The agent's action in every step.
+        how: A description of the braking, for a sentence that begins with "Braking".
+        deceleration: The deceleration in m/s²; None if the simulator does not report it.
     """
 
     action: object
@@ -85,7 +85,7 @@ class FullBraking:
 
 
 class ActionForm(Protocol):
-    """How the actions of one agent are written."""
+    """The form of one agent's actions: the space, the names of the elements, and the encoding."""
 
     @property
     def space(self) -> Space[object]:
@@ -93,38 +93,40 @@ class ActionForm(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the elements of an encoded action are."""
+        """The names of the elements of an encoded action."""
 
     def encode(self, action: object) -> NDArray[np.generic]:
-        """Return the action as an array of fixed shape and type; an encoded action is encoded to itself.
+        """Return the action as an array of fixed shape and type; encoding an encoded action changes nothing.
 
         Raises:
-            ActionError: it is not inside the space.
+            ActionError: The action is not inside the space.
         """
 
 
 class Simulator(Protocol):
     """Runs one episode after another.
 
-    Contract: between two calls of `reset` with equal arguments, everything that any method returns is equal to the
-    bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
-    What only some simulators can do is a protocol of its own: `TellsNotices`, `FlattensObservations`,
-    `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `SupportsDisturbances`, `HoldsBack`,
-    `LeavesOut`, `PlaysPaths`, `Reseeds`, `CountsSetUp`, `Tidies` and `ReadiesProcess`. A simulator supports one
-    by having its methods and attributes; there is nothing to register.
+    Contract: after two calls of `reset` with equal arguments, all methods return bit-identical results for equal
+    actions. This holds in the same process and in another process, whatever ran before. The simulator never changes an
+    array that it has returned.
+
+    Each optional capability is a protocol of its own: `TellsNotices`, `FlattensObservations`, `NamesObservations`,
+    `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `SupportsDisturbances`, `HoldsBack`, `LeavesOut`,
+    `PlaysPaths`, `Reseeds`, `CountsSetUp`, `Tidies` and `ReadiesProcess`. A simulator supports a protocol if it has the
+    methods and attributes of the protocol. It need not register them.
     """
 
     @property
     def agents(self) -> Sequence[str]:
-        """The agents that act in the next step; those that have terminated are gone."""
+        """The agents that act in the next step, without the terminated agents."""
 
     @property
     def observation_spaces(self) -> Mapping[str, Space[object]]:
-        """For every possible agent."""
+        """The observation space of every possible agent."""
 
     @property
     def actions(self) -> Mapping[str, ActionForm]:
-        """For every possible agent."""
+        """The action form of every possible agent."""
 
     @property
     def step_length_s(self) -> float:
@@ -134,278 +136,284 @@ class Simulator(Protocol):
         """Begin an episode; return the first observation of every agent, and infos.
 
         Args:
-            seed: of everything random.
-            options: ``{"arguments": {name: value}}``, the scenario arguments.
+            seed: The seed of all random generators of the episode.
+            options: The options of the episode, such as ``{"arguments": {name: value}}``.
 
         Raises:
-            InvalidEpisodeError: it cannot be set up.
+            InvalidEpisodeError: The episode cannot be set up.
         """
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Advance one control step.
 
         Args:
-            actions: of every agent in `agents`, as ``actions[agent].encode`` returned it.
+            actions: The action of every agent in `agents`, as ``actions[agent].encode`` returned it.
 
         Returns:
-            Observations, rewards, terminations, truncations and infos of the agents that acted. An agent is
-            terminated when it has arrived or crashed; a simulator never truncates on its own account of time.
+            Observations, rewards, terminations, truncations and infos of the agents that acted. An agent terminates
+            when it arrives or crashes. A simulator never truncates an episode because of its length.
 
         Raises:
-            SimulatorError: the simulator gave up.
+            SimulatorError: The simulator failed and cannot continue.
         """
 
     def scene(self) -> Scene:
         """Return the state of all actors after the last `reset` or `step`."""
 
     def close(self) -> None:
-        """Let go of everything. May be called twice."""
+        """Release all resources. A second call does nothing."""
 
 
 class TellsNotices(Protocol):
-    """A simulator that wants people to know something about what it runs."""
+    """A simulator that reports notices about the scenario to the user."""
 
     @property
     def notices(self) -> Iterable[str]:
-        """Lines of text, looked at after each episode; a hunt tells each once."""
+        """Lines of text. A hunt reads them after each episode and prints each line once."""
 
 
 class FlattensObservations(Protocol):
-    """A simulator whose observations are structured, and that hands out flattened arrays, which can be recorded."""
+    """A simulator with Dict or Tuple observations, which it flattens into arrays so that they can be recorded."""
 
     @property
     def shown_spaces(self) -> Mapping[str, Space[object]]:
-        """The Dict or Tuple space into which an agent's observations are unflattened before it is shown them.
+        """The Dict or Tuple space of each agent with structured observations, available after `Simulator.reset`.
 
-        Only of agents for which that is so; callable after `Simulator.reset`.
+        crashhunt unflattens an observation into this space before the agent receives it.
         """
 
 
 class NamesObservations(Protocol):
-    """A simulator whose observations are tables: one row an actor, and columns that have names."""
+    """A simulator whose observations are tables with one row per actor and named columns."""
 
     @property
     def observation_names(self) -> Sequence[str]:
-        """What the last axis of every observation holds, for people who read recordings; empty where nobody knows."""
+        """The names of the columns, which are the last axis of every observation; empty if they are unknown."""
 
 
 class TellsEvents(Protocol):
-    """A simulator that looks for traffic events, such as red lights, and puts them into its scenes."""
+    """A simulator that detects traffic events, such as running a red light, and puts them into its scenes."""
 
     @property
-    def told_events(self) -> Sequence[str]:
-        """The kinds that it looks for: of those and no others, a result says how often they happened."""
+    def reported_events(self) -> Sequence[str]:
+        """The types of events that the simulator detects; results count events of these types."""
 
 
 class NamesDanger(Protocol):
-    """A simulator without scenes that says itself how near to a crash an episode came."""
+    """A simulator that reports the criticality itself, because its scenes have no actors."""
 
     @property
     def named_danger(self) -> float | None:
-        """The greatest danger so far, from 0 (nothing near) to 1 (touched); None where nobody knows."""
+        """The highest criticality of the episode until now, from 0 (nothing near) to 1 (contact); None if unknown."""
 
 
 class HasMap(Protocol):
     """A simulator whose actors drive on lanes."""
 
     def lanes(self) -> Sequence[Lane]:
-        """Return all lanes; called after the first `Simulator.reset`.
+        """Return all lanes; crashhunt calls this method after the first `Simulator.reset`.
 
-        A simulator whose map is always the same returns the same object each time, so that nobody reads it twice.
+        A simulator whose map never changes returns the same object each time, so that callers read the map once.
         """
 
 
 class HasWindow(Protocol):
-    """A simulator with a window of its own, for people to watch. None of this changes what is simulated."""
+    """A simulator that can show episodes in its own window. The window does not change the simulation."""
 
     def open_window(self) -> None:
-        """Show the episodes from now on; called before the first `Simulator.reset`."""
+        """Show all later episodes; crashhunt calls this method before the first `Simulator.reset`."""
 
     def follow(self, agent: str, other: str) -> None:
         """Mark two actors, and keep the agent in view.
 
         Args:
-            agent: a controlled vehicle; it may have left.
-            other: any actor, or empty for none; it may have left as well, or not yet entered.
+            agent: A controlled vehicle, which may have left the simulation.
+            other: Any actor, or an empty string. The actor may have left, or may not have entered yet.
         """
 
     @property
     def window_open(self) -> bool:
-        """Whether nobody has closed the window."""
+        """Whether the window is still open."""
 
 
 class BrakesFully(Protocol):
-    """A simulator that knows how a vehicle brakes as hard as it can.
+    """A simulator that knows the action for full braking.
 
-    With it, a hunt finds out until when a crash could have been avoided.
+    A hunt needs this action to find the last step at which full braking avoids a crash.
     """
 
     def full_braking(self, agent: str) -> FullBraking | None:
-        """Return how; None where this vehicle's actions do not keep it in its lane. Called after `Simulator.reset`."""
+        """Return the action for full braking; None if no action keeps this vehicle in its lane while it brakes.
+
+        crashhunt calls this method after `Simulator.reset`.
+        """
 
 
 class ActiveDisturbance(Protocol):
-    """A vehicle that errs; it has begun to with the next step."""
+    """A disturbance of a vehicle that takes effect with the next step."""
 
     @property
     def how_strong(self) -> float:
-        """What the vehicle can do of what was asked for, in the unit of the kind."""
+        """The strength that the vehicle can reach, at most the requested strength, in the unit of the disturbance."""
 
     def keep(self) -> None:
-        """Go on; called before every further step. The vehicle may be gone."""
+        """Continue for another step; called before every further step. The vehicle may have left the simulation."""
 
     def end(self) -> None:
-        """Let the vehicle drive by itself again from the next step on. It may be gone."""
+        """Let the vehicle drive by itself again from the next step on. The vehicle may have left the simulation."""
 
 
 class SupportsDisturbances(Protocol):
-    """A simulator that can have others than the agents err.
+    """A simulator that can inject faults into vehicles other than the agents.
 
-    Contract: an erring vehicle does what vehicles of its type can do, and is never one of the agents'. Only one
-    disturbance at a time has the same vehicle. Whatever still goes on at the end is forgotten by `Simulator.reset`.
+    Contract: a disturbed vehicle stays within the physical limits of its type, and is never an agent's vehicle. A
+    vehicle has at most one disturbance at a time. `Simulator.reset` discards the disturbances that are still active.
     """
 
     @property
     def disturbing_kinds(self) -> Sequence[str]:
-        """What it can do, such as ``brake``."""
+        """The types of disturbances that the simulator supports, such as ``brake``."""
 
     def resolve_target(self, disturbance: Disturbance) -> str:
-        """Return which vehicle is meant, as it is now; empty where there is none.
+        """Return the identifier of the vehicle that the disturbance targets now; empty if no vehicle is there.
 
         Args:
-            disturbance: says the agent, and the place around it.
+            disturbance: Gives the agent, and the place around the agent.
         """
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance | None:
-        """Have a vehicle err from the next step on; None where it cannot, as where there is no lane to change to.
+        """Disturb a vehicle from the next step on; return None if that is impossible, as without a neighbouring lane.
 
         Args:
-            vehicle: as `resolve_target` has just said.
-            disturbance: what it is to do.
+            vehicle: The identifier that `resolve_target` has just returned.
+            disturbance: The disturbance to apply.
         """
 
 
 class HoldsBack(Protocol):
-    """A simulator that can keep one of the others from doing something, to see what hangs on it."""
+    """A simulator that can hold the speed or lane of a vehicle, or remove the vehicle, for counterfactual runs."""
 
     def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
-        """Keep a vehicle from something, from the next step on; None where that cannot be.
+        """Apply a hold to a vehicle from the next step on; return None if that is impossible.
 
         Args:
-            vehicle: its name; it may not be there, and is none of the agents'.
-            what: one of `HELD`. ``keep_speed`` holds the speed whoever is in its way, ``keep_lane`` the lane, and
-                ``gone`` takes it off the road for good.
+            vehicle: The identifier of a vehicle that is not an agent's. The vehicle may have left the simulation.
+            what: One of `HELD`. ``keep_speed`` keeps the speed even with an obstacle ahead, ``keep_lane`` keeps the
+                lane, and ``gone`` removes the vehicle for the rest of the episode.
         """
 
 
 class LeavesOut(Protocol):
-    """A simulator that can leave others than the agents out of an episode, by name."""
+    """A simulator that can exclude actors other than the agents from an episode."""
 
     @property
     def entered(self) -> Sequence[str]:
-        """Who has entered since `Simulator.reset` was given ``only``, whether it took part or not; else nobody."""
+        """Identifiers of all actors that have entered since `Simulator.reset`, excluded ones too.
+
+        The sequence is empty if `Simulator.reset` got no option ``only``.
+        """
 
 
 class PlaysPaths(Protocol):
-    """A simulator that can move others along recorded ways, so that nothing that anybody does changes them."""
+    """A simulator that can move all other actors along recorded paths, whatever the agents do."""
 
     @property
     def scripted(self) -> bool:
-        """Whether the others of this episode are moved along recorded ways."""
+        """Whether the other actors of this episode follow recorded paths."""
 
 
 class Reseeds(Protocol):
     """A simulator whose random generators can get another seed between two steps.
 
-    Contract: after `reseed`, the steps that follow are a function of the state and of this seed. What the generators
-    returned before changes nothing.
+    Contract: after `reseed`, all later steps depend on the state of the simulation and on this seed only. The numbers
+    that the generators returned before have no influence.
     """
 
     @property
     def why_no_reseeding(self) -> str:
-        """Why that is not possible here, as a sentence without its period; empty where it is."""
+        """Why re-seeding is impossible, as a sentence without its period; empty if it is possible."""
 
     def reseed(self, seed: int) -> None:
-        """Give all generators another seed, from the next step on.
+        """Re-seed all random generators, with effect from the next step on.
 
         Args:
-            seed: 0 to 2**31 - 1.
+            seed: The seed, from 0 to 2**31 - 1.
         """
 
 
 class CountsSetUp(Protocol):
-    """A simulator that simulates before the first step, as for traffic to warm up, and says how much."""
+    """A simulator that counts the steps that it simulates before the first step, such as the warm-up of traffic."""
 
     setup_steps: int
-    """How many steps the last `Simulator.reset` has simulated, whether or not it set up an episode in the end.
+    """Number of steps that the last `Simulator.reset` simulated, even if it failed.
 
-    Whoever goes on from such a place another time sets it to 0: those steps have been counted.
+    A caller that resumes from a suspended copy sets this number to 0, because these steps are already counted.
     """
 
 
 class Tidies(Protocol):
-    """A simulator whose episodes change something beyond itself, such as settings in classes of a library."""
+    """A simulator whose episodes change state outside the simulator object, such as class attributes of a library."""
 
     def tidy(self) -> None:
-        """Put it back as it was before the first episode. Called after each, and before the first; the next follows."""
+        """Restore that state as it was before the first episode; called before the first episode and after each."""
 
 
 class ReadiesProcess(Protocol):
-    """A simulator that can do once what the first episode of every process would do again, such as loading tables.
+    """A simulator that can prepare a process once, such as load tables that every first episode would load.
 
-    Its `reset` does not draw from the action spaces.
+    The simulator's `reset` does not sample from the action spaces.
     """
 
     def ready_process(self) -> None:
-        """Do it. Called once, before the first `Simulator.reset`, in a process whose forks run the episodes."""
+        """Prepare the process; called once, before the first `Simulator.reset`, in the process that forks episodes."""
 
 
 class HasMeanings(Protocol):
-    """A discrete action space whose numbers stand for something."""
+    """A discrete action space whose numbers have names."""
 
     @property
     def meanings(self) -> Sequence[str]:
-        """A word for each number, from 0, such as ``SLOWER``."""
+        """The name of each number, from 0, such as ``SLOWER``."""
 
 
 class AtOnce(Protocol):
-    """Takes steps of one episode with one agent in which nothing happens, with all that an episode does about them.
+    """Runs uneventful steps of an episode with one agent in the compiled core, each in one call.
 
-    While it goes ahead, the simulator stays where it was, until somebody asks.
+    The simulator object then lags behind the core until `catch_up` is called.
     """
 
     core: UsualSteps
-    """What takes a step, and says what has come of it."""
+    """The compiled object that runs a step and returns its outcome."""
 
     def is_unpatched(self, simulator: Simulator, /) -> bool:
-        """Whether it does what a simulator does: not where somebody has wrapped that, or a method of it."""
+        """Whether a step of the core equals a step of this simulator: false if the simulator or a method is wrapped."""
 
     @property
     def roster(self) -> Roster:
-        """Who is in sight, or will be after the step that `core` takes."""
+        """The actors in sight, which may already be those after the step that `core` runs."""
 
     def enter(self, ids: tuple[str, ...], /) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:
-        """Take note of who is in sight; what it returns is for `core`, None where it cannot go on with them."""
+        """Set the vehicles in sight; return their data for `core`, or None if `core` cannot continue with them."""
 
     def resume(self) -> Scene | None:
-        """Have `core` go on from where the simulator is; return its scene, None where that has to wait."""
+        """Let `core` continue from the simulator's state; return the scene, or None if that is not possible yet."""
 
     def catch_up(self) -> StepResult:
-        """Bring the simulator to where `core` is; return what its last step would have returned."""
+        """Bring the simulator to the state of `core`; return the result that its last step would have returned."""
 
     def apply(self, agent: str, action: NDArray[np.generic], /) -> bool:
-        """Apply an encoded action; return whether there is nothing about it to look into."""
+        """Apply an encoded action; return whether the step can stay uneventful."""
 
     def finish(self, actions: Mapping[str, NDArray[np.generic]], /) -> StepResult:
-        """Do what is left of a step that has been simulated."""
+        """Complete a step that SUMO has simulated and that is not uneventful."""
 
 
 class StepsAtOnce(Protocol):
-    """A simulator of which most steps may be taken in one call, by the compiled core."""
+    """A simulator whose uneventful steps the compiled core can run in one call each."""
 
     @property
     def at_once(self) -> AtOnce | None:
-        """What takes them, in this episode; None where nothing can."""
+        """The fast path of this episode; None if the episode has no fast path."""
 
 
 FACULTIES: tuple[type, ...] = (
@@ -427,4 +435,4 @@ FACULTIES: tuple[type, ...] = (
     Tidies,
     ReadiesProcess,
 )
-"""Everything that a simulator may offer."""
+"""All optional protocols of a simulator."""

@@ -1,4 +1,4 @@
-"""A counter of who has stood still for how long; whose standing counts is for each simulator to say."""
+"""A counter of the steps for which vehicles stand still; each simulator decides which vehicles it counts."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class Standstill:
     """Counts the steps in which vehicles stand still, one episode after another.
 
     Args:
-        step_length_s: of the simulation.
-        limits: ``not_moving``: how long is too long, in s, where it is not the default.
+        step_length_s: Step length of the simulation, in s.
+        limits: The scenario's event limits. ``not_moving`` is the longest allowed standstill in s.
     """
 
     SPEED: ClassVar[float] = 0.1
-    """Whoever is slower than this stands still, in m/s."""
+    """A vehicle slower than this stands still, in m/s."""
 
     def __init__(self, step_length_s: float, limits: Mapping[str, float]) -> None:
         self._limit_s = limits.get("not_moving", LIMITS["not_moving"][0])
@@ -34,15 +34,15 @@ class Standstill:
 
     @property
     def counted(self) -> tuple[dict[str, int], int]:
-        """For the core: for how many steps who has stood still, and how many are too many."""
+        """The number of steps for which each vehicle has stood still, and the limit in steps; for the compiled core."""
         return self._stood, self._steps
 
     def move(self, vehicle: str) -> None:
-        """Say that a vehicle moves, or that its standing does not count."""
+        """Reset the count of a vehicle that moves, or whose standstill does not count."""
         self._stood.pop(vehicle, None)
 
     def look(self, vehicle: str, speed: float) -> float:
-        """Count a step; return how long is too long, in s, in the one step in which it has become so, else 0."""
+        """Count a step of a vehicle; return the limit in s in the step in which its standstill reaches it, else 0."""
         if abs(speed) >= self.SPEED:
             if self._stood:
                 self.move(vehicle)

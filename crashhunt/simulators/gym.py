@@ -1,4 +1,4 @@
-"""Any environment of Gymnasium as a simulator. There is no scene: what is recorded is what the agent saw and did."""
+"""Any Gymnasium environment as a simulator. Its scenes have no actors: recordings hold observations and actions."""
 
 from __future__ import annotations
 
@@ -35,17 +35,18 @@ _NOBODY = Roster(())
 
 
 class GymSimulator:
-    """Runs the episodes of a scenario in an environment of Gymnasium, each in one of its own.
+    """Runs the episodes of a scenario in a Gymnasium environment, each in a new environment.
 
-    Scenario arguments are keywords of the environment. A step that the crash rule calls a crash is a collision with
-    nobody; an episode that ends without one has finished. The environment's own limit on steps does not count.
+    Scenario arguments are keyword arguments of the environment. When the crash rule holds, the step has a collision
+    without a collision partner. An episode that ends without a crash has finished. The environment's own step limit is
+    disabled.
 
     Args:
-        scenario: what to run.
-        stage: not used.
+        scenario: The scenario to run.
+        stage: Not used.
 
     Raises:
-        ScenarioError: there is no such environment or crash rule.
+        ScenarioError: The environment or the crash rule does not exist.
     """
 
     def __init__(self, scenario: Scenario, stage: Path) -> None:
@@ -60,7 +61,7 @@ class GymSimulator:
         self.agents: list[str] = []
         self.notices: dict[str, None] = {}
         try:
-            self._adopt(self._make(argument_values(scenario)))  # which says what the spaces are
+            self._adopt(self._make(argument_values(scenario)))  # to read its spaces
         except CrashhuntError:
             raise
         except Exception as error:
@@ -87,7 +88,7 @@ class GymSimulator:
     why_no_reseeding = ""
 
     def reseed(self, seed: int) -> None:
-        """Give Gymnasium's generator of the environment another seed; generators of its own keep theirs."""
+        """Re-seed the environment's Gymnasium generator; other generators that the environment has keep their state."""
         reseed_in_place(self._env.unwrapped.np_random, seed)
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
@@ -97,7 +98,7 @@ class GymSimulator:
         self._steps += 1
         self._look(self._rule(observation, float(reward), bool(terminated), bool(truncated), info))
         if self._key and self._key in info:
-            self._take_danger(info[self._key])
+            self._record_danger(info[self._key])
         over = bool(terminated or truncated) or self._crashed
         if over:
             self.agents = []
@@ -105,7 +106,7 @@ class GymSimulator:
         return {agent: shown}, {agent: float(reward)}, {agent: over}, {agent: False}, {agent: info}
 
     def scene(self) -> Scene:
-        """Return the time, and whether it has crashed; there are no actors."""
+        """Return the scene: the time and a crash, without actors."""
         return self._scene
 
     def close(self) -> None:
@@ -113,15 +114,15 @@ class GymSimulator:
         self._env.close()
 
     def _shown(self, observation: object) -> NDArray[np.generic]:
-        """An observation as it is recorded; one that is not what the environment promises is told, once a hunt.
+        """Return an observation as it is recorded; report an observation outside the space once per hunt.
 
-        The episode goes on: what an agent makes of it is its own business, and many environments stray by a rounding.
+        The episode continues, because many environments leave their space by a rounding error.
         """
         array = self._form.encode(observation)
         if not self._form.space.contains(array):
             what = "outside its own observation space"
             if array.dtype.kind == "f" and np.isnan(array).any():
-                what = "that has parts which are no numbers (NaN)"
+                what = "that contains NaN"
             notice = f"the environment {self._setup.id!r} shows its agent an observation {what}"
             if notice not in self.notices:
                 self.notices[notice] = None
@@ -133,7 +134,7 @@ class GymSimulator:
         if name.partition(":")[2].isidentifier():
             factory: Callable[..., object] = load_object(name)
             return factory
-        # The bound on steps is the trial's.
+        # The trial limits the number of steps, not the environment.
         return lambda **kwargs: gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True, **kwargs)
 
     def _make(self, arguments: Mapping[str, Value]) -> gymnasium.Env[Any, Any]:
@@ -142,12 +143,12 @@ class GymSimulator:
             merge(kwargs, table)
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DeprecationWarning)  # of older versions of an id, which are asked for
+                warnings.simplefilter("ignore", DeprecationWarning)  # for an outdated version, which the user chose
                 made = self._factory(**kwargs)
         except (gymnasium.error.Error, ImportError, TypeError) as error:
             raise self._mistake(str(error)) from None
         if not isinstance(made, gymnasium.Env):
-            raise self._mistake(f"a gymnasium.Env is needed, and it made a {type(made).__name__}")
+            raise self._mistake(f"this factory returned a {type(made).__name__}; it must return a gymnasium.Env")
         return made
 
     def _mistake(self, message: str) -> ScenarioError:
@@ -160,11 +161,12 @@ class GymSimulator:
         self.shown_spaces = {self._agent: self._form.original} if self._form.flattened else {}
         self.actions: dict[str, ActionForm] = {self._agent: action_form(env.action_space)}
 
-    def _take_danger(self, said: Any) -> None:
+    def _record_danger(self, reported: Any) -> None:
         try:
-            value = float(said)
+            value = float(reported)
         except (TypeError, ValueError):
-            raise self._mistake(f"gym.danger = {self._setup.danger!r} is {said!r:.80}, and no number") from None
+            message = f"gym.danger = {self._setup.danger!r} is {reported!r:.80}; it must be a number"
+            raise self._mistake(message) from None
         if not np.isnan(value):
             found = 1 / (1 + max(0.0, value)) if self._near else min(1.0, max(0.0, value))
             self.named_danger = max(found, self.named_danger or 0.0)
@@ -173,7 +175,16 @@ class GymSimulator:
         contacts: tuple[Contact, ...] = ()
         if what and not self._crashed:
             self._crashed = True
-            contacts = (Contact(self._agent, "", what, "", float("nan"), float("nan")),)
+            contacts = (
+                Contact(
+                    collider=self._agent,
+                    victim="",
+                    kind=what,
+                    lane="",
+                    collider_speed=float("nan"),
+                    victim_speed=float("nan"),
+                ),
+            )
         self._scene = Scene(self._steps * self.step_length_s, _NOBODY, [], [], [], contacts)
 
 
@@ -183,7 +194,7 @@ class _Rule:
         self._function = load_object(rule.function) if rule.function else None
 
     def __call__(self, observation: object, reward: float, terminated: bool, truncated: bool, info: Info) -> str:
-        """Say what happened; nothing where it is no crash."""
+        """Return a description of the crash; empty if the step has no crash."""
         rule = self._rule
         if rule.info and info.get(rule.info):
             return rule.info

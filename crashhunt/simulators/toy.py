@@ -1,7 +1,7 @@
-"""A toy: one straight lane, the controlled vehicles one behind the other, and a leader that brakes now and then.
+"""The toy simulator: controlled vehicles in a row on one straight lane, behind a leader that brakes at random.
 
-It is pure Python, takes microseconds a step, and can be told to fail in every way in which a simulator can: the double
-for tests, and the shortest example of the protocol.
+It is the test double of simulators and the shortest example of the protocol. It is pure Python, takes microseconds per
+step, and can fail on purpose in every way in which a simulator can fail.
 """
 
 from __future__ import annotations
@@ -38,15 +38,20 @@ _LEADER = "leader"
 
 
 class ToySimulator:
-    """Drives along the x axis.
+    """Simulates vehicles that drive along the x axis.
 
-    Scenario arguments, all optional: ``leader_speed`` (m/s, 10), ``gap_m`` (bumper to bumper at the start, 30),
-    ``road_m`` (1000), ``step_wall_s`` (wall time that a step takes at least), and to fail on purpose: ``fail_reset``
-    (bool), and the step at which to ``fail_at_step``, ``exit_at_step``, ``segfault_at_step``, ``hang_at_step``.
+    All scenario arguments are optional:
+
+    - ``leader_speed``: in m/s, 10 by default.
+    - ``gap_m``: the gap from bumper to bumper at the start, 30 by default.
+    - ``road_m``: the length of the road, 1000 by default.
+    - ``step_wall_s``: the shortest wall time of a step.
+    - ``fail_reset``: true makes `reset` fail on purpose.
+    - ``fail_at_step``, ``exit_at_step``, ``segfault_at_step``, ``hang_at_step``: the step that fails on purpose.
 
     Args:
-        scenario: its agents and its step length.
-        stage: not used.
+        scenario: Its agents and its step length are used.
+        stage: Not used.
     """
 
     def __init__(self, scenario: Scenario, stage: Path) -> None:
@@ -62,10 +67,10 @@ class ToySimulator:
         self.agents: list[str] = []
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
-        """Put everybody on the road, the leader in front."""
+        """Put the agents on the road, behind the leader."""
         self._arguments = dict((options or {}).get("arguments", {}))
         if self._argument("fail_reset", default=False):
-            raise InvalidEpisodeError("the toy was told to fail")
+            raise InvalidEpisodeError("the toy simulator fails as its scenario arguments demand")
         self._rng = np.random.default_rng(seed)
         self._step = 0
         self.agents = list(self._setups)
@@ -76,7 +81,7 @@ class ToySimulator:
         self._start = dict(self._x)
         self._touched: set[str] = set()
         self._kinematics.hidden.clear()
-        self._disturbed: dict[str, float] = {}  # who errs, and the speed that it brakes to in the next step, in m/s
+        self._disturbed: dict[str, float] = {}  # disturbed vehicles: target speed in m/s
         self._enlist()
         self._look(())
         return {agent: self._observe(agent) for agent in self.agents}, {}
@@ -84,13 +89,13 @@ class ToySimulator:
     why_no_reseeding = ""
 
     def reseed(self, seed: int) -> None:
-        """Draw when the leader brakes from another seed."""
+        """Re-seed the generator that decides when the leader brakes."""
         self._rng = np.random.default_rng(seed)
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
-        """Move everybody; the reward is the distance driven, in m."""
+        """Move all vehicles; the reward is the distance driven, in m."""
         self._step += 1
-        self._fail_as_told()
+        self._fail_on_purpose()
         wanted = {agent: self._target(agent, action) for agent, action in actions.items()}
         cruising = float(self._argument("leader_speed", 10.0))
         wanted[_LEADER] = 0.0 if self._rng.random() < 0.05 else cruising
@@ -119,7 +124,7 @@ class ToySimulator:
         return observations, rewards, terminations, dict.fromkeys(actions, False), {agent: {} for agent in actions}
 
     def scene(self) -> Scene:
-        """Return the state of everybody."""
+        """Return the state of all vehicles."""
         return self._scene
 
     def lanes(self) -> list[Lane]:
@@ -127,7 +132,7 @@ class ToySimulator:
         return [Lane("road_0", 3.5, ((0.0, 0.0), (float(self._argument("road_m", 1000.0)), 0.0)))]
 
     def full_braking(self, agent: str) -> FullBraking:
-        """Return how a vehicle brakes as hard as it can."""
+        """Return the action with which a vehicle brakes as hard as it can."""
         if self._setups[agent].action == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
         return FullBraking((0.0, 0), "all that it can do", _BRAKING)
@@ -135,26 +140,26 @@ class ToySimulator:
     disturbing_kinds = ("brake", "stop", "unseen")
 
     def resolve_target(self, disturbance: Disturbance) -> str:
-        """Return the leader where it is next ahead; everybody else is an agent."""
+        """Return the leader if it is directly ahead of the agent; all other vehicles are agents."""
         ahead = [name for name, x in self._x.items() if x > self._x.get(disturbance.agent, np.inf)]
         return _LEADER if disturbance.who == "ahead" and ahead == [_LEADER] else ""
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance:
-        """Brake, as hard as vehicles can at most, or be unseen."""
+        """Make a vehicle brake, at most as hard as vehicles can, or hide it."""
         if disturbance.what == "unseen":
             return Unseen(self._kinematics, disturbance.agent, vehicle)
         return _Braking(self, vehicle, min(disturbance.how_strong, _BRAKING))
 
     def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
-        """Hold the leader to its speed; there is but one lane, and it stays on it."""
+        """Keep the leader at its speed; the road has one lane, so lanes need no hold."""
         return _Steady(self, vehicle) if vehicle == _LEADER and what == "keep_speed" else None
 
     def keep_speed(self, vehicle: str) -> None:
-        """Have a vehicle go on at its speed in the next step."""
+        """Make a vehicle keep its speed in the next step."""
         self._disturbed[vehicle] = self._v[vehicle]
 
     def brake(self, vehicle: str, deceleration: float) -> None:
-        """Have a vehicle brake in the next step, in m/s²."""
+        """Make a vehicle brake in the next step, with a deceleration in m/s²."""
         self._disturbed[vehicle] = max(0.0, self._v[vehicle] - deceleration * self.step_length_s)
 
     def let_go(self, vehicle: str) -> None:
@@ -162,21 +167,21 @@ class ToySimulator:
         self._disturbed.pop(vehicle, None)
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing, because the toy holds no resources."""
 
     def _argument(self, name: str, default: Any) -> Any:
         return self._arguments.get(name, default)
 
-    def _fail_as_told(self) -> None:
+    def _fail_on_purpose(self) -> None:
         time.sleep(float(self._argument("step_wall_s", 0.0)))
         if self._step == self._argument("fail_at_step", 0):
-            raise SimulatorError("the toy was told to fail")
+            raise SimulatorError("the toy simulator fails as its scenario arguments demand")
         if self._step == self._argument("exit_at_step", 0):
             os._exit(3)
         if self._step == self._argument("segfault_at_step", 0):
             ctypes.string_at(0)
         if self._step == self._argument("hang_at_step", 0):
-            ctypes.PyDLL(None).sleep(3600)  # keeps the interpreter to itself, as a simulator's own code may
+            ctypes.PyDLL(None).sleep(3600)  # PyDLL holds the GIL, as a simulator's compiled code may
 
     def _target(self, agent: str, action: NDArray[np.generic]) -> float:
         if self._setups[agent].action != "meta":
@@ -185,7 +190,7 @@ class ToySimulator:
         return max(0.0, self._v[agent] + shift)
 
     def _contacts(self, agents: list[str]) -> tuple[Contact, ...]:
-        """Who drove into whoever is in front of it, in this step for the first time."""
+        """Return the contacts of agents that drove into the vehicle ahead in this step for the first time."""
         found = []
         for agent in agents:
             ahead = min(
@@ -193,11 +198,22 @@ class ToySimulator:
             )
             if ahead is not None and agent not in self._touched and self._x[agent] > self._x[ahead] - _LENGTH_M:
                 self._touched.add(agent)
-                found.append(Contact(agent, ahead, "collision", "road_0", self._v[agent], self._v[ahead]))
+                found.append(
+                    Contact(
+                        collider=agent,
+                        victim=ahead,
+                        kind="collision",
+                        lane="road_0",
+                        collider_speed=self._v[agent],
+                        victim_speed=self._v[ahead],
+                    )
+                )
         return tuple(found)
 
     def _enlist(self) -> None:
-        self._roster = Roster(tuple(Actor(name, "passenger", _LENGTH_M, _WIDTH_M) for name in sorted(self._x)))
+        self._roster = Roster(
+            tuple(Actor(id=name, kind="passenger", length=_LENGTH_M, width=_WIDTH_M) for name in sorted(self._x))
+        )
 
     def _look(self, contacts: tuple[Contact, ...]) -> None:
         names = sorted(self._x)
@@ -224,7 +240,7 @@ class ToySimulator:
 
 
 class _Braking:
-    """A vehicle that brakes, whatever it would do otherwise."""
+    """Makes a vehicle brake."""
 
     def __init__(self, toy: ToySimulator, vehicle: str, how_strong: float) -> None:
         self.how_strong = how_strong
@@ -237,12 +253,12 @@ class _Braking:
         self._toy.brake(self._vehicle, self.how_strong)
 
     def end(self) -> None:
-        """Drive by itself again."""
+        """Let the vehicle drive by itself again."""
         self._toy.let_go(self._vehicle)
 
 
 class _Steady:
-    """A vehicle that goes on at its speed."""
+    """Makes a vehicle keep its speed."""
 
     how_strong = 1.0
 
@@ -252,9 +268,9 @@ class _Steady:
         self.keep()
 
     def keep(self) -> None:
-        """Go on so in the next step as well."""
+        """Keep the speed in the next step as well."""
         self._toy.keep_speed(self._vehicle)
 
     def end(self) -> None:
-        """Drive by itself again."""
+        """Let the vehicle drive by itself again."""
         self._toy.let_go(self._vehicle)

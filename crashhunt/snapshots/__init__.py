@@ -1,4 +1,4 @@
-"""Snapshots: the code, scenario and versions that a hunt ran with, kept beside its crashes."""
+"""Snapshots: the code, scenario and versions that a hunt ran with, stored in its directory."""
 
 import lazy_loader
 

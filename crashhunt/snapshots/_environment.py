@@ -1,4 +1,4 @@
-"""What a result depends on besides code: Python, the machine, what is installed."""
+"""The environment of a hunt: Python, the machine, and the installed distributions, on which results may depend."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ _VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "OMP_NUM_THREADS", "VIRTUAL_ENV")
 def environment() -> Environment:
     """Return the content of ``environment.json``.
 
-    ``loaded`` are the distributions of which something has been imported by now: with the simulator's, those on which
-    a result may depend.
+    ``loaded`` lists the distributions with an imported module, and those of simulators. Results may depend on them.
     """
     modules = {name.partition(".")[0] for name in list(sys.modules)}
     distributions: dict[str, str] = {}
@@ -59,7 +58,7 @@ def _facts_of(distribution: metadata.Distribution) -> tuple[str, str, set[str]]:
 
 
 def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
-    """Read the two out of the text: `Distribution.metadata` parses all of it, which is most of a hunt's start."""
+    """Return name and version from the head of the text, because `Distribution.metadata` parses the whole text."""
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
     head, _, _ = text.partition("\n\n")
     found = dict(line.split(": ", 1) for line in head.splitlines() if line.startswith(("Name: ", "Version: ")))
@@ -73,7 +72,7 @@ def _version_of(name: str) -> str:
 
 
 def _top_level_modules(distribution: metadata.Distribution) -> set[str]:
-    """What can be imported of it, as `importlib.metadata.packages_distributions` finds it, in a tenth of the time."""
+    """Return the modules of a distribution, as `importlib.metadata.packages_distributions` does, but faster."""
     declared = (distribution.read_text("top_level.txt") or "").split()
     if declared:
         return set(declared)
@@ -84,7 +83,7 @@ def _top_level_modules(distribution: metadata.Distribution) -> set[str]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that every crash names: those of all simulators that are installed are among them."""
+    """Return the versions that every crash records, including those of all installed simulators."""
     found = {"python": platform.python_version()}
     for name in dict.fromkeys(
         (*_VERSIONED, *(name for _, backend in installed_backends() for name in backend.versions))
@@ -101,7 +100,7 @@ def _variables() -> tuple[str, ...]:
 
 
 def environment_changes(recorded: Environment) -> dict[str, tuple[str, str]]:
-    """Return what is another version here than in an ``environment.json``: name to (then, now)."""
+    """Return the versions that differ from an ``environment.json``: name to (recorded, current)."""
     changes = {}
     for name, then, now in (
         ("python", recorded.get("python"), platform.python_version()),
@@ -117,13 +116,13 @@ def environment_changes(recorded: Environment) -> dict[str, tuple[str, str]]:
         except metadata.PackageNotFoundError:
             now = "not installed"
         then = distributions.get(name, now)
-        if then != now and name != "crashhunt":  # which comes from the snapshot
+        if then != now and name != "crashhunt":  # crashhunt itself comes from the snapshot
             changes[name] = (str(then), now)
     return changes
 
 
 def processor() -> str:
-    """Return the model of the processor; NumPy rounds otherwise on some than on others."""
+    """Return the model of the processor, because NumPy's results may differ between models."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

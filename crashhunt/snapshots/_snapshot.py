@@ -1,4 +1,4 @@
-"""Snapshots: the code and the scenario that a hunt ran, kept beside its crashes and addressed by content."""
+"""Snapshots: the code and the scenario of a hunt, stored in its directory under the digest of their content."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 __all__ = ["Environment", "Manifest", "Snapshot", "code_of_manifest", "latest_snapshot", "without_code"]
 
 
-# The shapes of what describes a snapshot: ``manifest.json`` and ``environment.json``.
+# The content of ``manifest.json`` and ``environment.json``.
 
 
 class Manifest(TypedDict):
-    """``manifest.json``: which files there are, and from where modules are imported.
+    """The content of ``manifest.json``: the files of a snapshot, and the folders from which modules are imported.
 
-    ``described`` are the files that say what the snapshot is and are no part of its digest; the earliest had neither
-    them nor ``integrity``. ``authentication_code`` proves to the user who took the snapshot that it is unchanged.
+    ``described`` lists the files that describe the snapshot and are no part of its digest. The earliest snapshots have
+    neither ``described`` nor ``integrity``. ``authentication_code`` proves to its user that the snapshot is unchanged.
     """
 
     schema: int
@@ -56,10 +56,11 @@ class Manifest(TypedDict):
 
 
 class Environment(TypedDict):
-    """``environment.json``: what a result depends on besides code. ``git`` has the revision of each work tree.
+    """The content of ``environment.json``: everything besides code on which a result depends.
 
-    ``core`` is whether the simulator's compiled core was used, which makes no difference to results. ``load_order`` is
-    ``fixed`` or ``not fixed: REASON`` where results depend on an order at load; snapshots of earlier versions lack it.
+    The entry ``git`` has the revision of each work tree. The entry ``core`` says whether the simulator's compiled core
+    was used, which does not change results. If results depend on an order at load, ``load_order`` is ``fixed`` or
+    ``not fixed: REASON``. Snapshots of earlier versions lack it.
     """
 
     schema: int
@@ -81,18 +82,19 @@ SCHEMA = 2
 _PROTECTED = 2  # the first version with a digest of its manifest and of what describes the rest
 _DESCRIBING = (layout.HUNT, layout.ENVIRONMENT, layout.GIT_DIFF)
 _PARTS = (layout.CODE, layout.FILES, layout.SCENARIO_FILES)
-# What Python might import, or run when it starts.
+# Suffixes of files that Python may import, or run at its start.
 _IMPORTABLE = {".py", ".pyc", ".pyo", ".so", ".pth", *importlib.machinery.all_suffixes()}
 
 
 class Snapshot:
     """A snapshot on disk.
 
-    ``code/`` and ``scenario/``, ``files/`` that arguments name, the ``manifest.json`` with the size and hash of each,
-    the resolved ``hunt.toml``, ``environment.json`` and ``git.diff``.
+    The folders are ``code/``, ``scenario/`` and ``files/``, with the files that arguments name. The file
+    ``manifest.json`` has the size and hash of each file. The files ``hunt.toml``, ``environment.json`` and ``git.diff``
+    describe the snapshot.
 
     Args:
-        path: of the folder, whose name is its digest.
+        path: The folder, whose name is the digest of the snapshot.
     """
 
     def __init__(self, path: Path) -> None:
@@ -121,7 +123,7 @@ class Snapshot:
                     raise ValueError("it has changed since it was written")
             found.setdefault("argument_files", {})
             typed(found, {"argument_files": dict[str, str]})
-            _see_that_all_is_inside(found)
+            _check_names(found)
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise BundleError(f"the snapshot has no manifest: {reason}", fix=_UNDAMAGED, where=str(self.path)) from None
@@ -191,13 +193,13 @@ class Snapshot:
         return is_authentic("snapshot", _authenticated(manifest), manifest.get("authentication_code"))
 
     def fingerprint(self) -> str:
-        """Return the SHA-256 of everything that says what would run, in hexadecimal, whoever took the snapshot.
+        """Return the SHA-256 of everything that would run, in hexadecimal; it is equal for all users.
 
         Raises:
             BundleError: the manifest is missing or damaged.
         """
         found = hashlib.sha256(json.dumps(_authenticated(self.manifest), sort_keys=True).encode())
-        for name in (layout.HUNT, layout.ENVIRONMENT):  # which the manifests of the earliest versions do not list
+        for name in (layout.HUNT, layout.ENVIRONMENT):  # the manifests of the earliest versions do not list these files
             content = b""
             with suppress(OSError):
                 content = (self.path / name).read_bytes()
@@ -205,9 +207,9 @@ class Snapshot:
         return found.hexdigest()
 
     def faults(self) -> list[str]:
-        """Return what is not as it was: files that are missing or changed, and modules that were not there.
+        """Return the faults: missing files, changed files, and added modules.
 
-        What Python compiled by itself is removed first: nobody can tell whether it was made from the code beside it.
+        The method first removes compiled files, because they may not match the source files next to them.
         """
         manifest = self.manifest
         found = []
@@ -215,21 +217,21 @@ class Snapshot:
             wrong = changed_file(self.path / name, entry)
             if wrong:
                 found.append(f"{name} {wrong}")
-        digest = digest_of_described(manifest["files"], says=[manifest["paths"], manifest["argument_files"]])
+        digest = digest_of_described(manifest["files"], plain_data=[manifest["paths"], manifest["argument_files"]])
         if digest != self.digest:
             found.append(f"its manifest is that of the snapshot {digest}")
         self.discard_compiled()
         return found + [f"{name} was not there" for name in self._added() if self._may_run(name)]
 
     def additions(self) -> list[str]:
-        """Return the files that were not there and are no modules: an agent may write data beside its code."""
+        """Return the added files that are no modules, because an agent may write data into its folder."""
         return [name for name in self._added() if not self._may_run(name)]
 
     def discard_compiled(self) -> None:
-        """Remove what Python compiled, which it would take for the code beside it, whatever is in there."""
+        """Remove compiled files, which Python would run in place of the source files next to them."""
         for path in (self.path / layout.CODE).rglob("__pycache__/*.pyc"):
             if path.relative_to(self.path).as_posix() not in self.manifest["files"]:
-                with suppress(OSError):  # what cannot be removed is told as added
+                with suppress(OSError):  # `faults` then reports the file as added
                     path.unlink()
 
     def _may_run(self, name: str) -> bool:
@@ -245,10 +247,10 @@ class Snapshot:
         return sorted(name for name in found if name not in self.manifest["files"])
 
     def verify(self) -> None:
-        """Check that everything is as it was.
+        """Check that the snapshot is unchanged.
 
         Raises:
-            BundleError: with what is not.
+            BundleError: The snapshot has changed; the message names the first fault.
         """
         faults = self.faults()
         if faults:
@@ -272,8 +274,8 @@ def _authenticated(manifest: Manifest) -> dict[str, object]:
 _UNDAMAGED = "get an undamaged copy of the hunt's directory"
 
 
-def _see_that_all_is_inside(manifest: Manifest) -> None:
-    """See that no name in a manifest leads out of the snapshot."""
+def _check_names(manifest: Manifest) -> None:
+    """Raise ValueError if a name in a manifest leads out of the snapshot."""
     names = [*manifest["files"], *manifest["paths"], *manifest["argument_files"].values()]
     for name in names:
         parts = name.split("/")
@@ -287,31 +289,31 @@ def _see_that_all_is_inside(manifest: Manifest) -> None:
 
 
 def latest_snapshot(hunt: Path) -> Snapshot | None:
-    """Return the snapshot that a hunt took last; None where it has none."""
+    """Return the latest snapshot of a hunt; None if it has none."""
     found = sorted((hunt / layout.SNAPSHOTS).glob(layout.SHOWN), key=lambda path: path.stat().st_mtime)
     return Snapshot(found[-1]) if found else None
 
 
-# A snapshot without its code: the scenario alone, for whoever runs it with today's code.
+# A snapshot without code: the scenario alone, to be run with the current code.
 
 
 def without_code(snapshot: Snapshot, snapshots: Path) -> Snapshot:
-    """Copy what of a snapshot is no code: the scenario with its files, and on what its results depended.
+    """Copy a snapshot without its code: the scenario with its files, the settings and the environment.
 
     Args:
-        snapshot: of a hunt; nobody else needs to have it looked at.
-        snapshots: the folder to make the copy in.
+        snapshot: The snapshot of a hunt; the caller need not verify it.
+        snapshots: The folder in which to make the copy.
 
     Raises:
-        BundleError: a file of it is missing or has changed.
-        OSError: it cannot be written.
+        BundleError: A file of the snapshot is missing or has changed.
+        OSError: The copy cannot be written.
     """
     kept = {
         name: entry
         for name, entry in snapshot.manifest["files"].items()
         if name.startswith(f"{layout.SCENARIO_FILES}/")
     }
-    digest = digest_of_described(kept, says=[[], {}])
+    digest = digest_of_described(kept, plain_data=[[], {}])
     final = snapshots / digest
     (final / layout.SCENARIO_FILES).mkdir(parents=True)
     for name, entry in kept.items():
@@ -333,7 +335,7 @@ def without_code(snapshot: Snapshot, snapshots: Path) -> Snapshot:
 
 
 def _of_simulation(found: Environment) -> Environment:
-    """What a result depends on; not what else was installed, nor the folders of whoever ran it."""
+    """Return the environment without distributions that were not loaded, and without the user's folders."""
     loaded = set(found["loaded"])
     distributions = {name: version for name, version in found["distributions"].items() if name in loaded}
     return {**found, "distributions": distributions, "variables": {}, "git": {}}

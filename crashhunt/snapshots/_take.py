@@ -1,4 +1,4 @@
-"""Taking a snapshot: the code, the scenario and the files of a hunt, copied and addressed by content."""
+"""Takes snapshots: copies the code, the scenario and the files of a hunt into a folder named by their digest."""
 
 from __future__ import annotations
 
@@ -39,26 +39,26 @@ if TYPE_CHECKING:
 __all__ = ["SnapshotOptions", "Sources", "find_sources", "git", "take_snapshot"]
 
 
-# Which code a hunt runs: the agents' own projects, found through what has been imported.
+# The code that a hunt runs: the agents' own projects, found through the imported modules.
 
 _GENERATED = {"__pycache__", ".git", ".hg", ".venv", ".mypy_cache", ".ruff_cache", ".pytest_cache"}
 
 
 @dataclass(slots=True)
 class Sources:
-    """Code, and where in a snapshot it goes.
+    """Files of code, and their places in a snapshot.
 
     Attributes:
-        files: place in the snapshot (``code/…``) to the file.
-        paths: the folders of the snapshot from which modules are imported, the first one first.
-        trees: git work trees that are part of it.
-        left_out: what was not taken, and why.
+        files: The source file of each place in the snapshot (``code/…``).
+        paths: The folders of the snapshot from which modules are imported, in the order of ``sys.path``.
+        trees: The git work trees that are part of the snapshot.
+        excluded: The files that were not taken, each with the reason.
     """
 
     files: dict[str, Path] = field(default_factory=dict)
     paths: list[str] = field(default_factory=lambda: [layout.CODE])
     trees: list[Path] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
+    excluded: list[str] = field(default_factory=list)
 
 
 def find_sources(
@@ -68,20 +68,20 @@ def find_sources(
     roots: Sequence[Path] = (),
     without: Path | None = None,
 ) -> Sources:
-    """Find crashhunt itself, the whole project of each agent, and whatever else they imported that is not installed.
+    """Find crashhunt itself, the project of each agent, and all other imported modules that are not installed.
 
-    A project is the git work tree that holds a module: what is tracked, as it is now, and what is untracked and not
-    ignored. A module that is in none comes with its package, or alone. No link is followed out of a work tree, and
-    the directories of hunts are left out.
+    A project is the git work tree that holds a module, with its tracked files in their current state and its untracked
+    files that git does not ignore. A module outside of work trees comes with its package, or alone. Links that lead out
+    of a work tree are not followed. The directories of hunts are excluded.
 
     Args:
-        locators: of the agents.
-        modules: further modules that are part of it.
-        roots: further files and folders.
-        without: a folder to leave out.
+        locators: The locators of the agents.
+        modules: Further modules to include.
+        roots: Further files and folders to include.
+        without: A folder to exclude.
 
     Raises:
-        SnapshotError: a root does not exist.
+        SnapshotError: A root does not exist.
     """
     found = Sources()
     names = {locate("agents", locator).__module__.partition(".")[0] for locator in locators}
@@ -90,7 +90,7 @@ def find_sources(
         names.add(module.partition(".")[0])
     names |= {name for name in _top_level_modules() if not _is_installed(_place_of(name))}
     _take_module("crashhunt", found)
-    # The pages of the guide are read by people and never by a replay.
+    # A replay never reads the pages of the guide.
     found.files = {place: file for place, file in found.files.items() if not _is_page(place)}
     for name in sorted(names - {"crashhunt"}):
         place = _place_of(name)
@@ -104,12 +104,12 @@ def find_sources(
     for root in roots:
         _take_root(root, found, without)
     for odd in [name for name in found.files if "\\" in name]:
-        found.left_out.append(f"{found.files.pop(odd)}: its name has a backslash, which elsewhere parts folders")
+        found.excluded.append(f"{found.files.pop(odd)}: its name has a backslash, which elsewhere parts folders")
     return found
 
 
 def git(folder: Path, *arguments: str) -> bytes | None:
-    """Return what git prints, without any change to its index; None where there is no git or no repository."""
+    """Return git's output, without changing its index; None if git or the repository does not exist."""
     command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
     try:
         done = subprocess.run(command, capture_output=True, check=False, timeout=60, env=environment_of_git())
@@ -123,7 +123,7 @@ def _top_level_modules() -> set[str]:
 
 
 def _is_installed(place: Path | None) -> bool:
-    """Whether a module lies with the installed ones, which are everybody's and recorded by their versions."""
+    """Whether a module is installed, so that its version identifies it."""
     if place is None or not {"site-packages", "dist-packages"}.isdisjoint(place.parts):
         return True
     return any(map(place.is_relative_to, _installed_places()))
@@ -135,7 +135,7 @@ def _installed_places() -> tuple[Path, ...]:
 
 
 def _place_of(name: str) -> Path | None:
-    """The folder in which a top-level module or package lies; None where it is part of Python itself."""
+    """Return the folder that contains a top-level module or package; None for a module built into Python."""
     module = sys.modules.get(name)
     file = getattr(module, "__file__", None)
     if file is None:
@@ -146,7 +146,7 @@ def _place_of(name: str) -> Path | None:
 
 
 def _take_module(name: str, found: Sources) -> None:
-    """Take a package, or a module that is one file."""
+    """Add a package, or a module that is a single file."""
     module = sys.modules.get(name)
     file = getattr(module, "__file__", None)
     for folder in map(Path, getattr(module, "__path__", ())):
@@ -162,7 +162,7 @@ def _is_page(place: str) -> bool:
 
 
 def _walk(folder: Path) -> Iterator[str]:
-    """The names of all files below a folder; links to folders are not followed."""
+    """Yield the names of all files below a folder, without following links to folders."""
     for parent, folders, files in os.walk(folder):
         folders[:] = sorted(set(folders) - _GENERATED)
         below = Path(parent).relative_to(folder).as_posix()
@@ -172,7 +172,7 @@ def _walk(folder: Path) -> Iterator[str]:
 
 
 def _listing_that_has(place: Path, name: str, found: Sources) -> tuple[Path, list[str]] | None:
-    """The work tree that holds a module, and its files; None where none does, or where it is ignored there."""
+    """Return the work tree that holds a module, and its files; None if there is none, or if git ignores the module."""
     top = git(place, "rev-parse", "--show-toplevel")
     if top is None:
         return None
@@ -187,7 +187,7 @@ def _listing_that_has(place: Path, name: str, found: Sources) -> tuple[Path, lis
 
 
 def _listed(tree: Path) -> Iterator[str]:
-    """What is tracked, and what is untracked and not ignored, but nothing generated; inside submodules too."""
+    """Yield tracked files and untracked files that are not ignored, without generated files; also of submodules."""
     output = git(tree, "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--deduplicate") or b""
     for entry in filter(None, output.split(b"\0")):
         name = os.fsdecode(entry).rstrip("/")
@@ -201,7 +201,7 @@ def _listed(tree: Path) -> Iterator[str]:
 def _take_tree(
     tree: Path, names: Sequence[str], found: Sources, *, imports: Iterable[Path], without: Path | None
 ) -> None:
-    """Take the files of a work tree, or of a folder, under a name that no module can have."""
+    """Add the files of a work tree or of a folder, under a name that no module can have."""
     if tree in found.trees:
         base = _base_of(tree, found)
     else:
@@ -231,15 +231,15 @@ def _base_of(tree: Path, found: Sources) -> str:
 
 
 def _resolved(tree: Path, name: str, listed: Sequence[str], found: Sources) -> Iterator[tuple[str, Path]]:
-    """The files that an entry stands for: itself, or what a link inside the tree leads to."""
+    """Yield the files of an entry: the file itself, or the targets of a link inside the tree."""
     path = tree / name
     if not path.is_symlink():
-        if path.is_file():  # not deleted meanwhile, no pipe and no socket
+        if path.is_file():  # skips deleted files, pipes and sockets
             yield name, path
         return
     target = path.resolve()
     if not target.is_relative_to(tree):
-        found.left_out.append(f"{path}: a link that leads out of {tree}")
+        found.excluded.append(f"{path}: a link that leads out of {tree}")
     elif target.is_file():
         yield name, target
     elif target.is_dir():
@@ -268,15 +268,15 @@ _SMALL = 1 << 20  # bytes
 @clear_constructor
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SnapshotOptions:
-    """What a snapshot takes in.
+    """Options of a snapshot.
 
     Args:
-        code: whether it has code at all; without, a replay runs what is current.
-        roots: files and folders besides what is found.
-        limit_mb: how large it may be, in MB.
+        code: Whether the snapshot contains code; without code, a replay runs the current code.
+        roots: Files and folders to include in addition to those found.
+        limit_mb: Largest size of the snapshot, in MB.
 
     Raises:
-        UsageError: the limit is none.
+        UsageError: The limit is not above 0.
     """
 
     code: bool = True
@@ -284,15 +284,15 @@ class SnapshotOptions:
     limit_mb: float = 500.0
 
     def __post_init__(self) -> None:
-        if not self.limit_mb > 0:  # nor what is not a number
+        if not self.limit_mb > 0:  # also refuses NaN
             raise UsageError(f"--snapshot-limit is {self.limit_mb:g}", fix="give MB above 0, or --no-snapshot")
 
     @classmethod
     def of(cls, choices: SnapshotChoices) -> SnapshotOptions:
-        """Return what the options of a hunt say.
+        """Return the options that a hunt's settings contain.
 
         Raises:
-            UsageError: the limit is none.
+            UsageError: The limit is not above 0.
         """
         limit_mb = choices.snapshot_limit_mb
         return cls(code=choices.snapshot_code, roots=tuple(map(Path, choices.snapshot_roots)), limit_mb=limit_mb)
@@ -301,18 +301,18 @@ class SnapshotOptions:
 def take_snapshot(
     snapshots: Path, scenario: Scenario, settings: HuntSettings, options: SnapshotOptions | None = None
 ) -> Snapshot:
-    """Store the scenario, the agents' own projects, what their arguments name, and crashhunt itself.
+    """Store the scenario, the agents' own projects, the files that their arguments name, and crashhunt itself.
 
-    The very same content is stored once.
+    Equal content is stored only once.
 
     Args:
-        snapshots: the folder of all snapshots of a hunt.
-        scenario: with its agents.
-        settings: of the hunt.
-        options: what to take in.
+        snapshots: The folder of all snapshots of a hunt.
+        scenario: The scenario with its agents.
+        settings: The settings of the hunt.
+        options: The options of the snapshot.
 
     Raises:
-        SnapshotError: it is too large, or cannot be read or written.
+        SnapshotError: The snapshot is too large, or a file cannot be read or written.
     """
     options = options or SnapshotOptions()
     found = Sources(paths=[])
@@ -344,7 +344,7 @@ def _build(
     scenario: Scenario,
     settings: HuntSettings,
 ) -> Snapshot:
-    """Copy everything into a folder, and give that the name of its digest; nothing where it is there already."""
+    """Copy all files into a folder and rename the folder to its digest, unless that snapshot exists already."""
     building.mkdir()
     for folder in {name.rpartition("/")[0] for name in files}:
         (building / folder).mkdir(parents=True, exist_ok=True)
@@ -355,10 +355,10 @@ def _build(
         "schema": SCHEMA,
         "paths": found.paths,
         "argument_files": argument_files,
-        "left_out": found.left_out,
+        "left_out": found.excluded,
         "files": stored,
     }
-    digest = digest_of_described(stored, says=[found.paths, argument_files])
+    digest = digest_of_described(stored, plain_data=[found.paths, argument_files])
     final = building.with_name(digest)
     # The digest is too short to prove that two snapshots are the same, so use only a snapshot of this user.
     if final.exists() and not _is_damaged(Snapshot(final)) and Snapshot(final).is_made_here:
@@ -375,7 +375,7 @@ def _build(
     manifest["integrity"] = digest_of_data(manifest)
     (building / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
     sync_tree(building)
-    put_in_place(building, final)  # what is there already is the same, but for damage and the user who took it
+    put_in_place(building, final)  # an existing snapshot is equal, damaged, or taken by another user
     sync_folder(final.parent)
     return Snapshot(final)
 
@@ -388,7 +388,7 @@ def _is_damaged(snapshot: Snapshot) -> bool:
 
 
 def _argument_files(settings: HuntSettings) -> dict[str, str]:
-    """The files that arguments of agents name, such as the weights of a policy, and their place in the snapshot."""
+    """Return the files that arguments of agents name, such as the weights of a policy, and their places."""
     found: dict[str, str] = {}
     for agent in settings.agents.values():
         for spec in agent.arguments.values():
@@ -424,7 +424,7 @@ def _size(path: Path) -> int:
 
 
 def _store(path: Path, copy: Path) -> FileEntry | None:
-    """Copy a file, and whether it can be run; None where it has been deleted since it was listed."""
+    """Copy a file with its permissions; return None if the file has been deleted meanwhile."""
     try:
         with open(path, "rb", buffering=0) as file:
             status = os.fstat(file.fileno())
@@ -434,8 +434,8 @@ def _store(path: Path, copy: Path) -> FileEntry | None:
             return {"size": copy.stat().st_size, "blake2b": digest_of_file(copy)}
     except FileNotFoundError:
         return None
-    # There are hundreds of modules: to copy each and to read it again would take most of a hunt's start.
-    with open(copy, "wb") as file:  # and a Path takes twice as long
+    # A hunt copies hundreds of modules, so write the content that was read, without shutil and Path.
+    with open(copy, "wb") as file:
         file.write(content)
         os.fchmod(file.fileno(), stat.S_IMODE(status.st_mode))
     return {"size": len(content), "blake2b": digest_of_content(content)}
@@ -467,7 +467,7 @@ def _store_scenario(scenario: Scenario, building: Path) -> dict[str, FileEntry |
 
 
 def _describe_trees(trees: Sequence[Path], diff: Path) -> dict[str, str]:
-    """Write the uncommitted changes of work trees down; return their revisions."""
+    """Write the uncommitted changes of work trees into a file; return the revisions of the work trees."""
     revisions = {}
     for tree in trees:
         revision = git(tree, "rev-parse", "HEAD")

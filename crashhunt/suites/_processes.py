@@ -1,4 +1,4 @@
-"""Hunts that run in processes of their own, several at a time; whatever becomes of one, the others go on."""
+"""Hunts in processes of their own, several at a time: a failure of one does not affect the others."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class RunRequest:
     snapshot: SnapshotChoices = field(default_factory=SnapshotChoices)
 
     def to_json(self) -> dict[str, object]:
-        """Return plain data: what the snapshot takes in stands beside the request."""
+        """Return plain data: the request, and the options of the snapshot."""
         return {"request": asdict(self.request), "folder": self.folder, **asdict(self.snapshot)}
 
     def to_plain(self) -> object:
@@ -105,7 +105,7 @@ class RunRequest:
             snapshot = {name: data[name] for name in fields_of(SnapshotChoices) if name in data}
             return cls(Request(**{**given, "run": run}), data["folder"], SnapshotChoices(**snapshot))
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise HuntDirectoryError(f"no {REQUEST}: {error}", fix="plan the suite anew", where=str(file)) from None
+            raise HuntDirectoryError(f"no {REQUEST}: {error}", fix="plan the suite again", where=str(file)) from None
 
 
 def write_request(folder: Path, request: RunRequest) -> None:
@@ -145,7 +145,7 @@ def run_all(
     watch: Callable[[], None] | None = None,
     machine: Given | None = None,
 ) -> None:
-    """Run hunts, each in a process of its own, until the last has ended or somebody interrupts.
+    """Run hunts, each in a process of its own, until the last has ended or an interrupt arrives.
 
     Args:
         folders: of the runs, each with its ``request.json``.
@@ -197,9 +197,9 @@ def run_all(
 
 
 def set_aside(folder: Path, planned: Callable[[Path], RunRequest]) -> Path:
-    """Move what a run has left out of the way, beside it, so that it can run anew; return where it is now.
+    """Move the results of a run to a folder next to it, so that it can run again; return that folder.
 
-    A process that is killed meanwhile leaves the folder either as it was, or planned anew.
+    A process that is killed meanwhile leaves the folder either unchanged, or planned again.
 
     Args:
         folder: of the run.
@@ -275,7 +275,7 @@ def _main(folder: Path, run: Given, parent: int) -> None:
                 break
             except BusyError as error:
                 if time.monotonic() > deadline:
-                    print(f"crashhunt: {error}", file=sys.stderr)  # whoever runs there writes down what comes of it
+                    print(f"crashhunt: {error}", file=sys.stderr)  # the process that runs there records its result
                     return
                 time.sleep(0.5)
         print(describe_hunt(report), flush=True)

@@ -52,12 +52,12 @@ def rerun(
 ) -> tuple[list[HuntState], list[Path]]:
     """Run hunts again; return where they stand now, and where what they replace is kept.
 
-    A hunt that ended in an error runs anew; one that was interrupted or killed goes on, and so does one of which
-    trials could not be set up, with those again. What has finished stays as it is.
+    A hunt that ended in an error runs again. A hunt that was interrupted or killed resumes. A hunt with trials that
+    could not be set up resumes with these trials. Finished hunts stay unchanged.
 
     Args:
         hunts: their directories.
-        everything: run all of them anew, whatever became of them.
+        everything: run all of them again, including finished ones.
         changes: ``NAME`` or ``AGENT.NAME`` of an argument, ``trials``, ``max_steps`` or ``seed`` to what it shall be.
         to: run one hunt in this directory instead, and leave its own as it is.
         parallel: trials at a time, of all hunts together; 0 for one per core.
@@ -79,7 +79,7 @@ def rerun(
     if changes and not everything:
         raise UsageError(
             f"--set {next(iter(changes))}: other settings make another hunt",
-            fix="give --to DIR, or --all to begin anew",
+            fix="give --to DIR, or --all to begin again",
         )
     busy = [hunt for hunt in hunts if hunt_state(hunt).state == "running"]
     if busy:
@@ -206,7 +206,7 @@ def _replace_invalid(hunt: Path, state: HuntState) -> int:
         return 0
     with closing(Ledger(hunt / layout.LEDGER, writable=True)) as ledger:
         # With --only-at-fault, crashes of others' and their kinds are not what it was after.
-        if ledger.facts().get("state") in ("crash", "distinct") or (done and not run.only_at_fault):
+        if ledger.facts().get("state") in ("crash", "distinct", "rate") or (done and not run.only_at_fault):
             return 0
         return ledger.replace([result.spec.number for result in ledger.results(outcomes=(str(Outcome.INVALID),))])
 

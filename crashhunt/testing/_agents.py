@@ -71,7 +71,7 @@ class AgentContract:
     def test_panels_are_pictures_and_change_nothing(
         self, make: Make, form: ActionForm, observations: list[NDArray[np.generic]]
     ) -> None:
-        """`DrawsPanels`: it acts as it does when nobody looks, and what it shows can be drawn and told apart."""
+        """`DrawsPanels`: panels do not change its actions, and they can be drawn and distinguished."""
 
         def drive(*, looked_at: bool) -> list[bytes]:
             agent = make()
@@ -91,7 +91,7 @@ class AgentContract:
     def test_it_can_be_closed_whenever_a_trial_may_end(
         self, make: Make, observations: list[NDArray[np.generic]]
     ) -> None:
-        """`Closes`: before its reset, after it, and after it has acted; and another one drives all the same."""
+        """`Closes`: before its reset, after it, and after it has acted; and a new agent drives afterwards."""
         for ends_after in (-1, 0, 1):
             agent = make()
             if ends_after >= 0:

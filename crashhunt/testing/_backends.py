@@ -95,7 +95,7 @@ class BackendContract:
         return load_scenario(copy)
 
     def test_its_files_are_all_that_an_episode_reads(self, name: str, scenario: Path, tmp_path: Path) -> None:
-        """They lie in the folder, and whoever has them and the scenario.toml has the scenario."""
+        """They lie in the folder; with scenario.toml they are the complete scenario."""
         loaded = load_scenario(scenario)
         files = list(loaded.files())
         assert len(files) == len(set(files))
@@ -138,7 +138,7 @@ class BackendContract:
         assert kept.tables == loaded.tables
         assert scenario_digest(kept) == scenario_digest(loaded)
 
-    def test_what_it_says_of_the_simulator_can_be_used(self, name: str, scenario: Path) -> None:
+    def test_what_it_states_of_the_simulator_can_be_used(self, name: str, scenario: Path) -> None:
         """Versions are of what is installed, times are times, words are words."""
         backend, loaded = self._backend(name), load_scenario(scenario)
         assert backend.title
@@ -146,7 +146,7 @@ class BackendContract:
             # As it spells itself: so it is written down, and looked up in what was.
             assert metadata.metadata(distribution)["Name"] == distribution
         assert 0 < backend.step_length_s(loaded) < float("inf")
-        assert set(backend.told_events or ()) <= EVENT_WORDS.keys()
+        assert set(backend.reported_events or ()) <= EVENT_WORDS.keys()
         assert all(note and "\n" not in note for note in backend.notes(loaded))
         assert all(module and ":" not in module for module in loaded.modules())
         assert all(ending.startswith(".") for found in backend.configurations for ending in found.endings)
@@ -163,7 +163,7 @@ class BackendContract:
             assert accelerator.note(plain) == ""
 
     def test_it_answers_for_strangers_or_not_at_all(self, name: str, scenario: Path) -> None:
-        """What a stranger's scenario would do besides simulating is told in one line."""
+        """What a stranger's scenario would do besides simulating is reported in one line."""
         backend = self._backend(name)
         loaded, settings = plan(Request(trials=1, max_steps=1, scenario=scenario, seed=1))
         values = {argument: setup.default for argument, setup in loaded.arguments.items() if setup.default is not None}

@@ -48,7 +48,7 @@ class DisturbanceContract:
         found = []
         for seed in (1, 2):
             random.seed(seed)
-            np.random.seed(seed)  # noqa: NPY002 - whoever draws from a global generator is found out
+            np.random.seed(seed)  # noqa: NPY002 - detects draws from a global generator
             found.append(_draws(model, seed=3))
         assert found[0] == found[1] == _draws(make(), seed=3)
 

@@ -89,7 +89,7 @@ def check_escape(bundle: Bundle) -> EscapeCheck:
     avoided, later = (
         None if step is None else _avoids(rerun, step, _AFTERWARDS_S) for step in (said.step, said.too_late)
     )
-    return EscapeCheck(bundle.id, said.step, said.too_late, avoided, later)
+    return EscapeCheck(crash=bundle.id, step=said.step, too_late=said.too_late, avoided=avoided, avoided_later=later)
 
 
 def _avoids(rerun: Rerun, after: int, afterwards_s: float) -> bool:

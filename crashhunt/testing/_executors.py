@@ -56,7 +56,9 @@ class ExecutorContract:
         made.close()
 
     def _spec(self, number: int, **arguments: Value) -> TrialSpec:
-        return TrialSpec(number, number, {"ego": {"speed": 5.0}}, arguments, max_steps=30)
+        return TrialSpec(
+            number=number, seed=number, arguments={"ego": {"speed": 5.0}}, scenario_arguments=arguments, max_steps=30
+        )
 
     def _collect(self, executor: Executor, count: int) -> dict[int, TrialResult]:
         found: dict[int, TrialResult] = {}
@@ -69,7 +71,7 @@ class ExecutorContract:
         return found
 
     def _see_nodes(self, executor: Executor, place: HasNodes, ended: int) -> None:
-        """What people are told of nodes adds up, within some seconds."""
+        """The figures of nodes add up, within some seconds."""
         deadline = time.monotonic() + 30
         while sum(node.trials for node in place.nodes()) != ended:
             assert time.monotonic() < deadline, f"{ended} trials have ended, and the nodes are {place.nodes()}"
@@ -116,8 +118,8 @@ class ExecutorContract:
         executor.submit(self._spec(9))
         assert set(self._collect(executor, 1)) == {9}
 
-    def test_it_says_how_much_it_runs_and_where_that_is(self, executor: Executor) -> None:
-        """A trial that runs is somewhere, or nobody knows where; nothing that has not been submitted is anywhere."""
+    def test_it_states_how_much_it_runs_and_where_that_is(self, executor: Executor) -> None:
+        """A trial that runs is somewhere, or its place is unknown; nothing that has not been submitted is anywhere."""
         assert executor.capacity == 2
         assert dict(executor.where()) == {}
         executor.submit(self._spec(3, hang_at_step=5))
@@ -130,12 +132,12 @@ class ExecutorContract:
         executor.cancel()
         assert dict(executor.where()) == {}
 
-    def test_what_is_told_is_told_once(self, executor: Executor) -> None:
+    def test_what_is_reported_is_reported_once(self, executor: Executor) -> None:
         """Notes are lines for people."""
         executor.submit(self._spec(0))
         self._collect(executor, 1)
-        told = executor.notes()
-        assert all(isinstance(note, str) and note.strip() and "\n" not in note for note in told)
+        notes = executor.notes()
+        assert all(isinstance(note, str) and note.strip() and "\n" not in note for note in notes)
         assert executor.notes() == []
 
     def test_what_is_kept_has_its_black_box_here(self, executor: Executor, tmp_path: Path) -> None:

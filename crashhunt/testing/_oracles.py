@@ -32,7 +32,7 @@ class OracleContract:
         """Return what makes an oracle."""
         raise NotImplementedError("give the suite a fixture named make")
 
-    def test_it_has_a_name_and_says_which_outcomes_it_brings(self, make: Make) -> None:
+    def test_it_has_a_name_and_states_which_outcomes_it_brings(self, make: Make) -> None:
         """As names and categories that reports can print."""
         oracle = make()
         assert isinstance(oracle.name, str)
@@ -66,7 +66,7 @@ class OracleContract:
             assert (scene.data.tolist(), scene.contacts, scene.off_road, scene.events, scene.lanes) == before
 
     def test_it_bears_agents_that_are_not_there_and_empty_roads(self, make: Make) -> None:
-        """Somebody who has arrived is in no scene any more."""
+        """A vehicle that has arrived is in no scene any more."""
         oracle = make()
         _show_map(oracle, lanes=())
         assert oracle.check(Scene(0.0, Roster(()), [], [], []), _AGENTS) == []
@@ -80,7 +80,7 @@ def drive() -> Iterator[Scene]:
 
     ``ego`` drives into ``other``, passes ``near`` closely, runs a red light and leaves the road; ``second`` stands.
     """
-    actors = [Actor(name, "car", 4.5, 1.8) for name in ("ego", "second", "other", "near")]
+    actors = [Actor(id=name, kind="car", length=4.5, width=1.8) for name in ("ego", "second", "other", "near")]
     roster, previous = Roster(tuple(actors)), None
     for step in range(60):
         x = 1.5 * step
@@ -92,7 +92,18 @@ def drive() -> Iterator[Scene]:
             points,
             [0.0] * 4,
             [15.0, 0.0, 5.0, 0.0],
-            contacts=(Contact("ego", "other", "collision", "road_0", 15.0, 5.0),) if touching else (),
+            contacts=(
+                Contact(
+                    collider="ego",
+                    victim="other",
+                    kind="collision",
+                    lane="road_0",
+                    collider_speed=15.0,
+                    victim_speed=5.0,
+                ),
+            )
+            if touching
+            else (),
             off_road=("ego",) if step > 55 else (),
             lanes=("road_0", "road_0", "road_0", "road_1"),
             swept=step > 0,
@@ -106,7 +117,7 @@ def drive() -> Iterator[Scene]:
 
 def _watch(oracle: Oracle, seed: int = 0) -> Iterator[list[Finding]]:
     _show_map(oracle)
-    random.seed(seed)  # whoever draws from a global generator is found out by another seed
+    random.seed(seed)  # another seed detects draws from a global generator
     np.random.seed(seed)  # noqa: NPY002
     for scene in drive():
         yield oracle.check(scene, _AGENTS)

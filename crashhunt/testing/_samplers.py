@@ -42,7 +42,7 @@ class SamplerContract:
         raise NotImplementedError("give the suite a fixture named space")
 
     def test_every_proposal_is_complete_and_inside_the_space(self, make: Make, space: Space) -> None:
-        """A value for every key, and no other, as plain data; before it was told anything, and after."""
+        """A value for every key, and no other, as plain data; before it received results, and after."""
         asked: set[int] = set()
         for number, (_, proposal) in enumerate(_talk(make(space))):
             assert set(proposal.arguments) == set(space)
@@ -54,13 +54,13 @@ class SamplerContract:
             asked.add(number)
 
     def test_a_proposal_depends_on_number_and_generator_alone(self, make: Make, space: Space) -> None:
-        """Before it was told anything, the order of asking does not matter."""
+        """Before it received results, the order of asking does not matter."""
         forward, backward = make(space), make(space)
         asked = {number: _ask(forward, number) for number in range(20)}
         assert {number: _ask(backward, number) for number in reversed(range(20))} == asked
 
-    def test_one_that_is_made_anew_and_told_the_same_proposes_the_same(self, make: Make, space: Space) -> None:
-        """However a hunt ended, it goes on as if it had not; some results come out of order, as the rule allows."""
+    def test_one_that_is_made_again_and_reported_the_same_proposes_the_same(self, make: Make, space: Space) -> None:
+        """A resumed hunt continues as if it had not ended; some results are out of order, as the rule allows."""
         turns = _talk(make(space))
         for number in (0, 1, _LAG + 1, 9, 16, 23, _TRIALS - 1):
             again = make(space)
@@ -69,21 +69,21 @@ class SamplerContract:
                     again.tell(result)
             assert _ask(again, number) == turns[number][1], f"it was asked for trial {number}"
 
-    def test_one_that_does_not_learn_proposes_the_same_whatever_it_is_told(self, make: Make, space: Space) -> None:
-        """The hunt tells it nothing."""
+    def test_one_that_does_not_learn_proposes_the_same_whatever_it_is_reported(self, make: Make, space: Space) -> None:
+        """The hunt passes it no results."""
         sampler = make(space)
         if not sampler.learns:
             fresh = make(space)
             assert [proposal for _, proposal in _talk(sampler)] == [_ask(fresh, number) for number in range(_TRIALS)]
 
-    def test_it_says_whether_it_learns(self, make: Make, space: Space) -> None:
-        """The hunt asks before it tells."""
+    def test_it_states_whether_it_learns(self, make: Make, space: Space) -> None:
+        """The hunt checks this before it passes results."""
         sampler = make(space)
         assert isinstance(sampler.learns, bool)
         assert not isinstance(sampler, OnlyAsked) or isinstance(sampler.only_asked, bool)
 
     def test_trials_that_it_keeps_apart_are_plain_random_ones(self, make: Make, space: Space) -> None:
-        """At fixed numbers, whatever it was told: how often they crash says how often the agent does."""
+        """At fixed numbers, whatever results it received: their share of crashes is the crash rate of the agent."""
         sampler = make(space)
         if not isinstance(sampler, PlainStream):
             return
@@ -116,7 +116,7 @@ def _ask(sampler: Sampler, number: int) -> Proposal:
 
 
 def _talk(sampler: Sampler) -> list[tuple[list[TrialResult], Proposal]]:
-    """What a hunt tells and asks, trial by trial: some end late, and are told then."""
+    """Return the results and requests of a hunt, trial by trial; some trials end late."""
     turns: list[tuple[list[TrialResult], Proposal]] = []
     told: set[int] = set()
     for number in range(_TRIALS):
@@ -137,7 +137,15 @@ def _result(number: int, proposal: Proposal) -> TrialResult:
         arguments.setdefault(agent, {})[name] = value
     scenario = arguments.pop("", {})
     seed = number if proposal.seed is None else proposal.seed
-    spec = TrialSpec(number, seed, arguments, scenario, max_steps=50, parent=proposal.parent, origin=proposal.origin)
+    spec = TrialSpec(
+        number=number,
+        seed=seed,
+        arguments=arguments,
+        scenario_arguments=scenario,
+        max_steps=50,
+        parent=proposal.parent,
+        origin=proposal.origin,
+    )
     near = ClosestApproach(((7 * number) % 10) / 2, 1.0 + number, 3.0) if number % 4 else ClosestApproach()
     outcome = _OUTCOMES[number % len(_OUTCOMES)]
     danger = {Outcome.INVALID: None, Outcome.COLLISION: 1.0}.get(outcome, ((7 * number) % 10) / 10)

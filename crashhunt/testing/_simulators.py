@@ -139,7 +139,7 @@ class SimulatorContract:
         two.close()
 
     def test_what_is_handed_out_stays_as_it_is(self, make: Make) -> None:
-        """Neither observations nor scenes change when the episode goes on."""
+        """Neither observations nor scenes change when the episode continues."""
         simulator = make()
         observations, _ = simulator.reset(seed=1)
         scene = simulator.scene()
@@ -251,7 +251,7 @@ class SimulatorContract:
     def test_only_events_that_it_looks_for_happen(self, make: Make) -> None:
         """`TellsEvents`: its scenes have events of those kinds only, and none without it."""
         simulator = make()
-        kinds = tuple(simulator.told_events) if supports(simulator, TellsEvents) else ()
+        kinds = tuple(simulator.reported_events) if supports(simulator, TellsEvents) else ()
         assert {Outcome(kind).is_traffic_event for kind in kinds} <= {True}
         assert {event.kind for event in self._events(simulator)} <= set(kinds)
         simulator.close()
@@ -272,7 +272,9 @@ class SimulatorContract:
         erring = {}
         for number, kind in enumerate(simulator.disturbing_kinds):
             for cell in CELLS:
-                planned = Disturbance(number + 1, cell, kind, 0.5, 1.0, agents[0])
+                planned = Disturbance(
+                    step=number + 1, who=cell, what=kind, how_strong=0.5, how_long=1.0, agent=agents[0]
+                )
                 vehicle = simulator.resolve_target(planned)
                 assert vehicle == "" or vehicle in simulator.scene().roster.index
                 assert vehicle not in agents
@@ -284,7 +286,7 @@ class SimulatorContract:
                 if errs is not None:
                     assert np.isfinite(errs.how_strong)
                     errs.keep()
-        for errs in list(erring.values())[::2]:  # the others still go on at the end
+        for errs in list(erring.values())[::2]:  # the others continue to the end
             if errs is not None:
                 errs.end()
         assert self._drive(simulator, 1) == before

@@ -1,4 +1,4 @@
-"""A test of somebody's own suite that an agent does not crash, with a crash told so that it can be pasted."""
+"""An assertion for test suites that an agent does not crash; a crash is printed as a call that can be pasted."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Example(TypedDict, total=False):
         arguments: of the agents, by their ids.
         scenario_arguments: of the scenario.
         only: which of the others take part; all where it is missing.
-        disturbances: who errs, when and how, as `crash.json` has it; nobody where it is missing.
+        disturbances: as in `crash.json`; none where it is missing.
     """
 
     seed: int
@@ -113,9 +113,9 @@ def assert_survives(
 def _smaller(bundle: Bundle, budget: int, parallel: int) -> Bundle:
     if budget < 1:
         return bundle
-    try:  # the others go on driving: those that are moved as recorded cannot be written down in a line
+    try:  # the others drive: scripted actors cannot be written in a line
         return shrink(bundle, budget=budget, parallel=parallel, form="traffic").small or bundle
-    except CrashhuntError:  # it is told as it is
+    except CrashhuntError:  # report the crash as it is
         return bundle
 
 
@@ -123,7 +123,7 @@ def _asking(options: HuntOptions, example: Example) -> HuntOptions:
     """Return the options of a hunt that has just the values of an example: an agent may need some, or not know one.
 
     Raises:
-        UsageError: the example has another key, or arguments that are nobody's.
+        UsageError: the example has another key, or unknown arguments.
     """
     known = Example.__annotations__
     for key in example:
@@ -152,11 +152,11 @@ def _run_one(options: HuntOptions, example: Example, max_steps: int) -> TrialRes
     scenario, settings = plan(request_of(options, trials=1, max_steps=max_steps).checked())
     only = example.get("only")
     spec = TrialSpec(
-        0,
-        example.get("seed", 0),
-        example.get("arguments", {}),
-        example.get("scenario_arguments", {}),
-        max_steps,
+        number=0,
+        seed=example.get("seed", 0),
+        arguments=example.get("arguments", {}),
+        scenario_arguments=example.get("scenario_arguments", {}),
+        max_steps=max_steps,
         only=None if only is None else tuple(only),
         disturbances=tuple(map(Disturbance.from_json, example.get("disturbances", ()))),
     )

@@ -9,6 +9,7 @@ from ._disturbance import (
     KINDS as KINDS,
     OF_AGENT as OF_AGENT,
     Disturbance as Disturbance,
+    Manoeuvre as Manoeuvre,
     in_turn as in_turn,
     steps_of as steps_of,
     why_not as why_not,

@@ -1,6 +1,6 @@
-"""Checks of a trial's plain data, as it crosses between processes and stands in ledgers and bundles.
+"""Checks the plain data of trials, which processes exchange and which ledgers and bundles contain.
 
-What an earlier version did not write need not be there, and what a later one has added may be there as well.
+Keys that an earlier version did not write may be missing. Keys that a later version has added are accepted.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["check_disturbances", "check_parts", "check_plain"]
 
 
-# The types that the plain data of a trial must have before anything is made of it.
+# The types of the plain data of a trial, which are checked before objects are built.
 
 _TEXT_OR_NUMBER = bool | float | str | None
 
@@ -35,10 +35,10 @@ _SPEC = {
 
 
 def check_plain(data: JsonObject) -> None:
-    """See that plain data has the types that `TrialResult.from_json` takes for granted.
+    """Check that plain data has the types that `TrialResult.from_json` needs.
 
     Raises:
-        ValueError: with what is not as it should be.
+        ValueError: A value has a wrong type or range; the message says which.
     """
     typed(data, {"outcome": str, "steps": int, "spec": dict})
     typed_where_there(data, {"sim_time_s": float, "digest": str, "wall_s": float})
@@ -49,7 +49,9 @@ def check_plain(data: JsonObject) -> None:
     typed(data.get("events") or {}, dict.fromkeys(data.get("events") or (), int))
     for planned in (data.get("disturbances"), spec.get("disturbances")):
         check_disturbances(planned)
-    typed_where_there(data, dict.fromkeys(("log_likelihood", "danger"), float | None))
+    typed_where_there(
+        data, dict.fromkeys(("log_likelihood", "danger", "driven_m", "driven_s", "step_length_s"), float | None)
+    )
     typed_where_there(data, {"setup_steps": int | None})
     parts = (data.get("collision"), data.get("failure"), data.get("escape"), data.get("event"))
     check_parts(data.get("closest", {}), *parts)
@@ -58,10 +60,10 @@ def check_plain(data: JsonObject) -> None:
 
 
 def check_disturbances(disturbances: Sequence[JsonObject] | None) -> None:
-    """See the same of a list of disturbances, where there is one.
+    """Check the types and ranges of a list of disturbances; None is valid.
 
     Raises:
-        ValueError: with what is not as it should be.
+        ValueError: A value has a wrong type or range; the message says which.
     """
     typed({"disturbances": disturbances}, {"disturbances": list | None})
     for one in disturbances or ():
@@ -74,10 +76,10 @@ def check_disturbances(disturbances: Sequence[JsonObject] | None) -> None:
 def check_parts(
     closest: object, collision: object, failure: object, escape: object = None, event: object = None
 ) -> None:
-    """See the same of what a trial ended with, where anything is there.
+    """Check the types of the evidence with which a trial ended; None is valid.
 
     Raises:
-        ValueError: with what is not as it should be.
+        ValueError: A value has a wrong type; the message says which.
     """
     for name, part, kind in (
         ("closest", closest, ClosestApproach), ("collision", collision, Collision), ("failure", failure, Failure),

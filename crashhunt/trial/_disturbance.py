@@ -1,20 +1,22 @@
-"""A disturbance: somebody around the agent errs, or what the agent sees or does comes late."""
+"""Disturbances: an actor near the agent misbehaves, or the agent's observations or actions are late or wrong."""
 
 from __future__ import annotations
 
 import math
 import sys
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.codec import OMIT_DEFAULT, Serializable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-__all__ = ["CELLS", "HELD", "KINDS", "OF_AGENT", "Disturbance", "Kind", "in_turn", "steps_of", "why_not"]
+__all__ = [
+    "CELLS", "HELD", "KINDS", "OF_AGENT", "Disturbance", "Kind", "Manoeuvre", "in_turn", "steps_of", "why_not",
+]  # fmt: skip
 
-_DIGITS = 9  # of so many s: three steps of 0.1 s are 0.3 s
+_DIGITS = 9  # decimal places of a duration in s, so that three steps of 0.1 s are 0.3 s
 
 _PLACES = {
     "left ahead": "ahead of {} to the left",
@@ -28,20 +30,20 @@ _PLACES = {
     "right behind": "behind {} to the right",
 }
 CELLS = tuple(_PLACES)
-"""The grid around an agent, as it drives: three lanes, and itself in the middle."""
+"""The places in the grid around a driving agent: three lanes, with the agent itself in the middle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What crashhunt knows of a kind of disturbance.
+    """Properties of a type of disturbance.
 
     Args:
-        unit: of `Disturbance.how_strong`; empty for a share.
-        words: what happens, a sentence; ``share`` stands for the strength in per cent. What is behind a ``|`` is only
-            said where there is any strength.
-        of_agent: whether it is the agent's own eyes or hands that err: then every simulator can do it.
-        most: the strongest that means anything, such as the whole of a speed.
-        less_is_worse: whether a lower number is the stronger disturbance.
+        unit: The unit of `Disturbance.how_strong`; empty for a share.
+        words: A sentence that describes the disturbance. ``share`` is the strength in per cent. The part after ``|`` is
+            used only if the strength is above 0.
+        of_agent: Whether it affects the agent's own observations or actions, so that every simulator supports it.
+        most: The largest meaningful strength, such as 1 for a share of a speed.
+        less_is_worse: Whether a smaller number is a stronger disturbance.
     """
 
     unit: str
@@ -67,43 +69,46 @@ KINDS: Mapping[str, Kind] = {
     "unseen": Kind("", "{agent} does not see {vehicle} for {long:g} s"),
     "late_action": Kind("s", "what {agent} does takes effect {strong:g} s late for {long:g} s", of_agent=True),
 }  # fmt: skip
-"""The kinds that come with crashhunt, by name; a simulator of somebody's own may know more."""
+"""The types of disturbances that crashhunt has, by name; other simulators may add types."""
 
 HELD: Mapping[str, Kind] = {
     "keep_speed": Kind("", "{vehicle} is held to its speed for {long:g} s"),
     "keep_lane": Kind("", "{vehicle} is held in its lane for {long:g} s"),
     "gone": Kind("", "{vehicle} is taken off the road"),
 }
-"""What another vehicle is kept from, to see what hangs on it: no hunt draws these, and the vehicle is named."""
+"""The holds of other vehicles for counterfactual runs: hunts never draw them, and each names its vehicle."""
+
+Manoeuvre = Literal["brake", "left", "right", "keep_lane", "keep_speed"]
+"""What an agent can be overruled with: it brakes, changes lanes to a side and brakes, or keeps its lane or speed."""
 
 OF_AGENT = frozenset(name for name, kind in KINDS.items() if kind.of_agent)
-"""Those of them that need nothing of the simulator."""
+"""The types that affect the agent itself and need no support by the simulator."""
 
 
 def steps_of(seconds: float, step_length_s: float) -> int:
-    """Return in how many steps something of so many s goes on: in one at least."""
+    """Return the number of steps in a duration, at least 1."""
     return max(1, round(min(seconds / step_length_s, sys.maxsize)))
 
 
 def _in_steps(seconds: float, step_length_s: float) -> float:
-    """How long something of so many s is, in whole steps; nothing at all is none."""
+    """Return a duration in s, rounded to whole steps, but at least one step; 0 stays 0."""
     found = steps_of(seconds, step_length_s) * step_length_s if seconds > 0 else 0.0
     return seconds if math.isclose(found, seconds) else round(found, _DIGITS)
 
 
 @dataclass(frozen=True, slots=True)
 class Disturbance(Serializable):
-    """One disturbance: planned, as part of a trial's specification, or as it took place.
+    """A disturbance: planned, as part of a trial's specification, or as it took place.
 
     Args:
-        step: in which it begins, from 1.
-        who: the place in the grid around the agent, one of `CELLS`, in which the vehicle is when it begins.
-        what: the kind; of those that come with crashhunt, one of `KINDS` or `HELD`.
-        how_strong: in the unit of its kind: m/s² of a braking, s of a delay, a share of a speed or of what is seen.
-        how_long: in s of simulation time.
-        agent: around which of the controlled vehicles.
-        vehicle: who turned out to be meant; empty of what is planned, and where nobody was there. Of what a vehicle
-            is kept from (`HELD`), who is meant, from the beginning.
+        step: The step in which the disturbance begins, from 1.
+        who: The place of the vehicle in the grid around the agent when the disturbance begins, one of `CELLS`.
+        what: The type: one of `KINDS` or `HELD`, or a type that another simulator adds.
+        how_strong: The strength in the unit of the type: m/s² of braking, s of delay, a share of a speed or of a value.
+        how_long: The duration in s of simulation time.
+        agent: The controlled vehicle around which the grid lies.
+        vehicle: The vehicle that was at the place. It is empty if the disturbance is planned, or if no vehicle was at
+            the place. A hold (`HELD`) names its vehicle from the beginning.
     """
 
     step: int
@@ -115,12 +120,12 @@ class Disturbance(Serializable):
     vehicle: str = field(default="", metadata=OMIT_DEFAULT)
 
     def took_place(self, vehicle: str, how_strong: float, step_length_s: float = 0.0) -> Disturbance:
-        """Return it as it took place: in whole steps, so that with steps of 1 s nothing is 0.2 s late.
+        """Return the disturbance as it took place, with durations and delays in whole steps.
 
         Args:
-            vehicle: who was there.
-            how_strong: what that vehicle can do of it.
-            step_length_s: of the simulation; 0 where nobody knows.
+            vehicle: The vehicle that was at the place.
+            how_strong: The strength that this vehicle can reach.
+            step_length_s: Step length of the simulation, in s; 0 if it is unknown.
         """
         if not step_length_s:
             return replace(self, vehicle=vehicle, how_strong=how_strong)
@@ -130,9 +135,9 @@ class Disturbance(Serializable):
 
     @property
     def words(self) -> str:
-        """What happens, for people; such as ``main.35 brakes with 4 m/s² for 2 s``."""
+        """A sentence that describes the disturbance, such as ``main.35 brakes with 4 m/s² for 2 s``."""
         agent = self.agent or "the agent"
-        vehicle = self.vehicle or (agent if self.who == "itself" else f"whoever is {self.place}")
+        vehicle = self.vehicle or (agent if self.who == "itself" else f"the actor {self.place}")
         kind = KINDS.get(self.what) or HELD.get(self.what)
         if kind is None:
             return f"{vehicle}: {self.what} {self.how_strong:g} for {self.how_long:g} s"
@@ -143,27 +148,27 @@ class Disturbance(Serializable):
 
     @property
     def place(self) -> str:
-        """Where it is, for people; such as ``ahead of ego to the left``."""
+        """A phrase for the place, such as ``ahead of ego to the left``."""
         agent = self.agent or "the agent"
-        # A later version may know more places.
+        # A later version may add places.
         return _PLACES[self.who].format(agent) if self.who in _PLACES else f"{self.who} of {agent}"
 
-    def goes_on(self, step: int, step_length_s: float) -> bool:
-        """Whether it goes on in a step, of a simulation with such steps."""
+    def is_active(self, step: int, step_length_s: float) -> bool:
+        """Whether the disturbance is active in a step."""
         return self.step <= step < self.step + steps_of(self.how_long, step_length_s)
 
 
 def why_not(one: Disturbance) -> tuple[str, str] | None:
-    """Return why nobody can mean such a disturbance, and the fix; None where somebody can.
+    """Return why a disturbance is invalid, and the fix; None if it is valid.
 
     Args:
-        one: planned, of whatever kind; the step is not looked at.
+        one: A planned disturbance of any type; its step is not checked.
     """
     kind = KINDS.get(one.what)
     if not 0 <= one.how_strong < math.inf:
-        return f"{one.how_strong:g} is no strength", "give a number from 0 on"
+        return f"the strength is {one.how_strong:g}", "give a number of at least 0"
     if not 0 < one.how_long < math.inf:
-        return f"{one.how_long:g} is no length", "give seconds above 0"
+        return f"the duration is {one.how_long:g}", "give seconds above 0"
     if kind is None:
         return None
     if one.how_strong > kind.most:
@@ -175,5 +180,5 @@ def why_not(one: Disturbance) -> tuple[str, str] | None:
 
 
 def in_turn(disturbances: Iterable[Disturbance]) -> tuple[Disturbance, ...]:
-    """Return disturbances in the order that a specification has them in."""
+    """Return disturbances in the order that a specification needs."""
     return tuple(sorted(disturbances, key=lambda one: (one.step, one.agent, one.what)))

@@ -1,4 +1,4 @@
-"""What a crash leaves behind: who hit whom, what a program did wrong, and when braking would still have helped."""
+"""The evidence of a crash: the collision, the software fault, and the last step at which braking avoids it."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ KILLED: Final = "killed from outside"
 
 @dataclass(frozen=True, slots=True)
 class Collision(Serializable):
-    """Who hit whom, or who left the road.
+    """A collision, or a departure from the road.
 
     Args:
-        agent: the controlled vehicle that it happened to.
-        role: its part: ``collider`` (it drove into the other), ``victim``, or ``alone``.
-        collider: the actor that drove into the other.
-        victim: the actor that was hit; empty where there was none.
-        seen_by: the oracles that saw it, in order of their names. Where one of the simulator's own
-            report and the overlap of outlines is missing, the two disagree.
-        kind: the simulator's word for it, such as ``collision`` or ``junction``.
-        x: of the controlled vehicle's front bumper, in m.
-        y: likewise.
-        lane: where the controlled vehicle was.
-        collider_speed: at the first contact, in m/s.
-        victim_speed: likewise.
-        time_s: simulation time of the first contact, which lies within the step; NaN where nobody knows.
+        agent: The controlled vehicle of the collision.
+        role: The agent's role: ``collider`` (it drove into the other actor), ``victim``, or ``alone``.
+        collider: The actor that drove into the other actor.
+        victim: The actor that was hit; empty if there was none.
+        seen_by: The oracles that detected the collision, sorted by name. If the simulator's report or the overlap of
+            outlines is missing, these two disagree.
+        kind: The simulator's type of the collision, such as ``collision`` or ``junction``.
+        x: Position of the controlled vehicle's front bumper, in m.
+        y: Position of the controlled vehicle's front bumper, in m.
+        lane: The lane of the controlled vehicle.
+        collider_speed: Speed of the collider at the first contact, in m/s.
+        victim_speed: Speed of the victim at the first contact, in m/s.
+        time_s: Simulation time of the first contact, which lies within the step, in s; NaN if it is unknown.
     """
 
     agent: str
@@ -50,7 +50,7 @@ class Collision(Serializable):
 
     @property
     def other(self) -> str:
-        """The other party; empty where the agent was alone."""
+        """The collision partner of the agent; empty if the agent was alone."""
         if self.role == "alone":
             return ""
         return self.victim if self.role == "collider" else self.collider
@@ -58,13 +58,13 @@ class Collision(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Escape(Serializable):
-    """Until when the agent's brakes would have avoided a collision, found out by running the trial again.
+    """The last step at which full braking avoids a collision, found by counterfactual runs.
 
     Args:
-        step: braking as hard as it can after this step avoids the collision; None where no such step was found.
-        too_late: after this step it does not; it is the next one, unless there is no such step.
-        braking: the greatest deceleration of those runs, in m/s²; None where it never slowed down.
-        how: how it brakes, in words; one of `FullBraking`.
+        step: Full braking after this step avoids the collision; None if no such step was found.
+        too_late: Full braking after this step does not avoid the collision; the next step, if ``step`` exists.
+        braking: The greatest deceleration of these runs, in m/s²; None if the vehicle never slowed down.
+        how: A description of the braking, as in `FullBraking`.
     """
 
     step: int | None = None
@@ -75,15 +75,15 @@ class Escape(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Failure(Serializable):
-    """What a program did wrong.
+    """The evidence of a software fault.
 
     Args:
-        kind: the exception's type, ``exit code``, ``signal``, ``timeout`` or ``killed from outside``.
-        message: in one line.
-        traceback: of the exception, or the stack of the stuck thread.
-        agent: the agent in whose code it happened; empty where it was not an agent's.
-        exit_code: of a process that died; negative for a signal, as in `subprocess`.
-        last_output: what the process printed last.
+        kind: The exception's type, ``exit code``, ``signal``, ``timeout`` or ``killed from outside``.
+        message: The message in one line.
+        traceback: The traceback of the exception, or the stack of the stuck thread.
+        agent: The agent whose code failed; empty if it was no agent's code.
+        exit_code: The exit code of a process that died; negative for a signal, as in `subprocess`.
+        last_output: The last output of the process.
     """
 
     kind: str = ""
@@ -94,6 +94,6 @@ class Failure(Serializable):
     last_output: str = ""
 
     def __post_init__(self) -> None:
-        # It goes into JSON, a log and onto terminals, and what an exception says may be no valid text.
+        # The texts are written to JSON, logs and terminals, but an exception's message may contain invalid characters.
         for name in ("kind", "message", "traceback", "last_output"):
             object.__setattr__(self, name, encodable(getattr(self, name)))

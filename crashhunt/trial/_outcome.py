@@ -1,4 +1,4 @@
-"""How a trial can end, and which of the ends count as a crash."""
+"""The outcomes of a trial, and the outcomes that count as a crash."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["CRASHES", "EVENTS", "Category", "Outcome", "in_order", "outcome_of"]
 
 Category = Literal["traffic crash", "traffic event", "software fault", "no crash"]
-"""What a report calls an outcome."""
+"""The category of an outcome in reports."""
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 
@@ -22,7 +22,7 @@ _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 class Outcome(StrEnum):
     """How a trial ended.
 
-    Oracles may bring outcomes of their own (`Outcome.own`). Iterating over the class gives those that every hunt has.
+    Oracles may add outcomes (`Outcome.own`). Iterating over the class yields only the outcomes that every hunt has.
     """
 
     SURVIVED = "survived"
@@ -44,14 +44,14 @@ class Outcome(StrEnum):
 
     @classmethod
     def own(cls, name: str, category: Category) -> Self:
-        """Return an outcome that an oracle brings, or one that every hunt has.
+        """Return the outcome that an oracle adds, or the existing outcome of that name.
 
         Args:
-            name: lower-case letters, digits and underscores, such as ``too_close``.
-            category: what reports call it, ``traffic crash`` or ``traffic event``.
+            name: Lower-case letters, digits and underscores, such as ``too_close``.
+            category: The category in reports, ``traffic crash`` or ``traffic event``.
 
         Raises:
-            ValueError: the name is not valid, or stands for an outcome of another category.
+            ValueError: The name is invalid, or the outcome of that name has another category.
         """
         if category not in get_args(Category):
             raise ValueError(f"{category!r} is no category")
@@ -64,8 +64,8 @@ class Outcome(StrEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> Self | None:
-        # An enum cannot be extended, but it may hand out members that it does not list, as `enum.Flag` does. What is
-        # no name at all is refused as ever, and whoever takes names from people asks which oracles bring them.
+        # An enum cannot be extended, but it may return members that it does not list, as `enum.Flag` does. Callers that
+        # read names from users must check which outcomes the oracles add. This method refuses only invalid names.
         if not isinstance(value, str) or _NAME.fullmatch(value) is None:
             return None
         member = str.__new__(cls, value)
@@ -74,12 +74,12 @@ class Outcome(StrEnum):
         return cls._value2member_map_.setdefault(value, member)  # type: ignore[return-value]
 
     def __reduce_ex__(self, protocol: object) -> tuple[object, ...]:
-        """Take the category of an oracle's own along to another process."""
+        """Keep the category of an oracle's own outcome when it is sent to another process."""
         return (Outcome.own, (self.value, self.category)) if self.is_own else (Outcome, (self.value,))
 
     @property
     def is_own(self) -> bool:
-        """Whether an oracle has brought it."""
+        """Whether an oracle has added the outcome."""
         return self.name not in Outcome.__members__
 
     @property
@@ -89,7 +89,7 @@ class Outcome(StrEnum):
 
     @property
     def is_traffic_event(self) -> bool:
-        """Whether it is something of the traffic that ends a trial only where somebody asked for it."""
+        """Whether it is a traffic event, which ends a trial only if ``--crash-on`` names it."""
         return self.category == "traffic event"
 
     @property
@@ -99,7 +99,7 @@ class Outcome(StrEnum):
 
     @property
     def category(self) -> Category:
-        """What a report calls it; of an oracle's own that nobody has declared here, ``traffic event``."""
+        """The category in reports; ``traffic event`` for an oracle's outcome that is not declared in this process."""
         return _CATEGORIES.get(self.value, "traffic event")
 
 
@@ -109,14 +109,14 @@ _CATEGORIES: dict[str, Category] = {
     **dict.fromkeys(EVENT_WORDS, "traffic event"),
     **dict.fromkeys(("agent_error", "simulator_error", "process_died", "hang"), "software fault"),
 }
-"""By outcome; what oracles declare is added. It says how a name is to be read and never changes what a trial does."""
+"""The category of each outcome, with those that oracles declare. Categories only affect reports, not trials."""
 
 
 def outcome_of(data: Mapping[str, Any]) -> Outcome:
-    """Return what plain data calls ``outcome``, and an oracle's own with what it calls ``category``.
+    """Return the outcome in plain data, with the category that the data give for an oracle's own outcome.
 
     Raises:
-        ValueError: it is none.
+        ValueError: The outcome is invalid.
     """
     outcome = Outcome(data["outcome"])
     if outcome.is_own and "category" in data:
@@ -135,4 +135,4 @@ CRASHES = tuple(outcome for outcome in Outcome if outcome.is_traffic_crash or ou
 
 
 EVENTS = tuple(outcome for outcome in Outcome if outcome.is_traffic_event)
-"""The outcomes that count as a crash only where ``--crash-on`` names them; they are recorded in any case."""
+"""The outcomes that count as a crash only if ``--crash-on`` names them; all are recorded."""

@@ -1,4 +1,4 @@
-"""What came of a trial, which is what is kept of every trial: frozen, small, expressible as JSON."""
+"""The result of a trial, which the ledger keeps for every trial: immutable, small, convertible to JSON."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NOT_ALL_ANSWERED = written_if(lambda branches: branches.unanswered)
 _NOT_ALL_ASKED = written_if(lambda stress: stress.margin is None)
 
 
-# What else might have happened: copies of a trial that went on with other disturbances.
+# Branches: forks of a trial that continue with other disturbances.
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +28,12 @@ class Branch(Serializable):
     """A branch that crashed, as a specification from the start.
 
     Args:
-        disturbances: those of the trial up to where it branched, and those of the branch.
-        branched: after which step it left the trial.
-        outcome: of the branch.
-        step: at which it ended.
-        log_likelihood: that just what took place begins in these steps: the natural logarithm of the probability; None
-            where it is none that the hunt's models would draw.
+        disturbances: The trial's disturbances up to the branching step, and those of the branch.
+        branched: The step after which the branch leaves the trial.
+        outcome: The outcome of the branch.
+        step: The last step of the branch.
+        log_likelihood: Natural logarithm of the probability that exactly these disturbances begin in these steps; None
+            if the hunt's models cannot draw them.
     """
 
     disturbances: tuple[Disturbance, ...]
@@ -45,17 +45,17 @@ class Branch(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Branches(Serializable):
-    """What came of the branches of a trial.
+    """The results of the branches of a trial.
 
     Args:
-        moments: from how many copies went on.
-        asked: how many branches there were.
-        steps: how many steps they took.
-        left_out: how many were left out, because branches had taken enough steps.
-        crashes: those that crashed, in the order in which they were found.
-        unanswered: how many more there were to be, of which no copy answered.
-        why_unanswered: the reason for the first of them, in words; empty where there is none.
-        may_be_asked_again: whether a reason lies outside of the trial, so that another run may get all answers.
+        moments: Number of moments from which branches were started.
+        asked: Number of completed branches.
+        steps: Number of steps that the branches took.
+        left_out: Number of branches that were skipped because the budget of steps was used up.
+        crashes: The branches that crashed, in the order in which they were found.
+        unanswered: Number of planned branches without a result.
+        why_unanswered: The reason for the first of them; empty if there is none.
+        may_be_asked_again: Whether a reason lies outside the trial, so that another run may complete all branches.
     """
 
     moments: int = 0
@@ -69,11 +69,11 @@ class Branches(Serializable):
 
     @property
     def extent(self) -> str:
-        """How much of it was asked, in words: "asked 12 of 13"."""
+        """The number of completed branches as text: "asked 12 of 13"."""
         return f"asked {self.asked} of {self.asked + self.unanswered}"
 
 
-# How often it would have crashed: copies of a root, each with a first onset that was forced.
+# Rare mode: forks of a root, each with a forced first onset.
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,27 +124,28 @@ class Forced(Serializable):
     may_be_asked_again: bool = field(default=False, metadata=_NOT_ALL_ANSWERED)
 
 
-# How little it would have taken: what copies of a trial have found out while it ran.
+# Robustness probes: the minimal disturbance that makes a fork of the trial crash.
 
 
 @dataclass(frozen=True, slots=True)
 class Stress(Serializable):
-    """What came of asking copies of a trial.
+    """The results of the robustness probes of a trial.
 
     Args:
-        margin: the strength of the mildest disturbance that made it crash, as a share of the strongest that is
-            plausible; 1 where none did, 0 where it crashed without any. None where not all was asked.
-        probes: how many copies were asked.
-        steps: how many steps they took.
-        left_out: how many questions were left out, because copies had taken enough steps.
-        disturbance: the mildest that made it crash; None where none did.
-        outcome: of that copy.
-        step: at which it ended.
-        moments: at how many moments copies were to be asked; 0 where an earlier version wrote it.
-        moments_asked: at how many of these every copy that was asked answered.
-        margin_upper_bound: where not all was asked, the margin of what was: the whole margin is not greater.
-        why_unasked: why not all was asked, in words; empty where all was.
-        may_be_asked_again: whether the reason lies outside of the trial, so that another run may get all answers.
+        margin: The robustness margin: strength of the minimal disturbance that made a probe crash, as a share of the
+            strongest plausible one. It is 1 if no probe crashed, and 0 if the trial crashed without a disturbance. None
+            if a probe has no result.
+        probes: Number of probes.
+        steps: Number of steps that the probes took.
+        left_out: Number of probes that were skipped because the budget of steps was used up.
+        disturbance: The minimal disturbance that made a probe crash; None if no probe crashed.
+        outcome: The outcome of that probe.
+        step: The last step of that probe.
+        moments: Number of moments at which probes were planned; 0 in results of earlier versions.
+        moments_asked: Number of these moments at which all probes have a result.
+        margin_upper_bound: If a probe has no result, an upper bound of the margin, from the other probes.
+        why_unasked: Why a probe has no result; empty if all have.
+        may_be_asked_again: Whether the reason lies outside the trial, so that another run may complete all probes.
     """
 
     margin: float | None
@@ -162,21 +163,21 @@ class Stress(Serializable):
 
     @property
     def least(self) -> float:
-        """The margin, or what it is at most where not all was asked."""
+        """The margin, or its upper bound if a probe has no result."""
         found = self.margin_upper_bound if self.margin is None else self.margin
         return 1.0 if found is None else found
 
     @property
     def extent(self) -> str:
-        """How much of it was asked, in words: "asked 1 of 9"."""
+        """The number of completed moments as text: "asked 1 of 9"."""
         return f"asked {self.moments_asked} of {self.moments}"
 
 
-# A result in one sentence, "ego drove into main.31 at step 47": what commands, screen and page say of a trial.
+# The sentence about a result that all reports use, such as "ego drove into main.31 at step 47".
 
 
 def summarize(result: TrialResult) -> str:
-    """Return the outcome of a trial in one line, for people."""
+    """Return a sentence about the outcome of a trial, in one line."""
     if result.collision is not None:
         hit = result.collision
         if hit.role == "alone":
@@ -197,34 +198,37 @@ def summarize(result: TrialResult) -> str:
 
 @dataclass(frozen=True, slots=True)
 class TrialResult(Serializable):
-    """What came of one trial.
+    """The result of a trial.
 
     Args:
-        spec: what was asked.
-        outcome: how it ended.
-        steps: how many steps were completed; for a crash, the step at which it happened.
-        sim_time_s: simulation time at the end, in s.
-        digest: BLAKE2b over everything recorded, in hexadecimal; equal digests mean runs equal to the bit.
-        closest: how near to a crash it came.
-        collision: the evidence of a traffic crash.
-        event: the evidence of a traffic event that somebody asked for.
-        failure: the evidence of a software fault, or why the episode is invalid.
-        wall_s: how long it took, in s of wall time.
-        setup_s: the part of it before the first step.
-        worker: the process id.
-        kept: whether the worker left its scratch folder for the hunt to collect.
-        escape: until when braking would have avoided it; None where nobody tried, or where it cannot be told.
-        why_no_escape: why the search for it did not come to its end, where it was killed from outside; else empty.
-        events: how many traffic events of which kind there were; None where nobody looked.
-        disturbances: those that took place, with who turned out to be meant.
-        log_likelihood: that just these disturbances begin in these steps, and no others: the natural logarithm of the
-            probability, as the hunt's models have it; None where the hunt has none.
-        danger: how near to a crash it came, from 0 (nothing near) to 1 (touched); None where nobody measured it.
-        stress: how little it would have taken; None where nobody asked.
-        branches: what else might have happened where it came near to a crash; None where nobody asked.
-        setup_steps: how many steps were simulated before the first one, as for traffic to warm up; None where nobody
-            counted. Where trials share a warm-up, it is that of the first of them.
-        forced: what came of copies with a forced first onset; None where there were to be none.
+        spec: The specification of the trial.
+        outcome: The outcome.
+        steps: Number of completed steps; for a crash, the step of the crash.
+        sim_time_s: Simulation time at the end, in s.
+        digest: BLAKE2b over the whole recording, in hexadecimal; equal digests mean bit-identical runs.
+        closest: The closest approach to another actor.
+        collision: The evidence of a traffic crash.
+        event: The evidence of a traffic event that ``--crash-on`` names.
+        failure: The evidence of a software fault, or the reason why the episode is invalid.
+        wall_s: Wall time of the trial, in s.
+        setup_s: Wall time before the first step, which is part of ``wall_s``.
+        worker: The process id of the worker.
+        kept: Whether the worker left its scratch folder for the hunt to collect.
+        escape: The last step at which braking avoids the crash; None if the search was not run or found no answer.
+        why_no_escape: Why that search did not end, if its process was killed from outside; otherwise empty.
+        events: Number of traffic events by type; None if they were not counted.
+        disturbances: The disturbances that took place, with their vehicles.
+        log_likelihood: Natural logarithm of the probability, under the hunt's models, that exactly these disturbances
+            begin in these steps; None if the hunt has no models.
+        danger: The criticality, from 0 (nothing near) to 1 (contact); None if it was not measured.
+        stress: The results of robustness probes; None if there were none.
+        branches: The results of branches; None if there were none.
+        setup_steps: Number of steps before the first step, such as a warm-up of traffic; None if they were not counted.
+            If trials share a warm-up, the first of them counts it.
+        driven_m: Distance that the agents drove after the warm-up, all together, in m; None if it is not known.
+        driven_s: Time that the agents drove, all together, in s of simulation time; None if it is not known.
+        step_length_s: Step length of the simulator, in s; None if it is not known.
+        forced: The results of forks with a forced first onset; None if there were none.
     """
 
     spec: TrialSpec
@@ -249,78 +253,83 @@ class TrialResult(Serializable):
     branches: Branches | None = field(default=None, metadata=OMIT_DEFAULT)
     setup_steps: int | None = field(default=None, metadata=OMIT_DEFAULT)
     why_no_escape: str = field(default="", metadata=OMIT_DEFAULT)
+    driven_m: float | None = field(default=None, metadata={**OMIT_DEFAULT, **null_is(None)})
+    driven_s: float | None = field(default=None, metadata={**OMIT_DEFAULT, **null_is(None)})
+    step_length_s: float | None = field(default=None, metadata={**OMIT_DEFAULT, **null_is(None)})
     forced: Forced | None = field(default=None, metadata=OMIT_DEFAULT)
 
     json_keys = (
         "steps", "sim_time_s", "digest", "wall_s", "setup_s", "worker", "kept", "outcome", "category?", "spec",
         "closest", "collision", "failure", "escape", "event", "events", "disturbances", "log_likelihood", "danger",
-        "stress", "branches", "setup_steps", "why_no_escape", "forced",
+        "stress", "branches", "setup_steps", "why_no_escape", "driven_m", "driven_s",
+        "step_length_s", "forced",
     )  # fmt: skip
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
-        """Rebuild what `to_json` returned, of any version; an oracle's own outcome keeps its category."""
+        """Return the result from the data of `to_json` of any version; an oracle's own outcome keeps its category."""
         outcome_of(data)
         return from_plain(cls, data)
 
     @property
     def category(self) -> str | None:
-        """The category of an outcome that an oracle has brought; None for the outcomes that every hunt has."""
+        """The category of an outcome that an oracle has added; None for the outcomes that every hunt has."""
         return self.outcome.category if self.outcome.is_own else None
+
+    def is_identical_run(self, other: TrialResult) -> bool:
+        """Return whether two runs had the same outcome and bit-identical steps."""
+        return (self.outcome, self.digest) == (other.outcome, other.digest)
 
     @property
     def was_killed_from_outside(self) -> bool:
-        """Whether its processes were killed from outside until no attempt was left: how it ends is not known."""
+        """Whether processes of the trial were killed from outside in every attempt, so that its outcome is unknown."""
         return self.failure is not None and self.failure.kind == KILLED
 
     @property
     def is_to_be_run_again(self) -> bool:
-        """Whether something outside of the trial kept answers from it, so that a resumed hunt runs it again.
-
-        Its processes were killed from outside, or those of its copies.
-        """
+        """Whether a resumed hunt runs the trial again, because its processes or forks were killed from outside."""
         unasked = (one for one in (self.stress, self.branches, self.forced) if one is not None)
         return self.was_killed_from_outside or any(one.may_be_asked_again for one in unasked)
 
     @property
     def is_fully_asked(self) -> bool:
-        """Whether every question to its copies has an answer; also where there were to be none."""
+        """Whether all planned probes and branches have a result; true if none were planned."""
         unasked = self.stress is not None and self.stress.margin is None
         asked = (one for one in (self.branches, self.forced) if one is not None)
         return not unasked and not any(one.unanswered for one in asked)
 
     @property
     def steps_begun(self) -> int:
-        """How many steps were begun: one more than were completed, where something failed in the next."""
+        """Number of begun steps: one more than the completed steps if a software fault ended the trial."""
         return self.steps + (self.failure is not None)
 
     @property
     def other_steps(self) -> int:
-        """How many steps were simulated for it beside its own: before the first one, and by copies of it."""
+        """Number of steps simulated in addition to the trial's own: before the first step, and in its forks."""
         return (self.setup_steps or 0) + sum(
             one.steps for one in (self.stress, self.branches, self.forced) if one is not None
         )
 
     @property
     def nearness(self) -> tuple[float, float]:
-        """What ranks trials by how near to a crash they came, the greater the nearer.
+        """The sort key of trials by criticality; a greater key means a more critical trial.
 
-        By danger; those of which nobody measured it come last, by time to collision.
+        Trials without a measured criticality come last, sorted by time to collision.
         """
         return -1.0 if self.danger is None else self.danger, -self.closest.time_to_collision_s
 
     @property
     def disturbed(self) -> bool:
-        """Whether anything disturbed it: if not, it took place in the traffic as it is."""
+        """Whether a disturbance took place in the trial."""
         return bool(self.disturbances)
 
     @property
     def summary(self) -> str:
-        """The outcome in one line, for people."""
+        """A sentence about the outcome, in one line."""
         return summarize(self)
 
 
-def in_effect(result: TrialResult, told: Iterable[Disturbance]) -> TrialResult:
-    """Return a result with those disturbances that had an effect by the end, of all that were told."""
-    found = tuple(one for one in told if one.vehicle and one.step <= result.steps_begun)
+def in_effect(result: TrialResult, reported: Iterable[Disturbance]) -> TrialResult:
+    """Return a result with those of the reported disturbances that took effect before the end of the trial."""
+    found = tuple(one for one in reported if one.vehicle and one.step <= result.steps_begun)
     return replace(result, disturbances=found) if found else result

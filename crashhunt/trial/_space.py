@@ -1,14 +1,12 @@
-"""Argument spaces: what an argument may be, how it is written, and how a value is drawn.
+"""Argument spaces: the values of an argument, their notation, and how a value is drawn.
 
-A specification is a short text, as in ``--arg speed=5:40``:
+A specification is a short text, as in ``--arg speed=5:40``::
 
-=================  =================================================================
-``20``             always this value
-``5:40``           uniform between both ends (whole numbers for an integer argument)
-``5:40:5``         only 5, 10, 15 … 40
-``log:1e-3:1``     uniform in the logarithm
-``a|b|c``          one of these
-=================  =================================================================
+    ``20``             always this value
+    ``5:40``           uniform between both ends (whole numbers for an integer argument)
+    ``5:40:5``         only 5, 10, 15 … 40
+    ``log:1e-3:1``     uniform in the logarithm
+    ``a|b|c``          one of these
 """
 
 from __future__ import annotations
@@ -244,10 +242,10 @@ class Argument:
     Args:
         name: its name, as in ``--arg NAME=SPEC``.
         kind: the type of its values, where it is known.
-        default: the value it has when nobody asks for another; None where it has none.
-        distribution: what a hunt tries when nobody asks for anything else; None where it stays at the default.
-        unit: such as ``m/s``, for people.
-        help: one line, for people.
+        default: The default value; None if there is none.
+        distribution: The distribution from which a hunt draws by default; None if the argument keeps its default.
+        unit: The unit, such as ``m/s``.
+        help: A description in one line.
     """
 
     name: str
@@ -259,7 +257,7 @@ class Argument:
 
 
 def without_folder(value: object) -> str:
-    """Return a value for people, who know in which folder their weights are."""
+    """Return a value as text, with the folder of an absolute path replaced by ``…``."""
     text = str(value)
     return f"…/{Path(text).name}" if Path(text).is_absolute() else text
 
@@ -470,4 +468,11 @@ def _argument(parameter: inspect.Parameter, hint: object) -> Argument:
     kind = _KINDS.get(hint) or (kind_of(default) if default is not None else None)
     if declared is None:
         return Argument(parameter.name, kind, default)
-    return Argument(parameter.name, kind, default, declared.distribution, declared.unit, declared.help)
+    return Argument(
+        name=parameter.name,
+        kind=kind,
+        default=default,
+        distribution=declared.distribution,
+        unit=declared.unit,
+        help=declared.help,
+    )

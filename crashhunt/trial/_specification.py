@@ -1,4 +1,4 @@
-"""What a trial is asked: everything that determines it."""
+"""The specification of a trial: everything that determines it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from crashhunt.world import Paths
 __all__ = ["EVERYBODY", "Forcing", "Handover", "Overruled", "Reseeding", "TrialSpec"]
 
 EVERYBODY = "*"
-"""In `TrialSpec.only`: nobody is left out, but who enters is written down."""
+"""In `TrialSpec.only`: no actor is excluded, but the trial records which actors enter."""
 
 
 _ESSENTIAL = {**ESSENTIAL, **OMIT_DEFAULT}
@@ -25,14 +25,14 @@ _ESSENTIAL = {**ESSENTIAL, **OMIT_DEFAULT}
 
 @dataclass(frozen=True, slots=True)
 class Overruled(Serializable):
-    """A trial in which an agent does not do as its code says: its vehicle brakes as hard as it can, or holds still.
+    """An override of an agent's actions: its vehicle brakes fully, or keeps its lane or its speed.
 
     Args:
-        agent: whose.
-        after: the step after which it brakes; its first decision that is not its own is the one of the next step.
-        manoeuvre: ``brake``; ``left`` or ``right`` also changes lanes to that side, in that first decision.
-        keeps: ``lane`` or ``speed``: then the agent is asked on, and only what it says about that is passed over: the
-            vehicle stays in its lane, or holds the speed that it has. There is no manoeuvre then.
+        agent: Identifier of the agent.
+        after: The step after which the override begins; the next step is the first with an overridden action.
+        manoeuvre: ``brake``; ``left`` or ``right`` also changes to the lane on that side in the first step.
+        keeps: ``lane`` or ``speed``: the agent still acts, but the vehicle keeps its lane or its current speed. Then
+            the manoeuvre has no effect.
     """
 
     agent: str
@@ -93,16 +93,16 @@ class TrialSpec(Serializable):
         arguments: agent id to argument name to value.
         scenario_arguments: name to value.
         max_steps: the bound on its length, in steps.
-        overruled: which agent is not asked any more, and from when on; None where all drive to the end.
-        parent: the trial that the sampler made it from; None where there is none. It determines nothing.
-        origin: the sampler's word on where it came from, such as the name of a strategy. It determines nothing.
-        disturbances: who around the agents errs, and when; in the order of their steps.
-        only: which of the others take part; None for all. A crash that was made smaller has it.
-        script: recorded ways along which the others are moved, whatever anybody does; the agents begin where theirs
-            do, and the traffic takes no part. None where the others drive.
-        handover: which agent takes over from recorded actions, and when; None where all agents drive from the start.
-        reseeding: when the simulator's generators get another seed; None where they keep that of the trial.
-        forcing: how copies of it are disturbed; None where there are none. It determines nothing of the trial itself.
+        overruled: The override of an agent's actions; None if all agents act to the end.
+        parent: The trial from which the sampler derived this trial, or None. It does not affect the trial.
+        origin: The sampler's label, such as the name of a strategy. It does not affect the trial.
+        disturbances: The planned disturbances, sorted by step.
+        only: The other actors that take part; None for all. Minimized crashes have it.
+        script: Recorded paths along which all other actors are moved; the agents begin at the start of their paths, and
+            the scenario's traffic takes no part. None if the other actors drive.
+        handover: The agent that takes over from recorded actions, and when; None if all agents act from the start.
+        reseeding: When the simulator's generators are re-seeded, and the seed; None if they keep the trial's seed.
+        forcing: How forks of the trial are disturbed; None for no such forks. It does not affect the trial itself.
     """
 
     number: int
@@ -129,7 +129,7 @@ class TrialSpec(Serializable):
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
-        """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default.
+        """Return the specification from the data of `to_json` of any version; unknown keys are ignored.
 
         Raises:
             CrashhuntError: it needs what this version does not know.

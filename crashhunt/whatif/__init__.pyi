@@ -1,4 +1,5 @@
-from ._counts import Counts as Counts, CountsData as CountsData, Run as Run
+from ._avoidability import judge as judge
+from ._counts import Counts as Counts, Run as Run
 from ._engine import FUTURES as FUTURES, WhatIfOptions as WhatIfOptions, what_if as what_if
 from ._interventions import (
     Disturb as Disturb,
@@ -11,3 +12,4 @@ from ._interventions import (
     interventions_of as interventions_of,
     step_before as step_before,
 )
+from ._reruns import Ended as Ended, Reruns as Reruns, StoppedError as StoppedError

@@ -5,57 +5,16 @@ from __future__ import annotations
 import statistics
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypedDict
 
+from crashhunt.base.codec import Serializable
 from crashhunt.crashes import wilson
+from crashhunt.trial import Outcome
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from crashhunt.trial import Outcome
-
-
-__all__ = ["Counts", "CountsData", "Run", "RunData"]
-
-
-class RunData(TypedDict):
-    """The plain data of a `Run`."""
-
-    number: int
-    outcome: str
-    steps: int
-    digest: str
-    crashed: bool
-    excluded: str
-
-
-class CountsData(TypedDict):
-    """What ``whatif --json`` prints."""
-
-    crash: str
-    interventions: Sequence[str]
-    from_step: int | None
-    code: str
-    recorded_outcome: str
-    recorded_steps: int
-    asked: int
-    runs: int
-    crashed: int
-    survived: int
-    excluded: Mapping[str, int]
-    share: float | None
-    interval: Sequence[float] | None
-    outcomes: Mapping[str, int]
-    earliest_crash_step: int | None
-    median_crash_step: float | None
-    different: int
-    interrupted: str
-    warnings: Sequence[str]
-    each: Sequence[RunData]
+__all__ = ["Counts", "Run"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Run:
+class Run(Serializable):
     """One run.
 
     Args:
@@ -74,20 +33,9 @@ class Run:
     crashed: bool
     excluded: str = ""
 
-    def to_json(self) -> RunData:
-        """Return plain data."""
-        return {
-            "number": self.number,
-            "outcome": str(self.outcome),
-            "steps": self.steps,
-            "digest": self.digest,
-            "crashed": self.crashed,
-            "excluded": self.excluded,
-        }
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Counts:
+class Counts(Serializable):
     """The counted runs of one question.
 
     Args:
@@ -96,11 +44,12 @@ class Counts:
         from_step: up to which step each counted run was bit-identical to the recording; None where the change holds
             from the start, so that no step has to be.
         code: whose code drove, ``snapshot`` or ``current``.
-        recorded: the outcome of the recorded trial.
+        recorded_outcome: the outcome of the recorded trial.
         recorded_steps: its length, in steps.
         asked: how many runs were asked for.
         each: the runs, by number.
-        interrupted: why there are fewer than that; empty where there are not.
+        interrupted: why there are fewer than that; empty where there are not. Then `each` ends before the first run
+            that had not finished: short runs finish first, so counting all finished runs would favour early crashes.
         warnings: what may make a difference, in words.
     """
 
@@ -108,12 +57,18 @@ class Counts:
     interventions: tuple[str, ...]
     from_step: int | None
     code: str
-    recorded: Outcome
+    recorded_outcome: Outcome
     recorded_steps: int
     asked: int
     each: tuple[Run, ...]
     interrupted: str = ""
     warnings: tuple[str, ...] = ()
+
+    json_keys = (
+        "crash", "interventions", "from_step", "code", "recorded_outcome", "recorded_steps", "asked", "runs",
+        "crashed", "survived", "excluded", "share", "interval", "outcomes", "earliest_crash_step",
+        "median_crash_step", "different", "interrupted", "warnings", "each",
+    )  # fmt: skip
 
     @property
     def counted(self) -> tuple[Run, ...]:
@@ -164,35 +119,19 @@ class Counts:
         return sorted(run.steps for run in self.counted if run.crashed)
 
     @property
+    def earliest_crash_step(self) -> int | None:
+        """The step of the earliest crash; None without a crash."""
+        return min(self.crash_steps, default=None)
+
+    @property
+    def median_crash_step(self) -> float | None:
+        """The median step of the crashes; None without a crash."""
+        return statistics.median(self.crash_steps) if self.crash_steps else None
+
+    @property
     def different(self) -> int:
         """How many counted runs differ from each other."""
         return len({run.digest for run in self.counted})
-
-    def to_json(self) -> CountsData:
-        """Return the shape that ``whatif --json`` prints."""
-        steps = self.crash_steps
-        return {
-            "crash": self.crash,
-            "interventions": list(self.interventions),
-            "from_step": self.from_step,
-            "code": self.code,
-            "recorded_outcome": str(self.recorded),
-            "recorded_steps": self.recorded_steps,
-            "asked": self.asked,
-            "runs": self.runs,
-            "crashed": self.crashed,
-            "survived": self.survived,
-            "excluded": self.excluded,
-            "share": self.share,
-            "interval": list(self.interval) if self.interval is not None else None,
-            "outcomes": self.outcomes,
-            "earliest_crash_step": steps[0] if steps else None,
-            "median_crash_step": statistics.median(steps) if steps else None,
-            "different": self.different,
-            "interrupted": self.interrupted,
-            "warnings": list(self.warnings),
-            "each": [run.to_json() for run in self.each],
-        }
 
     def lines(self) -> list[str]:
         """Return what people read: the answer first, then the evidence."""
@@ -200,12 +139,12 @@ class Counts:
         if self.interval is not None and self.share is not None:
             low, high = self.interval
             answer += f" ({self.share:.1%}; 95 % interval: {low:.1%} to {high:.1%})"
-        found = [answer, f"  recorded: {self.recorded} at step {self.recorded_steps}"]
+        found = [answer, f"  recorded: {self.recorded_outcome} at step {self.recorded_steps}"]
         found += [f"  changed: {what}" for what in self.interventions]
         if self.outcomes:
             found.append(f"  outcomes: {', '.join(f'{name} {count}' for name, count in self.outcomes.items())}")
-        if steps := self.crash_steps:
-            found.append(f"  crash steps: earliest {steps[0]}, median {statistics.median(steps):g}")
+        if self.median_crash_step is not None:
+            found.append(f"  crash steps: earliest {self.earliest_crash_step}, median {self.median_crash_step:g}")
         if self.from_step is not None and self.runs:
             found.append(
                 f"  verified: every run started at step 0 and matched the recording up to step {self.from_step}"
@@ -214,5 +153,6 @@ class Counts:
             found.append("  all runs are bit-identical")
         found += [f"  excluded: {count} runs, {reason}" for reason, count in self.excluded.items()]
         if self.interrupted:
-            found.append(f"  interrupted: {self.interrupted}, after {len(self.each)} of {self.asked} runs")
+            counted = f"{len(self.each)} of {self.asked} runs (those before the first run that had not finished)"
+            found.append(f"  interrupted: {self.interrupted}, after {counted}")
         return [*found, *(f"  warning: {warning}" for warning in self.warnings)]

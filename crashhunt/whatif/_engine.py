@@ -1,37 +1,46 @@
 """The engine: runs the trial of a crash again with something changed, many times, and counts the outcomes.
 
-Every run starts at step 0, so that a claimed crash is a run that anybody can repeat. Where the change begins at a step,
-the recording of each run is compared with that of the crash up to this step, bit by bit. A run that differs does not
-count, and the counts say why: it would answer a question about another moment.
+Every run starts at step 0, so each counted crash can be repeated from its specification alone. Where the change begins
+at a step, the recording of each run is compared with that of the crash up to this step, bit by bit. A run that differs
+does not count, and the counts say why: it would answer a question about another moment.
 
-Warm workers keep the simulator as it is after its set-up, and each run is a fork of that. Forks at the step itself
-would be cheaper, but would show nothing about the steps before.
+Invariant: which runs count depends on their numbers only. Runs end in the order of their lengths, and crashed runs are
+short. Where the runs are stopped, only those before the first unfinished number count.
+
+Cost: a run is a fork of a simulator that has been set up, so only its steps are simulated. Measured on a busy machine,
+one run at a time: 72 ms per run of 148 steps on loop, 108 ms per run of 392 steps on merge. The trial itself takes 45
+and 91 ms of that. A fork 20 steps before the end would cost about 9 ms and save all steps before it. The runs would be
+about 1.7 and 3.5 times as fast: 50 futures would take 3.4 s each instead of 4.7 s and 6.8 s, start-up included.
+It is not built: the steps before the fork would be verified once, while now each counted run is verified by itself.
 """
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.errors import UsageError, WorkerError
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.recording import first_divergence
-from crashhunt.replays import NotUnderstoodError, ReplayOptions, Reruns, StoppedError, prepare, up_to
+from crashhunt.replays import ReplayOptions, is_todays, prepare, up_to
 from crashhunt.trial import EVERYBODY, Outcome, Reseeding
 from crashhunt.whatif._counts import Counts, Run
 from crashhunt.whatif._interventions import LeaveOut, Reseed, SetArguments
+from crashhunt.whatif._reruns import NotUnderstoodError, Reruns, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from crashhunt.base.watching import Watch
     from crashhunt.crashes import Bundle
-    from crashhunt.replays import Code, Ended, Rerun
+    from crashhunt.replays import Code, Rerun
     from crashhunt.trial import TrialSpec
     from crashhunt.whatif._interventions import Intervention
+    from crashhunt.whatif._reruns import Ended
 
 
 __all__ = ["FUTURES", "WhatIfOptions", "future_seed", "what_if"]
@@ -46,17 +55,17 @@ _INTERRUPTED = "stopped"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WhatIfOptions:
-    """How what-if runs are run.
+    """Options of what-if runs.
 
     Args:
-        code: who drives, the code of the ``snapshot`` or the ``current`` code.
-        times: how many runs; 0 for `FUTURES` where there are futures, else 1.
-        parallel: how many at a time.
-        time_s: the most wall time for all of them, in s; None for no limit.
-        trusted: whether the code of the crash may run; None to find out.
+        code: whose code drives, that of the ``snapshot`` or the ``current`` code.
+        times: number of runs; 0 for `FUTURES` where there are futures, else 1.
+        parallel: number of runs at a time.
+        time_s: limit on the wall time of all runs, in s; None for no limit.
+        trusted: whether the code of the crash may run; None to look it up.
         force: run even from a snapshot that is damaged.
-        watch: called with how many have been run, and how many there are.
-        stopped: asked now and then whether to stop.
+        watch: called with the number of finished runs and the number of all runs.
+        stopped: called about twice a second; returns whether to stop.
     """
 
     code: Code = "snapshot"
@@ -78,11 +87,11 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
         options: how.
 
     Returns:
-        The counts; where it was stopped, of the runs that had ended.
+        The counts; where it was stopped, of the runs before the first one that had not finished.
 
     Raises:
-        UsageError: an intervention or an option cannot be meant, or the simulator cannot do it.
-        UntrustedError: its code would run, and it is neither made here nor trusted.
+        UsageError: an intervention or an option is not valid, or the simulator does not support it.
+        UntrustedError: the code of the crash would run, and this user has neither made nor trusted it.
         CrashhuntError: the runs could not be run.
     """
     options = options or WhatIfOptions()
@@ -113,9 +122,9 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
             pass
         except NotUnderstoodError as error:
             raise _too_old() from error
-        except CrashhuntError as error:
-            if "which crashhunt" in error.message and rerun.code == "snapshot":
-                raise _too_old() from error
+        except WorkerError as error:
+            if rerun.code == "snapshot" and not is_todays(rerun):
+                raise _too_old(error.message) from error
             raise
         finally:
             reruns.close()
@@ -125,10 +134,10 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
         interventions=(*edits, *(str(one) for one in interventions if not isinstance(one, SetArguments))),
         from_step=runs.from_step,
         code=rerun.code,
-        recorded=bundle.result.outcome,
+        recorded_outcome=bundle.result.outcome,
         recorded_steps=bundle.result.steps,
         asked=times,
-        each=tuple(sorted(runs.found.values(), key=lambda run: run.number)),
+        each=runs.counted,
         interrupted=why.reason if len(runs.found) < times else "",
         warnings=rerun.warnings,
     )
@@ -161,10 +170,9 @@ def _from_step(interventions: Iterable[Intervention]) -> int | None:
     return None if None in steps else min((step for step in steps if step is not None), default=None)
 
 
-def _too_old() -> UsageError:
-    return UsageError(
-        "the crashhunt in the snapshot of this crash is too old for this change", fix="add --code current"
-    )
+def _too_old(reason: str = "") -> UsageError:
+    message = "the crashhunt in the snapshot of this crash is too old for this change"
+    return UsageError(f"{message}: {reason}" if reason else message, fix="add --code current")
 
 
 class _Stop:
@@ -183,7 +191,7 @@ class _Stop:
 
 
 class _Runs:
-    """Runs one specification, or its futures, and keeps what becomes of the runs."""
+    """Runs one specification, or its futures, and keeps the results."""
 
     def __init__(self, rerun: Rerun, reruns: Reruns, from_step: int | None, options: WhatIfOptions, times: int) -> None:
         self.found: dict[int, Run] = {}
@@ -191,6 +199,12 @@ class _Runs:
         self._rerun, self._reruns, self._times, self._watch = rerun, reruns, times, options.watch
         self._spec = rerun.spec
         self._prefix = None if from_step is None else up_to(rerun.recorded, from_step)
+
+    @property
+    def counted(self) -> tuple[Run, ...]:
+        """The runs before the first one that has not finished, by number."""
+        first = next(number for number in itertools.count() if number not in self.found)
+        return tuple(self.found[number] for number in range(first))
 
     def leave_out(self, interventions: Sequence[LeaveOut], recorded: TrialSpec) -> None:
         """Find out who takes part in the recorded trial, and leave some out."""
@@ -238,7 +252,7 @@ class _Runs:
         self._run(list(range(begun, self._times)), future)
 
     def _run(self, numbers: Sequence[int], spec: Callable[[int], TrialSpec]) -> dict[int, Run]:
-        """Run some futures; return what became of them by place, and keep those that were asked for."""
+        """Run some futures; return the runs by place, and keep those below the requested number."""
         if not numbers:
             return {}
         places: dict[int, Run] = {}
@@ -252,10 +266,10 @@ class _Runs:
         return places
 
     def _counted(self, number: int, ended: Ended) -> Run:
-        """Return what became of a run.
+        """Return how a run ended, and whether it counts.
 
         Raises:
-            UsageError: it could not be set up, so that no other will be.
+            UsageError: the trial with the change cannot be set up; its other runs would fail in the same way.
         """
         result = ended.result
         if result.outcome is Outcome.INVALID and not result.was_killed_from_outside:

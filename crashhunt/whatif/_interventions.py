@@ -7,13 +7,13 @@ leaves everything before it as it was recorded, and the engine verifies that. On
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Protocol, get_args
 
 from crashhunt.base import layout
 from crashhunt.base.errors import ArgumentError, UsageError
 from crashhunt.base.text import one_of
 from crashhunt.plans import Owners, agent_of, takes_of
-from crashhunt.trial import OF_AGENT, Constant, Handover, Overruled, in_turn, parse_spec
+from crashhunt.trial import OF_AGENT, Constant, Handover, Manoeuvre, Overruled, in_turn, parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,16 +28,12 @@ __all__ = [
     "HandOver",
     "Intervention",
     "LeaveOut",
-    "Manoeuvre",
     "Overrule",
     "Reseed",
     "SetArguments",
     "interventions_of",
     "step_before",
 ]
-
-Manoeuvre = Literal["brake", "left", "right", "keep_lane", "keep_speed"]
-_MANOEUVRES = ("brake", "left", "right", "keep_lane", "keep_speed")
 
 
 class Intervention(Protocol):
@@ -121,8 +117,8 @@ class Overrule:
 
     def applied(self, rerun: Rerun) -> Rerun:
         """Return the run with the agent overruled."""
-        if self.manoeuvre not in _MANOEUVRES:
-            raise UsageError(f"manoeuvre is {self.manoeuvre!r}", fix=one_of(self.manoeuvre, _MANOEUVRES))
+        if self.manoeuvre not in get_args(Manoeuvre):
+            raise UsageError(f"manoeuvre is {self.manoeuvre!r}", fix=one_of(self.manoeuvre, get_args(Manoeuvre)))
         agent = _agent_of(self.agent, rerun)
         verb, _, kept = self.manoeuvre.partition("_")
         overruled = Overruled(agent, self.from_step, keeps=kept) if kept else Overruled(agent, self.from_step, verb)

@@ -206,7 +206,18 @@ def _near_block(
     x, y, heading, speed, *half = np.frombuffer(found[0]).reshape(6, -1)
     step, own = np.frombuffer(found[1], np.int64).reshape(2, -1)
     flat = np.zeros(len(x))
-    return _Block(x, y, heading, speed, np.stack(half, axis=1), step, own, flat, flat, flat)
+    return _Block(
+        x=x,
+        y=y,
+        heading=heading,
+        speed=speed,
+        half=np.stack(half, axis=1),
+        step=step,
+        own=own,
+        z=flat,
+        grade=flat,
+        tall=flat,
+    )
 
 
 def _blocks(frame: Frame, row: int) -> list[_Block]:
@@ -218,16 +229,16 @@ def _block(frame: Frame, row: int) -> _Block:
     scenes, actors = len(columns), len(roster)
     heights = frame.heights if frame.heights is not None else np.zeros((scenes, 2 * actors))
     return _Block(
-        columns[:, 0 : 2 * actors : 2].ravel(),
-        columns[:, 1 : 2 * actors : 2].ravel(),
-        columns[:, 2 * actors : 3 * actors].ravel(),
-        columns[:, 3 * actors :].ravel(),
-        np.tile(roster.half_sizes, (scenes, 1)),
-        np.repeat(np.arange(scenes), actors),
-        np.repeat(np.arange(row, scenes * actors, actors), actors),
-        heights[:, :actors].ravel(),
-        heights[:, actors:].ravel(),
-        np.tile([actor.height for actor in roster.actors], scenes),
+        x=columns[:, 0 : 2 * actors : 2].ravel(),
+        y=columns[:, 1 : 2 * actors : 2].ravel(),
+        heading=columns[:, 2 * actors : 3 * actors].ravel(),
+        speed=columns[:, 3 * actors :].ravel(),
+        half=np.tile(roster.half_sizes, (scenes, 1)),
+        step=np.repeat(np.arange(scenes), actors),
+        own=np.repeat(np.arange(row, scenes * actors, actors), actors),
+        z=heights[:, :actors].ravel(),
+        grade=heights[:, actors:].ravel(),
+        tall=np.tile([actor.height for actor in roster.actors], scenes),
     )
 
 
@@ -254,7 +265,11 @@ def _bent_blocks(frame: Frame, row: int) -> list[_Block]:
             here = np.full(len(values), step)
             own = np.zeros(len(values), np.intp)
             half = np.stack((length, width), axis=1)
-            blocks.append(_Block(x, y, heading, speed, half, here, own, z, grade, tall))
+            blocks.append(
+                _Block(
+                    x=x, y=y, heading=heading, speed=speed, half=half, step=here, own=own, z=z, grade=grade, tall=tall
+                )
+            )
     return blocks
 
 

@@ -171,7 +171,7 @@ def first_contact(previous: Scene | None, present: Scene, row: int, other: int) 
     x, y, *_ = ways[0][0].at(share)
     first, second = (way.at(share) for way in touching)
     drives_into = _drives_into((first, one == 0, moving[0]), (second, two == 0, moving[1]))
-    return Touch(time_s, share, drives_into, x, y, speeds[0], speeds[1])
+    return Touch(time_s=time_s, share=share, drives_into=drives_into, x=x, y=y, speed=speeds[0], other_speed=speeds[1])
 
 
 def reachable_m(speed: float, time_s: float) -> float:

@@ -143,7 +143,7 @@ def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float
     """
     count = sum(len(frame.columns) for frame in frames)
     whole: Array
-    whole, most = np.zeros(count), DangerousMoment(0.0, 0, agents[0] if agents else "", "")
+    whole, most = np.zeros(count), DangerousMoment(danger=0.0, step=0, agent=agents[0] if agents else "", other="")
     for agent in agents:
         measured = _measured(frames, agent, step_length_s)
         if measured is None or not len(measured[0]):
@@ -151,7 +151,9 @@ def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float
         times, found, who, names = measured
         at = int(found.argmax())
         if found[at] > most.danger:
-            most = DangerousMoment(float(found[at]), round(times[at] / step_length_s), agent, names[who[at]])
+            most = DangerousMoment(
+                danger=float(found[at]), step=round(times[at] / step_length_s), agent=agent, other=names[who[at]]
+            )
         whole = np.maximum(whole, by_step(times, found, count, step_length_s))
     return whole, most
 
@@ -399,7 +401,7 @@ def followers_danger(frames: Sequence[Frame], agent: str, step_length_s: float) 
         from 0 to below 1. The ``other`` of the moment is the actor that closed in.
     """
     count = sum(len(frame.columns) for frame in frames)
-    nothing = DangerousMoment(0.0, 0, agent, "")
+    nothing = DangerousMoment(danger=0.0, step=0, agent=agent, other="")
     seen = ways(frames, agent, AHEAD_M, step_length_s)
     if seen is None or not len(seen[0].time):
         return np.zeros(count), nothing, 0.0
@@ -415,7 +417,13 @@ def followers_danger(frames: Sequence[Frame], agent: str, step_length_s: float) 
     at = int(found.argmax())
     if who[at] < 0:
         return whole, nothing, total
-    return whole, DangerousMoment(float(found[at]), round(track.time[at] / step_length_s), agent, names[who[at]]), total
+    return (
+        whole,
+        DangerousMoment(
+            danger=float(found[at]), step=round(track.time[at] / step_length_s), agent=agent, other=names[who[at]]
+        ),
+        total,
+    )
 
 
 def _behind(track: Track, others: Others) -> list[int]:
@@ -439,14 +447,14 @@ def _pieces(track: Track, others: Others, number: int) -> Iterator[tuple[NDArray
             continue
         here, these = samples[part], rows[part]
         theirs = Track(
-            track.time[here],
-            others.x[these],
-            others.y[these],
-            np.unwrap(others.heading[these]),
-            others.z[these],
-            others.half_length[these],
-            others.half_width[these],
-            others.height[these],
+            time=track.time[here],
+            x=others.x[these],
+            y=others.y[these],
+            heading=np.unwrap(others.heading[these]),
+            z=others.z[these],
+            half_length=others.half_length[these],
+            half_width=others.half_width[these],
+            height=others.height[these],
         )
         own = Others(np.arange(len(here)), np.zeros(len(here), np.intp), *(column[here] for column in track[1:]))
         yield here, theirs, own

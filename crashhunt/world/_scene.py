@@ -214,7 +214,7 @@ def joined_frame(
         heights = np.array(rows).reshape(len(scenes), 2 * len(roster))
     if any(scene is not None and scene.spines for scene in scenes):
         spines = tuple(scene.spines if scene is not None else _NO_SPINES for scene in scenes)
-    return Frame(roster, columns, heights, spines, core)
+    return Frame(roster=roster, columns=columns, heights=heights, spines=spines, core=core)
 
 
 class Scene:

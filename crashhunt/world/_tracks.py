@@ -219,7 +219,12 @@ def _fronts_from_core(
     sample, who = np.frombuffer(pairs, np.int64).reshape(2, -1)
     other_x, other_y, other_heading, *other_half = np.frombuffer(theirs).reshape(5, -1)
     z = np.zeros(len(sample))
-    return _Fronts(time, mine, [sample, who, other_x, other_y, other_heading, z, *other_half, z], list(numbers))
+    return _Fronts(
+        time=time,
+        own=mine,
+        theirs=[sample, who, other_x, other_y, other_heading, z, *other_half, z],
+        names=list(numbers),
+    )
 
 
 def _fronts(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) -> _Fronts:
@@ -241,10 +246,10 @@ def _fronts(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) -
     if not times:
         return _NOWHERE
     columns = [np.concatenate(column) for column in zip(*theirs, strict=True)]
-    return _Fronts(np.concatenate(times), np.concatenate(own, axis=1), columns, list(numbers))
+    return _Fronts(time=np.concatenate(times), own=np.concatenate(own, axis=1), theirs=columns, names=list(numbers))
 
 
-_NOWHERE = _Fronts(np.zeros(0), np.zeros((7, 0)), [np.zeros(0)] * 9, [])
+_NOWHERE = _Fronts(time=np.zeros(0), own=np.zeros((7, 0)), theirs=[np.zeros(0)] * 9, names=[])
 
 
 def _filled(seen: _Fronts, between: int, step_length_s: float) -> _Fronts:
@@ -275,7 +280,7 @@ def _filled(seen: _Fronts, between: int, step_length_s: float) -> _Fronts:
     put_in = _between(pairs, old, new, share, 4)
     put_in[0] = (first[pairs[0, old].astype(int), None] + np.arange(1, between)).ravel()
     pairs[0] = first[pairs[0].astype(int)]
-    return _Fronts(whole[0], whole[1:], list(np.hstack((pairs, put_in))), names)
+    return _Fronts(time=whole[0], own=whole[1:], theirs=list(np.hstack((pairs, put_in))), names=names)
 
 
 def _between(columns: Array, old: NDArray[np.intp], new: NDArray[np.intp], share: Array, heading: int) -> Array:
@@ -410,14 +415,14 @@ class Path:
             return None
         before = [lane for step, lane in self.lanes if step <= first][-1:]
         return Path(
-            self.actor,
-            first - begin,
-            self.states[first - self.first : last - self.first + 1],
-            (
+            actor=self.actor,
+            first=first - begin,
+            states=self.states[first - self.first : last - self.first + 1],
+            lanes=(
                 *((first - begin, lane) for lane in before),
                 *((step - begin, lane) for step, lane in self.lanes if first < step <= last),
             ),
-            tuple((step - begin, spine) for step, spine in self.spines if first <= step <= last),
+            spines=tuple((step - begin, spine) for step, spine in self.spines if first <= step <= last),
         )
 
 
@@ -456,7 +461,7 @@ class Paths(Serializable):
         """Return the part from after step ``begin`` to after step ``end``, counted from ``begin``."""
         parts = [[part for path in some if (part := path.cut(begin, end))] for some in (self.agents, self.others)]
         time_s = self.time_s + begin * step_length_s
-        return Paths(time_s, min(end, self.steps) - begin, tuple(parts[0]), tuple(parts[1]))
+        return Paths(time_s=time_s, steps=min(end, self.steps) - begin, agents=tuple(parts[0]), others=tuple(parts[1]))
 
     def placing(self) -> Paths:
         """Return the paths with only the first states of the agents."""
@@ -513,7 +518,12 @@ def paths_of(scenes: Sequence[Scene], agents: Collection[str]) -> Paths:
     paths = [way.path() for way in found]
     mine = [path for path in paths if path.actor.id in agents]
     others = [path for path in paths if path.actor.id not in agents]
-    return Paths(scenes[0].time_s if scenes else 0.0, max(0, len(scenes) - 1), tuple(mine), tuple(others))
+    return Paths(
+        time_s=scenes[0].time_s if scenes else 0.0,
+        steps=max(0, len(scenes) - 1),
+        agents=tuple(mine),
+        others=tuple(others),
+    )
 
 
 class _Open:
@@ -535,7 +545,13 @@ class _Open:
             self._spines.append((step, tuple(tuple(map(float, point)) for point in scene.spines[row])))  # type: ignore[misc]
 
     def path(self) -> Path:
-        return Path(self._actor, self._first, tuple(self._states), tuple(self._lanes), tuple(self._spines))
+        return Path(
+            actor=self._actor,
+            first=self._first,
+            states=tuple(self._states),
+            lanes=tuple(self._lanes),
+            spines=tuple(self._spines),
+        )
 
 
 def _plain(path: Path) -> list[object]:
@@ -560,4 +576,4 @@ def _path(
     seen = tuple(State(*map(float, state)) for state in states)
     if not seen:
         raise ValueError(f"{name} is nowhere")
-    return Path(actor, int(first), seen, where, centre_lines)  # type: ignore[arg-type]
+    return Path(actor=actor, first=int(first), states=seen, lanes=where, spines=centre_lines)  # type: ignore[arg-type]

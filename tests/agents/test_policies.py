@@ -103,7 +103,7 @@ def test_a_file_without_weights_is_said_to_be_one(tmp_path, path, says):
         NumpyPolicy(str(tmp_path / path))
 
 
-def test_the_weights_of_a_scenario_lie_beside_it_and_are_named_by_their_path():
+def test_the_weights_of_a_scenario_lie_next_to_it_and_are_named_by_their_path():
     for name in ("highway-policy", "motorway"):
         default = load_scenario(name).agents["ego"].arguments["path"].default
         assert Path(default).resolve() == WEIGHTS.resolve()
@@ -253,6 +253,6 @@ def test_what_is_not_installed_or_not_there_is_said(kind, tmp_path, monkeypatch)
         kind(str(tmp_path / "no.zip"))
 
 
-def test_an_algorithm_that_nobody_knows_is_refused():
+def test_an_algorithm_that_no_one_knows_is_refused():
     with pytest.raises(ValueError, match="none of PPO"):
         StableBaselines3("x.zip", algorithm="POP")

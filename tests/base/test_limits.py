@@ -63,7 +63,7 @@ def test_what_no_limit_has_caused_names_none(limits, error):
     assert limit_behind(error) == ""
 
 
-def test_trial_that_failed_by_a_limit_says_so(limits):
+def test_trial_that_failed_by_a_limit_states_so(limits):
     assert failure_of(MemoryError(), "ego").message == ""
     limits |= {resource.RLIMIT_AS: 1 << 30, resource.RLIMIT_FSIZE: 1 << 30}
     assert failure_of(MemoryError(), "ego").message == "the limit on memory is 1024 MiB: raise it with ulimit -v"

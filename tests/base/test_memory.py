@@ -38,6 +38,6 @@ def test_of_a_container_files_that_are_only_kept_count_as_free(machine):
     assert free_memory(machine(**given, memory_stat="inactive_file 990\n")) == 0.75
 
 
-def test_where_nobody_can_say(tmp_path, machine):
+def test_where_no_one_can_say(tmp_path, machine):
     assert free_memory(tmp_path) == 1.0
     assert free_memory(machine(meminfo="odd\n")) == 1.0

@@ -64,7 +64,7 @@ def test_a_neighbour_is_meant(tmp_path):
         ("logs o --trial -1", "--trial is -1; give at least 0"),
     ],
 )
-def test_a_command_line_says_what_was_meant(words, says, capsys, tmp_path, monkeypatch):
+def test_a_command_line_states_what_was_meant(words, says, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("signal.signal", lambda *_: None)  # pytest's own Ctrl-C stays
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
@@ -102,7 +102,7 @@ def test_none_at_a_time_is_one_per_core():
         (crashhunt.run, {"directory": "x"}, "missing a required argument: 'parallel'; call run(directory, parallel,"),
     ],
 )
-def test_a_call_says_what_was_meant(function, arguments, says):
+def test_a_call_states_what_was_meant(function, arguments, says):
     with pytest.raises(CrashhuntError) as caught:
         function(**arguments)
     assert isinstance(caught.value, CallError | TypeError)
@@ -152,7 +152,7 @@ class Careless:
         raise KeyError("weights")
 
 
-def test_a_sampler_that_cannot_be_made_says_where():
+def test_a_sampler_that_cannot_be_made_states_where():
     with pytest.raises(PluginError) as caught:
         plan(Request(trials=1, max_steps=1, sampler=f"{__name__}:Careless"))
     assert "KeyError: 'weights'" in caught.value.message

@@ -29,7 +29,7 @@ def anything(**arguments):
     return arguments
 
 
-def test_a_signature_tells_names_types_ranges_and_spaces():
+def test_a_signature_reports_names_types_ranges_and_spaces():
     signature = signature_of(Planner)
     assert list(signature.arguments) == ["headway_s", "mode", "count"]
     headway = signature.arguments["headway_s"]
@@ -103,7 +103,7 @@ def test_what_is_installed_or_removed_meanwhile_is_seen(tmp_path, monkeypatch):
         ("def f(:", "broken:Agent", "SyntaxError"),
     ],
 )
-def test_what_leads_nowhere_says_why(tmp_path, monkeypatch, content, name, says):
+def test_what_leads_nowhere_states_why(tmp_path, monkeypatch, content, name, says):
     (tmp_path / "broken.py").write_text(content)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
@@ -136,7 +136,7 @@ def test_what_leads_nowhere_says_why(tmp_path, monkeypatch, content, name, says)
         ("x\0y", "broken:Agent", "", "null bytes"),
     ],
 )
-def test_an_import_that_fails_says_where(tmp_path, monkeypatch, content, name, where, says):
+def test_an_import_that_fails_states_where(tmp_path, monkeypatch, content, name, where, says):
     (tmp_path / "broken.py").write_text(content)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])

@@ -93,7 +93,7 @@ def test_mapping_of_a_file_with_a_name_stays_shared(tmp_path):
         assert mapped[0] == 9
 
 
-def test_what_is_too_large_is_told_and_stays_shared():
+def test_what_is_too_large_is_reported_and_stays_shared():
     gc.collect()  # what other tests have left open
     if before := SharedState().remaining:
         pytest.skip(f"this process shares {before} already")

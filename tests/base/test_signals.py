@@ -39,7 +39,7 @@ def test_a_second_request_a_while_later_ends_the_process_at_once(monkeypatch):
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_whoever_ignores_hang_ups_goes_on_ignoring_them_and_threads_are_left_alone():
+def test_the_one_that_ignores_hang_ups_continues_ignoring_them_and_threads_are_left_alone():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with stop_requests() as asked:

@@ -38,7 +38,7 @@ def crash(tmp_path_factory):
     (directory / layout.HUNT).write_text("# how it was asked\n")
     code = b"x = 1\n"
     files = {"code/agent.py": described(code)}
-    digest = digest_of_described(files, says=[["code"], {}])
+    digest = digest_of_described(files, plain_data=[["code"], {}])
     snapshot = directory / layout.SNAPSHOTS / digest
     (snapshot / "code").mkdir(parents=True)
     (snapshot / "code" / "agent.py").write_bytes(code)
@@ -189,7 +189,7 @@ def test_what_is_damaged_is_not_exported(crash, tmp_path):
         export_crash(crash, tmp_path / "gone" / "crash.zip")
 
 
-def test_a_link_beside_a_crash_is_not_followed(crash, tmp_path):
+def test_a_link_next_to_a_crash_is_not_followed(crash, tmp_path):
     link = crash.path / "secret"
     link.symlink_to("/etc/hostname")
     try:

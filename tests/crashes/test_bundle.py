@@ -109,7 +109,7 @@ def test_what_is_written_is_read(tmp_path):
     }  # fmt: skip
 
 
-def test_a_crash_that_is_confirmed_or_not_says_so(tmp_path):
+def test_a_crash_that_is_confirmed_or_not_states_so(tmp_path):
     bundle = made(tmp_path)
     dataclasses.replace(bundle, confirmed=False, divergence={"step": 3}).write()
     found = read_bundle(bundle.path)
@@ -131,7 +131,7 @@ def test_a_fault_comes_with_what_was_said(tmp_path):
     assert (made(tmp_path, silent).path / "error.log").read_text() == "signal: killed\n"
 
 
-def test_the_driver_is_whom_it_is_about(bundle, tmp_path):
+def test_the_driver_is_which_it_is_about(bundle, tmp_path):
     event = Event("red_light", "b", "b ran a red light")
     for evidence, driver in (
         ({"collision": CRASH.collision}, "ego"),
@@ -176,9 +176,9 @@ def test_what_has_changed_is_refused(bundle):
         ({"events": {"red_light": "2"}}, "events"),
         ({"closest_approach": None}, "closest"),
         ({"collision": {"agent": 1}}, "agent"),
-        ({"files": {"../log.mcap": {"size": 1, "blake2b": ""}}}, "is not beside it"),
-        ({"files": {"..": {"size": 1, "blake2b": ""}}}, "is not beside it"),
-        ({"files": {"": {"size": 1, "blake2b": ""}}}, "is not beside it"),
+        ({"files": {"../log.mcap": {"size": 1, "blake2b": ""}}}, "is not in the folder of the bundle"),
+        ({"files": {"..": {"size": 1, "blake2b": ""}}}, "is not in the folder of the bundle"),
+        ({"files": {"": {"size": 1, "blake2b": ""}}}, "is not in the folder of the bundle"),
         ({"files": {"log.mcap": {"size": "1", "blake2b": ""}}}, "size"),
         ({"digest": 3}, "digest"),
     ],
@@ -229,7 +229,7 @@ def test_a_log_of_another_crash_or_with_other_views_is_refused(tmp_path):
     assert bundle.faults() == ["log.mcap is missing"]
 
 
-def test_every_file_beside_it_is_looked_at(bundle):
+def test_every_file_next_to_it_is_looked_at(bundle):
     (bundle.path / "run.log").write_text("other")
     (bundle.path / "note.txt").write_text("mine")
     (bundle.path / ".hidden").write_text("an editor's")
@@ -263,7 +263,7 @@ def test_a_crash_is_found_by_what_people_call_it(tmp_path):
         find_bundle(tmp_path / "gone", "1")
 
 
-def test_a_damaged_crash_is_in_the_way_of_nobody_who_means_another(tmp_path):
+def test_a_damaged_crash_is_in_the_way_of_no_one_who_means_another(tmp_path):
     made(tmp_path, numbered(1))
     broken = made(tmp_path, numbered(20))
     (broken.path / layout.CRASH).unlink()

@@ -31,7 +31,7 @@ def recording(steps, there):
     return SimpleNamespace(all_steps=records, scenes=lambda: scenes, prologue=Prologue((), DT))
 
 
-def test_there_is_none_where_the_agent_is_not_and_at_the_end_where_nobody_knows():
+def test_there_is_none_where_the_agent_is_not_and_at_the_end_where_no_one_knows():
     found = danger_course(recording(100, range(20, 90)), "ego")
     assert found.steps == tuple(range(100))
     assert np.isnan(found.own[:20]).all()

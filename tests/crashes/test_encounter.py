@@ -48,7 +48,7 @@ def test_the_moments_before_a_rear_end_collision():
 
 @given(st.floats(8, 30), st.floats(3, 9))
 @settings(deadline=None, max_examples=30)
-def test_the_last_escape_is_where_the_braking_distance_says(speed, braking):
+def test_the_last_escape_is_where_the_braking_distance_states(speed, braking):
     """v² / (2 b) is what is needed to stop; the last step with more room than that is the last escape."""
     episode = rear_end(speed=speed, gap=speed**2 / (2 * braking) + 3.3 * speed)
     found = last_escape(episode, "ego", "other", braking=braking)

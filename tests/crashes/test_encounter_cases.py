@@ -56,7 +56,7 @@ def test_the_last_escape_behind_a_leader_that_moves_on(leader, turned):
     assert gaps[harder] >= (speed - leader) ** 2 / 18 - 0.01 > gaps[harder + 1] - 0.02
 
 
-def test_the_leader_goes_on_where_the_recording_ends():
+def test_the_leader_continues_where_the_recording_ends():
     """It brakes in the end of the recording: what counts after it is its last speed."""
     steps, own, ahead = [], 0.0, 30.0
     for number in range(60):

@@ -95,7 +95,7 @@ def test_the_answer_is_where_one_more_step_is_too_many(gap, said):
     assert found.how == expected
 
 
-def test_a_run_goes_on_for_as_long_as_stopping_takes():
+def test_a_run_continues_for_as_long_as_stopping_takes():
     world = World()
     world.escape(said=4.0)
     assert world.last.max_steps == world.crash()[0].steps + math.ceil((5.0 + 20 / 4.0) / DT)
@@ -117,7 +117,7 @@ def test_brakes_that_never_help_or_always_do():
     assert World(braking=0.0).escape(said=8.0).braking is None
 
 
-def test_nobody_asks_what_was_longer_than_ten_seconds_ago():
+def test_no_one_asks_what_was_longer_than_ten_seconds_ago():
     world = World(gap=300.0, braking=0.6)  # 333 m to stop, and 15 s to the crash
     found = world.escape(said=0.6)
     assert found.step is None

@@ -55,7 +55,7 @@ def test_that_nothing_helps_is_said_only_where_all_was_run(attempts, why_not, av
     assert Judgement(attempts, why_not).avoidable is avoidable
 
 
-def test_it_is_kept_in_a_bundle_beside_what_others_have_added():
+def test_it_is_kept_in_a_bundle_next_to_what_others_have_added():
     judgement = Judgement((BRAKE, HOPELESS), "it was interrupted")
     bundle = with_judgement(Bundle({"others": 1}), judgement)
     assert bundle.added["others"] == 1

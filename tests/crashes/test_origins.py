@@ -88,7 +88,7 @@ def rewrite_snapshot(snapshot, *, keep_name=False):
         manifest["files"][name] = describe_files((snapshot / name).parent)[Path(name).name]
     manifest["described"] = {name: describe_files(snapshot)[name] for name in manifest["described"]}
     (snapshot / "manifest.json").write_text(json.dumps({**manifest, "integrity": digest_of_data(manifest)}))
-    digest = digest_of_described(manifest["files"], says=[manifest["paths"], manifest["argument_files"]])
+    digest = digest_of_described(manifest["files"], plain_data=[manifest["paths"], manifest["argument_files"]])
     if not keep_name:
         snapshot.rename(snapshot.with_name(digest))
     return digest
@@ -108,7 +108,7 @@ def test_what_was_made_here_is_trusted_wherever_it_is_now(place):
 
 
 @pytest.mark.parametrize("code", ["snapshot", "current"])
-def test_what_another_user_made_is_refused_and_says_what_would_run(place, code):
+def test_what_another_user_made_is_refused_and_states_what_would_run(place, code):
     bundle = crash_of(place / "theirs")
     assert not is_bundle_trusted(bundle)
     assert not is_hunt_trusted(place / "theirs", latest_snapshot(place / "theirs"))

@@ -176,7 +176,7 @@ def test_what_a_later_version_asked_is_kept_where_hunt_toml_is_written_again(hun
 @pytest.mark.parametrize(
     ("was", "now"), [("max_steps", "max_stepz"), ("sampler", "smapler"), ("timeout_s", "timeut_s")]
 )
-def test_a_slip_in_hunt_toml_is_told(hunt, was, now):
+def test_a_slip_in_hunt_toml_is_reported(hunt, was, now):
     file = hunt / "hunt.toml"
     file.write_text(file.read_text().replace(f"\n{was} =", f"\n{now} ="))
     with pytest.raises(HuntDirectoryError, match=f"unknown key '.*{now}'|the key '{was}' is missing"):

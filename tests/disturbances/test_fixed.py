@@ -52,9 +52,9 @@ def test_any_word_is_a_disturbance_or_refused(text):
         ("brake@9=ahead:4", "is no disturbance"),
         ("@9=ahead:4:2", "is no disturbance"),
         ("brake@9=above:4:2", "'above' is no place"),
-        ("brake@9=ahead:-4:2", "-4 is no strength"),
-        ("brake@9=ahead:much:2", "nan is no strength"),
-        ("brake@9=ahead:4:0", "0 is no length"),
+        ("brake@9=ahead:-4:2", "the strength is -4"),
+        ("brake@9=ahead:much:2", "the strength is nan"),
+        ("brake@9=ahead:4:0", "the duration is 0"),
         ("dawdle@9=ahead:1.5:2", "dawdle of 1.5 is more than all"),
         ("late_action@9=ahead:1:2", "late_action is not about 'ahead'; it is about itself"),
         ("brake@9=itself:4:2", "brake is not about 'itself'"),
@@ -112,7 +112,7 @@ def test_where_it_is_fixed_whether_it_is_drawn_as_well_makes_no_difference():
     assert math.isclose(always.log_likelihood(drawn, 5), expected)
 
 
-def test_a_branch_keeps_what_is_fixed_after_it_and_what_has_begun_is_not_told_again():
+def test_a_branch_keeps_what_is_fixed_after_it_and_what_has_begun_is_not_reported_again():
     draws = disturber([STOP], brake=0.5)
     for number in range(20):
         assert STOP in draws.draw_another(3, number, 10, 5, 40)

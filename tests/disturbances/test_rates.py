@@ -134,7 +134,7 @@ def test_models_and_agents_are_drawn_independently_of_each_other():
     assert len(set(begins)) == 4
 
 
-def test_they_begin_as_often_as_the_rate_says():
+def test_they_begin_as_often_as_the_rate_states():
     disturber = make(brake=0.4)
     count = sum(len(disturber.draw(seed, 1000)) for seed in range(100))  # 4000 expected of 100,000 steps
     assert abs(count - 4000) < 6 * math.sqrt(100_000 * 0.04 * 0.96)
@@ -181,7 +181,7 @@ def test_what_the_models_never_draw_is_impossible():
     assert math.isfinite(always.log_likelihood(always.draw(1, 5), 5))
 
 
-def test_what_was_drawn_while_nobody_was_there_makes_a_trial_no_less_likely():
+def test_what_was_drawn_while_no_one_was_there_makes_a_trial_no_less_likely():
     disturber = make(brake=1.0)
     drawn = Disturbance(3, "ahead", "brake", 4.0, 2.0, "ego")
     spec = _spec(disturbances=(Disturbance(2, "ahead", "brake", 6.0, 1.0, "ego"), drawn))

@@ -6,7 +6,7 @@ What is not run says so, in a comment above its block:
     <!-- tests run: 150 -> 20 -->      the commands are run with another number, to save time; see what else they print
     <!-- exit code: 1 -->              of the last command of the block
 
-A page may begin where another one ends: ``<!-- goes on from: your-town -->``.
+A page may begin where another one ends: ``<!-- continues from: your-town -->``.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Page:
     def __init__(self, topic: str) -> None:
         self.topic = topic
         self.text = PAGES[topic].read_text(encoding="utf-8")
-        goes_on = re.search(r"<!-- goes on from: (\S+) -->", self.text)
-        self.before = goes_on[1] if goes_on else ""
+        continues = re.search(r"<!-- continues from: (\S+) -->", self.text)
+        self.before = continues[1] if continues else ""
         self.files: dict[str, str] = {}
         self.commands: list[Command] = []
         self.unclear: list[str] = []
@@ -81,7 +81,7 @@ class Page:
 
 
 def tree(root: str) -> list[Page]:
-    """A page, and all that go on where it ends, each after the one that it goes on from."""
+    """A page, and all that go on where it ends, each after the one that it continues from."""
     pages = [Page(topic) for topic in PAGES]
     found = [page for page in pages if page.topic == root]
     for page in found:

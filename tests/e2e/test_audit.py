@@ -24,13 +24,13 @@ def test_trials_that_are_the_same_are_said_to_be(toy):
     audit = done.json["audit"]
     assert audit["differences"] == []
     assert 0 < audit["trials"] < 6
-    assert f"Audit: {audit['trials']} run again in fresh processes, {audit['trials']} the same to the bit." in done.err
+    assert f"Audit: {audit['trials']} replayed in new processes, {audit['trials']} bit-identical." in done.err
     assert not (toy.folder / "h" / "trials").exists()
     again = toy.crashhunt(*WORDS, "--arg", "speed=5", "--audit", "0.5", "--overwrite").json["audit"]
     assert again == audit  # which are chosen depends on the seed only
 
 
-def test_a_difference_is_told_with_the_first_step_and_field(toy):
+def test_a_difference_is_reported_with_the_first_step_and_field(toy):
     done = toy.crashhunt(*WORDS, "--agent", "faulty:Remembers", "--audit", "1")
     audit = done.json["audit"]
     assert audit["trials"] == 6
@@ -47,7 +47,7 @@ def test_a_difference_is_told_with_the_first_step_and_field(toy):
     assert f"audit: {line}" in toy.crashhunt("logs", "h").out
 
 
-def test_nobody_pays_who_does_not_ask(toy):
+def test_no_one_pays_who_does_not_ask(toy):
     assert toy.crashhunt(*WORDS, "--arg", "speed=5").json["audit"] is None
 
 
@@ -93,7 +93,7 @@ def test_audits_of_a_hunt_that_was_stopped_are_made_up_for_when_it_is_resumed(to
     assert done.json["trials_run"] == 6
 
 
-def test_audit_left_over_of_a_trial_that_differs_is_told_without_a_step(toy):
+def test_audit_left_over_of_a_trial_that_differs_is_reported_without_a_step(toy):
     toy.crashhunt(*WORDS, "--agent", "faulty:Remembers", "--audit", "1e-9")
     with closing(sqlite3.connect(toy.folder / "h" / "ledger.sqlite")) as ledger, ledger:
         row = ("audits_left", "[5]")

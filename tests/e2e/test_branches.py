@@ -39,7 +39,7 @@ def test_a_hunt_branches_where_trials_come_near_and_confirms_what_it_finds_from_
     assert crash["disturbed"]
     assert (shell.folder / crash["path"]).parent == shell.folder / "h" / "branches"
     again = found["run_again"]
-    assert f"of the {again} likeliest, {again} crashed from the start as well:" in done.err
+    assert f"of the {again} likeliest crashes, {again} reproduce from the start:" in done.err
     rows = list(csv.DictReader(io.StringIO(shell.crashhunt("trials", "h", "--format", "csv").out)))
     assert sum(int(row["branches"]) for row in rows) == found["branches"]
     assert sum(int(row["branch_crashes"]) for row in rows) == found["crashed"]
@@ -65,9 +65,11 @@ def test_a_hunt_stops_at_what_a_branch_has_found(shell):
     done = shell.crashhunt(*asked, "--fail-on-crash", expect=1)  # where it was killed before it had looked, likewise
     assert (done.json["stopped_because"], done.json["trials_run"], done.json["crashes"]) == ("crash", 3, [])
     assert done.json["copied"] == f"h/branches/{first}"
-    assert f"Trial {int(first[:6])} did not crash; a copy of it did, and from the start it crashed as well." in done.err
+    assert (
+        f"Trial {int(first[:6])} did not crash, but a copy of it did. The crash reproduces from the start." in done.err
+    )
     assert f"Replay it:  crashhunt replay h/branches/{first}" in done.err
-    assert "log-likelihood of those that were drawn" in done.err
+    assert "log-likelihood of exactly these disturbances" in done.err
     anew = shell.crashhunt(*asked, "--overwrite", "--deterministic").json
     assert (anew["stopped_because"], anew["copied"]) == ("crash", f"h/branches/{first}")
     assert anew["trials_run"] < 9
@@ -81,6 +83,6 @@ def test_a_hunt_stops_at_what_a_branch_has_found(shell):
 def test_branches_need_disturbances(shell):
     done = shell.crashhunt("run", "h", "1", "3", "60", "--branch", expect=2)
     assert done.err == (
-        "crashhunt: --branch has copies of trials go on with other disturbances, and there are none; say what may "
-        "happen there, such as --disturb brake=0.02,cut_in=0.02\n"
+        "crashhunt: --branch needs disturbances, and there are none; give rates, "
+        "such as --disturb brake=0.02,cut_in=0.02\n"
     )

@@ -58,7 +58,7 @@ NIGHTLY = [pytest.param(level, marks=pytest.mark.nightly) for level in (1, 2, 3)
 
 @pytest.mark.long
 @pytest.mark.parametrize("level", [0, *NIGHTLY])  # the hunt, what workers are forked from, a worker, a copy
-def test_whoever_is_killed_nothing_goes_on_and_the_hunt_comes_to_its_end(toy, level):
+def test_the_one_that_is_killed_nothing_continues_and_the_hunt_reaches_its_end(toy, level):
     process = toy.start(*HUNT)
     levels = wait_for(lambda: with_copies(process))
     victim = levels[level][-1]

@@ -182,7 +182,7 @@ def test_a_log_belongs_to_its_crash(hunt, crash):
     assert command("show", "h", "--crash", other.name)[0] == 0  # one that is damaged is in nobody's way
 
 
-def test_a_log_of_text_that_was_edited_says_so(hunt, crash):
+def test_a_log_of_text_that_was_edited_states_so(hunt, crash):
     (crash / "run.log").write_text("all is well\n")
     number = str(int(crash.name[:6]))
     assert "run, which has changed since it was written <==" in command("logs", "h", "--trial", number)[1]
@@ -245,7 +245,7 @@ def test_a_snapshot_that_is_damaged_is_made_again(hunt, toy):
     assert command("check", "h")[0] == 0
 
 
-def test_check_says_what_is_lost_and_saves_the_rest(hunt, crash, toy):
+def test_check_states_what_is_lost_and_saves_the_rest(hunt, crash, toy):
     whole = command("check", "h", "--json")
     found = json.loads(whole[1])
     assert (whole[0], found["fine"], found["hunts"][0]["trials"]) == (0, True, 12)

@@ -63,7 +63,7 @@ def test_a_hunt_stops_on_what_an_oracle_of_ones_own_sees(own):
     assert own.crashhunt("check", "h").code == 0
 
 
-def test_crash_on_decides_where_it_says_something(own):
+def test_crash_on_decides_where_it_states_something(own):
     words = ["--oracle", "own:Fast:above=8", "--keep-going"]
     assert "too_fast" not in run(own, *words, "--crash-on", "collision", name="only", trials="6")["outcomes"]
     assert set(run(own, *words, "--crash-on", "too_fast", name="both", trials="6")["outcomes"]) >= {"too_fast"}

@@ -75,7 +75,7 @@ def test_a_case_is_small_has_no_code_and_is_looked_at_like_a_hunt(kept):
         assert str(kept.folder) not in file.read_text()
 
 
-def test_crashes_that_a_corpus_has_are_told_from_new_ones(kept):
+def test_crashes_that_a_corpus_has_are_reported_from_new_ones(kept):
     words = ("crashes", "h", "--json", "--annotate", "--summary", "s.md", "--sarif", "x.sarif", "--known")
     done = kept.crashhunt(*words, "kept crashes")
     (group,) = done.json["groups"]
@@ -86,7 +86,7 @@ def test_crashes_that_a_corpus_has_are_told_from_new_ones(kept):
     assert done.json["groups"][0]["known"] is None
     assert "::error file=driver.py,line=2,title=rear end" in done.err
     summary = (kept.folder / "s.md").read_text()
-    assert summary.count("### crashhunt: 2 crashes of 1 kind, ") == 2  # the second is added to the first
+    assert summary.count("### crashhunt: 2 crashes of 1 type, ") == 2  # the second is added to the first
     assert (kept.folder / "x.sarif").is_file()
     assert "known" not in kept.crashhunt("crashes", "h", "--json").json["groups"][0]
     assert "'nowhere' does not exist" in kept.crashhunt("crashes", "h", "--known", "nowhere", expect=2).err
@@ -136,12 +136,12 @@ def test_todays_code_is_judged(kept):
     assert "driver" in done.json["cases"][0]["now"]
 
 
-def test_what_is_damaged_or_no_case_is_told_and_does_not_keep_the_others(kept):
+def test_what_is_damaged_or_no_case_is_reported_and_does_not_keep_the_others(kept):
     first, second = find_cases([kept.folder / "kept crashes"])
     (next(first.glob("snapshots/*")) / "scenario" / "scenario.toml").write_text("schema = 1")
     (report, other) = run_cases([first, second], parallel=2)
     assert (report.got, other.got) == ("cannot_run", "still")
-    assert "has changed; get the case back from the repository" in report.now  # there is no --force, as of a replay
+    assert "has changed; restore the case from the repository" in report.now  # there is no --force, as of a replay
     case = second / "crashhunt-case.toml"
     for text, said in (("expect = 'maybe'", "maybe"), ("expect = [", "not valid TOML"), ("", "expect")):
         case.write_text(text)
@@ -168,8 +168,8 @@ def test_a_strangers_crash_is_added_only_with_trust(kept):
     assert names[0] == names[1]
 
 
-def test_a_large_log_is_left_out_and_the_case_still_runs(kept, monkeypatch):
-    monkeypatch.setattr("crashhunt.corpus._cases._MOST", 1000)
+def test_a_large_log_is_excluded_and_the_case_still_runs(kept, monkeypatch):
+    monkeypatch.setattr("crashhunt.corpus._cases._MAX_BYTES_WITH_LOG", 1000)
     added = add_case(find_bundle(kept.folder / "h", "0"), kept.folder / "small")
     assert not list(added.case.path.rglob("log.mcap"))
     (report,) = run_cases([added.case.path])
@@ -202,7 +202,7 @@ def test_two_add_the_same_at_once(kept, monkeypatch):
     assert [path.name for path in corpus.iterdir()] == [path.name for path in find_cases([corpus])]
 
 
-def test_ctrl_c_ends_all_and_tells_what_has_ended(kept):
+def test_ctrl_c_ends_all_and_reports_what_has_ended(kept):
     begun = kept.folder / "begun"
     drive(kept, DRIVER.replace("return", f"import time; open({str(begun)!r}, 'w'); time.sleep(60); return"))
     running = kept.begin("corpus", "run", "kept crashes", "--parallel", "1")
@@ -229,7 +229,7 @@ def pytest_run(kept, *words, plugins=("crashhunt.corpus.pytest_plugin",)):
     )  # fmt: skip
 
 
-def test_pytest_runs_each_case_and_tells_it_readably(kept):
+def test_pytest_runs_each_case_and_reports_it_readably(kept):
     expect(kept, 0, "fixed")
     done = pytest_run(kept, "kept crashes", "--junit-xml", "junit.xml", "-rx")
     assert done.returncode == 1, done.stdout + done.stderr

@@ -30,7 +30,7 @@ def test_crashes_with_disturbances_from_the_hunt_to_the_report(toy):
     assert all(one["vehicle"] == "leader" for data in saved for one in data["disturbances"])
     assert f"{len(disturbed)} with disturbances." in done.err
     likeliest = max(disturbed, key=lambda data: data["log_likelihood"])
-    assert f"The likeliest of those with disturbances: {likeliest['id']} (log-likelihood " in done.err
+    assert f"Likeliest crash with disturbances: {likeliest['id']} (log-likelihood " in done.err
     state = toy.crashhunt("status", "h", "--json").json["hunts"][0]
     assert (state["crashes"], state["disturbed"]) == (len(crashes), len(disturbed))
     assert f"{len(crashes)} ({len(disturbed)} disturbed, " in toy.crashhunt("status", "h").out
@@ -82,7 +82,7 @@ def test_trials_in_which_nothing_is_drawn_are_those_of_an_undisturbed_hunt(toy):
     assert 'disturb = [\n    "stop=1e-06",\n]' in (toy.folder / "h" / "hunt.toml").read_text()
 
 
-def test_a_scenario_says_it_and_none_takes_it_back(toy):
+def test_a_scenario_states_it_and_none_takes_it_back(toy):
     file = toy.folder / "toy" / "scenario.toml"
     before = file.read_text()
     file.write_text(f"{before}\n[disturbances]\nbrake = 0.5\n")

@@ -14,7 +14,7 @@ from crashhunt.plans import Request, RunSettings
 HUNT = ("--scenario", "toy", "--seed", "4", "--arg", "speed=1", "--set", "step_wall_s=0.001")
 
 
-def test_a_hunt_ends_by_the_clock_and_goes_on_with_a_clock_of_its_own(toy):
+def test_a_hunt_ends_by_the_clock_and_continues_with_a_clock_of_its_own(toy):
     first = toy.crashhunt("run", "h", "1", "0", "20", *HUNT, "--for", "0.3s", "--json")
     assert first.json["stopped_because"] == "time"
     assert first.json["trials_planned"] == 0

@@ -22,7 +22,7 @@ def told(folder: Path) -> Counter[str]:
 
 
 @pytest.mark.long
-def test_a_rear_end_collision_could_be_avoided_until_the_step_that_is_told(toy):
+def test_a_rear_end_collision_could_be_avoided_until_the_step_that_is_reported(toy):
     toy.crashhunt("run", "h", "2", "4", "300", "--scenario", "toy", "--arg", "speed=12:14", *KEEP)
     assert told(toy.folder / "h")["wrong"] == 0
     bundles = list_bundles(toy.folder / "h")
@@ -57,7 +57,7 @@ def test_long_steps(shell, length):
     assert told(shell.folder / "h")["wrong"] == 0
 
 
-def test_a_crash_from_before_says_nothing(toy):
+def test_a_crash_from_before_states_nothing(toy):
     toy.crashhunt("run", "h", "1", "1", "300", "--scenario", "toy", "--arg", "speed=14", "--seed", "1")
     (file,) = (toy.folder / "h" / "crashes").glob("*/crash.json")
     data = json.loads(file.read_text())

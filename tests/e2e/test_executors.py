@@ -123,7 +123,7 @@ def test_ours_are_chosen_by_name(mine):
     assert calls(mine)[:2] == ["made 1 1000 ", "submit 2"]
 
 
-def test_it_may_know_better_than_this_machine_what_0_stands_for(mine):
+def test_it_may_know_better_than_this_machine_what_0_represents(mine):
     mine.crashhunt(*WORDS[:2], "0", *WORDS[3:], "--executor", "mine:Everywhere")
     assert calls(mine)[0] == "made 2 1000 asked 0"
     assert tomllib.loads((mine.folder / "h" / "hunt.toml").read_text())["run"]["parallel"] == 0
@@ -181,7 +181,7 @@ def test_what_there_is_not_is_one_line(mine, name, message):
     assert not (mine.folder / "s").exists()
 
 
-def test_one_that_cannot_be_made_says_why(mine):
+def test_one_that_cannot_be_made_states_why(mine):
     done = mine.crashhunt(*WORDS, "--executor", "mine:Broken", "--json", expect=2)
     assert done.json["error"]["message"] == "the executor 'mine:Broken' cannot be made: RuntimeError: no cluster here"
     assert "mine.py, line" in done.json["error"]["where"]

@@ -90,7 +90,7 @@ def test_a_film_from_the_log_runs_no_code_at_all(crash):
     assert "run" not in done.err.replace("crashhunt", "")
 
 
-def test_panels_that_fail_are_told_in_the_film_and_do_not_change_the_verdict(crash):
+def test_panels_that_fail_are_reported_in_the_film_and_do_not_change_the_verdict(crash):
     crash.crashhunt("run", "b", "1", "1", "60", "--agent", "showy:Showy", "--arg", "broken=true", *WORDS)
     done = crash.crashhunt("replay", "b", "--frames", "f", "--size", "240x160", "--json").json
     assert done["verdict"] == "reproduced"
@@ -170,7 +170,7 @@ def test_film_of_a_replay_that_is_killed_once_is_made(toy, number):
         (("--gif", "a.gif", "--from-log", "--set", "speed=3"), "--set: a film --from-log simulates nothing"),
     ],
 )
-def test_bad_options_are_told_before_anything_is_run(crash, words, message):
+def test_bad_options_are_reported_before_anything_is_run(crash, words, message):
     done = crash.crashhunt("replay", "h", *words, expect=2)
     assert message in done.err
     assert "reproduced" not in done.out

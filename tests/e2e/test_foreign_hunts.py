@@ -170,7 +170,7 @@ def test_trust_for_one_command_makes_nothing_ones_own(theirs):
         theirs.crashhunt("replay", place, expect=2)
 
 
-def test_hunt_that_goes_on_runs_no_code_of_another_user(theirs):
+def test_hunt_that_continues_runs_no_code_of_another_user(theirs):
     """What today's code tries is new; what is there already would run from the snapshot of the other user."""
     crash = find_bundle(theirs.folder / "h", "0")
     data = json.loads((crash.path / "crash.json").read_text())
@@ -234,7 +234,7 @@ def test_corpus_of_ones_own_repository_needs_no_question(theirs, tmp_path):
     theirs.crashhunt("corpus", "run", "unpacked", "--trust")
 
 
-def test_pytest_runs_a_corpus_as_it_runs_the_tests_beside_it(theirs):
+def test_pytest_runs_a_corpus_as_it_runs_the_tests_next_to_it(theirs):
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:randomly", "corpus"],
         cwd=theirs.folder, env=theirs.environment, capture_output=True, text=True, timeout=300, check=False,
@@ -250,7 +250,7 @@ def test_what_is_added_to_a_corpus_is_ones_own(theirs):
 
 
 @pytest.mark.nightly
-def test_suite_that_goes_on_in_a_foreign_folder_is_refused(theirs):
+def test_suite_that_continues_in_a_foreign_folder_is_refused(theirs):
     suite = """
     [defaults]
     scenario = "toy"

@@ -243,7 +243,7 @@ def test_a_hunt_and_its_corpus_as_a_runner_does_it(toy):
     assert len(lines) == 2
     assert all("file=driver.py,line=2," in line or "file=driver.py," in line for line in lines)
     summary = first.summary.read_text()
-    assert "2 kinds, 2 new" not in summary  # no corpus was given
+    assert "2 types, 2 new" not in summary  # no corpus was given
     assert f"crashhunt replay {exported[0]} --trust" in summary
     results = json.loads((place / "crashes.sarif").read_text())["runs"][0]["results"]
     assert {one["ruleId"] for one in results} == {"collision", "agent_error"}

@@ -68,7 +68,7 @@ def test_the_window_follows_the_ego_and_pauses_before_the_crash(crash, screen):
 
 
 @pytest.mark.nightly
-def test_nobody_at_the_terminal_is_not_waited_for_and_sleep_slows_it_down(crash, screen):
+def test_no_one_at_the_terminal_is_not_waited_for_and_sleep_slows_it_down(crash, screen):
     crash.environment["DISPLAY"] = screen
     began = time.monotonic()
     process = crash.start("replay", "h", "--gui", "--sleep", "0.5", "--until", "5", "--json", stdin=subprocess.DEVNULL)

@@ -48,12 +48,12 @@ def test_a_page_in_a_pipe_is_plain_text(shell):
     out = shell.crashhunt("guide", "files").out
     assert out.endswith("\n")
     assert not out.endswith("\n\n")
-    assert out.startswith("# What is on disk\n")
+    assert out.startswith("# Files on disk\n")
     assert "<!--" not in out
     assert "\x1b" not in out
     (said,) = [shell.crashhunt("guide", "files", "--json").json]
     assert said["topic"] == "files"
-    assert said["text"].startswith("# What is on disk\n")
+    assert said["text"].startswith("# Files on disk\n")
 
 
 def test_a_page_on_a_terminal_is_drawn(shell):
@@ -162,7 +162,7 @@ def test_a_topic_that_is_none_is_refused_from_python_too():
         find_page("x")
 
 
-def test_what_stands_for_the_reference_in_the_file_is_not_shown():
+def test_what_represents_the_reference_in_the_file_is_not_shown():
     for topic in ("commands", "api", "toml", "modules"):
         page = find_page(topic)
         assert "shows them" in page.file.read_text()

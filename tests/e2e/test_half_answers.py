@@ -111,8 +111,8 @@ def test_margin_of_a_trial_whose_copies_are_killed_is_open_until_they_are_asked_
     report, err = hunt_and_kill(shell, probed)
     assert report["outcomes"] == undisturbed["outcomes"]
     assert (report["probes"]["trials"], report["probes"]["not_fully_asked"], report["unanswered"]) == (1, 1, 1)
-    assert "1 trial was not fully asked: a copy was killed by SIGKILL" in err
-    assert "The same command runs it again." in err
+    assert "1 trial was not fully probed: a copy was killed by SIGKILL" in err
+    assert "Run the same command to run it again." in err
     assert "probes: a copy of a trial was killed by SIGKILL, and another is asked" in err
     assert "left out from here on" not in err
     rows, copies = table(shell, "h")
@@ -153,7 +153,7 @@ def test_branches_that_are_killed_are_counted_and_asked_again(shell, folder, gap
     assert (report["branches"]["not_fully_asked"], report["unanswered"]) == (1, 1), str(
         (table(shell, "h")[1], report["notes"])
     )
-    assert "1 trial was not fully asked: a copy was killed by SIGKILL" in err
+    assert "1 trial was not fully probed: a copy was killed by SIGKILL" in err
     rows, _ = table(shell, "h")
     asked, of = map(int, rows[0]["branches_asked"].removeprefix("asked ").split(" of "))
     assert asked < of
@@ -181,7 +181,8 @@ def test_trial_that_is_killed_at_different_steps_is_invalid_until_it_is_run_agai
     report = json.loads(out)
     assert (report["outcomes"], report["crashes"], report["unanswered"]) == ({"invalid": 1, "survived": 1}, [], 1)
     assert (
-        "Answers are missing from 1 trial: processes were killed from outside. The same command runs it again." in err
+        "1 trial has incomplete answers: processes were killed from outside. Run the same command to run it again."
+        in err
     )
     again = shell.crashhunt(*words).json
     assert (again["outcomes"], again["trials_run"], again["unanswered"]) == ({"survived": 2}, 2, 0)

@@ -116,7 +116,7 @@ def test_a_crash_stops_everything_at_once_even_hung_workers(toy):
     ("number", "hunted", "trials"),
     [(signal.SIGINT, LONG, 30), pytest.param(signal.SIGTERM, ON_SUMO, 24, marks=pytest.mark.nightly)],
 )
-def test_an_interrupt_keeps_what_has_finished_and_the_same_command_goes_on(toy, number, hunted, trials):
+def test_an_interrupt_keeps_what_has_finished_and_the_same_command_continues(toy, number, hunted, trials):
     words = ("run", "h", "2", str(trials), *hunted, "--json")
     process = toy.begin(*words, start_new_session=True)
     wait_for(lambda: count(toy.folder / "h") >= 4)
@@ -152,7 +152,7 @@ def test_an_interrupt_while_it_starts_is_not_lost(toy, libraries):
     wait_for(lambda: session_is_gone(process.pid))
 
 
-def test_a_killed_hunt_leaves_no_process_and_goes_on(toy):
+def test_a_killed_hunt_leaves_no_process_and_continues(toy):
     words = ("run", "h", "2", "30", *LONG, "--json")
     process = toy.begin(*words, start_new_session=True)
     wait_for(lambda: count(toy.folder / "h") >= 4)
@@ -193,7 +193,7 @@ def running_worker(folder: Path) -> int:
     return found[0]
 
 
-def test_other_settings_are_refused_and_overwrite_begins_anew(toy):
+def test_other_settings_are_refused_and_overwrite_begins_again(toy):
     toy.crashhunt("run", "h", "1", "2", "30", *FINE)
     done = toy.crashhunt("run", "h", "1", "2", "40", *FINE, "--json", expect=2)
     assert "max_steps was 30 and is now 40" in done.json["error"]["message"]
@@ -216,7 +216,7 @@ def test_a_second_hunt_on_one_directory_is_refused(toy):
         process.communicate()
 
 
-def test_a_finished_hunt_says_again_what_it_found(toy):
+def test_a_finished_hunt_states_again_what_it_found(toy):
     words = ("run", "h", "1", "5", "60", "--agent", "faulty:Raises", "--scenario", "toy", "--json")
     first, second = toy.crashhunt(*words).json, toy.crashhunt(*words).json
     assert first["crashes"] == second["crashes"]

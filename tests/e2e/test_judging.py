@@ -9,15 +9,16 @@ import pytest
 
 from crashhunt.crashes import INTERRUPTED, find_bundle, judgement_of, with_judgement
 from crashhunt.errors import UsageError
-from crashhunt.replays import ReplayOptions, judge, prepare
-from crashhunt.replays._avoidability import Search
-from crashhunt.replays._causes import _Search
+from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Outcome
+from crashhunt.whatif import judge
+from crashhunt.whatif._avoidability import Search
+from crashhunt.whatif._causes import _Search
 
 HUNT = ("--scenario", "toy", "--arg", "speed=14", "--seed", "1")
 
 
-def test_what_is_found_is_kept_and_told(toy):
+def test_what_is_found_is_kept_and_reported(toy):
     found = toy.crashhunt("run", "h", "1", "2", "300", *HUNT, "--only-at-fault", "--json").json
     assert (found["stopped_because"], found["trials_run"], found["at_fault"]) == ("crash", 1, [0])
     (group,) = toy.crashhunt("crashes", "h", "--json").json["groups"]
@@ -86,7 +87,7 @@ def test_slips(toy, words, said):
     assert said in toy.crashhunt("judge", "h", *words, expect=2).err
 
 
-def test_what_a_failure_hangs_on_is_run_and_told(toy):
+def test_what_a_failure_hangs_on_is_run_and_reported(toy):
     words = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=2|30", "--seed", "1")
     toy.crashhunt("run", "h", "1", "9", "9", *words)
     (judged,) = toy.crashhunt("judge", "h", "--why", "9", "--parallel", "1", "--json").json["judged"]
@@ -97,8 +98,8 @@ def test_what_a_failure_hangs_on_is_run_and_told(toy):
     assert factors["seed", "seed"]["needed"] is False
     said = toy.crashhunt("show", "h").out
     assert "- other values of ego.at (it was 2): no crash." in said
-    assert "the seed (" in said.partition("No difference, in any run without it: ")[2]
-    assert "only what it hangs on can be run" in toy.crashhunt("judge", "h", "--why", "0", expect=2).err
+    assert "the seed (" in said.partition("No difference in any run: ")[2]
+    assert "only its causes can be analysed" in toy.crashhunt("judge", "h", "--why", "0", expect=2).err
     assert toy.crashhunt("judge", "h", "--all", "--json").json == {"judged": []}  # it has been judged
 
 

@@ -199,7 +199,7 @@ def test_salvage_refuses_a_directory_with_anything_else(damaged):
     assert left_in(damaged.folder) == []
 
 
-def test_rerun_to_that_was_killed_before_it_ran_goes_on(damaged, monkeypatch):
+def test_rerun_to_that_was_killed_before_it_ran_continues(damaged, monkeypatch):
     hunt, to = damaged.folder / "h", damaged.folder / "to"
     ran: list[Path] = []
     monkeypatch.setattr(_rerun, "run_all", lambda folders, *_, **__: ran.extend(folders))

@@ -110,7 +110,7 @@ def test_a_damaged_proposal_is_found_and_the_others_are_saved(own):
 
 
 @pytest.mark.nightly
-def test_a_sampler_that_says_so_is_independent_even_when_nobody_can_import_it(own):
+def test_a_sampler_that_states_so_is_independent_even_when_no_one_can_import_it(own):
     own.crashhunt("run", "mine", *HUNT, "--sampler", "mine:Mine")
     own.crashhunt("run", "random", *HUNT)
     own.crashhunt("run", "old", *HUNT, "--sampler", "climber:Old")
@@ -127,7 +127,7 @@ def test_what_is_wrong_with_a_sampler_is_one_line(own):
     assert "climber.py, line" in done.err
 
 
-def test_a_crash_without_a_row_gets_one_that_says_where_it_is_from(own):
+def test_a_crash_without_a_row_gets_one_that_states_where_it_is_from(own):
     words = ("1", "3", "20", "--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=5", "--keep-going")
     own.crashhunt("run", "h", *words, "--sampler", "climber:Climber")
     before = trials(own.folder / "h")

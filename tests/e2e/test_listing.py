@@ -26,7 +26,7 @@ def test_agents_are_listed_with_arguments_ranges_and_units(shell):
     assert all(entry["locator"] in text and entry["title"] in text for entry in agents.values())
 
 
-def test_every_listed_scenario_says_what_it_is(shell):
+def test_every_listed_scenario_states_what_it_is(shell):
     scenarios = shell.crashhunt("scenarios", "--json").json["scenarios"]
     assert {entry["name"] for entry in scenarios} == set(shipped_scenarios())  # each of which test_scenarios hunts
     for entry in scenarios:

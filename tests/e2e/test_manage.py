@@ -74,7 +74,7 @@ def test_every_end_has_its_state(toy):
         "fine": "finished", "crash": "crashed", "none": "error",
     }  # fmt: skip
     assert (found["crash"]["crashes"], found["none"]["errors"]) == (1, 5)
-    assert "told to fail" in found["none"]["detail"]
+    assert "fails as its scenario arguments demand" in found["none"]["detail"]
     (lost,) = (toy.folder / "crash/crashes").glob("*/crash.json")
     lost.unlink()
     (found,) = toy.crashhunt("status", "crash", "--json").json["hunts"]
@@ -187,7 +187,7 @@ def test_a_hunt_whose_scenario_is_gone_runs_again_from_its_snapshot(toy):
     assert [row["digest"] for row in rows(toy, "again")] == [row["digest"] for row in rows(toy, "h")]
 
 
-def test_a_hunt_of_ones_own_scenario_begins_anew(toy):
+def test_a_hunt_of_ones_own_scenario_begins_again(toy):
     toy.crashhunt("run", "h", "1", "4", "99", *KEEP)
     before = [row["digest"] for row in rows(toy, "h")]
     for number in range(2):  # the second time, the scenario is that of what was set aside the first time
@@ -244,14 +244,14 @@ def test_the_shortest_few_of_a_kind_are_kept(toy, made_once):
     assert sorted(path.name for path in folder.iterdir()) == sorted(
         f"{row['number']:06d}-collision" for row in crashes[:2]
     )
-    assert f"{len(crashes)} crashes of 1 kind" in told.out
+    assert f"{len(crashes)} crashes of 1 type" in told.out
     assert rows(toy, "k") == before
     (group,) = toy.crashhunt("crashes", "k", "--json").json["groups"]
     assert (group["count"], len(group["members"])) == (len(crashes), 2)
     assert "2 crashes are as written" in toy.crashhunt("check", "k").out
     told = toy.crashhunt("run", "k", "2", "25", "99", "--scenario", "toy", "--seed", "4", *KEEP[-1:], "--keep", "1")
     assert len(list(folder.iterdir())) == 1
-    assert f"{len(crashes)} crashes of 1 kind" in told.out
+    assert f"{len(crashes)} crashes of 1 type" in told.out
     shutil.rmtree(next(folder.iterdir()))  # one that is missing is not one that was given up
     assert "crashed, and its bundle is missing" in toy.crashhunt("check", "k", expect=1).out
 

@@ -51,7 +51,7 @@ def test_one_is_replayed_shown_and_exported_by_its_number(hunt):
     assert (hunt.folder / "near.gif").stat().st_size > 1000
 
 
-def test_it_is_told_around_the_moment_when_it_was_nearest(hunt):
+def test_it_is_reported_around_the_moment_when_it_was_nearest(hunt):
     number = str(survivors(hunt)[0]["number"])
     words = ("h", "--crash", number)
     told = hunt.crashhunt("show", *words, "--last-seconds", "1", "--json").json
@@ -101,7 +101,7 @@ def test_without_a_crash_there_is_nothing_to_be_fixed(hunt):
     assert "changed: it crashes now" in faster.out
 
 
-def test_a_hunt_that_goes_on_keeps_those_of_all_its_trials(hunt):
+def test_a_hunt_that_continues_keeps_those_of_all_its_trials(hunt):
     before = {path.name: path.stat().st_mtime_ns for path in (hunt.folder / "h" / "near-misses").iterdir()}
     done = hunt.crashhunt(*WORDS[:3], "8", *WORDS[4:], "--near-misses", "1", "--json").json
     (kept,) = done["near_misses"]

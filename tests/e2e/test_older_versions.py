@@ -31,7 +31,7 @@ def test_its_crash_is_replayed_by_the_crashhunt_inside(shell, bundle):
 
 
 @bundles
-def test_it_is_told_and_driven_from_its_log_without_running_its_code(shell, bundle):
+def test_it_is_reported_and_driven_from_its_log_without_running_its_code(shell, bundle):
     assert "drove into left.8 at step 40" in shell.crashhunt("show", bundle).out
     shell.crashhunt("report", bundle, "--output", "page.html")
     assert "left.8" in (shell.folder / "page.html").read_text()
@@ -53,7 +53,7 @@ def test_a_hunt_is_listed_read_and_checked(shell, place):
 
 
 @hunts
-def test_a_hunt_goes_on_with_the_trials_that_it_would_have_had(shell, place):
+def test_a_hunt_continues_with_the_trials_that_it_would_have_had(shell, place):
     shutil.copytree(place / "hunt", shell.folder / "hunt")
     shutil.copytree(FROZEN / "toy", shell.folder / "toy")
     options = ("--scenario", "toy", "--seed", "1", "--keep-going", "--no-snapshot")

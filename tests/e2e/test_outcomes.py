@@ -74,7 +74,7 @@ def test_a_software_fault_is_found_saved_and_replayed(toy, agent, outcome, kind,
     assert verdict["divergence"] is None
 
 
-def test_an_agent_that_goes_elsewhere_takes_nobody_along(toy):
+def test_an_agent_that_goes_elsewhere_takes_no_one_along(toy):
     (toy.folder / "needed.txt").write_text("8")
     words = ("run", "h", "1", "3", "60", "--agent", "faulty:Wanders", *TOY, "--keep-going", "--json")
     report = toy.crashhunt(*words).json
@@ -112,7 +112,7 @@ def test_process_that_dies_in_the_constructor_of_an_agent_is_no_crash(toy):
     assert not [*toy.folder.glob("h/crashes/*")]
 
 
-def test_a_traffic_crash_says_who_hit_whom(shell):
+def test_a_traffic_crash_states_who_hit_which(shell):
     words = ("run", "h", "2", "60", "600", "--arg", "speed=22:25", "--seed", "3", "--json")
     (found,) = shell.crashhunt(*words).json["crashes"]
     assert found["outcome"] == "collision"

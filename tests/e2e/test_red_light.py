@@ -58,11 +58,11 @@ def test_a_red_light_from_the_hunt_to_the_report(shell):
     assert (shell.folder / "crash.gif").stat().st_size > 1000
 
 
-def test_what_nobody_hunts_for_is_told_at_the_end_and_in_the_table(shell):
+def test_what_no_one_hunts_for_is_reported_at_the_end_and_in_the_table(shell):
     make(shell)
     words = ("--scenario", "signal", "--arg", "speed=10", "--seed", "1", "--no-snapshot")
     done = shell.crashhunt("run", "h", "1", "2", "300", *words)
     assert "No crash was found." in done.out
-    assert "Also: 2 red lights run in 2 trials; --crash-on red_light hunts for that." in done.out
+    assert "Traffic events: 2 red lights run in 2 trials. To hunt for them: --crash-on red_light" in done.out
     rows = json.loads(shell.crashhunt("trials", "h", "--format", "json").out)
     assert [(row["outcome"], row["red_light"], row["teleport"]) for row in rows] == [("finished", 1, 0)] * 2

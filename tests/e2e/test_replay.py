@@ -238,7 +238,7 @@ def test_an_agent_that_is_not_deterministic_is_found_out(toy):
     assert done["agreed"] < 3
 
 
-def test_what_cannot_be_compared_says_which(crash_on_sumo):
+def test_what_cannot_be_compared_states_which(crash_on_sumo):
     crash = crash_on_sumo
     (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
     scenario = snapshot / "scenario" / "scenario.toml"
@@ -324,7 +324,7 @@ def test_a_fixed_order_of_links_that_is_missing_is_the_first_suspect(crash_on_su
     assert judged(rerun, rerun.recorded, rerun.recorded, result).verdict == "reproduced"
 
 
-def test_a_snapshot_of_a_crashhunt_that_runs_trials_in_another_way_says_so(crash):
+def test_a_snapshot_of_a_crashhunt_that_runs_trials_in_another_way_states_so(crash):
     (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
     code = snapshot / "code" / "crashhunt"
     edit(code / "episode" / "_settings.py", "_SCHEMA = 1", "_SCHEMA = 99")

@@ -17,7 +17,7 @@ def crash(shell, made_once):
     return made_once(hunted, shell)
 
 
-def test_a_collision_is_told_in_words_and_a_table(crash):
+def test_a_collision_is_reported_in_words_and_a_table(crash):
     text = crash.crashhunt("show", "h").out
     facts = crash.crashhunt("show", "h", "--json").json
     assert facts["summary"] in text
@@ -56,11 +56,11 @@ def test_bad_numbers_are_refused(crash):
     ("agent", "says"),
     [("faulty:Raises", "ValueError: no plan"), ("faulty:Segfaults", "SIGSEGV"), ("faulty:Nan", "target_speed")],
 )
-def test_software_faults_are_told_too(shell, agent, says):
+def test_software_faults_are_reported_too(shell, agent, says):
     shell.crashhunt("run", "h", "1", "1", "100", "--agent", agent, "--set", "vehicles=10")
     text = shell.crashhunt("show", "h").out
     assert says in text
-    assert "The last that it was shown" in text
+    assert "Its last observation, in step" in text
 
 
 def test_a_terminal_that_does_not_know_every_letter_is_shown_the_others(crash):

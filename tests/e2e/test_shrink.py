@@ -39,16 +39,16 @@ def test_arguments_become_plain_and_the_rest_stays(hunt):
         len(str(small.result.spec.arguments["ego"]["speed"])) <= 4 < len(str(was.result.spec.arguments["ego"]["speed"]))
     )
     assert small.added["shrunk"]["changed"] == told["changed"] != {}
-    assert any("can leave nobody out" in note for note in told["notes"])
+    assert any("cannot exclude actors" in note for note in told["notes"])
     assert hunt.crashhunt("replay", "h", "--crash", small.id, "--json").json["verdict"] == "reproduced"
-    assert f"{was.id} made smaller" in hunt.crashhunt("show", "h", "--crash", small.id).out
+    assert f"minimized from {was.id}: " in hunt.crashhunt("show", "h", "--crash", small.id).out
 
     # To the hunt, it is none of its crashes.
     assert small.id not in [bundle.id for bundle in list_bundles(hunt.folder / "h")]
     assert find_bundle(hunt.folder / "h", str(was.result.spec.number)).id == was.id
     assert hunt.crashhunt("status", "h", "--json").json["hunts"][0]["crashes"] == len(list_bundles(hunt.folder / "h"))
     assert hunt.crashhunt("check", "h", "--json").json["fine"]
-    with pytest.raises(UsageError, match="has been made smaller already"):
+    with pytest.raises(UsageError, match="is already minimized"):
         shrink(small)
     hunt.crashhunt("corpus", "add", told["path"], "--to", "kept")
     assert hunt.crashhunt("corpus", "run", "kept", "--json").json["cases"][0]["got"] == "still"
@@ -60,7 +60,7 @@ def test_a_budget_that_is_too_small_leaves_the_best_and_is_gone_on_from(hunt):
     assert part.ended == "budget"
     assert part.trials <= 3
     assert "larger --budget" in part.why
-    assert "000000-collision.small.jsonl: shrink goes on from it" in hunt.crashhunt("check", "h").out
+    assert "000000-collision.small.jsonl: shrink resumes from it" in hunt.crashhunt("check", "h").out
     whole = shrink(bundle, parallel=1)
     assert whole.ended == "done"
     shutil.rmtree(whole.small.path)
@@ -69,7 +69,7 @@ def test_a_budget_that_is_too_small_leaves_the_best_and_is_gone_on_from(hunt):
     assert not list(bundle.path.parent.glob(".*"))
 
 
-def test_a_crash_that_does_not_come_again_is_told(hunt, monkeypatch):
+def test_a_crash_that_does_not_come_again_is_reported(hunt, monkeypatch):
     bundle = find_bundle(hunt.folder / "h")
     monkeypatch.setattr("crashhunt.shrinking._runs.signature_of", lambda _: None)
     found = shrink(bundle, parallel=1)
@@ -80,7 +80,7 @@ def test_a_crash_that_does_not_come_again_is_told(hunt, monkeypatch):
         shrink(bundle)
 
 
-def test_a_full_disk_is_told_and_what_came_of_the_trials_is_remembered(hunt, monkeypatch):
+def test_a_full_disk_is_reported_and_what_came_of_the_trials_is_remembered(hunt, monkeypatch):
     bundle = find_bundle(hunt.folder / "h")
     folder = bundle.path.parent
 
@@ -190,7 +190,7 @@ def test_what_is_asked_for_must_make_sense(hunt):
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("parallel", ["1", "3"])
-def test_others_are_left_out_on_sumo(shell, parallel, tmp_path_factory):
+def test_others_are_excluded_on_sumo(shell, parallel, tmp_path_factory):
     shell.crashhunt("run", "h", "2", "15", "300", "--seed", "1", "--keep-going", "--arg", "speed=20:25")
     told = shell.crashhunt("shrink", "h", "--parallel", parallel, "--json").json
     assert told["actors_after"] <= 3 < told["actors_before"]

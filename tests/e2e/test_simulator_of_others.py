@@ -51,7 +51,7 @@ BACKEND = Backend(
     notes=lambda scenario: [f"the road is {scenario.table(RoadSetup).road}"],
     versions=("mysim-engine",),
     variables=("MYSIM_HOME",),
-    told_events=(),
+    reported_events=(),
     configurations=(Configuration(endings=(".road",), load=load),),
 )
 '''
@@ -145,10 +145,10 @@ def test_its_table_files_and_versions_are_those_of_the_hunt_and_its_crash_is_rep
     mysim.crashhunt("export", "h", exported)
     mysim.environment["XDG_STATE_HOME"] = str(mysim.folder / "of somebody else")  # whom this user does not know
     refused = mysim.crashhunt("replay", exported, "--from-log", expect=2)
-    assert "nobody knows what the simulator 'mysim' does besides simulating; give --trust" in refused.err
+    assert "the side effects of the simulator 'mysim' are unknown; give --trust" in refused.err
 
 
-def test_mistakes_are_told_in_one_line(mysim):
+def test_mistakes_are_reported_in_one_line(mysim):
     file = mysim.folder / "town" / "scenario.toml"
     for said, instead, says in (
         ("road =", "rod =", "unknown key 'mysim.rod'; did you mean 'road'?"),

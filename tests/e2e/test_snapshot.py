@@ -219,7 +219,7 @@ def test_more_can_be_taken_in(project):
     assert "'../gone' does not exist" in refused.err
 
 
-def test_hunts_inside_the_work_tree_are_left_out(project):
+def test_hunts_inside_the_work_tree_are_excluded(project):
     words = list(RUN)
     for name in ("hunts/first", "second"):
         (project.folder / "hunts").mkdir(exist_ok=True)

@@ -142,7 +142,7 @@ def test_an_interrupt_while_a_hang_is_confirmed_ends_it_at_once(toy):
     assert toy.crashhunt(*words, "--timeout", "2", "--json").json["crashes"][0]["confirmed"] is True
 
 
-def test_a_ledger_that_is_removed_is_written_anew(toy):
+def test_a_ledger_that_is_removed_is_written_again(toy):
     process = toy.begin("run", "h", "2", "1000", "20", *FINE, *SLOW, "--json")
     wait_for(lambda: len(rows(toy.folder / "h")) >= 3)
     before = rows(toy.folder / "h")

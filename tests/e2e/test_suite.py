@@ -98,7 +98,7 @@ def test_every_hunt_stops_at_its_own_first_crash(toy):
     assert (toy.folder / "out/slow/0/ledger.sqlite").stat().st_mtime_ns == before
 
 
-def test_what_cannot_run_leaves_the_others_untouched_and_is_told(toy):
+def test_what_cannot_run_leaves_the_others_untouched_and_is_reported(toy):
     written(toy, SUITE + BROKEN)
     (toy.folder / "explodes.py").write_text("raise OSError('no such luck')")
     done = toy.crashhunt("suite", "run", "suite.toml", "out", "2", expect=1)
@@ -201,7 +201,7 @@ def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
     out, err = process.communicate(timeout=300)
     assert process.returncode == 130, err
     assert len(json.loads(out)["hunts"]) == 3
-    assert "the same command goes on from here" in err
+    assert "Run the same command to resume" in err
     found = states(toy)
     assert (found["a/0"], found["b/0"], found["c/0"]) == ("interrupted", "interrupted", "queued")
 

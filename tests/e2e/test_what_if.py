@@ -14,9 +14,10 @@ import crashhunt
 from crashhunt.base.errors import UsageError
 from crashhunt.crashes import find_bundle
 from crashhunt.recording import first_divergence
-from crashhunt.replays import ReplayOptions, Reruns, prepare, up_to
+from crashhunt.replays import ReplayOptions, prepare, up_to
 from crashhunt.trial import KILLED, Failure, Outcome, Reseeding
 from crashhunt.whatif import Reseed, WhatIfOptions, _engine, what_if
+from crashhunt.whatif._reruns import Reruns
 
 SPEED = ("--agent", "crashhunt.agents:KeepLaneWithSpeed", "--arg")
 
@@ -201,6 +202,7 @@ def test_ctrl_c_counts_the_runs_that_ended(toy):
         assert running.returncode == (0 if more else 130), err
         assert "Traceback" not in err
         assert f"  interrupted: {why}, after " in out
+        assert "(those before the first run that had not finished)" in out
         assert int(out.split(" of ")[1].split(" runs")[0]) > 0
 
 
@@ -217,8 +219,8 @@ def test_python_counts_as_the_command_does(crash):
 class Tampered(Reruns):
     """Runs of which some are changed on the way."""
 
-    def run(self, specs, *, recorded=True):
-        for ended in super().run(specs, recorded=recorded):
+    def run(self, specs, **options):
+        for ended in super().run(specs, **options):
             if ended.place == 1:
                 failure = Failure(KILLED, "killed from outside 3 times", exit_code=-9)
                 killed = replace(ended.result, outcome=Outcome.INVALID, failure=failure)
@@ -254,7 +256,8 @@ def test_runs_that_are_killed_or_differ_before_the_step_do_not_count(crash, monk
 def test_crash_of_an_earlier_version_takes_changes_and_names_what_needs_todays_code(toy, name):
     bundle = str(Path(__file__).with_name("bundles") / f"{name}.zip")
     done = toy.crashhunt("whatif", bundle, "--trust", "--from-step", "3", "--futures", "--times", "2", expect=2)
-    assert "is too old for this change; add --code current" in done.err
+    assert "the crashhunt in the snapshot of this crash is too old for this change" in done.err
+    assert done.err.endswith("add --code current\n")
     assert done.err.count("\n") == 1
     found = toy.crashhunt("whatif", bundle, "--trust", "--from-step", "3", *SPEED, "speed=5", "--json").json
     assert (found["runs"], found["crashed"], found["from_step"], found["code"]) == (1, 0, 3, "current")

@@ -119,7 +119,7 @@ def test_others_err_where_it_is_asked_for():
     assert not np.array_equal(first[-1], undisturbed[-1][0])
 
 
-def test_what_disturbs_the_first_observation_is_told_with_it():
+def test_what_disturbs_the_first_observation_is_reported_with_it():
     env = SumoEnv("loop", disturb="late_observation@1=itself:0.2:1,late_action@2=itself:0.2:1", max_steps=5)
     _, told = env.reset(seed=4)
     *_, then = env.step((8.0, 0))
@@ -129,7 +129,7 @@ def test_what_disturbs_the_first_observation_is_told_with_it():
 
 
 def test_what_cannot_disturb_is_refused():
-    with pytest.raises(UsageError, match="disturb needs to know how long"):
+    with pytest.raises(UsageError, match="disturb needs a limit of the episode"):
         SumoEnv("loop", disturb="brake=1")
     with pytest.raises(UsageError, match="there is no disturbance 'brakes'"):
         SumoEnv("loop", process=True, disturb="brakes=1", max_steps=5)
@@ -148,17 +148,89 @@ def ended(pid):
     return False
 
 
-def test_a_process_that_dies_is_told():
+def test_a_process_that_dies_is_reported():
     env = SumoEnv(process=True)
     with pytest.raises(UsageError, match="nothing to render"):
         SumoEnv.render(_with_mode(env))
     env.reset(seed=1)
     os.kill(env._episodes._process.pid, signal.SIGKILL)
-    with pytest.raises(SimulatorError, match="ended by signal 9; make a new one"):
+    with pytest.raises(SimulatorError, match="ended by signal 9; make a new environment"):
         env.step((8.0, 0))
     with pytest.raises(SimulatorError, match="has been closed"):
         env.step((8.0, 0))
     env.close()
+    env.close()
+
+
+def drive(env, steps=25):
+    found = []
+    for _ in range(steps):
+        observation, reward, terminated, _, _ = env.step((15.0, 0))
+        found.append((observation.tobytes(), reward, terminated))
+        if terminated:
+            break
+    return found
+
+
+@pytest.fixture
+def branching():
+    """A running environment in a process of its own; what it branches is closed with it."""
+    env = SumoEnv("loop", process=True)
+    env.reset(seed=3)
+    drive(env, 20)
+    made = [env]
+    yield env, made
+    pids = [one._episodes.pid for one in made]
+    for one in made:
+        one.close()
+        one.close()
+    assert all(ended(pid) for pid in pids)
+
+
+def test_copies_of_an_episode_are_bit_identical_and_independent(branching):
+    env, made = branching
+    one, other = env.branch(2)
+    made += [one, other]
+    assert len({each._episodes.pid for each in made}) == 3
+    first = drive(one)
+    (nested,) = one.branch(1)
+    made.append(nested)
+    tail = drive(one, 5)
+    assert drive(env) == first == drive(other)  # neither copy has moved the original
+    env.close()
+    assert drive(other, 5) == tail == drive(nested, 5)  # copies outlive the original
+    with pytest.raises(UsageError, match="a copy of an episode cannot be reset"):
+        other.reset(seed=1)
+
+
+def test_reseeded_copies_differ_and_can_be_repeated(branching):
+    env, made = branching
+    made += (copies := [*env.branch(2, seed=5), *env.branch(2, seed=5)])
+    one, other, same, again = (drive(copy) for copy in copies)
+    assert one != other
+    assert (one, other) == (same, again)
+
+
+def test_a_copy_that_dies_is_named_and_costs_no_other(branching):
+    env, made = branching
+    made += (copies := env.branch(2))
+    pid = copies[0]._episodes.pid
+    os.kill(pid, signal.SIGKILL)
+    with pytest.raises(SimulatorError, match=rf"^copy 1 of 2 of the environment \(process {pid}\) ended; make a new"):
+        copies[0].step((15.0, 0))
+    assert drive(copies[1]) == drive(env)
+
+
+def test_what_cannot_be_branched_is_refused_in_one_line(own, monkeypatch):
+    here = SumoEnv("loop")
+    with pytest.raises(UsageError, match="process of its own can be branched; make it with process=True"):
+        here.branch(1)
+    here.close()
+    with pytest.raises(UsageError, match="n is 0; branch at least 1"):
+        own.branch(0)
+    env = SumoEnv("loop", process=True)
+    with pytest.raises(SimulatorError, match="no episode is running, so there is nothing to branch; call reset"):
+        env.branch(1)
     env.close()
 
 

@@ -134,7 +134,7 @@ def test_function_of_an_agent_that_raises_inside_the_simulator_is_the_agents(wri
 
 
 @pytest.mark.usefixtures("toy_mended")
-def test_agent_in_a_module_of_its_own_is_told_from_another_agent(write, tmp_path):
+def test_agent_in_a_module_of_its_own_is_reported_from_another_agent(write, tmp_path):
     second = write("second", agent_module("pass", name="Calm")).Calm
     first = write("mine", agent_module(RAISES_IN_SIMULATOR)).Agent
     assert told(run(tmp_path, toy(tmp_path, "a", "b"), second, first)) == ("agent_error", 2, "b")
@@ -184,7 +184,7 @@ def gym(tmp_path):
         ("shared.help()", "def help(): ...\n", "shared.help = lambda: 1 / 0", ("agent_error", 3, "ego")),
     ],
 )
-def test_environment_of_a_users_is_told_from_the_agent(write, tmp_path, fail, helper, harm, expected):
+def test_environment_of_a_users_is_reported_from_the_agent(write, tmp_path, fail, helper, harm, expected):
     write("shared", helper)
     write("environment", ENVIRONMENT.replace("FAIL", fail))
     agent = write("mine", agent_module(harm, "environment, shared", action="0")).Agent

@@ -84,7 +84,7 @@ def test_the_leader_brakes_for_so_long_and_drives_on_by_itself(run):
     assert recording.disturbances == result.disturbances
 
 
-def test_the_same_again_to_the_bit_and_elsewhere_the_first_difference(run):
+def test_the_same_again_bit_by_bit_and_elsewhere_the_first_difference(run):
     (one, recorded), (again, _) = run(planned(11)), run(planned(11))
     assert one.digest == again.digest
     _, other = run(planned(11, strong=3.0))
@@ -105,7 +105,7 @@ def test_it_brakes_no_harder_than_vehicles_can(run):
     assert np.isclose(min(np.diff(speeds(recording))) / 0.1, -8.0)
 
 
-def test_nobody_there_and_agents_are_never_meant(run):
+def test_no_one_there_and_agents_are_never_meant(run):
     result, recording = run(planned(3, who="behind"), planned(5, agent="ego"), scenario=TWO)
     assert result.disturbances == ()  # ahead of ego is the second agent
     assert [one.vehicle for one in recording.disturbances] == ["", ""]
@@ -113,7 +113,7 @@ def test_nobody_there_and_agents_are_never_meant(run):
     assert [one.vehicle for one in result.disturbances] == ["leader"]
 
 
-def test_a_vehicle_errs_once_at_a_time_and_right_after_again(run):
+def test_a_vehicle_deviates_once_at_a_time_and_right_after_again(run):
     result, _ = run(planned(5, long=1.0), planned(10, long=1.0), planned(15, long=0.5))
     assert [(one.step, one.vehicle) for one in result.disturbances] == [(5, "leader"), (15, "leader")]
 
@@ -172,7 +172,7 @@ def test_a_late_action_is_recorded_when_it_is_decided_and_done_later(run):
     assert there[16] == pytest.approx(here[11])
 
 
-def test_what_is_late_is_so_in_whole_steps_and_told_so(run):
+def test_what_is_late_is_so_in_whole_steps_and_reported_so(run):
     given = {"steps": 8, "agent": Counts(lambda step: (10.0 + 0.1 * step, 0))}
     _, without = run(**given)
     for what, shown in (("late_action", lambda made: speeds(made, "ego")), ("late_observation", observed)):

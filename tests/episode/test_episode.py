@@ -100,7 +100,7 @@ def drive(episode):
     return episode.result
 
 
-def test_observers_are_told_everything_in_order(begin):
+def test_observers_are_reported_everything_in_order(begin):
     log = []
     episode = begin(scenario=TWO, observers=(Teller(log, " 1"), Teller(log, " 2")), steps=1)
     assert [entry[0] for entry in log] == ["begin 1", "begin 2", "scene 1", "scene 2"]
@@ -308,7 +308,7 @@ def test_an_episode_leaves_the_generators_of_the_process_alone(begin):
     assert random.getstate() == state
 
 
-def test_what_is_told_of_an_exception_is_bounded():
+def test_what_is_reported_of_an_exception_is_bounded():
     def fail(message):
         try:
             raise ValueError(message)

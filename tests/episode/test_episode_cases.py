@@ -213,7 +213,7 @@ def test_the_same_is_drawn_in_every_run(run, monkeypatch):
     assert other.asked[0][3:] == (random.random(), np.random.random())  # noqa: NPY002
 
 
-def test_actors_are_told_of_once_and_rosters_when_they_change(run):
+def test_actors_are_reported_of_once_and_rosters_when_they_change(run):
     late = Actor("late", "truck", 12.0, 2.5)
     script = {
         1: {"scene": {"roster": Roster((EGO, SECOND, late)), "xs": (0.0, 10.0, 40.0)}},
@@ -246,7 +246,7 @@ def test_everything_of_a_scene_is_recorded(run):
         2: {"scene": {"off_road": ("other",)}, "events": (event,)},
     }
     simulator = Scripted(script)
-    simulator.told_events = ("teleport", "red_light")
+    simulator.reported_events = ("teleport", "red_light")
     result = run(simulator)
     _, first, second, third = run.recording().scenes()
     assert (first.contacts, first.heights, first.grades, first.spines) == (
@@ -260,11 +260,11 @@ def test_everything_of_a_scene_is_recorded(run):
     assert (result.outcome, result.events) == (Outcome.SURVIVED, {"teleport": 1})
     assert run(Scripted()).events is None
     silent = Scripted()
-    silent.told_events = ("teleport",)
+    silent.reported_events = ("teleport",)
     assert run(silent).events == {}
 
 
-def test_a_crash_ends_it_and_says_who(run):
+def test_a_crash_ends_it_and_states_who(run):
     contact = Contact("ego", "other", "collision", "a_0", 3.0, 1.0)
     result = run(Scripted({2: {"scene": {"contacts": (contact,)}}}))
     assert (result.outcome, result.steps, result.sim_time_s) == (Outcome.COLLISION, 2, 1.0)
@@ -282,7 +282,7 @@ def test_a_crash_ends_it_and_says_who(run):
     assert (off.outcome, off.steps, off.collision.agent) == (Outcome.OFF_ROAD, 1, "second")
 
 
-def test_what_nobody_asked_for_does_not_end_it(run):
+def test_what_no_one_asked_for_does_not_end_it(run):
     contact, event = Contact("ego", "other", "collision", "a_0", 3.0, 1.0), Event("red_light", "second", "it ran")
     script = {1: {"scene": {"contacts": (contact,)}, "events": (event,)}, 2: {"scene": {"off_road": ("ego",)}}}
     assert run(Scripted(script), crash_on=(Outcome.HANG,)).outcome is Outcome.SURVIVED
@@ -432,7 +432,7 @@ def test_what_an_oracle_or_our_own_files_raise_ends_it(run, error, outcome):
     assert log[-1] == "closed"
 
 
-def test_an_oracle_of_somebody_elses_is_asked_with_the_others(run):
+def test_an_oracle_of_an_actor_elses_is_asked_with_the_others(run):
     seen = []  # how late it was in the scene before
 
     class Sees:
@@ -500,7 +500,7 @@ def test_braking_begins_after_a_step():
     assert log == [("seed", 5), "seen", "seen", ("seed", 6), "seen", "closed"]
     Braking(SimpleNamespace(), Car(), "ego", 2).close()
     for simulator, agent in ((Car(), "second"), (Scripted(), "ego")):
-        with pytest.raises(InvalidEpisodeError, match=f"nobody knows how {agent} brakes"):
+        with pytest.raises(InvalidEpisodeError, match=f"{agent} cannot be made to brake fully"):
             Braking(Driver(), simulator, agent, 2)
 
 
@@ -524,7 +524,7 @@ def test_an_agent_is_kept_from_one_thing_after_a_step(keeps, form, decided, done
     assert [agent.act("seen") for _ in range(4)] == [decided, decided, done, done]
 
 
-def test_what_nobody_understands_keeps_nobody_from_anything():
+def test_what_no_one_understands_keeps_no_one_from_anything():
     car = SimpleNamespace(actions={"ego": SimpleNamespace(names=(), space=spaces.Discrete(5))})
-    with pytest.raises(InvalidEpisodeError, match="nobody knows what the actions of ego say"):
+    with pytest.raises(InvalidEpisodeError, match="ego cannot be held: its actions"):
         overruled_agent(SimpleNamespace(), car, Overruled("ego", 2, keeps="lane"))

@@ -51,7 +51,7 @@ def ask(tmp_path):
 
 
 @pytest.mark.parametrize("scenario", ["toy", "loop", pytest.param("highway", marks=pytest.mark.nightly)])
-def test_a_copy_and_a_copy_of_it_go_on_to_the_same_bits(ask, scenario):
+def test_a_copy_and_a_copy_of_it_continue_to_the_same_bits(ask, scenario):
     unforked, *others = ask(scenario)["ends"]
     assert len(others) == 3
     assert unforked["steps"] >= 50  # on highway-env it drives off then

@@ -17,7 +17,7 @@ def drawn():
 
 
 @pytest.mark.parametrize("torch", [None, "there"])
-def test_all_of_them_go_on_where_they_were(monkeypatch, torch):
+def test_all_of_them_continue_where_they_were(monkeypatch, torch):
     told = []
     there = SimpleNamespace(
         manual_seed=lambda seed: told.append(("seed", seed)),

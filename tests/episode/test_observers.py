@@ -48,10 +48,10 @@ def box():
 
 @pytest.fixture
 def recorder(box):
-    return Recorder(box, SimpleNamespace(told_events=("teleport", "red_light")))
+    return Recorder(box, SimpleNamespace(reported_events=("teleport", "red_light")))
 
 
-def test_who_is_new_is_told_once_and_who_is_there_when_that_changes(box, recorder):
+def test_who_is_new_is_reported_once_and_who_is_there_when_that_changes(box, recorder):
     first = scene(EGO, OTHER)
     recorder.scene(0, first, (0.0,))
     recorder.scene(1, scene(roster=first.roster), (0.0,))
@@ -113,7 +113,7 @@ def test_scenes_do_not_pile_up_until_the_end(nearness):
     assert len(calls) == before + 1
 
 
-def test_whoever_has_touched_was_in_the_greatest_danger(nearness):
+def test_the_one_that_has_touched_was_in_the_greatest_danger(nearness):
     meter, _ = nearness
     hit = Collision("ego", "collider", "ego", "other", ("overlap",))
     crashed = replace(RESULT, outcome=Outcome.COLLISION, collision=hit)

@@ -72,13 +72,13 @@ def test_it_changes_lanes_in_its_first_decision(side, change):
     assert said(meta, 3) == ["drive", WORDS.index(f"LANE_{side.upper()}"), "full"]
 
 
-def test_whom_nobody_knows_how_to_overrule_is_refused():
+def test_which_no_one_knows_how_to_overrule_is_refused():
     unknown = action_form(spaces.Box(-1.0, 1.0, (2,)))
     for simulator, overruled, what in (
-        (Lanes(brakes=""), Overruled("ego", 1), "ego brakes"),
-        (Lanes(), Overruled("other", 1), "other brakes"),
-        (Lanes(unknown), Overruled("ego", 1, "left"), "ego changes lanes to the left"),
-        (Lanes(MetaAction(("IDLE", "LANE_LEFT"))), Overruled("ego", 1, "right"), "lanes to the right"),
+        (Lanes(brakes=""), Overruled("ego", 1), "ego cannot be made to brake"),
+        (Lanes(), Overruled("other", 1), "other cannot be made to brake"),
+        (Lanes(unknown), Overruled("ego", 1, "left"), "ego cannot be made to change to the left lane"),
+        (Lanes(MetaAction(("IDLE", "LANE_LEFT"))), Overruled("ego", 1, "right"), "change to the right lane"),
         (Lanes(unknown), Overruled("ego", 1, keeps="lane"), "lanes and speeds"),
         (Lanes(MetaAction(("GO", "STOP"))), Overruled("ego", 1, keeps="speed"), "lanes and speeds"),
     ):

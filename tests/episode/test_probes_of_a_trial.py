@@ -159,7 +159,7 @@ def test_other_kinds_are_asked_for_what_is_milder_only():
     assert stress.left_out == 0
 
 
-def test_how_late_is_told_as_it_was():
+def test_how_late_is_reported_as_it_was():
     asker, _ = prober()
     road = Road({"late_action": 0.01}, kinds=())
     asker.ask(road)
@@ -170,7 +170,7 @@ def test_how_late_is_told_as_it_was():
     assert late == []  # which would be as late at least
 
 
-def test_where_nothing_milder_is_left_nobody_else_is_asked():
+def test_where_nothing_milder_is_left_nothing_else_is_asked():
     asker, _ = prober()
     road = Road({"brake": 1 / 16})
     asker.ask(road)
@@ -189,7 +189,7 @@ def test_as_long_as_something_milder_is_left_it_is_asked_for():
     assert stress_of(asker).margin == 1 / 16
 
 
-def test_of_a_trial_that_crashes_anyway_a_disturbance_says_nothing():
+def test_of_a_trial_that_crashes_anyway_a_disturbance_states_nothing():
     asker, _ = prober()
     road = Road({"brake": 0.5}, doomed=True)
     asker.ask(road)
@@ -199,7 +199,7 @@ def test_of_a_trial_that_crashes_anyway_a_disturbance_says_nothing():
     assert (stress.margin, stress.disturbance) == (1.0, None)
 
 
-def test_a_copy_is_followed_for_five_seconds_and_only_if_somebody_is_there():
+def test_a_copy_is_followed_for_five_seconds_and_only_if_an_actor_is_there():
     asker, _ = prober()
     road = Road({}, absent=("brake",))
     asker.ask(road)
@@ -218,7 +218,7 @@ def test_who_is_not_there_is_asked_for_nothing():
     assert len(road.asked) == 4
 
 
-def test_copies_take_four_times_the_steps_of_their_trial_and_others_are_left_out_each_time():
+def test_copies_take_four_times_the_steps_of_their_trial_and_others_are_excluded_each_time():
     asker, _ = prober()
     road = Road({}, steps=20)  # of which copies may take 80
     asker.ask(road)
@@ -258,7 +258,7 @@ def test_what_is_no_crash_of_the_hunt_is_none_of_a_copy(outcome, crash_on):
     assert (stress.margin, stress.disturbance, stress.outcome) == (1.0, None, "")
 
 
-def test_a_trial_that_crashed_has_no_margin_and_one_that_nobody_asked_says_nothing():
+def test_a_trial_that_crashed_has_no_margin_and_one_that_no_one_asked_states_nothing():
     asker, _ = prober()
     assert stress_of(asker) is None
     assert stress_of(asker, Outcome.COLLISION).margin == 0.0
@@ -367,7 +367,7 @@ def test_an_answer_between_failures_keeps_the_asking_going():
     assert stress_of(asker).extent == "asked 1 of 5"
 
 
-def test_what_has_no_copy_is_told_and_its_time_counts():
+def test_what_has_no_copy_is_reported_and_its_time_counts():
     class Refused(Road):
         def fork(self, work, *, observed=True):
             raise CannotForkError("threads have no copy", fix="none")

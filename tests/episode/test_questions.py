@@ -81,7 +81,7 @@ def test_kills_end_the_asking_of_one_trial_and_failures_that_of_the_process():
     assert (questions.why_unanswered, questions.may_be_answered) == (questions.why_not, False)
 
 
-def test_answer_begins_the_count_anew():
+def test_answer_begins_the_count_again():
     questions = Questions("probes")
     for reason in (RAISED, KILLED):
         for _ in range(5):
@@ -100,7 +100,7 @@ def test_what_cannot_be_copied_is_not_tried_again():
     assert (len(rest), questions.may_be_answered, told) == (1, False, [])
 
 
-def test_reason_is_one_short_line_whatever_an_exception_says():
+def test_reason_is_one_short_line_whatever_an_exception_states():
     told = []
     questions = Questions("probes", told.append)
     questions.ask(lambda: (None, NoAnswer("raised Boom: \x1b[2J\n" + "x\n" * 10**6 + "\ud800")))

@@ -54,7 +54,7 @@ def test_it_crosses_as_json(settings):
 
 
 @pytest.mark.parametrize(("name", "value"), [("warm_copies", 3), ("probe_s", 2.5)])
-def test_what_has_come_since_is_told_where_it_is_asked_for_only(settings, name, value):
+def test_what_has_come_since_is_reported_where_it_is_asked_for_only(settings, name, value):
     assert name not in plain(settings)
     asked = replace(settings, **{name: value})
     assert plain(asked)[name] == value
@@ -79,7 +79,7 @@ def test_what_is_not_said_is_the_usual(scenario, tmp_path):
     assert WorkerSettings.from_json(data) == usual
 
 
-def test_an_older_version_is_told_of_nothing_that_it_need_not_know(settings):
+def test_an_older_version_is_reported_of_nothing_that_it_need_not_know(settings):
     data = plain(settings)
     assert data["schema"] == 1
     scenario = data["scenario"]

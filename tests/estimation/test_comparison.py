@@ -112,7 +112,7 @@ def test_of_a_hunt_that_guided_its_trials_only_those_count_that_it_did_not(tmp_p
     assert "guided: counted are the trials of origin random" in describe_comparison(found)
 
 
-def test_a_hunt_that_stopped_at_a_guided_crash_says_nothing_either(tmp_path):
+def test_a_hunt_that_stopped_at_a_guided_crash_states_nothing_either(tmp_path):
     """The trials that count have not crashed, but how many there are was up to one that does not."""
     guided = hunt(tmp_path / "guided", 0, sampler="guided", plain=5, trials=13, keep_going=False)
     with closing(Ledger(guided / "ledger.sqlite", writable=True)) as ledger:

@@ -112,7 +112,7 @@ def test_any_bytes_are_refused_in_words(left_behind, records, report):
     assert isinstance(check(left_behind, report, records=records), str)
 
 
-def test_black_box_file_says_what_the_process_wrote(tmp_path):
+def test_black_box_file_states_what_the_process_wrote(tmp_path):
     supervised = BlackBoxFile(tmp_path / "box")
     supervised.begin(trial=9, started=2.5)
     box = BlackBox(tmp_path / "box", begun=supervised.reserved)

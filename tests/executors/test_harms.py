@@ -246,7 +246,7 @@ MESSAGES = {
 }
 
 
-def test_trial_says_what_happened(run):
+def test_trial_states_what_happened(run):
     found = run(MESSAGES)
     said = {pair: found[number].failure and found[number].failure.message for number, pair in enumerate(MESSAGES)}
     assert said == MESSAGES

@@ -100,16 +100,16 @@ class TestRayExecutor(ExecutorContract):
         return lambda settings, parallel: RayExecutor(settings, parallel=parallel, argument=cluster.address)
 
     @pytest.mark.nightly
-    def test_what_is_told_is_told_once(self, executor):
-        super().test_what_is_told_is_told_once(executor)
+    def test_what_is_reported_is_reported_once(self, executor):
+        super().test_what_is_reported_is_reported_once(executor)
 
     @pytest.mark.nightly
     def test_closing_twice_is_fine(self, executor):
         super().test_closing_twice_is_fine(executor)
 
     @pytest.mark.nightly
-    def test_it_says_how_much_it_runs_and_where_that_is(self, executor):
-        super().test_it_says_how_much_it_runs_and_where_that_is(executor)
+    def test_it_states_how_much_it_runs_and_where_that_is(self, executor):
+        super().test_it_states_how_much_it_runs_and_where_that_is(executor)
 
     @pytest.mark.nightly
     def test_cancelled_trials_do_not_come_back(self, executor):
@@ -214,7 +214,7 @@ def test_what_is_killed_costs_time_and_nothing_else(begin, add, settings, tmp_pa
 
 
 @pytest.mark.nightly
-def test_where_all_nodes_are_lost_it_waits_and_says_so(begin, add):
+def test_where_all_nodes_are_lost_it_waits_and_states_so(begin, add):
     """The machine goes with everything on it; CPUs that somebody else leaves then are as good as a new one."""
     other = begin(2)
     other.submit(spec(99))
@@ -239,7 +239,7 @@ def test_where_all_nodes_are_lost_it_waits_and_says_so(begin, add):
 
 
 @pytest.mark.nightly
-def test_a_node_that_differs_takes_no_part_and_the_others_go_on(begin, add, tmp_path):
+def test_a_node_that_differs_takes_no_part_and_the_others_continue(begin, add, tmp_path):
     """What travels to it says so, whatever there is."""
     other = tmp_path / "other" / "libsumo-0.1.dist-info"
     other.mkdir(parents=True)
@@ -269,7 +269,7 @@ def refusal(executor):
 
 
 @pytest.mark.nightly
-def test_a_cluster_that_can_run_nothing_says_why(begin, settings, cluster):
+def test_a_cluster_that_can_run_nothing_states_why(begin, settings, cluster):
     lacking = replace(settings, scenario=replace(settings.scenario, agents={"ego": AgentSetup(agent="nowhere:Agent")}))
     executor = RayExecutor(lacking, argument=cluster.address)
     said = refusal(executor)

@@ -66,7 +66,7 @@ def listener(answer):
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("127.0.0.1:1", "--executor ray:127.0.0.1:1: nobody answers there (Connection refused); start one with"),
+        ("127.0.0.1:1", "--executor ray:127.0.0.1:1: no cluster answers there (Connection refused); start one with"),
         ("nowhere", "--executor ray:nowhere is no address HOST:PORT; write --executor ray:nowhere:6379"),
         ("a:b", "--executor ray:a:b is no address HOST:PORT; write --executor ray:a:6379"),
         (".x:1", "--executor ray:.x:1: no machine can have that name; start one with"),
@@ -92,10 +92,10 @@ def test_an_address_that_leads_nowhere_is_one_line(settings, argument, message):
     [
         (b"HTTP/1.0 400 Bad Request\r\n\r\n", "what answers there is not the head of a Ray cluster; start one"),
         (b"", "what answers there is not the head of a Ray cluster; start one"),
-        (None, "somebody listens there and does not answer; start one"),
+        (None, "a process listens there and does not answer; start one"),
     ],
 )
-def test_whoever_answers_and_is_no_cluster_is_told_from_one(monkeypatch, answer, message):
+def test_the_one_that_answers_and_is_no_cluster_is_reported_from_one(monkeypatch, answer, message):
     monkeypatch.setattr("crashhunt.executors.ray._cluster._ANSWER_S", 0.5)
     with listener(answer) as address:
         with pytest.raises(UsageError) as raised:
@@ -105,12 +105,12 @@ def test_whoever_answers_and_is_no_cluster_is_told_from_one(monkeypatch, answer,
         assert cluster_of(address).address == address, "what is encrypted is left to Ray"
 
 
-def test_a_hunt_that_nobody_would_run_ends_at_once(toy):
+def test_a_hunt_that_no_one_would_run_ends_at_once(toy):
     began = time.monotonic()
     words = ("run", "h", "0", "4", "20", "--scenario", "toy", "--executor", "ray:127.0.0.1:1")
     said = toy.crashhunt(*words, expect=2).err.splitlines()
     assert said[-1].startswith(
-        "crashhunt: --executor ray:127.0.0.1:1: nobody answers there (Connection refused); start"
+        "crashhunt: --executor ray:127.0.0.1:1: no cluster answers there (Connection refused); start"
     )
     assert time.monotonic() - began < 60  # Ray itself gives up after two minutes
     assert not [*(toy.folder / "h").glob(".scratch*")]
@@ -118,11 +118,11 @@ def test_a_hunt_that_nobody_would_run_ends_at_once(toy):
 
 def test_the_address_may_stand_in_the_environment(settings, monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
-    with pytest.raises(UsageError, match=r"RAY_ADDRESS=127\.0\.0\.1:1: nobody answers there"):
+    with pytest.raises(UsageError, match=r"RAY_ADDRESS=127\.0\.0\.1:1: no cluster answers there"):
         RayExecutor(settings)
 
 
-def test_a_token_goes_to_nobody_but_a_cluster_that_runs_here(monkeypatch, tmp_path):
+def test_a_token_goes_to_no_one_but_a_cluster_that_runs_here(monkeypatch, tmp_path):
     """And there only where it is asked for."""
     assert cluster_of("").address == ""
     assert cluster_of("").environment != cluster_of("local").environment, "our own get a new one each"
@@ -154,7 +154,7 @@ def test_a_token_goes_to_nobody_but_a_cluster_that_runs_here(monkeypatch, tmp_pa
     assert cluster_of("198.51.100.7:6379").spare == {}, "another machine"
 
 
-def test_without_ray_it_says_how_to_get_it(monkeypatch):
+def test_without_ray_it_states_how_to_get_it(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(PluginError, match=r"which is not installed; pip install 'crashhunt\[ray\]'"):
         require_ray()

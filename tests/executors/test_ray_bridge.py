@@ -224,7 +224,7 @@ def test_a_machine_is_lost_with_all_its_parts(begin):
     assert sorted(left) == [*range(10)]
 
 
-def test_an_actor_whose_cpus_somebody_else_got_is_taken_back(begin):
+def test_an_actor_whose_cpus_another_got_is_taken_back(begin):
     """Two hunts that begin at once both see the same CPUs free; whoever is late says so, or waits for other nodes."""
     _, cluster, after = begin(a=2)
     cluster.late = True
@@ -235,7 +235,7 @@ def test_an_actor_whose_cpus_somebody_else_got_is_taken_back(begin):
     assert not any(actor.alive for actor in cluster.actors)
 
 
-def test_whoever_loses_a_race_of_two_hunts_is_told_soon(begin):
+def test_the_one_that_loses_a_race_of_two_hunts_is_reported_soon(begin):
     """In ten seconds on an idle machine, of which some go by until the other hunt has begun."""
     _, cluster, after = begin(a=2)
     cluster.late = True
@@ -268,7 +268,7 @@ def test_an_actor_that_takes_long_to_start_is_given_more_time_again(begin):
     assert {"capacity": 2} in after()
 
 
-def test_where_no_node_is_left_it_says_so_once_and_goes_on(begin):
+def test_where_no_node_is_left_it_states_so_once_and_continues(begin):
     bridge, cluster, after = begin(a=2)
     submit(bridge, 0, 1, 2)
     after()
@@ -316,7 +316,7 @@ def test_a_loss_between_trials_that_end_is_no_reason_to_give_a_node_up(begin):
     assert not bridge._refused
 
 
-def test_whoever_ends_every_node_is_told_apart_from_who_was_there(begin):
+def test_the_one_that_ends_every_node_is_distinguished_from_who_was_there(begin):
     bridge, cluster, after = begin(a=1)
     submit(bridge, 0, 1)
     results = []
@@ -408,7 +408,7 @@ def test_what_is_submitted_for_what_has_ended_goes_along_with_the_next_question(
     assert cluster.given == [("a", "take", [(103, spec(3)), (104, spec(4))])]
 
 
-def test_a_disk_that_is_full_here_is_told_from_a_cluster_that_is_lost(begin, monkeypatch):
+def test_a_disk_that_is_full_here_is_reported_from_a_cluster_that_is_lost(begin, monkeypatch):
     bridge, cluster, after = begin(a=1)
     submit(bridge, 0)
     after()

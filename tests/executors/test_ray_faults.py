@@ -245,7 +245,7 @@ def by_hand(port, folder, **environment):
         process.wait()
 
 
-def test_a_head_that_dies_is_waited_for_and_the_hunt_goes_on_with_the_next_one(toy, started):
+def test_a_head_that_dies_is_waited_for_and_the_hunt_continues_with_the_next_one(toy, started):
     with tempfile.TemporaryDirectory(prefix="chf-", dir="/tmp") as short:
         port = free_port()
         words = ("--executor", f"ray:127.0.0.1:{port}")
@@ -265,7 +265,7 @@ def test_a_head_that_dies_is_waited_for_and_the_hunt_goes_on_with_the_next_one(t
         time.sleep(3)
         other.send_signal(signal.SIGINT)
         said = ends(other, code=130)
-        assert "Interrupted; the same command goes on from here." in said
+        assert "Interrupted. Run the same command to resume." in said
         assert len(rows(toy, "g")) < TRIALS
         toy.crashhunt("run", "g", "2", str(TRIALS), "30", *SLOW)
         whole(toy, "g")

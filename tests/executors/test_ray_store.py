@@ -78,7 +78,7 @@ def test_a_name_is_any_that_a_file_can_have(settings, tmp_path):
     assert {path.name for path in there} == {*names, "agent.py"}
 
 
-def test_what_stands_for_the_current_folder_is_that_of_the_other_machine(settings, tmp_path, monkeypatch):
+def test_what_represents_the_current_folder_is_that_of_the_other_machine(settings, tmp_path, monkeypatch):
     """Where a snapshot has it: agents open their files by names that count from there."""
     for name in ("proj/agents/weights.txt", "else/agents/other.txt", "code/@proj/agents/weights.txt"):
         (tmp_path / name).parent.mkdir(parents=True)
@@ -140,7 +140,7 @@ def test_what_is_kept_is_bounded_and_what_is_damaged_is_let_go(settings, tmp_pat
     assert store.find("large") is None
 
 
-def test_a_place_is_removed_by_whoever_comes_after_its_owner(tmp_path):
+def test_a_place_is_removed_by_the_one_that_comes_after_its_owner(tmp_path):
     store = Store(tmp_path / "store")
     mine = store.place()
     left = store.place()
@@ -173,7 +173,7 @@ def test_a_folder_that_is_being_made_is_not_taken_for_one_that_was_left(make, tm
         place.remove()
 
 
-def test_a_node_says_what_differs(monkeypatch):
+def test_a_node_states_what_differs(monkeypatch):
     here = versions()
     assert {"python", "crashhunt", "numpy"} <= {*here}
     assert Site().differs(here, code_digest()) == ""
@@ -272,7 +272,7 @@ def submissions(*numbers):
     return [(100 + number, TrialSpec(number, number, {}, {}, max_steps=3).to_json()) for number in numbers]
 
 
-def test_what_ends_together_goes_back_together_as_long_as_nobody_waits_for_more(work):
+def test_what_ends_together_goes_back_together_as_long_as_no_one_waits_for_more(work):
     node = work(*((number, False) for number in range(8)))
     assert [ended.number for ended in node.take(0.0, submissions(*range(8))).ended] == [0, 1, 2]
     assert [ended.number for ended in node.take(0.0, submissions(8, 9, 10)).ended] == [3, 4, 5]
@@ -284,7 +284,7 @@ def test_what_is_kept_goes_back_at_once(work):
     assert [ended.number for ended in node.take(0.0, submissions(*range(8))).ended] == [0, 1]
 
 
-def test_whatever_an_agent_has_put_where_its_trial_is_recorded_the_node_goes_on(work):
+def test_whatever_an_agent_has_put_where_its_trial_is_recorded_the_node_continues(work):
     node = work((0, True))
     folder = scratch_of(node._place.scratch, 0)
     (folder / "deep" / "er").mkdir(parents=True)
@@ -305,7 +305,7 @@ def test_what_was_given_up_on_its_way_is_not_run(work):
     assert node._pool.submitted == [1, 2, 7], "which came later, and is meant"
 
 
-def test_the_folder_of_a_cluster_is_removed_by_whoever_comes_after_its_owner(tmp_path):
+def test_the_folder_of_a_cluster_is_removed_by_the_one_that_comes_after_its_owner(tmp_path):
     mine, left = Folder(tmp_path), Folder(tmp_path)
     heir = os.dup(left.fileno())  # as a process has it that was started
     left._lock.close()  # as when its process is killed
@@ -326,7 +326,7 @@ def test_a_folder_in_which_ray_cannot_work_is_not_used(usual, monkeypatch):
     assert folder.path.parent == Path("/tmp")
 
 
-def test_a_folder_of_somebody_else_is_not_used(tmp_path):
+def test_a_folder_of_another_is_not_used(tmp_path):
     (tmp_path / "open").mkdir(mode=0o777)
     (tmp_path / "open").chmod(0o777)
     (tmp_path / "open" / "a.zip").write_bytes(b"planted")
@@ -358,7 +358,7 @@ def numbers(given):
     return {node.name: [trial.number for trial in trials] for node, trials in given.items()}
 
 
-def test_trials_go_to_whoever_has_least_to_do_in_their_order():
+def test_trials_go_to_the_one_that_has_least_to_do_in_their_order():
     found = roster(a=2, b=1)
     found.waiting += [Trial(number, {"number": number}) for number in range(9)]
     assert numbers(found.assign()) == {"a": [0, 2, 3, 5], "b": [1, 4]}

@@ -99,7 +99,7 @@ def test_before_the_first_step_it_is_no_crash(begun, tmp_path, phase):
     assert _postmortem.hung(SPEC, begun, 9).outcome is Outcome.INVALID
 
 
-def test_a_recording_that_cannot_be_read_is_told(begun, phase, monkeypatch):
+def test_a_recording_that_cannot_be_read_is_reported(begun, phase, monkeypatch):
     def fails(path):
         raise ValueError(path)
 
@@ -180,7 +180,7 @@ def test_the_map_of_a_trial_is_its_own_or_that_of_the_hunt(tmp_path):
     assert _postmortem.read_tail(tmp_path / "nowhere") == ""
 
 
-def test_each_note_is_told_once(tmp_path):
+def test_each_note_is_reported_once(tmp_path):
     notes = Notes(tmp_path)
     notes.add("a")
     notes.add("a")

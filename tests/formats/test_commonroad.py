@@ -107,7 +107,7 @@ def test_without_roads_or_vehicles_it_is_refused_in_one_line(tmp_path):
         assert not (tmp_path / "one.xml").exists()
 
 
-def test_the_command_says_who_is_which_number(shell):
+def test_the_command_states_who_is_which_number(shell):
     crash(shell.folder, agents=["ego"])
     done = shell.crashhunt("export", "crashes/000007-collision", "one.xml", "--as", "commonroad", "--json").json
     numbers = {

@@ -111,7 +111,7 @@ def test_replaced_and_proposed_trials_are_read(hunt):
     assert not found_in(hunt).fine
 
 
-def test_a_ledger_that_is_gone_or_no_ledger_is_told(hunt):
+def test_a_ledger_that_is_gone_or_no_ledger_is_reported(hunt):
     ledger = hunt / "ledger.sqlite"
     ledger.write_bytes(b"no database" * 100)
     finding = only_finding(hunt)
@@ -123,7 +123,7 @@ def test_a_ledger_that_is_gone_or_no_ledger_is_told(hunt):
     assert found_in(hunt).fine
 
 
-def test_settings_that_cannot_be_read_are_told_and_those_of_the_snapshot_serve(hunt):
+def test_settings_that_cannot_be_read_are_reported_and_those_of_the_snapshot_serve(hunt):
     (hunt / "hunt.toml").write_text("nothing")
     finding = only_finding(hunt)
     assert (finding.where, finding.lost) == (str(hunt / "hunt.toml"), "what the hunt was asked")
@@ -155,7 +155,7 @@ def test_a_file_of_a_crash_that_has_changed_is_damage_and_one_that_was_added_is_
     assert {finding.lost for finding in found.findings} == {"", "that file"}
 
 
-def test_a_crash_that_is_missing_is_told_unless_it_was_given_up(hunt):
+def test_a_crash_that_is_missing_is_reported_unless_it_was_given_up(hunt):
     shutil.rmtree(hunt / "crashes" / CRASH)
     finding = only_finding(hunt)
     assert finding.what == "trial 0 crashed, and its bundle is missing"
@@ -166,7 +166,7 @@ def test_a_crash_that_is_missing_is_told_unless_it_was_given_up(hunt):
     assert (found.findings, found.dropped) == ([], {0})
 
 
-def test_a_crash_of_another_hunt_or_trial_is_told(hunt):
+def test_a_crash_of_another_hunt_or_trial_is_reported(hunt):
     file = hunt / "crashes" / CRASH / "crash.json"
     whole = file.read_text()
     signed(file, hunt_seed=9)
@@ -184,7 +184,7 @@ def test_a_crash_of_another_hunt_or_trial_is_told(hunt):
     assert [finding.lost for finding in found_in(hunt).findings] == ["trials 0"]
 
 
-def test_a_crash_that_the_ledger_does_not_know_is_told(hunt):
+def test_a_crash_that_the_ledger_does_not_know_is_reported(hunt):
     settings = hunt / "hunt.toml"
     settings.write_text(settings.read_text().replace('    "collision",\n', ""))
     assert {finding.what for finding in found_in(hunt).findings} == {"the ledger has no crash of its trial"}
@@ -217,7 +217,7 @@ def test_a_snapshot_that_no_crash_needs_is_looked_at_as_well(hunt):
         ("branches", "--branch", "branches/000000-collision"),
     ],
 )
-def test_bundles_beside_the_crashes_are_looked_at(hunt, place, option, lost):
+def test_bundles_next_to_the_crashes_are_looked_at(hunt, place, option, lost):
     shutil.copytree(hunt / "crashes" / CRASH, hunt / place / CRASH)
     assert found_in(hunt).fine
     cut(hunt / place / CRASH / "log.mcap")
@@ -227,7 +227,7 @@ def test_bundles_beside_the_crashes_are_looked_at(hunt, place, option, lost):
     assert found.findings[0].fix == f"remove it: the same hunt with {option} makes it again"
 
 
-def test_leftovers_are_told_and_harmless(hunt):
+def test_leftovers_are_reported_and_harmless(hunt):
     left = [hunt / "crashes" / ".000001-collision.tmp", hunt / "snapshots" / ".half", hunt / ".scratch-1-2-3"]
     for path in left:
         path.mkdir()
@@ -236,8 +236,8 @@ def test_leftovers_are_told_and_harmless(hunt):
     assert found.fine
     said = {Path(finding.where).name: finding.what for finding in found.findings}
     assert said == {
-        **{path.name: "somebody was killed while writing it; it may be removed" for path in left},
-        ".000000-collision.small.jsonl": "shrink goes on from it; it may be removed",
+        **{path.name: "its writer was killed; it may be removed" for path in left},
+        ".000000-collision.small.jsonl": "shrink resumes from it; it may be removed",
     }
 
 

@@ -42,7 +42,7 @@ def _claim(path, said, meeting, *, is_first):
         said.put(f"{type(error).__name__}: {error}")
 
 
-def test_of_several_at_once_one_has_it_and_the_others_are_told_that_it_is_busy(tmp_path):
+def test_of_several_at_once_one_has_it_and_the_others_are_reported_that_it_is_busy(tmp_path):
     context = get_context("spawn")  # forking a process with threads is asking for it
     said, meeting = context.Queue(), context.Barrier(3, timeout=140)
     processes = [
@@ -56,7 +56,7 @@ def test_of_several_at_once_one_has_it_and_the_others_are_told_that_it_is_busy(t
     assert sum(answers) >= 2
 
 
-def test_a_folder_of_somebody_else_stays_as_it_is(tmp_path):
+def test_a_folder_of_another_stays_as_it_is(tmp_path):
     (tmp_path / "thesis.tex").write_text("x")
     with pytest.raises(HuntDirectoryError, match=r"not a hunt: it has 'thesis\.tex'"), HuntDirectory(tmp_path).locked():
         pass

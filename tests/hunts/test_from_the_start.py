@@ -22,13 +22,13 @@ def runs(tmp_path, stops, run):
     return SimpleNamespace(place=SimpleNamespace(path=tmp_path), stops=stops, notes=[], failed=[], parallel=2, run=run)
 
 
-def test_whoever_stops_keeps_what_there_was(tmp_path):
+def test_the_one_that_stops_keeps_what_there_was(tmp_path):
     copies = VerificationRuns(runs(tmp_path, [2], None), None)
     assert (copies.crashes([FOUND], "probes"), copies.is_stopped) == (((), 0), True)
     assert [path.name for path in (tmp_path / "probes").iterdir()] == ["000001-collision"]
 
 
-def test_what_cannot_be_run_is_told_and_the_hunt_has_ended_well(tmp_path):
+def test_what_cannot_be_run_is_reported_and_the_hunt_has_ended_well(tmp_path):
     def fails(specs, folder):
         assert ([*specs], folder) == ([FOUND.spec], "probes")
         yield from ()

@@ -9,7 +9,8 @@ import pytest
 
 from crashhunt.base.errors import UsageError
 from crashhunt.hunts import _progress
-from crashhunt.hunts._progress import Kinds, kind_data
+from crashhunt.hunts._progress import Kinds
+from crashhunt.hunts._reports import kind_data
 from crashhunt.plans import RunSettings
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
@@ -64,7 +65,7 @@ def test_of_each_kind_the_shortest_few_are_kept_and_all_count():
     assert kinds.until == 2  # it was found, though its bundle is gone
     again = Kinds(2, [crash(5, "KeyError", 2)], dropped=kinds.dropped)
     assert again.groups()[0].count == 4
-    with pytest.raises(UsageError, match="--keep 2 is for hunts that go on after a crash"):
+    with pytest.raises(UsageError, match="--keep 2 requires a hunt that continues after a crash"):
         RunSettings(keep=2).checked()
     assert RunSettings(keep=2, distinct=2).checked().keep == 2
 
@@ -87,7 +88,7 @@ def test_what_was_hunted_for_is_kept_before_what_is_shorter(monkeypatch):
     assert Kinds(1, [crash(3, "KeyError", 6)], only_at_fault=True, dropped=kinds.dropped).until == 3
 
 
-def test_whoever_wants_several_kinds_goes_on_after_the_first_crash():
+def test_the_one_that_wants_several_kinds_continues_after_the_first_crash():
     assert RunSettings(distinct=3).checked().keep_going
     assert not RunSettings().checked().keep_going
     with pytest.raises(UsageError, match="--distinct is -1"):

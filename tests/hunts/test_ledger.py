@@ -139,7 +139,7 @@ for number in range(80):
 """
 
 
-def test_whoever_sees_a_ledger_can_read_it(tmp_path):
+def test_the_one_that_sees_a_ledger_can_read_it(tmp_path):
     command = [sys.executable, "-c", READS_WHEN_THERE, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
         try:
@@ -152,7 +152,7 @@ def test_whoever_sees_a_ledger_can_read_it(tmp_path):
     assert reader.returncode == 0
 
 
-def test_damage_in_the_middle_is_told_whatever_is_read(tmp_path):
+def test_damage_in_the_middle_is_reported_whatever_is_read(tmp_path):
     path = tmp_path / "ledger.sqlite"
     ledger = Ledger(path, writable=True)
     for number in range(300):

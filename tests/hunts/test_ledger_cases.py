@@ -40,7 +40,7 @@ def raw(path, query):
         return database.execute(query).fetchall()
 
 
-def test_a_row_has_what_ranks_it_beside_its_text(ledger, path):
+def test_a_row_has_what_ranks_it_next_to_its_text(ledger, path):
     ledger.record(result(3, Outcome.COLLISION, ttc=math.inf, steps=4), snapshot="abc")
     columns = "number, seed, outcome, steps, time_to_collision_s, gap_m, required_deceleration, wall_s, snapshot"
     (row,) = raw(path, f"SELECT {columns} FROM trials")
@@ -199,7 +199,7 @@ def test_without_a_seal_whole_rows_say_it(path):
     writer.close()
 
 
-def test_a_ledger_that_was_removed_is_written_anew(path, tmp_path):
+def test_a_ledger_that_was_removed_is_written_again(path, tmp_path):
     writer = Ledger(path, writable=True)
     writer.record(result(0), snapshot="")
     assert writer.restore() is False
@@ -216,7 +216,7 @@ def test_a_ledger_that_was_removed_is_written_anew(path, tmp_path):
     path.unlink()
     moved = tmp_path.rename(f"{tmp_path}-moved")
     try:
-        with pytest.raises(HuntDirectoryError, match=r"the folder does not exist|cannot be written anew"):
+        with pytest.raises(HuntDirectoryError, match=r"the folder does not exist|cannot be written again"):
             writer.restore()
     finally:
         moved.rename(tmp_path)
@@ -242,7 +242,7 @@ def test_in_a_ledger_without_digests_two_places_may_not_contradict_each_other(pa
         Ledger(path, writable=True)
 
 
-def test_what_sqlite_says_is_said_in_our_words(path, tmp_path):
+def test_what_sqlite_states_is_said_in_our_words(path, tmp_path):
     with pytest.raises(HuntDirectoryError, match="is not the directory of a hunt") as caught:
         Ledger(path)
     assert "give the directory" in caught.value.fix
@@ -291,7 +291,7 @@ def test_reads_are_the_same_in_pieces(path, monkeypatch):
         assert sorted(whole)[4] == (4, 28, "collision", 10, 5.0 - 4 / 3)
 
 
-def test_a_full_disk_is_told_of_and_what_was_written_stays(path):
+def test_a_full_disk_is_reported_of_and_what_was_written_stays(path):
     ledger = Ledger(path, writable=True)
     ledger.record(result(0), snapshot="")
     pages = ledger._database.execute("PRAGMA page_count").fetchone()[0]

@@ -139,7 +139,7 @@ def test_tables_and_facts_that_were_changed_are_refused(copy, statement, says):
     assert f"crashhunt check {copy.parent}" in str(refused.value)
 
 
-def test_any_damage_is_told_or_changes_nothing(whole, tmp_path):
+def test_any_damage_is_reported_or_changes_nothing(whole, tmp_path):
     generator = random.Random(10)
     right = answers(whole)
     data = whole.read_bytes()
@@ -194,7 +194,7 @@ def as_version_1(path):
     )
 
 
-def test_an_early_ledger_is_read_and_goes_on_as_one_of_today(whole, copy):
+def test_an_early_ledger_is_read_and_continues_as_one_of_today(whole, copy):
     right = answers(whole)
     as_version_1(copy)
     assert answers(copy) == right
@@ -230,7 +230,7 @@ def test_of_an_early_ledger_what_contradicts_itself_is_refused(copy, statement):
         Ledger(copy, writable=True)
 
 
-def test_what_is_no_file_or_no_ledger_is_told(tmp_path, copy):
+def test_what_is_no_file_or_no_ledger_is_reported(tmp_path, copy):
     folder = tmp_path / "folder" / "ledger.sqlite"
     folder.mkdir(parents=True)
     with pytest.raises(HuntDirectoryError, match="a folder is where the file should be"):

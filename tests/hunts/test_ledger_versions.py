@@ -78,7 +78,7 @@ def check(ledger, frozen):
 
 
 @pytest.mark.parametrize("copy", FROZEN, indirect=True, ids=[path.stem for path in FROZEN])
-def test_a_ledger_of_before_is_read_as_it_is_and_goes_on_as_one_of_today(copy, tmp_path):
+def test_a_ledger_of_before_is_read_as_it_is_and_continues_as_one_of_today(copy, tmp_path):
     frozen = version(copy)
     was = copy.read_bytes()
     with closing(Ledger(copy)) as ledger:
@@ -148,7 +148,7 @@ def newer(path, *, reader):
         database.execute("PRAGMA user_version = 99")
 
 
-def test_a_ledger_of_later_is_read_where_it_says_so_and_never_written(tmp_path):
+def test_a_ledger_of_later_is_read_where_it_states_so_and_never_written(tmp_path):
     path = tmp_path / "ledger.sqlite"
     write(path)
     today = version(path)

@@ -165,7 +165,7 @@ def test_with_one_worker_nothing_depends_on_time(tmp_path):
     assert [turn.told for turn in turns] == [(n - 2,) if n > 1 else () for n in range(TRIALS)]
 
 
-def test_a_trial_that_hangs_keeps_nobody_from_learning(tmp_path):
+def test_a_trial_that_hangs_keeps_no_one_from_learning(tmp_path):
     path, slow = tmp_path / "ledger.sqlite", frozenset({7})
     hunt(path, settings(parallel=2), random.Random(1), slow=slow)
     with closing(Ledger(path)) as ledger:
@@ -228,7 +228,7 @@ def test_what_a_later_class_draws_in_another_way_is_not_independent_by_inheritan
     assert not Stratified({}).independent
 
 
-def test_a_ledger_of_before_goes_on_with_a_sampler_that_learns(tmp_path):
+def test_a_ledger_of_before_continues_with_a_sampler_that_learns(tmp_path):
     path = tmp_path / "ledger.sqlite"
     chosen = settings(deterministic=True)
     hunt(path, settings(deterministic=True, trials=20), random.Random(1), lag=8)
@@ -276,7 +276,7 @@ def test_a_sampler_that_is_none_is_one_clear_line(tmp_path, argument, says):
 @pytest.mark.parametrize(
     ("sampler", "says"), [("builtins:int", "cannot be made: TypeError"), ("builtins:dict", "has no 'learns'")]
 )
-def test_what_is_no_sampler_is_told_before_anything_runs(sampler, says):
+def test_what_is_no_sampler_is_reported_before_anything_runs(sampler, says):
     with pytest.raises(PluginError, match=says):
         NamedSampler(sampler, settings().space, points=3)
 

@@ -90,7 +90,7 @@ def test_a_hunt_whose_process_is_there_runs(hunt):
 
 
 @pytest.mark.parametrize(("silent_s", "state"), [(5, "running"), (55, "running"), (65, "killed")])
-def test_on_another_machine_a_heartbeat_tells_that_it_runs(hunt, silent_s, state):
+def test_on_another_machine_a_heartbeat_reports_that_it_runs(hunt, silent_s, state):
     owner = {"host": "elsewhere", "pid": 1, "started": 1}
     note(hunt, state="running", owner=owner, heartbeat=time.time() - silent_s)
     assert hunt_state(hunt).state == state
@@ -164,7 +164,7 @@ def status(**figures):
         ({"elapsed_s": 0.0, "time_left_s": 0.0}, 0.0, 1.0),
     ],
 )
-def test_how_long_it_takes_is_told_by_trials_or_by_the_clock(figures, left, share):
+def test_how_long_it_takes_is_reported_by_trials_or_by_the_clock(figures, left, share):
     found = status(**figures)
     assert found.seconds_left == pytest.approx(left)
     assert found.share_done == pytest.approx(share)

@@ -77,7 +77,7 @@ def test_two_hunts_draw_from_the_same_vehicles(town):
     assert one == other
 
 
-def test_a_hunt_of_before_goes_on_with_the_vehicles_that_its_files_promised(town):
+def test_a_hunt_of_before_continues_with_the_vehicles_that_its_files_promised(town):
     _, before = surveyed(town.folder, survey=False)
     promised = before.scenario_arguments["vehicle"].spec
     town.crashhunt("run", "h", "1", "1", "5", *WORDS, "--ego", "any", "--set", f"vehicle={promised}", expect=None)
@@ -123,7 +123,7 @@ def test_the_demand_is_simulated_at_both_ends_of_its_range(town, monkeypatch):
     ],
     ids=["rails", "nobody"],
 )  # fmt: skip
-def test_where_no_trial_can_be_valid_one_line_says_so_before_the_first(shell, demand, code, says):
+def test_where_no_trial_can_be_valid_one_line_states_so_before_the_first(shell, demand, code, says):
     write(shell.folder, demand)
     done = shell.crashhunt("run", "h", "1", "4", "20", *WORDS, expect=code)
     assert says in done.json["error"]["message"]
@@ -144,7 +144,7 @@ def test_vehicles_that_stand_for_ever_are_a_gridlock(shell):
     assert "in 2 of 2 runs" in note
 
 
-def test_where_sumo_refuses_its_input_the_hunt_says_so(town):
+def test_where_sumo_refuses_its_input_the_hunt_states_so(town):
     (town.folder / "r.rou.xml").write_text(f'<routes>{WAY}<vehicle id="a" route="gone" depart="1"/></routes>')
     done = town.crashhunt("run", "h", "1", "2", "20", *WORDS, expect=3)
     assert "simulating the plain traffic failed" in done.err
@@ -175,7 +175,7 @@ def test_busy_machine_finds_the_same_candidates(town, monkeypatch):
     assert surveyed(town.folder)[0].arguments == before.arguments
 
 
-def test_without_room_for_the_survey_the_hunt_goes_on(town, monkeypatch):
+def test_without_room_for_the_survey_the_hunt_continues(town, monkeypatch):
     monkeypatch.setattr(_preflight, "Kept", lambda *_, **__: raise_full())
     scenario, settings = surveyed(town.folder)
     assert "the survey cannot run: [Errno 28]" in scenario.notes[1]

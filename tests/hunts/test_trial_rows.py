@@ -53,7 +53,7 @@ def test_a_row_has_every_column():
     assert tuple(row) == columns
 
 
-def test_where_nobody_looked_for_events_a_row_does_not_say_that_there_were_none():
+def test_where_no_one_looked_for_events_a_row_does_not_say_that_there_were_none():
     unseen = dataclasses.replace(RESULT, events=None, closest=ClosestApproach())
     row = TrialRow(unseen.to_json())
     assert set(row.cells([str(kind) for kind in EVENTS]).values()) == {None}
@@ -72,7 +72,7 @@ def test_a_row_of_an_earlier_version_has_what_that_wrote():
     }
 
 
-def test_margin_that_is_not_fully_asked_is_empty_and_what_was_asked_stands_beside_it():
+def test_margin_that_is_not_fully_asked_is_empty_and_what_was_asked_stands_next_to_it():
     half = Stress(None, moments=9, moments_asked=1, margin_upper_bound=0.25)
     branches = Branches(asked=12, unanswered=1)
     row = TrialRow(replace(RESULT, stress=half, branches=branches).to_json()).cells((*STRESS, *BRANCHES))

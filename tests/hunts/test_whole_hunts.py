@@ -113,7 +113,7 @@ def test_a_hunt_ends_with_its_first_crash_and_does_not_depend_on_how_many_run_at
     assert found[1] == found[3]
 
 
-def test_a_hunt_without_one_valid_trial_says_why(tmp_path):
+def test_a_hunt_without_one_valid_trial_states_why(tmp_path):
     (tmp_path / "toy.toml").write_text(TOY + "\n[arguments.fail_reset]\ndefault = true\n")
     report = crashhunt.run(tmp_path / "h", 2, 3, 60, **OPTIONS)
     assert (report.stopped_because, report.outcomes) == ("no_valid_trial", {"invalid": 3})

@@ -39,7 +39,7 @@ def built(hook, version="standard"):
 
 
 @pytest.mark.parametrize(("version", "where"), [("standard", "force_include"), ("editable", "force_include_editable")])
-def test_it_goes_beside_the_package(hook, version, where):
+def test_it_goes_next_to_the_package(hook, version, where):
     data = built(hook, version)
     core, link_order = data[where].values()
     assert core.startswith("_crashhunt_core.cpython-")
@@ -48,7 +48,7 @@ def test_it_goes_beside_the_package(hook, version, where):
 
 
 @pytest.mark.parametrize("compiler", ["/no/such/compiler", "false"])
-def test_without_a_compiler_that_works_it_is_left_out(hook, monkeypatch, compiler):
+def test_without_a_compiler_that_works_it_is_excluded(hook, monkeypatch, compiler):
     monkeypatch.setenv("CXX", compiler)
     assert built(hook) == {"force_include": {}, "force_include_editable": {}, "pure_python": True}
     assert "goes without its compiled core" in hook.app.warnings[0]
@@ -58,7 +58,7 @@ def test_without_a_compiler_that_works_it_is_left_out(hook, monkeypatch, compile
         built(hook)
 
 
-def test_without_a_compiler_at_all_and_elsewhere_it_is_left_out(hook, monkeypatch):
+def test_without_a_compiler_at_all_and_elsewhere_it_is_excluded(hook, monkeypatch):
     monkeypatch.delenv("CXX")
     monkeypatch.setenv("PATH", "/nowhere")
     assert built(hook)["pure_python"]
@@ -67,7 +67,7 @@ def test_without_a_compiler_at_all_and_elsewhere_it_is_left_out(hook, monkeypatc
     assert "for CPython on Linux" in hook.app.warnings[2]
 
 
-def test_it_can_be_left_out(hook, monkeypatch):
+def test_it_can_be_excluded(hook, monkeypatch):
     monkeypatch.setenv("CRASHHUNT_CORE", "0")
     assert built(hook)["pure_python"]
     assert not hook.app.warnings

@@ -68,7 +68,7 @@ def both_ways(scene, call):
 
 @settings(deadline=None, max_examples=60)
 @given(two_scenes(), some.integers(1, 10), some.floats(-1e4, 1e4))
-def test_an_observation_is_the_same_to_the_bit(scenes, rows, place):
+def test_an_observation_is_the_same_bit_by_bit(scenes, rows, place):
     kinematics = Kinematics(ObservationSetup(vehicles=rows))
     where = {"distance": place, "from_left": place / 3, "lateral_speed": -place, "lanes": 2}
     for row in range(len(scenes[1].points)):
@@ -108,7 +108,7 @@ def test_who_has_got_as_far_away_as_anybody_can_is_within_reach():
     assert ours == theirs == [1]
 
 
-def test_somebody_is_within_reach():
+def test_an_actor_is_within_reach():
     roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name in "abc"))
     was = Scene(0.0, roster, [(0.0, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0])
     now = Scene(0.1, roster, [(3.1, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0], core=core)
@@ -119,7 +119,7 @@ def test_somebody_is_within_reach():
 
 @settings(deadline=None, max_examples=80)
 @given(some.lists(two_scenes(), min_size=1, max_size=3))
-def test_the_closest_approach_is_the_same_to_the_bit(episodes):
+def test_the_closest_approach_is_the_same_bit_by_bit(episodes):
     for scene in itertools.chain(*episodes):  # as if many were one: rosters differ
         scene.points[0] = (scene.points[0][0] % 100, scene.points[0][1] % 100)
     agent = "0"
@@ -130,7 +130,7 @@ def test_the_closest_approach_is_the_same_to_the_bit(episodes):
         assert mine.tobytes() == reference.tobytes()
 
 
-def test_of_many_far_away_nobody_is_looked_at():
+def test_of_many_far_away_no_one_is_looked_at():
     near = [(0.0, 0.0), (30.0, 0.0), (400.0, 3.0), (90.0, 60.0)]
     frame = np.array([[*itertools.chain(*near), 0.0, 0.0, 0.0, 0.0, 20.0, 5.0, 20.0, 20.0]] * 2)
 
@@ -151,7 +151,7 @@ def test_of_many_far_away_nobody_is_looked_at():
         assert found(odd) is None
 
 
-def test_whoever_is_near_enough_leaves_out_those_further_away():
+def test_the_one_that_is_near_enough_leaves_out_those_further_away():
     # Outlines 45.6 m and 49.5 m away, and within 50 m it is the one ahead that is nearest, by 49 m at the most.
     frame = np.array([[0.0, 0.0, 51.0, 0.0, 0.0, 54.9, *[0.0] * 3, *[9.0] * 3]])
     part = (frame, 0, [5.0] * 3, [2.0] * 3, [0, 1, 2])
@@ -223,7 +223,7 @@ def driven(seed, scenes=60, cars=14, step_s=0.1, way=1):
     return [joined_frame(roster, part, [None] * len(part)) for part in np.split(columns, [scenes // 3])]
 
 
-def test_the_danger_is_the_same_to_the_bit():
+def test_the_danger_is_the_same_bit_by_bit():
     found, kept, all_of_them = [], 0, 0
     for seed in [*range(16), 22, 43]:
         frames = driven(seed, way=-1 if seed >= 16 else 1)  # the last ones reverse
@@ -247,7 +247,7 @@ def test_the_danger_is_the_same_to_the_bit():
     assert kept < all_of_them / 20  # of those who are not touched
 
 
-def test_the_closest_of_many_scenes_is_the_same_to_the_bit():
+def test_the_closest_of_many_scenes_is_the_same_bit_by_bit():
     kept, found = 0, []
     for seed in range(100, 150):
         frames = driven(seed)
@@ -272,7 +272,7 @@ def repr_of(seen):
 
 @settings(deadline=None, max_examples=60)
 @given(some.lists(two_scenes(), min_size=2, max_size=4))
-def test_the_closest_so_far_leaves_out_nothing(episodes):
+def test_the_closest_until_then_leaves_out_nothing(episodes):
     ours, theirs = ApproachMeter("0"), ApproachMeter("0")
     for one, two in episodes:
         both = np.concatenate([one.frame.columns, two.frame.columns])
@@ -281,7 +281,7 @@ def test_the_closest_so_far_leaves_out_nothing(episodes):
     assert repr(ours.closest) == repr(theirs.closest)
 
 
-def test_the_closest_of_a_crowd_is_the_same_where_somebody_is_wider_than_long():
+def test_the_closest_of_a_crowd_is_the_same_where_an_actor_is_wider_than_long():
     sizes = [(1.0, 1.0), (1.0, 1.0), (1.0, 2.0), (1.0, 12.0)]
     roster = Roster(tuple(Actor(str(row), "passenger", *size) for row, size in enumerate(sizes)))
     columns = np.array([[0.0] * 6 + [5.0, 0.0] + [0.0] * 4 + [1.0, 0.0, 0.0, 0.0]])
@@ -542,7 +542,7 @@ def run(tmp_path):
 
 
 @pytest.mark.parametrize("scenario", ["loop", "loop-two-agents"])
-def test_a_trial_is_the_same_to_the_bit(run, scenario):
+def test_a_trial_is_the_same_bit_by_bit(run, scenario):
     steps = 250 if scenario == "loop" else 120
     (ours, simulator), (theirs, _) = (run(scenario, native=native, steps=steps) for native in (None, False))
     assert simulator._sight.core is core

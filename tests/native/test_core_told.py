@@ -10,7 +10,7 @@ from crashhunt.native import why_no_link_order, why_not
 
 
 @pytest.mark.parametrize("native", [True, False])
-def test_it_is_told(shell, native):
+def test_it_is_reported(shell, native):
     words = () if native else ("--no-native",)
     done = shell.crashhunt("run", "h", "1", "1", "3", "--seed", "1", *words)
     reason = why_not("1.28.0") if native else "--no-native"

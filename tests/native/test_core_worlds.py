@@ -94,7 +94,7 @@ WORLDS = {
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_a_trial_in_another_world_is_the_same_to_the_bit(tmp_path, world):
+def test_a_trial_in_another_world_is_the_same_bit_by_bit(tmp_path, world):
     from crashhunt.simulators.sumo import SumoSimulator
 
     net, traffic, step_s, steps = WORLDS[world]

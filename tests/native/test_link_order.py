@@ -258,7 +258,7 @@ def test_a_load_that_is_not_ordered_is_reported_once(tmp_path, monkeypatch):
 
 
 @needs_library
-def test_check_load_tells_whether_the_library_was_called():
+def test_check_load_reports_whether_the_library_was_called():
     loads = [(0, 0), (1, 0), (1, 1), (1, 1)]
     order = LinkOrder(None, "")
     order._counted = lambda: loads.pop(0)  # type: ignore[method-assign]
@@ -284,7 +284,7 @@ def test_recorded_order_is_kept(tmp_path, monkeypatch):
     assert with_recorded_load_order(toy, None) is toy
 
 
-def test_hunt_says_where_the_order_is_not_fixed(tmp_path, monkeypatch):
+def test_hunt_states_where_the_order_is_not_fixed(tmp_path, monkeypatch):
     scenario = sumo_scenario(tmp_path)
     monkeypatch.setattr(_link_order, "_installed", lambda: "/somewhere/library.so")
     monkeypatch.setattr(_link_order, "_interface", lambda: _link_order._INTERFACE)

@@ -119,7 +119,7 @@ ANSWERS = {
 
 
 @pytest.mark.parametrize("how", ANSWERS)
-def test_an_episode_is_the_same_to_the_bit(street, how):
+def test_an_episode_is_the_same_bit_by_bit(street, how):
     street.both(ANSWERS[how])
     street.both(ANSWERS[how], crash_on=[*CRASHES, Outcome("not_moving"), Outcome("hard_braking")], oracles=[RedLight()])
     assert street.comes[DONE] + street.comes[ANSWERED] > 20 or how == "raises at once"
@@ -134,7 +134,7 @@ def test_most_steps_are_taken_at_once(street):
 
 
 @pytest.mark.parametrize("every", [1, 7, 10, 11])
-def test_whoever_looks_sees_the_same(street, every):
+def test_the_one_that_looks_sees_the_same(street, every):
     def seen(*, at_once):
         with street.episode(ANSWERS["what it sees"], at_once=at_once) as episode:
             while episode.result is None:
@@ -180,7 +180,7 @@ def test_where_there_is_no_room_python_makes_some(street, monkeypatch, tmp_path)
     street.both(ANSWERS["steady"])
 
 
-def test_a_disk_that_is_full_as_somebody_comes_is_told(street, monkeypatch):
+def test_a_disk_that_is_full_as_an_actor_comes_is_reported(street, monkeypatch):
     append, calls = BlackBox.append, Counter()
 
     def full(box, tag, aux, payload):
@@ -217,7 +217,7 @@ class _Answers(Observer):
 
 
 @pytest.mark.parametrize("kind", [_Scenes, _Answers])
-def test_observers_are_told_of_everything(street, kind):
+def test_observers_are_reported_of_everything(street, kind):
     ours, theirs = kind(), kind()
     street.run(ANSWERS["stands and goes on"], observers=[ours])
     street.run(ANSWERS["stands and goes on"], observers=[theirs], at_once=False)
@@ -276,7 +276,7 @@ def test_given_actions_are_not_asked_for(street):
     assert not street.comes
 
 
-def test_a_simulator_of_somebody_elses_takes_its_own_steps(street, tmp_path):
+def test_a_simulator_of_an_actor_elses_takes_its_own_steps(street, tmp_path):
     class Slower(type(street.simulator)):
         def step(self, actions):
             return super().step({agent: action / 2 for agent, action in actions.items()})
@@ -322,7 +322,7 @@ def _slower(street):
     del simulator.step
 
 
-def test_what_somebody_wraps_or_sets_is_not_passed_by(street):
+def test_what_an_actor_wraps_or_sets_is_not_passed_by(street):
     plain, simulator = street.run(ANSWERS["steady"]), street.simulator
     found = set()
     for slower in _slower(street):
@@ -375,7 +375,7 @@ def test_a_black_box_that_fails_at_an_action_is_the_agents_doing(street, monkeyp
     assert street.comes[REFUSED] > 20
 
 
-def test_another_simulator_is_told_of(street, tmp_path):
+def test_another_simulator_is_reported_of(street, tmp_path):
     (tmp_path / "other").mkdir()
     other = Street(tmp_path / "other")
 
@@ -390,7 +390,7 @@ def test_another_simulator_is_told_of(street, tmp_path):
     other.simulator.close()
 
 
-def test_what_sumo_raises_is_told(street, monkeypatch):
+def test_what_sumo_raises_is_reported(street, monkeypatch):
     import libsumo
 
     step, calls = libsumo.simulationStep, []

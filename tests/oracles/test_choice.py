@@ -125,7 +125,7 @@ def test_a_near_miss_is_a_gap_below_the_limit_and_no_contact(turn):
     assert oracle.check(scene(0.3, turn=turn), ["nobody"]) == []
 
 
-def test_of_several_the_nearest_is_told():
+def test_of_several_the_nearest_is_reported():
     roster = Roster(tuple(Actor(name, "car", 4.0, 2.0) for name in ("ego", "ahead", "beside", "touched")))
     points = [(0.0, 0.0), (4.4, 0.0), (0.0, 2.2), (0.0, -1.9)]  # 0.4 m, 0.2 m, and not missed
     near = Scene(1.0, roster, points, [0.0] * 4, [10.0, 5.0, 5.0, 5.0])
@@ -133,7 +133,7 @@ def test_of_several_the_nearest_is_told():
     assert finding.event.what == "ego came within 0.20 m of beside"
 
 
-def test_whoever_creeps_up_in_a_queue_has_no_near_miss():
+def test_the_one_that_creeps_up_in_a_queue_has_no_near_miss():
     assert TooClose(gap_m=0.5, speed=1.0).check(scene(0.3, speed=5.5), ["ego"]) == []
     assert [bool(TooClose(speed=0.0).check(scene(gap, speed=5.5), ["ego"])) for gap in (0.4, 0.6)] == [True, False]
     assert TooClose(gap_m=0.5, speed=0.0).check(scene(0.3, speed=5.5), ["ego"]) != []

@@ -44,7 +44,7 @@ def facts(hit):
 REAR_END = ("ego", 0, 0, 0, 5), ("other", -4, 0, 0, 12)
 
 
-def test_speeds_are_those_of_collider_and_victim_whoever_is_asked_about():
+def test_speeds_are_those_of_collider_and_victim_the_one_that_is_asked_about():
     (hit,) = hits(Overlap(), scene(*REAR_END, time_s=3.0, lanes=("a_0", "a_1")))
     assert facts(hit) == ("ego", "victim", "other", "ego", 12, 5)
     assert (hit.seen_by, hit.kind, hit.lane, hit.x, hit.y, hit.time_s) == (("overlap",), "overlap", "a_0", 0, 0, 3)
@@ -55,7 +55,7 @@ def test_speeds_are_those_of_collider_and_victim_whoever_is_asked_about():
     assert [hit.agent for hit in two] == ["ego", "other"]
 
 
-def test_the_lane_is_what_the_simulator_says_of_the_agent():
+def test_the_lane_is_what_the_simulator_states_of_the_agent():
     view = scene(*REAR_END)
     view.agent_lanes = {"ego": "b_2"}
     (hit,) = hits(Overlap(), view)
@@ -89,7 +89,7 @@ def test_a_report_is_believed_where_the_outlines_do_not_say():
     assert hit.role == "collider"
 
 
-def test_the_outlines_say_who_of_a_report_drove_into_whom():
+def test_the_outlines_say_who_of_a_report_drove_into_which():
     reported = Contact("ego", "other", "collision", "c_0", 7.0, 3.0)
     before = scene(("ego", 0, 0, 0, 5), ("other", -7, 0, 0, 12), time_s=1.0)
     after = scene(("ego", 5, 0, 0, 5), ("other", 5, 0, 0, 12), time_s=2.0, contacts=(reported,), swept=True)
@@ -107,7 +107,7 @@ def test_the_outlines_say_who_of_a_report_drove_into_whom():
 
 
 @pytest.mark.parametrize("turned", [0.0, 1.0, 2.5])
-def test_nobody_nearby_is_left_out(turned):
+def test_no_one_nearby_is_excluded(turned):
     """What spares the work of looking finds whoever was there within the step: passing, crossing, turning, entering."""
     c, s = math.cos(turned), math.sin(turned)
 
@@ -142,7 +142,7 @@ def test_nobody_nearby_is_left_out(turned):
     assert hits(Overlap(), *clear) == []
 
 
-def test_whoever_turns_within_a_step_is_looked_at_with_what_that_sweeps():
+def test_the_one_that_turns_within_a_step_is_looked_at_with_what_that_sweeps():
     """Its back swings through a place where it is neither before nor after."""
     small = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("post", "post", 0.4, 0.4)))
 
@@ -157,7 +157,7 @@ def test_whoever_turns_within_a_step_is_looked_at_with_what_that_sweeps():
 
 
 @pytest.mark.parametrize("same", [True, False], ids=["as before", "somebody came"])
-def test_whoever_drives_through_early_in_a_step_and_is_far_away_at_its_end_has_hit(same):
+def test_the_one_that_drives_through_early_in_a_step_and_is_far_away_at_its_end_has_hit(same):
     before = scene(("ego", 0, 0, 0, 0), ("other", -8, 0, 0, 60))
     fresh = [] if same else [("new", 0, 30, 0, 0)]
     after = scene(*fresh, ("ego", 0, 0, 0, 0), ("other", 52, 0, 0, 60), time_s=1.0, swept=True)
@@ -207,7 +207,7 @@ def test_events_are_those_of_the_agents():
     ("oracle", "kind"),
     [(RedLight, "red_light"), (Teleport, "teleport"), (WrongWay, "wrong_way"), (OffRoute, "off_route")],
 )
-def test_whoever_looks_for_one_kind_of_event_sees_that_of_the_agents_only(oracle, kind):
+def test_the_one_that_looks_for_one_kind_of_event_sees_that_of_the_agents_only(oracle, kind):
     view = scene(*REAR_END)
     other = "teleport" if kind != "teleport" else "red_light"
     view.events = (Event(kind, "other", "theirs"), Event(other, "ego", "another"), Event(kind, "ego", "ours"))
@@ -229,7 +229,7 @@ def test_findings_of_others_are_not_credited():
     assert merge_findings([event, one]) is event
 
 
-def test_whoever_is_left_out_has_not_touched():
+def test_the_one_that_is_excluded_has_not_touched():
     """Against looking at everybody: fast and slow, in bends, aside, just entered, and in steps of any length."""
     random = np.random.default_rng(11)
     found = 0

@@ -175,7 +175,7 @@ def test_neighbors_are_sorted_and_complete():
     assert corners(view, 1) == pytest.approx(np.array([[3, 5], [-2, 5], [-2, 3], [3, 3]]))
 
 
-def test_who_drove_into_whom():
+def test_who_drove_into_which():
     behind = scene(("ego", 0, 0, 0, 20), ("a", 4, 0, 0, 10))
     (finding,) = Overlap().check(behind, ["ego"])
     hit = finding.collision

@@ -88,7 +88,7 @@ class Open(Agent):
 """
 
 
-def test_an_agent_says_what_it_takes(tmp_path, monkeypatch):
+def test_an_agent_states_what_it_takes(tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(AGENTS)
     assert takes_of("mine:Agent", folder=tmp_path) == Takes(("speed", "model"))
     assert takes_of("mine:Open", (str(tmp_path),)) == Takes(("speed",), open=True)

@@ -47,7 +47,7 @@ def test_names_and_limits():
         ([], "names no outcome"),
     ],
 )
-def test_what_is_none_is_told_in_one_line(words, message):
+def test_what_is_none_is_reported_in_one_line(words, message):
     with pytest.raises(UsageError) as caught:
         parse_crash_on(words)
     assert message in str(caught.value)
@@ -70,11 +70,13 @@ def test_limits_reach_the_simulator_and_the_file(tmp_path):
     assert "events" not in (tmp_path / "plain.toml").read_text()  # as before there were any
 
 
-def test_what_a_simulator_never_tells(tmp_path):
-    with pytest.raises(UsageError, match="the simulator 'highway' never tells that; it tells wrong_way, not_moving"):
+def test_what_a_simulator_never_reports(tmp_path):
+    with pytest.raises(
+        UsageError, match="the simulator 'highway' never reports that; it reports wrong_way, not_moving"
+    ):
         plan(Request(trials=1, max_steps=10, scenario="highway", crash_on=("red_light",)))
     scenario, _ = plan(Request(trials=1, max_steps=10, scenario="highway", crash_on=("red_light", "collision")))
-    assert "the simulator 'highway' never tells red_light" in scenario.notes
+    assert "the simulator 'highway' never reports red_light" in scenario.notes
 
 
 @pytest.mark.parametrize(("key", "message"), [("red_light = 3", "has no limit"), ("not_moving = 0", "is no limit")])

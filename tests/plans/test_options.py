@@ -270,7 +270,7 @@ def test_a_request_of_an_older_version_is_read(tmp_path):
     assert found.snapshot.snapshot_roots == ("/a/file",)
 
 
-def test_what_has_no_such_option_says_what_it_has():
+def test_what_has_no_such_option_states_what_it_has():
     for make, name in ((SuiteEntry, "SuiteEntry"), (RunSettings, "RunSettings"), (Request, "Request")):
         with pytest.raises(CallError, match=rf"{name}\(\) has no argument 'keep_gong'"):
             make(keep_gong=True)

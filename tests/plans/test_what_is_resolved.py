@@ -107,7 +107,7 @@ def test_how_many_run_here_is_known_of_each_executor(folder, monkeypatch):
     assert plan(asked(run=replace(asked().run, parallel=7)))[1].run.parallel == 7
 
 
-def test_an_option_says_what_it_means_and_whether_it_may_be_left_out():
+def test_an_option_states_what_it_means_and_whether_it_may_be_excluded():
     options = {option.name: option for option in hunt_options()}
     assert options["snapshot_code"].default is True
     assert options["snapshot_code"].about.meaning.startswith("whether the snapshot has code")
@@ -167,7 +167,7 @@ def test_what_an_agent_needs_has_to_be_given(folder):
         ({"scenario_arguments": {"gap": "3"}}, "the scenario has no argument 'gap'"),
         ({"agents": {"other": "drives:Agent"}}, "other"),
         ({"action": "meta"}, "--action meta is for"),
-        ({"branch": True}, "--branch has copies of trials go on with other disturbances, and there are none"),
+        ({"branch": True}, "--branch needs disturbances, and there are none"),
         ({"disturb": ["brake@101=ahead:4:2"]}, "--disturb brake@101: a trial has 100 steps"),
         ({"crash_on": ["red-light"]}, "did you mean 'red_light'"),
     ],
@@ -289,7 +289,7 @@ def test_of_a_record_the_code_is_asked_only_where_it_does_not_know():
     assert owners.of_record("a.weights", ask, option="--set") is None
 
 
-def test_code_says_what_an_agent_takes(folder):
+def test_code_states_what_an_agent_takes(folder):
     assert takes_of("drives:Agent") == Takes(("speed", "mode", "needed"))
     assert takes_of("drives:Open") == Takes((), open=True)
     assert takes_of("drives:Nothing") == Takes(open=True)  # whoever runs it says why

@@ -36,7 +36,7 @@ def header(tmp_path):
     return found.step, found.phase, found.agent
 
 
-def test_the_header_says_where_the_process_is(box, tmp_path):
+def test_the_header_states_where_the_process_is(box, tmp_path):
     found = read_header(tmp_path / "box")
     assert (found.pid, found.trial, found.started, found.committed) == (42, 7, 12.5, 64)
     assert header(tmp_path) == (0, Phase.SETUP, 0)
@@ -108,7 +108,7 @@ def test_the_numbers_on_disk_stay_what_they_are():
     assert [(phase.name, phase.value) for phase in Phase] == [("SETUP", 0), ("ACT", 1), ("SIMULATE", 2), ("DONE", 3)]
 
 
-def test_an_incomplete_record_is_left_out():
+def test_an_incomplete_record_is_excluded():
     whole = Record(Tag.LANES, 0, b"12345").encode() + Record(Tag.EVENTS, 1, b"{}").encode()
     assert [record.tag for record in decode_records(whole)] == [Tag.LANES, Tag.EVENTS]
     assert [record.tag for record in decode_records(whole[:-6])] == [Tag.LANES, Tag.EVENTS]  # without its padding
@@ -184,7 +184,7 @@ def test_more_than_is_reserved_is_reserved_in_time(tmp_path, monkeypatch):
     assert [record.tag for record in read_black_box(tmp_path / "box")] == [1, Tag.LANES, Tag.OBSERVATION, Tag.STEP]
 
 
-def test_a_full_disk_is_an_error_that_says_so(tmp_path, monkeypatch):
+def test_a_full_disk_is_an_error_that_states_so(tmp_path, monkeypatch):
     box = BlackBox(tmp_path / "box")
     box.begin(pid=1, trial=1, started=0.0)
 

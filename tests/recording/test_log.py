@@ -79,7 +79,7 @@ def test_what_is_no_log_is_refused(tmp_path):
             read_log(path)
 
 
-def test_the_views_say_what_the_recording_says(tmp_path):
+def test_the_views_say_what_the_recording_states(tmp_path):
     """Every view message is parsed with Foxglove's own classes and compared with the scene it shows."""
     recording = record(Episode(["ego", "odd name/§ #1"], 20, 4), tmp_path / "box")
     write_log(tmp_path / "log.mcap", recording, lanes=LANES, crash=CRASH)

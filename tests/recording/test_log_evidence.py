@@ -77,7 +77,7 @@ def test_without_any_evidence_or_its_end_it_is_another_recording(recording, tmp_
         read_log(path)
 
 
-def test_evidence_of_nobody_is_refused(recording, tmp_path):
+def test_evidence_of_no_one_is_refused(recording, tmp_path):
     path = tmp_path / "log.mcap"
     write_log(path, recording)
     rewrite(

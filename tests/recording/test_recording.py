@@ -96,7 +96,7 @@ def test_values_rosters_and_lengths_that_differ(tmp_path):
         recording.scene(9)
 
 
-def test_a_speed_that_nobody_knows_is_no_difference(tmp_path):
+def test_a_speed_that_no_one_knows_is_no_difference(tmp_path):
     recordings = []
     for name in "ab":
         recording = record(Episode(["ego"], 8, 1), tmp_path / name)

@@ -44,7 +44,7 @@ def film(*shots: Shot, **options) -> list[np.ndarray]:
     return list(frames(shots, FilmOptions(**({"size": (320, 200)} | options))))
 
 
-def test_what_disturbs_is_told_while_it_goes_on():
+def test_what_disturbs_is_reported_while_it_continues():
     plain, disturbed = shot(), shot()
     disturbed.recording.disturbances = (
         Disturbance(5, "ahead", "brake", 4.0, 0.5, "ego", "other"),

@@ -185,7 +185,7 @@ def test_a_panel_of_ones_own_draws_itself():
         Panel().draw()
 
 
-def test_a_panel_of_ones_own_of_the_wrong_size_says_so(tmp_path):
+def test_a_panel_of_ones_own_of_the_wrong_size_states_so(tmp_path):
     class Wide(Panel):
         def draw(self, width=240, height=160, label=""):
             return np.zeros((10, 900, 3), np.uint8)
@@ -194,7 +194,7 @@ def test_a_panel_of_ones_own_of_the_wrong_size_says_so(tmp_path):
     assert render.load_panels(tmp_path)[1]["w"].shape == (160, 240, 3)
 
 
-def test_panels_travel_as_pictures_and_one_that_fails_says_why(tmp_path):
+def test_panels_travel_as_pictures_and_one_that_fails_states_why(tmp_path):
     render.save_panels(tmp_path, 4, [("a", Bar([1, 2])), ("b", Heatmap(np.zeros((2, 2, 2))))])
     render.save_panels(tmp_path, 4, [("c", Text("another agent's"))])
     found = render.load_panels(tmp_path)

@@ -77,7 +77,7 @@ def test_replay_that_is_killed_leaves_a_crash_unconfirmed(bundle, monkeypatch, t
 
 
 @pytest.mark.nightly
-def test_unknown_escape_is_told_and_searched_again(bundle, toy):
+def test_unknown_escape_is_reported_and_searched_again(bundle, toy):
     unknown = replace(
         bundle.result, escape=None, why_no_escape="the process that searched was killed by SIGKILL, 2 times"
     )

@@ -54,7 +54,7 @@ def groups(tmp_path):
     ]
 
 
-def test_a_failure_is_told_where_it_was_in_the_agents_code(groups):
+def test_a_failure_is_reported_where_it_was_in_the_agents_code(groups):
     collision, fault = findings_of(groups)
     assert (fault.file, fault.line) == ("src/my planner.py", 13)  # not NumPy's, into which it called
     assert (collision.file, collision.line) == ("", 1)  # there is no snapshot
@@ -93,13 +93,13 @@ def test_the_place_of_a_collision_is_where_the_agent_is_defined(tmp_path, groups
 
 def test_the_summary_is_a_table_that_nothing_breaks(groups):
     summary = crashes_summary(findings_of(groups))
-    assert summary.startswith("### crashhunt: 6 crashes of 2 kinds\n")
+    assert summary.startswith("### crashhunt: 6 crashes of 2 types\n")
     assert "ego drove into a\\|b" in summary
     rows = [line for line in summary.splitlines() if line.startswith("| ")]
     assert len(rows) == 4
     assert {row.replace("\\|", "").count("|") for row in rows} == {6}
     compared = crashes_summary(findings_of(groups, {groups[0].signature: "kept/one"}), compared=True)
-    assert "2 kinds, 1 new" in compared
+    assert "2 types, 1 new" in compared
     assert "| `kept/one` |" in compared
     assert crashes_summary([]) == "### crashhunt: no crash was saved\n"
 
@@ -120,7 +120,7 @@ def test_sarif_has_an_alert_a_kind_with_a_place_and_known_ones_are_notes(groups,
     assert all(one["partialFingerprints"]["primaryLocationLineHash"] for one in run["results"])
 
 
-def test_a_place_that_nobody_knows_is_the_hunt_however_it_was_given(tmp_path, monkeypatch):
+def test_a_place_that_no_one_knows_is_the_hunt_however_it_was_given(tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     signature, uris = Signature("collision", "collider", "rear end"), []
@@ -140,7 +140,7 @@ def test_a_corpus_knows_what_is_expected_to_crash_still(groups):
     assert known_kinds([replace(signature, lane_change="agent")], [case]) == {}
 
 
-def test_cases_that_are_not_as_expected_come_first_and_are_told_beside_their_files():
+def test_cases_that_are_not_as_expected_come_first_and_are_reported_next_to_their_files():
     fine = CaseReport(Path("kept/a"), "still", "still", "x", "x", "a | note")
     wrong = CaseReport(Path("kept/b"), "fixed", "changed", "it was", "ValueError: 5 %")
     better = CaseReport(Path("kept/c"), "still", "fixed")

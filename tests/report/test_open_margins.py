@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 from types import SimpleNamespace
 
-from crashhunt.hunts._fork_results import BranchReport, ProbeReport
+from crashhunt.hunts._reports import BranchReport, ProbeReport
 from crashhunt.ledger import Ledger
 from crashhunt.report._page import _trials
 from crashhunt.report._words import describe_branches, describe_probes
@@ -23,29 +23,29 @@ def probed(*margins, open_ones=0, run_again=0, not_finished=0):
 
 def test_nothing_plausible_made_them_crash_is_said_of_fully_asked_trials_only():
     assert describe_probes(probed(0.25, 1.0, 1.0, open_ones=2)) == [
-        "Stress margin of 3 trials: least 0.25, median 1.00; nothing plausible made 2 of them crash.",
-        "  2 trials were not fully asked: a copy was killed by SIGKILL",
-        "  copies were asked 62 times, with 2751 steps beside 900 of trials",
+        "Stress margin of 3 trials: least 0.25, median 1.00; 2 of them crashed under no plausible disturbance.",
+        "  2 trials were not fully probed: a copy was killed by SIGKILL",
+        "  62 probes of copies took 2751 steps, in addition to 900 steps of trials",
     ]
     assert describe_probes(probed(open_ones=1))[:2] == [
-        "Stress margin: no trial was fully asked.",
-        "  1 trial was not fully asked: a copy was killed by SIGKILL",
+        "Stress margin: no trial was fully probed.",
+        "  1 trial was not fully probed: a copy was killed by SIGKILL",
     ]
     assert describe_probes(probed()) == []
     assert probed(0.25, open_ones=2).probes.to_json()["not_fully_asked"] == 2
     assert probed(0.25, open_ones=2).probes.to_json()["trials"] == 1
 
 
-def test_what_could_not_be_run_from_the_start_is_told_apart_from_what_did_not_crash():
+def test_what_could_not_be_run_from_the_start_is_distinguished_from_what_did_not_crash():
     line = describe_probes(probed(0.25, run_again=3, not_finished=1))[-1]
     assert line == (
-        "  of the 3 mildest disturbances with which a trial crashed, 0 made it crash from the start as well, "
-        "and 1 could not be run to the end:"
+        "  of the 3 mildest disturbances that made a trial crash, 0 reproduce the crash from the start, "
+        "and 1 did not finish:"
     )
     branched = BranchReport(8, 133, 163, 8163, 28, 13, 5, 1, WHY, 5, 2, ())
     lines = describe_branches(SimpleNamespace(branches=branched, trial_steps=2400))
-    assert lines[2] == "  1 trial was not fully asked: a copy was killed by SIGKILL"
-    assert lines[3] == "  of the 5 likeliest, 0 crashed from the start as well, and 2 could not be run to the end:"
+    assert lines[2] == "  1 trial was not fully probed: a copy was killed by SIGKILL"
+    assert lines[3] == "  of the 5 likeliest crashes, 0 reproduce from the start, and 2 did not finish:"
     assert branched.to_json()["not_fully_asked"] == 1
 
 

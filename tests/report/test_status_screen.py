@@ -72,7 +72,7 @@ def test_the_least_stress_margin_is_shown_where_there_is_room():
         console = Console(width=100, height=height, force_terminal=True, color_system=None)
         with console.capture() as captured:
             console.print(Watcher(console, TITLE)._screen(replace(found, stressed=stressed)))
-        line = "least stress margin: 0.38, trial 123, whoever is ahead of ego brakes with 2.25 m/s² for 3 s"
+        line = "least stress margin: 0.38, trial 123, the actor ahead of ego brakes with 2.25 m/s² for 3 s"
         assert (line in captured.get()) is shown
 
 
@@ -85,7 +85,7 @@ def test_margin_that_is_not_fully_asked_is_shown_as_such():
     with console.capture() as captured:
         console.print(Watcher(console, TITLE)._screen(shown))
     assert "least stress margin: at most 0.38 (asked 1 of 9), trial 123" in captured.get()
-    assert "2 trials were not fully asked: copies of them died" in captured.get()
+    assert "2 trials were not fully probed: copies of them died" in captured.get()
 
 
 def test_kinds_of_crashes_and_when_the_last_new_one_came():
@@ -97,9 +97,9 @@ def test_kinds_of_crashes_and_when_the_last_new_one_came():
             console.print(Watcher(console, TITLE)._screen(found))
         lines = [line.rstrip() for line in shown.get().splitlines()]
         assert len(lines) < 12
-        assert any(line.startswith("2 kinds of crashes, the last new one 3") for line in lines)
-    assert any("3:12 ago (1 trial): 2 rear end, the" in line for line in lines)
-    assert describe_kinds(replace(found, newest_kind_trials=None)).endswith("one 3:12 ago")
+        assert any(line.startswith("2 crash types (last new type: 1 trial") for line in lines)
+    assert any("(last new type: 1 trial / 3:12 ago): 2 rear end, the" in line for line in lines)
+    assert describe_kinds(replace(found, newest_kind_trials=None)).endswith("(last new type: 3:12 ago)")
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_how_many_crashes_had_disturbances(crashes, disturbed, said):
         assert (said in told) if said else ("disturbances" not in told)
 
 
-def test_where_not_all_fit_it_says_how_many_more():
+def test_where_not_all_fit_it_states_how_many_more():
     lines = screen(40, 12, 64)
     assert len(lines) < 12
     assert "and 53 more" in lines[-1]
@@ -129,7 +129,7 @@ def test_nodes_are_on_the_screen_and_in_the_line():
     for shown, expected in (
         (nodes[:2], ["node n0   4 at a time   0 trials   1.2/s", "node n1   4 at a time   10 trials   1.2/s"]),
         (nodes, ["node n0   4 at a time   0 trials   1.2/s", "and 8 more nodes"]),
-        ((), ["no node takes part now; the hunt waits"]),
+        ((), ["no node is connected; the hunt waits"]),
     ):
         console = Console(width=60, height=12, force_terminal=True, color_system=None)
         with console.capture() as captured:
@@ -139,7 +139,7 @@ def test_nodes_are_on_the_screen_and_in_the_line():
         assert [line for line in lines if "node" in line] == expected or len(shown) == 9
         assert expected[-1] in lines or len(shown) == 9
     plain = Console(width=200, force_terminal=False)
-    for shown, expected in ((nodes, "left; nodes that take part: 9"), ((), "left; no node takes part now")):
+    for shown, expected in ((nodes, "left; connected nodes: 9"), ((), "left; no node is connected")):
         with plain.capture() as captured:
             Watcher(plain, TITLE)(replace(status(2), nodes=shown))
         assert captured.get().rstrip().endswith(expected)

@@ -9,13 +9,13 @@ from crashhunt.report._words import about_judgement, about_why
 
 
 @pytest.mark.parametrize("drawn", [(), ("unclear", "unclear")])
-def test_a_default_is_told_where_other_values_say_nothing(drawn):
+def test_a_default_is_reported_where_other_values_say_nothing(drawn):
     default = Factor("argument", "ego.speed", "default", was=9.0, runs=(LeftOut(5.0, "none"),))
     others = Factor("argument", "ego.speed", "drawn", was=9.0, runs=tuple(LeftOut(6.0, one) for one in drawn))
     assert about_why(Why((default, others), 100), str)[1:] == ["- ego.speed at its default 5: no crash."]
 
 
-def test_that_braking_helped_from_the_first_step_on_is_told_beside_what_helped_longer():
+def test_that_braking_helped_from_the_first_step_on_is_reported_next_to_what_helped_longer():
     brake, left = Attempt("brake", 3, {0: "avoided", 1: "hit", 2: "hit"}), Attempt("left", 3, {2: "avoided"})
     told = about_judgement(Judgement((brake, left)), lambda step: f"step {step}", "ego", "other")
     assert [sentence.partition(",")[0] for sentence in told[:2]] == [

@@ -49,7 +49,7 @@ def test_as_long_as_nothing_came_near_strategies_have_a_third_at_most():
     assert far["model"] > 2 * far["mutation"]
 
 
-def test_after_a_crash_strategies_begin_anew_with_what_is_not_near_to_it():
+def test_after_a_crash_strategies_begin_again_with_what_is_not_near_to_it():
     made = portfolio_told(*[("random", 0.02 * number) for number in range(40)])
     model, mutation = made._strategies.values()
     middle = PLACES[7]

@@ -63,7 +63,7 @@ def test_where_another_kind_comes_there_is_more_to_find():
     assert known.cover(at(0.52))
 
 
-def test_what_is_most_dangerous_just_beside_a_crash_is_that_crash_still():
+def test_what_is_most_dangerous_just_next_to_a_crash_is_that_crash_still():
     known = KnownCrashes(4)
     known.add(crash(0.5))
     assert not known.widen(at(0.8))
@@ -114,7 +114,7 @@ def kind_of(**evidence):
     return scored_trial(TrialResult(spec, outcome, danger=0.5, **evidence), Cube(UNIT), HuntFacts()).kind
 
 
-def test_kinds_are_told_by_manner_and_road_and_by_what_was_raised():
+def test_kinds_are_reported_by_manner_and_road_and_by_what_was_raised():
     hit = Collision("ego", "collider", "ego", "a", kind="collision", lane="north_1")
     assert kind_of(collision=hit) == "collision collider collision north"
     same = Collision("ego", "collider", "ego", "b", kind="collision", lane="north_0", x=3.0)
@@ -145,7 +145,7 @@ def test_a_danger_is_never_a_crash_and_a_crash_is_the_greatest_danger():
     assert scored_trial(TrialResult(spec, Outcome.INVALID), Cube(UNIT), HuntFacts()) is None
 
 
-def test_a_hunt_that_goes_on_comes_back_to_arguments_that_lead_to_several_kinds():
+def test_a_hunt_that_continues_comes_back_to_arguments_that_lead_to_several_kinds():
     """All crashes are in one small region, and of four kinds: whoever kept away from it would find one."""
     lanes = ["north_0", "south_0", "east_0", "west_0"]
 

@@ -43,7 +43,7 @@ def test_quantiles_of_even_shares_are_spread_as_draws_are(known):
 
 @quickly
 @given(spaces, st.integers(0, 2**40))
-def test_a_point_stands_for_arguments_and_comes_back(space, seed):
+def test_a_point_represents_arguments_and_comes_back(space, seed):
     cube = Cube(space)
     point = np.random.default_rng(seed).random(cube.dimensions)
     arguments = cube.arguments(point)

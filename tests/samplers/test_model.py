@@ -64,7 +64,7 @@ def trials(danger_of, count, seeds=None):
         yield ScoredTrial(number, point, number if seeds is None else number % seeds, danger_of(point, number))
 
 
-def test_noise_and_arguments_are_told_apart():
+def test_noise_and_arguments_are_distinguished():
     luck = np.random.default_rng(5)
     clear, blurred = Model(PLANE), Model(PLANE)
     for told in trials(lambda point, _: float(1 - abs(point - 0.6).sum() / 2), 60):

@@ -87,7 +87,7 @@ def test_whatever_the_arguments_proposals_are_inside(kind, space, seed, luck):
     ("kind", "trials"),
     [("optuna:tpe", 71), ("optuna:cma-es", 71), pytest.param("optuna:nsgaii", 161, marks=pytest.mark.nightly)],
 )
-def test_danger_leads_it_and_one_that_is_made_anew_goes_on_exactly(kind, trials):
+def test_danger_leads_it_and_one_that_is_made_again_continues_exactly(kind, trials):
     """Later than the contract looks: CMA-ES and NSGA-II have generations, of which the study keeps the state."""
     asked, results = talk(kind, UNIT, near, trials)
     guided = [result.danger for one, result in zip(asked, results, strict=True) if one.origin == "optuna"]
@@ -131,7 +131,7 @@ def test_names_may_be_written_short(name):
     assert not varies_only_asked(name)
 
 
-def test_what_optuna_says_is_not_shown_and_its_own_settings_stay(capfd, recwarn):
+def test_what_optuna_states_is_not_shown_and_its_own_settings_stay(capfd, recwarn):
     level = optuna.logging.get_verbosity()
     talk("optuna:cma-es", UNIT, near, 12)
     assert capfd.readouterr() == ("", "")

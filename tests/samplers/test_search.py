@@ -109,7 +109,7 @@ def test_the_even_search_leaves_no_part_of_an_argument_out():
         assert np.histogram(drawn, bins=5, range=(0.0, 1.0))[0].min() >= 15
 
 
-def test_danger_that_says_nothing_gets_probes_only():
+def test_danger_that_states_nothing_gets_probes_only():
     luck = np.random.default_rng(1)
     asked, _ = hunt(GuidedSampler(UNIT), lambda _: luck.random() * 0.9, 800)
     guided = [proposal.origin for proposal in asked[100:]]
@@ -125,7 +125,7 @@ def test_danger_that_leads_nowhere_has_a_try_and_then_next_to_nothing():
     assert sum(unguided[200:]) > 0.8 * 600
 
 
-def test_a_hunt_that_goes_on_looks_for_other_crashes():
+def test_a_hunt_that_continues_looks_for_other_crashes():
     def two(proposal):
         x = values(proposal)
         near = min(np.linalg.norm(x - 0.2), np.linalg.norm(x - 0.8))

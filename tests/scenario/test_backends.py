@@ -70,7 +70,7 @@ class TestToy(_Written):
 
 
 def test_what_comes_with_crashhunt_is_found_without_entry_points(monkeypatch):
-    monkeypatch.setattr("crashhunt.scenario._backend._others", dict)
+    monkeypatch.setattr("crashhunt.scenario._scenario._others", dict)
     assert {"gym", "highway", "sumo", "toy"} <= set(backend_names())
     assert backend_of("a.module:Simulator") is None
 
@@ -91,7 +91,7 @@ class Point:
 def test_a_broken_backend_is_an_error_where_it_is_asked_for_and_nowhere_else(monkeypatch, target, says):
     from crashhunt.scenario import installed_backends
 
-    monkeypatch.setattr("crashhunt.scenario._backend._others", lambda: {"other": Point(target)})
+    monkeypatch.setattr("crashhunt.scenario._scenario._others", lambda: {"other": Point(target)})
     with pytest.raises(PluginError) as caught:
         backend_of("other")
     assert says in str(caught.value)
@@ -138,7 +138,7 @@ def test_a_table_that_is_missing_is_called_as_it_is_in_the_file():
         ("[sumo]\nnet = 3\n", "sumo.net = 3: "),
     ],
 )
-def test_a_table_of_nobody_is_refused(tmp_path, changes, says):
+def test_a_table_of_no_one_is_refused(tmp_path, changes, says):
     (tmp_path / "scenario.toml").write_text(f"schema = 1\n{changes}")
     with pytest.raises(ScenarioError) as caught:
         load_scenario(tmp_path)
@@ -152,7 +152,7 @@ def test_a_table_that_an_older_crashhunt_sends_as_nothing_is_none():
     assert scenario_from_dict(sent, where="worker settings", folder=Path()).tables == {}
 
 
-def test_what_ran_before_with_a_table_that_nobody_used_still_runs(tmp_path):
+def test_what_ran_before_with_a_table_that_no_one_used_still_runs(tmp_path):
     shutil.copytree(shipped_folder() / "highway", tmp_path / "s")
     file = tmp_path / "s" / "scenario.toml"
     file.write_text('schema = 1\nsimulator = "toy"\n[agents.ego]\n[sumo]\nnet = "gone.net.xml"\n')

@@ -212,7 +212,7 @@ def test_a_bare_sumocfg_is_a_scenario(town):
     assert scenario.notes[0].endswith("each trial replaces one random vehicle (3 candidates, departing at 50-57 s)")
 
 
-def test_whom_a_controlled_vehicle_may_replace(town):
+def test_which_a_controlled_vehicle_may_replace(town):
     """Whoever departs when there is traffic, on a road, and can be named; of very many, as many as can be looked at."""
     path = sumocfg(town, '<input><n v="net.net.xml"/><r v="r.rou.xml"/></input>')
 
@@ -274,7 +274,7 @@ def test_a_vehicle_of_a_flow_is_waited_for(town, rate, depart_s):
     assert load_scenario(path, ego="a.b.9").agents["a.b.9"].depart_s == depart_s
 
 
-def test_files_beside_and_above_and_compressed(town):
+def test_files_next_to_and_above_and_compressed(town):
     (town / "cfg").mkdir()
     with gzip.open(town / "r.rou.xml.gz", "wb") as file:
         file.write((town / "r.rou.xml").read_bytes())
@@ -299,7 +299,7 @@ def test_files_beside_and_above_and_compressed(town):
         ('<net-file value="net.net.xml"/><weight-files value="w.xml"/>', "route=a", "weight-files"),
     ],
 )
-def test_a_sumocfg_that_cannot_be_used_says_why(town, text, ego, says):
+def test_a_sumocfg_that_cannot_be_used_states_why(town, text, ego, says):
     with pytest.raises(ScenarioError) as caught:
         load_scenario(sumocfg(town, text), ego=ego)
     assert says in str(caught.value)

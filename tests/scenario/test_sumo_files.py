@@ -160,7 +160,7 @@ def test_files_that_include_each_other_end(town):
         ('<phemlight-path value="/usr/share/p"/>', {"phemlight-path": "/usr/share/p/"}, "not archived"),
     ],
 )
-def test_what_somebody_wrote_is_kept_or_told(town, tmp_path, text, kept, says):
+def test_what_an_actor_wrote_is_kept_or_reported(town, tmp_path, text, kept, says):
     scenario = load_scenario(config(town, text))
     options = staged(scenario, tmp_path / "stage")
     assert {name: options[name] for name in kept} == kept
@@ -170,7 +170,7 @@ def test_what_somebody_wrote_is_kept_or_told(town, tmp_path, text, kept, says):
     assert bool(told) is bool(says)
 
 
-def test_a_jam_of_a_scenario_stays_one_unless_it_says_otherwise(town, tmp_path):
+def test_a_jam_of_a_scenario_stays_one_unless_it_states_otherwise(town, tmp_path):
     (town / "scenario.toml").write_text(
         'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
     )
@@ -261,7 +261,7 @@ def test_what_is_filled_in_is_so_in_compressed_files_too(town, tmp_path):
         StagedFiles(scenario, tmp_path / "again").arguments(1, {})
 
 
-def test_what_a_scenario_would_have_written_is_told_and_no_more_than_xml_is_asked(town, tmp_path):
+def test_what_a_scenario_would_have_written_is_reported_and_no_more_than_xml_is_asked(town, tmp_path):
     # What an argument stands for may be several attributes.
     (town / "a.add.xml").write_text('<additional><e1Detector file="x.xml" ${more} pos="3" period="9"/></additional>')
     (town / "scenario.toml").write_text(

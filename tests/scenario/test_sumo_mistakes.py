@@ -160,14 +160,14 @@ def test_sumos_words_get_file_key_and_fix(own, message, output, where, says):
     assert "stage-" not in str(error)
 
 
-def test_a_process_that_died_at_set_up_says_what_it_said(own):
+def test_a_process_that_died_at_set_up_states_what_it_said(own):
     error = explained("the process died of SIGSEGV", "Error: Attribute 'shape' is missing of lane 'south_0'.\n", own)
     assert str(own.folder / "loop.net.xml, line ") in error.where
     assert "the process died of SIGSEGV" in error.message
     assert explained("the vehicle 'ego' was not on the road", "", own) is None
 
 
-def test_a_hunt_tells_it(shell):
+def test_a_hunt_reports_it(shell):
     shutil.copytree(shipped_folder() / "loop", shell.folder / "own")
     file = shell.folder / "own" / "traffic.rou.xml"
     file.write_text(file.read_text().replace('<vType id="ego"', '<vType id="ego" carFollowModel="nope"'))

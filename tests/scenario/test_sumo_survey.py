@@ -118,7 +118,7 @@ def test_a_demand_of_0_at_one_end_is_no_reason_to_refuse(town):
     assert candidates(refine(town(), [run([]), run([("a", 1.0), ("b", 2.0), ("c", 3.0)])])) == ["a", "b", "c"]
 
 
-def test_a_long_wait_is_told_in_one_line(town):
+def test_a_long_wait_is_reported_in_one_line(town):
     late = run([("a", 1000.0), ("b", 1100.0)])
     (note,) = [note for note in refine(town(step_length=0.5), [late]).notes if note.startswith("warning")]
     assert "no vehicle enters before step 2000 (1000 s)" in note

@@ -11,12 +11,14 @@ from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError
 from crashhunt.crashes import Bundle, Signature, signature_of
 from crashhunt.shrinking import _runs
 from crashhunt.trial import EVERYBODY, Collision, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.whatif import Ended, StoppedError, _reruns
 
 
 @dataclass
 class Worker:
     scratch: object = None
     keep_trials: bool = True
+    warm_copies: int = 0
     code: tuple = ()
 
 
@@ -38,9 +40,12 @@ class Refuses:
     def completed(self, timeout_s):
         raise self.error(f"trial {self.spec.number} has only, which crashhunt 0.1.0 does not know")
 
+    def cancel(self, *, above=-1):
+        pass
 
-def test_an_older_crashhunt_that_refuses_to_leave_others_out_has_nobody_left_out(tmp_path, monkeypatch):
-    monkeypatch.setattr(_runs, "PoolExecutor", Refuses)
+
+def test_an_older_crashhunt_that_refuses_to_leave_others_out_has_no_one_excluded(tmp_path, monkeypatch):
+    monkeypatch.setattr(_reruns, "PoolExecutor", Refuses)
     rerun = SimpleNamespace(worker=Worker(), bundle=SimpleNamespace(result=SimpleNamespace(steps_begun=9)))
     words = {"parallel": 1, "budget": 9, "time_s": None, "stopped": lambda: False, "watch": None}
     runs = _runs.Runs(rerun, None, tmp_path, tmp_path / "memory", **words)
@@ -85,9 +90,9 @@ class Instant:
             same, steps = spec.arguments["ego"]["same"], spec.arguments["ego"]["steps"]
             outcome = Outcome.AGENT_ERROR if same in ("yes", "other") else Outcome.SURVIVED
             failure = replace(FAILED, kind="KeyError") if same == "other" else FAILED if same == "yes" else None
-            yield TrialResult(spec, outcome, steps=steps, failure=failure, digest=f"{steps:032x}")
+            yield TrialResult(spec, outcome, steps=steps, failure=failure, digest=f"{steps:032x}", kept=same == "yes")
 
-    def cancel(self, *, above):
+    def cancel(self, *, above=-1):
         self.cancelled.append(above)
         self.waiting = [spec for spec in self.waiting if spec.number <= above]
 
@@ -102,8 +107,8 @@ def candidate(same, steps=5, name=0):
 @pytest.fixture
 def make_runs(tmp_path, monkeypatch):
     """Makes runs of a crash of 20 steps; the memory of what came of candidates is a file."""
-    monkeypatch.setattr(_runs, "PoolExecutor", Instant)
-    monkeypatch.setattr(_runs, "is_todays", lambda rerun: True)
+    monkeypatch.setattr(_reruns, "PoolExecutor", Instant)
+    monkeypatch.setattr(_reruns, "is_todays", lambda rerun: True)
     monkeypatch.setattr(Instant, "made", ())
     result = TrialResult(candidate("yes", 20), Outcome.AGENT_ERROR, steps=20, failure=FAILED, digest="f" * 32)
     bundle = Bundle(tmp_path / "b", result, 1, "abc")
@@ -168,17 +173,17 @@ def test_what_came_of_a_candidate_is_remembered(make_runs, tmp_path):
 
 def test_more_than_the_budget_is_not_run(make_runs):
     runs = make_runs(budget=3)
-    with pytest.raises(_runs.StoppedError) as error:
+    with pytest.raises(StoppedError) as error:
         runs.first([candidate("no", name=name) for name in range(4)])
     assert not isinstance(error.value, _runs.OutOfTimeError)
     assert runs.count == len(Instant.made[0].ran) == 3
-    with pytest.raises(_runs.StoppedError):
+    with pytest.raises(StoppedError):
         runs.first([candidate("yes")])
     assert make_runs(budget=3).first([candidate("no", name=0), candidate("yes"), *[candidate("no", name=9)] * 5]) == 1
 
 
 @pytest.mark.parametrize(
-    ("options", "error"), [({"stopped": lambda: True}, _runs.StoppedError), ({"time_s": 1e-9}, _runs.OutOfTimeError)]
+    ("options", "error"), [({"stopped": lambda: True}, StoppedError), ({"time_s": 1e-9}, _runs.OutOfTimeError)]
 )
 def test_it_stops_when_asked_and_when_time_is_over(make_runs, options, error):
     runs = make_runs(**options)
@@ -189,20 +194,22 @@ def test_it_stops_when_asked_and_when_time_is_over(make_runs, options, error):
     assert make_runs(time_s=99.0).first([candidate("no", 6), candidate("no", 7, 1)]) is None
 
 
-@pytest.mark.parametrize(("digest", "names"), [("f" * 32, ("a", "b")), ("0" * 32, ())])
+@pytest.mark.parametrize(("digest", "names"), [(f"{4:032x}", ("a", "b")), ("0" * 32, ())])
 def test_who_enters_is_what_the_same_trial_has_written(make_runs, tmp_path, monkeypatch, digest, names):
     runs = make_runs()
     folder = tmp_path / "entered"
     folder.mkdir()
     (folder / "entered.json").write_text('["a", "b", "a"]')
-    monkeypatch.setattr(_runs, "scratch_of", lambda scratch, number: folder)
-    monkeypatch.setattr(_runs.layout, "ENTERED", "entered.json")
-    monkeypatch.setattr(_runs.Runs, "_judged", lambda self, result, keep: _runs.Ran(True, 4, digest))
-    assert runs.entered(candidate("yes", 4)) == names
+    monkeypatch.setattr(_reruns, "scratch_of", lambda scratch, number: folder)
+    monkeypatch.setattr(_reruns.layout, "ENTERED", "entered.json")
+    result = runs._rerun.bundle.result
+    runs._rerun = SimpleNamespace(bundle=SimpleNamespace(result=replace(result, digest=digest)))
+    everybody = replace(candidate("yes", 4), only=(EVERYBODY,))
+    assert runs.entered(everybody) == names
     assert (runs.count, runs.steps) == (1, 4)
     assert not folder.exists()
-    with pytest.raises(_runs.StoppedError):
-        make_runs(stopped=lambda: True).entered(candidate("yes", 4))
+    with pytest.raises(StoppedError):
+        make_runs(stopped=lambda: True).entered(replace(everybody, max_steps=3))
 
 
 def test_what_disturbed_others_that_are_moved_is_in_their_ways():
@@ -237,7 +244,7 @@ def test_of_a_collision_the_signature_is_made_only_where_it_may_be_the_same(
     asked = []
     monkeypatch.setattr(runs, "_signature_of", lambda result, folder: asked.append(result) or runs._signature)
     result = TrialResult(candidate("yes"), outcome, steps=7, collision=collision, digest="d")
-    assert runs._judged(result) == _runs.Ran(same, 7, "d")
+    assert runs._judged(Ended(0, result, None, bundle.path)) == _runs.Ran(same, 7, "d")
     assert len(asked) == same
 
 

@@ -43,14 +43,16 @@ def test_what_is_small_or_no_crash_is_refused(crash):
         with pytest.raises(UsageError, match="is a near miss, and nothing crashes in it"):
             shrink(replace(crash, result=replace(crash.result, outcome=outcome)))
     small = replace(crash, path=crash.path.with_name(f"{crash.id}.small"))
-    with pytest.raises(UsageError, match="has been made smaller already; give --crash 000000-collision to begin anew"):
+    with pytest.raises(
+        UsageError, match="is already minimized; give --crash 000000-collision to minimize the original crash again"
+    ):
         shrink(small)
     with pytest.raises(UntrustedError):
         shrink(crash, trusted=False)
 
 
 @pytest.mark.long
-def test_what_is_left_is_written_beside_it_and_confirmed(crash):
+def test_what_is_left_is_written_next_to_it_and_confirmed(crash):
     with_budget = shrink(crash, budget=1, parallel=1, trusted=True)
     assert (with_budget.verdict, with_budget.ended, with_budget.small) == ("unchanged", "budget", None)
     assert with_budget.to_json()["path"] is None
@@ -81,7 +83,7 @@ def test_what_is_left_is_written_beside_it_and_confirmed(crash):
     assert (told["signature_kept"], told["confirmed"], told["scripted"], told["steps_cut"]) == (True, True, None, 0)
     assert told["trials_run"] == found.trials > 3
     assert told["steps_run"] == found.steps > 52
-    assert any("can leave nobody out" in note for note in told["notes"])
+    assert any("cannot exclude actors" in note for note in told["notes"])
 
 
 class AskedError(Exception):
@@ -152,7 +154,7 @@ def test_what_cannot_be_confirmed_leaves_nothing(crash, tmp_path, monkeypatch):
     assert not path.exists()
 
 
-def test_a_crash_that_does_not_come_again_is_told(crash, monkeypatch):
+def test_a_crash_that_does_not_come_again_is_reported(crash, monkeypatch):
     runs = SimpleNamespace(
         most_steps=9, count=3, steps=30, first=lambda specs, *, again=False: None, close=lambda: None
     )  # fmt: skip

@@ -10,10 +10,11 @@ from hypothesis import given, strategies as st
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.shrinking import _scripting, _stages, fewest, plainest
-from crashhunt.shrinking._runs import OutOfTimeError, StoppedError
+from crashhunt.shrinking._runs import OutOfTimeError
 from crashhunt.shrinking._scripting import Part
 from crashhunt.shrinking._stages import Search
 from crashhunt.trial import EVERYBODY, Disturbance, Escape, TrialSpec
+from crashhunt.whatif import StoppedError
 from crashhunt.world import Actor, Roster, Scene
 
 
@@ -46,7 +47,7 @@ def test_what_is_likely_is_tried_first():
     assert seen == [(), (3,), (7,)]
 
 
-def test_where_each_is_needed_none_is_left_out_and_nothing_of_nothing():
+def test_where_each_is_needed_none_is_excluded_and_nothing_of_nothing():
     assert fewest("abcd", first(lambda some: len(some) == 4, [])) == ("a", "b", "c", "d")
     assert fewest((), first(lambda some: True, [])) == ()
     assert fewest("abcd", first(lambda some: True, [])) == ()
@@ -201,7 +202,7 @@ class FewRuns(LaterRuns):
         return None
 
 
-def test_whom_it_takes_no_more_where_it_begins_later_is_left_out_of_a_few_as_well(monkeypatch):
+def test_which_it_takes_no_more_where_it_begins_later_is_excluded_of_a_few_as_well(monkeypatch):
     monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS))
     monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
     search = _stages.Search(RERUN, FewRuns("gh"), "either")
@@ -332,7 +333,7 @@ def test_a_crash_that_comes_again_late_is_made_smaller():
         (CrashhuntError("a worker died"), False, "error", "a worker died"),
     ],
 )
-def test_why_a_search_ended_is_told_and_the_best_is_kept(error, stopped, ended, says):
+def test_why_a_search_ended_is_reported_and_the_best_is_kept(error, stopped, ended, says):
     rerun = crash()
 
     def crashes(spec):
@@ -358,7 +359,7 @@ def test_an_error_before_the_crash_has_come_again_is_raised():
         Search(crash(), Takes(fails), "traffic").run(lambda: False)
 
 
-def test_a_form_that_the_simulator_does_not_have_is_told():
+def test_a_form_that_the_simulator_does_not_have_is_reported():
     rerun = crash()
     search = Search(rerun, Takes(), "scripted")
     ended, words = search.run(lambda: False)
@@ -442,7 +443,7 @@ def test_two_agents_are_always_scripted_as_well():
     assert search._wants_script()
 
 
-def test_where_nobody_can_be_left_out_that_is_told():
+def test_where_no_one_can_be_excluded_that_is_reported():
     search = Search(crash(), Takes(entered=()), "traffic")
     assert search.run(lambda: False) == ("done", "")
     assert len(search.notes) == 1
@@ -473,7 +474,7 @@ class Moved:
     agents: tuple[SimpleNamespace, ...]
 
 
-def test_of_a_script_the_steps_that_are_cut_off_and_who_is_gone_are_told():
+def test_of_a_script_the_steps_that_are_cut_off_and_who_is_gone_are_reported():
     search = Search(crash(disturbances=(BRAKE, STOP, LATE, replace(LATE, step=50))), Takes(), "traffic")
     script = Moved(12.0, ("b",), (SimpleNamespace(actor=Actor("ego", "passenger", 5.0, 1.8)),))
     search.best = replace(search.best, script=script, disturbances=(replace(LATE, step=20),))
@@ -532,7 +533,7 @@ def test_an_agent_that_need_not_drive_is_moved():
     assert never._fewest_moved(TwoDrive()) is None
 
 
-def test_where_it_begins_later_pairs_with_whom_it_crashed_are_tried_first():
+def test_where_it_begins_later_pairs_with_which_it_crashed_are_tried_first():
     runs = Takes(lambda spec: False)
     search = Search(crash(other="c"), runs, "traffic")
     search._fewer_from_later_on(FromLaterOn(), Part(("ego",), ("a", "b", "c", "d"), 60))
@@ -619,7 +620,7 @@ def test_a_script_may_take_a_second_longer_than_what_was_recorded():
     assert scripting.spec(Part(("ego",), (), begin=40)).disturbances == ()
 
 
-def test_after_a_part_was_left_out_the_parts_stay_as_small():
+def test_after_a_part_was_excluded_the_parts_stay_as_small():
     """Zeller and Hildebrandt: of n parts, n - 1 are left; to begin with halves again would try each of them twice."""
     seen = []
     needed = {0, 2, 4, 6, 8, 10, 12, 14}

@@ -342,7 +342,7 @@ def test_a_road_of_another_class_keeps_its_own_methods():
     assert road.asked >= 3
 
 
-def test_somebody_who_moves_somebody_is_noticed():
+def test_an_actor_who_moves_an_actor_is_noticed():
     """Coordinates that were computed are not used where a vehicle is no longer there."""
     assert switch_on() == ""
     road = small_road(IDMVehicle, IDMVehicle, IDMVehicle)
@@ -357,7 +357,7 @@ def test_somebody_who_moves_somebody_is_noticed():
     assert road.neighbour_vehicles(first, ("0", "1", 2))[0] is second
 
 
-def test_it_says_whom_it_leaves_alone(caplog):
+def test_it_states_which_it_leaves_alone(caplog):
     class Odd(IDMVehicle):
         def mobil(self, lane_index):
             return False
@@ -370,7 +370,7 @@ def test_it_says_whom_it_leaves_alone(caplog):
 
 def test_it_steps_aside_for_another_version(monkeypatch):
     monkeypatch.setattr(highway_env, "__version__", "9.9")
-    assert "highway-env 9.9 is not known" in switch_on()
+    assert "highway-env 9.9 is not supported" in switch_on()
     assert Road.act.__module__ == "highway_env.road.road"
 
 
@@ -406,7 +406,7 @@ for name in sys.argv[1:]:
 """
 
 
-def test_it_steps_aside_where_somebody_else_has_replaced_a_method(tmp_path):
+def test_it_steps_aside_where_another_has_replaced_a_method(tmp_path):
     names = ["Vehicle.clip_actions", "AbstractLane.on_lane", "highway_env.utils.not_zero"]
     (tmp_path / "patched.py").write_text(PATCHED)
     command = [sys.executable, "patched.py", *names]

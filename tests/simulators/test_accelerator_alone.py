@@ -92,7 +92,7 @@ def passer_by(env):
 
 
 @pytest.mark.parametrize(("change", "times"), [(lambda env: None, 2), (onlooker, 2), (passer_by, 16)])
-def test_everybody_is_looked_at_once_in_a_step_unless_somebody_might_do_anything(change, times, monkeypatch):
+def test_everybody_is_looked_at_once_in_a_step_unless_an_actor_might_do_anything(change, times, monkeypatch):
     slow, fast = both(made, driven(change, steps=2))
     assert slow == fast
     env = made()
@@ -152,7 +152,7 @@ def looking_away(env):
         (Counting, lambda env: None),
     ],
 )
-def test_whoever_changes_something_between_two_sub_steps_is_noticed(kind, change):
+def test_the_one_that_changes_something_between_two_sub_steps_is_noticed(kind, change):
     slow, fast = both(lambda: made(kind), driven(change))
     assert slow == fast
     assert slow != driven()(made())  # it matters
@@ -161,7 +161,7 @@ def test_whoever_changes_something_between_two_sub_steps_is_noticed(kind, change
 @pytest.mark.parametrize("early", [True, False])
 @pytest.mark.parametrize(("owner", "name"), [(AbstractEnv, "_simulate"), (AbstractEnv, "_automatic_rendering"),
                                              (road.Road, "act"), (road.Road, "step")])  # fmt: skip
-def test_what_somebody_wraps_is_called_in_every_sub_step(owner, name, early, monkeypatch):
+def test_what_an_actor_wraps_is_called_in_every_sub_step(owner, name, early, monkeypatch):
     """Before highway-env is sped up or afterwards; of a road's methods, before it the accelerator steps aside."""
     method = getattr(owner, name)
 
@@ -193,7 +193,7 @@ def test_a_copy_of_a_road_is_looked_at_by_the_same():
     assert copy.deepcopy(env).road.step is env.road.step
 
 
-def test_whoever_changes_something_between_two_steps_is_noticed():
+def test_the_one_that_changes_something_between_two_steps_is_noticed():
     def drive(env):
         trace = []
         for _ in range(3):
@@ -243,7 +243,7 @@ def test_who_sees_the_end_of_a_lane_later_is_still_in_the_way_there():
 SLOW = {"speed": 2.0, "DISTANCE_WANTED": 0.5}  # so that it matters who is ahead
 
 
-def test_a_lane_that_somebody_says_a_vehicle_is_on():
+def test_a_lane_that_an_actor_states_a_vehicle_is_on():
     def make():
         poses = [([3.0 + 7 * number, 0.0 if number % 2 else 4.0], 0.05 * number, SLOW) for number in range(14)]
         place = two_roads(poses)

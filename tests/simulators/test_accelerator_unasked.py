@@ -17,7 +17,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.objects import Landmark
 from test_highway import drive, simulator_of
 
-from crashhunt.accelerator import Unasked, switch_off, switch_on
+from crashhunt.accelerator import SkippedObservation, switch_off, switch_on
 from crashhunt.scenario import ObservationSetup
 
 assert HighwaySimulator
@@ -36,7 +36,7 @@ def made(kind=HighwayEnvFast, **config):
 
 
 def stepped(env):
-    with Unasked(env):
+    with SkippedObservation(env):
         return env.step(1)
 
 
@@ -51,7 +51,7 @@ TWO = {"observation": {"type": "MultiAgentObservation", "observation_config": {"
 
 
 @pytest.mark.parametrize("config", [{}, TWO, {"observation": {"type": "OccupancyGrid"}}])
-def test_nothing_is_observed_where_nobody_asks(config):
+def test_nothing_is_observed_where_no_one_asks(config):
     env, other = made(**config), made(**config)
     assert not seen(env)
     _, *expected = other.step(1)
@@ -114,7 +114,7 @@ def test_it_is_made_where_an_object_describes_itself_otherwise():
 
 
 @pytest.mark.parametrize(("make", "config", "change"), CASES)
-def test_it_is_made_where_somebody_can_tell(make, config, change):
+def test_it_is_made_where_an_actor_can_tell(make, config, change):
     env = make(**config)
     if change is not None:
         change(env)
@@ -124,12 +124,12 @@ def test_it_is_made_where_somebody_can_tell(make, config, change):
 def test_it_is_made_where_an_environment_looks_at_it():
     env = gymnasium.make("parking-v0", disable_env_checker=True).unwrapped
     env.reset(seed=1)
-    with Unasked(env):
+    with SkippedObservation(env):
         assert env.step(np.zeros(2))[0] is not None
 
 
 @pytest.mark.parametrize("owner", [KinematicObservation, MultiAgentObservation, HighwayEnvFast])
-def test_it_is_made_where_somebody_has_replaced_a_method(owner, monkeypatch):
+def test_it_is_made_where_an_actor_has_replaced_a_method(owner, monkeypatch):
     name = "_info" if owner is HighwayEnvFast else "space"
     method = getattr(owner, name)
     assert not seen(made())
@@ -143,7 +143,7 @@ def test_it_is_made_without_the_accelerator():
     assert seen(env)
 
 
-def test_a_scenario_that_shows_something_else_is_not_told_apart(tmp_path, monkeypatch):
+def test_a_scenario_that_shows_something_else_is_not_distinguished(tmp_path, monkeypatch):
     """And one that shows what highway-env shows has it made."""
 
     def run(observation):

@@ -119,7 +119,7 @@ def braking_that_is_none(place, patch):
     "change",
     [a_list_names_a_target, a_list_names_a_lane, no_number, no_direction, a_huge_exponent, braking_that_is_none],
 )
-def test_what_nobody_expects_comes_to_the_same(change):
+def test_what_no_one_expects_reaches_the_same(change):
     """Of what is no number, not even nothing is nothing: a driver who is not polite heeds it all the same."""
     slow, fast = both(change)
     assert slow == fast
@@ -148,7 +148,7 @@ def a_route_without_lanes(place):
 @pytest.mark.parametrize(
     ("change", "error"), [(a_road_to_nowhere, "nowhere"), (a_route_without_lanes, "tuple index out of range")]
 )
-def test_an_error_is_that_of_the_same_vehicle_and_everybody_goes_on_as_after_it(change, error):
+def test_an_error_is_that_of_the_same_vehicle_and_everybody_continues_as_after_it(change, error):
     slow, fast = both(lambda place, patch: change(place))
     assert slow == fast
     assert any(error in step for step in slow if isinstance(step, str))

@@ -331,7 +331,7 @@ def test_every_bit_is_the_same_whatever_a_user_changes(number):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("number", mostly_nightly(range(20, 60), range(20, 60, 20)))
-def test_every_bit_is_the_same_where_a_user_says_when_something_changes(number):
+def test_every_bit_is_the_same_where_a_user_states_when_something_changes(number):
     assert first_difference(number, alone=True) == ""
 
 
@@ -367,7 +367,7 @@ class Reversed(road.RoadNetwork):
         return ("0", "1", 0)
 
 
-def test_a_network_of_ones_own_says_which_lane_is_closest():
+def test_a_network_of_ones_own_states_which_lane_is_closest():
     def make():
         network = Reversed()
         network.graph = road.RoadNetwork.straight_road_network(2).graph
@@ -457,7 +457,7 @@ def test_a_number_that_is_changed_is_heeded_and_does_not_slow_it_down(monkeypatc
     assert why_not() == ""
 
 
-def test_in_public_it_says_what_it_does_and_is_undone():
+def test_in_public_it_states_what_it_does_and_is_undone():
     with crashhunt.accelerate() as faster:
         assert faster
         assert repr(faster) == "<highway-env is accelerated>" or "has its own" in repr(faster)
@@ -482,7 +482,7 @@ def test_in_public_it_says_what_it_does_and_is_undone():
     assert road.Road.act.__module__ == "highway_env.road.road"
 
 
-def test_what_somebody_has_wrapped_meanwhile_stays_and_does_without_it():
+def test_what_an_actor_has_wrapped_meanwhile_stays_and_does_without_it():
     assert switch_on() == ""
     with pytest.MonkeyPatch.context() as patch:
         calls = []

@@ -87,7 +87,7 @@ def drives_by_itself(name):
     return own and modes == (31, 1621) and libsumo.vehicle.getSpeedFactor(name) == 1.0
 
 
-def test_whoever_is_ahead_brakes_and_drives_on_by_itself(drive):
+def test_the_one_that_is_ahead_brakes_and_drives_on_by_itself(drive):
     episode, watch = drive(planned(6, "brake"))
     advance(episode, 5)
     assert drives_by_itself("lead")
@@ -100,7 +100,7 @@ def test_whoever_is_ahead_brakes_and_drives_on_by_itself(drive):
     assert watch.speeds("lead")[-1] > speeds[-1]
 
 
-def test_nobody_brakes_harder_than_its_type_can(drive):
+def test_no_one_brakes_harder_than_its_type_can(drive):
     episode, watch = drive(planned(6, "brake", strong=9.0))
     advance(episode, 15)
     assert watch.told[0].how_strong == 4.5
@@ -134,7 +134,7 @@ def test_a_dawdler_slows_down_gently(drive):
     assert drives_by_itself("lead")
 
 
-def test_a_dawdler_that_had_to_wait_goes_on_as_slowly_as_before_and_no_slower(drive):
+def test_a_dawdler_that_had_to_wait_continues_as_slowly_as_before_and_no_slower(drive):
     front = AHEAD.replace('"lead"', '"front"').replace('"60"', '"75"')
     episode, watch = drive(planned(3, "dawdle", strong=0.5, long=18.0), traffic=front + AHEAD, agent=Steady(0.0))
     advance(episode, 4)
@@ -166,7 +166,7 @@ def test_places_are_along_the_lanes(drive, at, who):
     assert [episode.simulator.resolve_target(planned(2, "cut_in", place)) for place in others] == [""] * 4
 
 
-def test_somebody_cuts_in_and_brakes_and_goes_on_as_it_likes(drive):
+def test_an_actor_cuts_in_and_brakes_and_continues_as_it_likes(drive):
     episode, watch = drive(planned(2, "cut_in", "left ahead", 3.0, 2.0), traffic=LEFT.format(40))
     advance(episode, 6)
     assert libsumo.vehicle.getLaneID("left") == "west_0"
@@ -177,7 +177,7 @@ def test_somebody_cuts_in_and_brakes_and_goes_on_as_it_likes(drive):
     assert drives_by_itself("left")
 
 
-def test_nobody_cuts_in_into_the_side_of_somebody(drive):
+def test_no_one_cuts_in_into_the_side_of_an_actor(drive):
     episode, watch = drive(planned(2, "cut_in", "left", 0.0, 1.0), traffic=LEFT.format(27))
     advance(episode, 12)
     assert watch.told[0].vehicle == "left"
@@ -185,7 +185,7 @@ def test_nobody_cuts_in_into_the_side_of_somebody(drive):
     assert libsumo.vehicle.getLaneID("left") == "west_1"
 
 
-def test_where_there_is_no_lane_nobody_cuts_in(drive):
+def test_where_there_is_no_lane_no_one_cuts_in(drive):
     episode, watch = drive(planned(2, "cut_in", "right ahead", 0.0, 1.0))
     advance(episode, 4)
     assert watch.told == [planned(2, "cut_in", "right ahead", 0.0, 1.0)]
@@ -199,7 +199,7 @@ def test_who_is_in_the_lane_of_the_agent_does_not_cut_in(drive, who):
     assert {libsumo.vehicle.getLaneID(name) for name in ("lead", "follow")} == {"west_0"}
 
 
-def test_who_leaves_while_it_errs_is_let_go(drive):
+def test_who_leaves_while_it_deviates_is_let_go(drive):
     short = AHEAD.replace('departPos="60"', 'departPos="120"') + '<vehicle id="last" type="car" route="up" depart="9"/>'
     episode, watch = drive(planned(2, "dawdle", strong=0.2, long=60.0), traffic=short, agent=Steady(6.0))
     advance(episode, 400)
@@ -207,14 +207,14 @@ def test_who_leaves_while_it_errs_is_let_go(drive):
     assert episode.result.failure is None
 
 
-def test_an_agent_that_has_left_has_nobody_around_it(drive):
+def test_an_agent_that_has_left_has_no_one_around_it(drive):
     episode, watch = drive(planned(390, "brake"), agent=Steady(30.0), traffic="")
     advance(episode, 400)
     assert watch.told == []
     assert episode.simulator.resolve_target(planned(1, "brake")) == ""
 
 
-def test_who_is_not_seen_is_left_out_of_the_observation_and_nothing_else_changes(drive):
+def test_who_is_not_seen_is_excluded_of_the_observation_and_nothing_else_changes(drive):
     seen = []
     for disturbances in ((), (planned(3, "unseen", "behind", 1.0, 1.0),)):
         episode, watch = drive(*disturbances)
@@ -277,7 +277,7 @@ def test_in_dense_traffic_everybody_stays_within_its_type(tmp_path, name):
     assert count > 4
 
 
-def test_somebody_ignores_the_red_light(drive):
+def test_an_actor_ignores_the_red_light(drive):
     """The street is green first; who comes from the south has red until it ignores that."""
     crossing = '<vehicle id="cross" type="car" route="up" depart="0" departPos="50" departSpeed="8"/>'
     where = []
@@ -299,7 +299,7 @@ SLOW = """<vType id="slow" sigma="0" maxSpeed="2"/><vType id="eager" sigma="0" s
 <vehicle id="slow" type="slow" route="across" depart="0" departPos="{}" departLane="0" departSpeed="2"/>"""
 
 
-def test_who_is_held_to_its_speed_heeds_nobody_and_then_drives_by_itself_again(drive):
+def test_who_is_held_to_its_speed_heeds_no_one_and_then_drives_by_itself_again(drive):
     speeds = []
     for disturbances in ((), (held(6, "keep_speed", "eager", 2.0),)):
         episode, watch = drive(*disturbances, traffic=SLOW.format(0, 90))

@@ -90,7 +90,7 @@ def follow(episode, vehicle, steps):
     return speeds
 
 
-def test_whoever_is_ahead_brakes_and_drives_on_by_itself(begin):
+def test_the_one_that_is_ahead_brakes_and_drives_on_by_itself(begin):
     episode, idle = begin(planned(3, "brake"))
     other = place(episode, 1, 40.0)
     speeds = follow(episode, other, 12)
@@ -101,7 +101,7 @@ def test_whoever_is_ahead_brakes_and_drives_on_by_itself(begin):
     assert told.vehicle.startswith("vehicle.")
 
 
-def test_nobody_brakes_harder_than_the_model_or_drives_backwards(begin):
+def test_no_one_brakes_harder_than_the_model_or_drives_backwards(begin):
     episode, idle = begin(planned(1, "stop", strong=20.0, long=5.0))
     other = place(episode, 1, 99.0, speed=10.0)
     speeds = follow(episode, other, 18)
@@ -134,7 +134,7 @@ def test_places_are_along_the_lanes(begin, lane, ahead, who):
     assert found == {who}
 
 
-def test_somebody_cuts_in_and_nobody_into_a_side(begin):
+def test_an_actor_cuts_in_and_no_one_into_a_side(begin):
     episode, idle = begin(planned(2, "cut_in", "left ahead", 2.0, 3.0))
     other = place(episode, 0, 15.0)
     follow(episode, other, 16)
@@ -153,7 +153,7 @@ def test_somebody_cuts_in_and_nobody_into_a_side(begin):
 
 
 @pytest.mark.parametrize("observation", [None, ObservationSetup(vehicles=3, features=("presence", "x", "y"))])
-def test_somebody_is_not_seen_for_a_while(begin, observation):
+def test_an_actor_is_not_seen_for_a_while(begin, observation):
     """Whoever makes the observation: highway-env itself, or crashhunt's own layout."""
     episode, idle = begin(planned(3, "unseen", "ahead", 1.0, 0.6), observation=observation)
     other = place(episode, 1, 40.0)
@@ -186,7 +186,7 @@ def crossing(episode, other_road, meters):
 JUNCTION = {"env": "intersection-v0", "initial_vehicle_count": 0, "spawn_probability": 0.0}
 
 
-def test_somebody_ignores_that_others_have_priority(begin):
+def test_an_actor_ignores_that_others_have_priority(begin):
     """Of two that come to the junction at once, the one from the minor road gives way, or does not."""
     least = {}
     for what in ("ignore_priority", "late_action"):

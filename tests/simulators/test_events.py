@@ -135,7 +135,7 @@ def edge(lane):
     return lane.rpartition("_")[0]
 
 
-def test_a_red_light_ends_a_trial_where_somebody_asked_for_it(drive):
+def test_a_red_light_ends_a_trial_where_an_actor_asked_for_it(drive):
     result, told = drive(steady(10.0), warmup_s=10.0, crash_on=(Outcome.RED_LIGHT,))
     ((step, event),) = told
     assert (result.outcome, result.steps, result.collision, result.event) == (Outcome.RED_LIGHT, step, None, event)
@@ -146,7 +146,7 @@ def test_a_red_light_ends_a_trial_where_somebody_asked_for_it(drive):
     assert again.events == {"red_light": 1}
 
 
-def test_what_is_told_is_no_part_of_the_digest(drive, monkeypatch):
+def test_what_is_reported_is_no_part_of_the_digest(drive, monkeypatch):
     told, _ = drive(steady(10.0), warmup_s=10.0)
     monkeypatch.setattr(SumoEvents, "look", lambda *_: ())
     silent, _ = drive(steady(10.0), warmup_s=10.0)
@@ -155,7 +155,7 @@ def test_what_is_told_is_no_part_of_the_digest(drive, monkeypatch):
     assert told.digest == silent.digest
 
 
-def test_a_missed_route_is_told_where_sumo_stops_the_vehicle(drive):
+def test_a_missed_route_is_reported_where_sumo_stops_the_vehicle(drive):
     """SUMO's vehicles never leave their route: one on the wrong lane is held at its end for ever."""
     result, told = drive(steady(10.0), route="left", depart_lane="0", limits={"not_moving": 5.0}, crash_on=())
     assert kinds(told) == ["off_route", "not_moving"]
@@ -166,7 +166,7 @@ def test_a_missed_route_is_told_where_sumo_stops_the_vehicle(drive):
     assert drive(steady(10.0), route="left", depart_lane="1")[1] == []
 
 
-def test_a_standstill_is_told_once_and_after_its_limit_only(drive):
+def test_a_standstill_is_reported_once_and_after_its_limit_only(drive):
     def stops(step):
         return (10.0 if step < 20 or 180 <= step < 200 else 0.0), 0
 
@@ -209,7 +209,7 @@ BEHIND = '<vehicle id="f" type="car" route="across" depart="1" departLane="1" de
 IN_FRONT_OF_IT = {"depart_lane": "0", "depart_speed": "6", "depart_pos": "40", "steps": 100}
 
 
-def test_whoever_brakes_hard_behind_is_told(drive):
+def test_the_one_that_brakes_hard_behind_is_reported(drive):
     _, ((step, event),) = drive(cuts_in, traffic=BEHIND, **IN_FRONT_OF_IT)
     assert (event.kind, event.agent, event.others) == ("hard_braking", "ego", ("f",))
     assert event.what == "f braked at 9.0 m/s² with ego ahead of it"
@@ -245,7 +245,7 @@ def test_whoever_brakes_hard_behind_is_told(drive):
     assert drive(watches, traffic=ahead + BEHIND, **{**place, "depart_lane": "1"})[1] == []
 
 
-def test_whoever_brakes_hard_for_one_that_crosses_is_told(drive):
+def test_the_one_that_brakes_hard_for_one_that_crosses_is_reported(drive):
     cross = '<flow id="c" type="car" route="across" begin="0" end="60" period="1.7" departSpeed="15"/>'
     place = {"depart_pos": "60", "depart_speed": "0", "traffic": cross}
     result, told = drive(lambda step: (8.0 if step > 37 else 0.0, 0), route="up", **place)

@@ -192,7 +192,7 @@ def test_our_own_layout_is_highway_envs_on_a_straight_road(tmp_path):
         )  # nearest along the lane, and as the crow flies
 
 
-def test_a_crash_says_who_drove_into_whom_and_how_fast(tmp_path):
+def test_a_crash_states_who_drove_into_which_and_how_fast(tmp_path):
     simulator = simulator_of(tmp_path, "highway-fast-v0", config={"vehicles_density": 1.5})
     *_, (_, _, terminations, _, _) = drive(simulator, "FASTER", 100)
     scene = simulator.scene()
@@ -221,7 +221,7 @@ def test_an_obstacle_is_hit_and_never_drives(tmp_path):
     assert len(simulator.scene().roster) == 5  # itself and four walls; the goal is no obstacle
 
 
-def test_leaving_the_lanes_is_told_once_and_can_be_turned_off(tmp_path):
+def test_leaving_the_lanes_is_reported_once_and_can_be_turned_off(tmp_path):
     config = {"action": {"type": "ContinuousAction"}, "vehicles_count": 0}
     off = np.array([0.0, 0.3], np.float32)
     for counts in (True, False):
@@ -288,7 +288,7 @@ def test_arguments_are_entries_of_the_configuration(tmp_path):
     assert lanes[1].shape == ((0.0, -4.0), (10000.0, -4.0))
 
 
-def test_whoever_arrives_is_gone_and_the_others_go_on(tmp_path):
+def test_the_one_that_arrives_is_gone_and_the_others_continue(tmp_path):
     scenario = load_scenario("intersection-two-agents")
     simulator = HighwaySimulator(scenario, tmp_path)
     lengths = set()
@@ -306,7 +306,7 @@ MISTAKES = [
     ({"name": "highway-v9"}, "highway-v9"),
     ({"name": "CartPole-v1"}, 'simulator = "gym"'),
     ({"name": "highway-fast-v0", "config": {"vehicle_count": 3}}, "did you mean 'vehicles_count'"),
-    ({"name": "merge-v0", "agents": 2}, "one controlled vehicle, not 2"),
+    ({"name": "merge-v0", "agents": 2}, "one controlled vehicle; the scenario has 2 agents"),
     ({"name": "no.such.module:env-v0"}, "no.such"),
     ({"name": "highway-fast-v0", "config": {"policy_frequency": 6}}, "at most simulation_frequency, 5"),
 ]

@@ -57,7 +57,7 @@ def test_the_others_are_where_they_were_and_the_agent_sees_what_it_saw(simulator
     np.testing.assert_allclose(seen, shown, atol=1e-6)
 
 
-def test_it_begins_later_without_most_of_them_and_goes_on_after_the_end(simulator, recorded):
+def test_it_begins_later_without_most_of_them_and_continues_after_the_end(simulator, recorded):
     scenes, _ = recorded
     paths = paths_of(scenes, ("ego",))
     stays = paths.names[0]

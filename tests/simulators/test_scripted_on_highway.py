@@ -62,7 +62,7 @@ def test_others_and_obstacles_are_where_they_were_and_the_agent_drives_as_it_did
     np.testing.assert_allclose([each["ego"] for each in seen], [each["ego"] for each in shown], atol=1e-5)
 
 
-def test_it_begins_later_without_most_and_goes_on_after_the_recorded_end(merging, merged):
+def test_it_begins_later_without_most_and_continues_after_the_recorded_end(merging, merged):
     scenes, _ = merged
     paths = paths_of(scenes, ("ego",))
     stays = next(name for name in paths.names if name.startswith("vehicle"))

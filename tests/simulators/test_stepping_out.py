@@ -86,7 +86,7 @@ def test_a_walker_steps_out_and_walks_on_where_it_was_going(drive):
     assert np.array(plain.of("person walker", "points"))[:20].tolist() == points[:20].tolist()
 
 
-def test_nobody_steps_out_faster_than_its_type_can_nor_further_than_it_is_back_in_time(drive):
+def test_no_one_steps_out_faster_than_its_type_can_nor_further_than_it_is_back_in_time(drive):
     slow = WALKER.replace('"1.4"', '"0.5"')
     _, watch = drive(EGO + slow, stepping(20, strong=3.0, long=2.0))
     assert watch.told[0].how_strong == 0.5
@@ -133,7 +133,7 @@ def test_a_vehicle_merges_only_at_the_end_of_its_lane(drive, strong):
     assert strong - 2 < left[1] <= strong
 
 
-def test_whose_lane_goes_on_merges_nowhere(drive):
+def test_whose_lane_continues_merges_nowhere(drive):
     ego, other = MERGING.format("ego", 10, 0), MERGING.format("other", 25, 1)
     _, watch = drive(ego + other, Disturbance(2, "left ahead", "late_merge", 10.0, 60.0, "ego"), net="taper", steps=5)
     assert [one.vehicle for one in watch.told] == [""]

@@ -58,7 +58,7 @@ EGOS = {"odd.name#1.2": ("--ego", "odd.name#1.2"), "ego": ("--ego", "edges=-sout
 
 
 @pytest.mark.parametrize(("agent", "ego"), EGOS.items(), ids=["named", "added"])
-def test_a_network_that_nobody_wrote_for_us(town, agent, ego):
+def test_a_network_that_no_one_wrote_for_us(town, agent, ego):
     before = sorted(path.name for path in town.folder.iterdir())
     words = ("run", "h", "2", "3", "100", "--scenario", "town.sumocfg", *ego, "--arg", "speed=5:9", "--keep-going")
     done = town.crashhunt(*words, "--keep-trials", "--json")
@@ -124,7 +124,7 @@ def test_who_departs_further_on_is_replaced_there(town, tmp_path):
     assert entered(town, tmp_path, "here") == ("north", ("north", "west"))
 
 
-def test_who_has_departed_in_the_warm_up_is_told_of(town, tmp_path):
+def test_who_has_departed_in_the_warm_up_is_reported_of(town, tmp_path):
     with pytest.raises(
         InvalidEpisodeError, match=r"'odd.name#1.0' had departed in the warm-up already; lower warmup_s"
     ):
@@ -209,7 +209,7 @@ def test_two_agents_have_channels_and_arguments_of_their_own(shell):
     assert "keeper=keep-lane" in done.err
 
 
-def test_seen_and_done_by_the_ego_is_what_the_log_says(shell):
+def test_seen_and_done_by_the_ego_is_what_the_log_states(shell):
     shell.crashhunt("run", "h", "1", "30", "1500", "--arg", "speed=20:25", "--seed", "2")
     (path,) = (shell.folder / "h" / "crashes").glob("*/log.mcap")
     recording = read_log(path)

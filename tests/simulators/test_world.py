@@ -101,7 +101,7 @@ STANDS_ON_THE_BRIDGE = (
 )
 
 
-def test_who_drives_below_a_bridge_touches_nobody_on_it(drive, tmp_path):
+def test_who_drives_below_a_bridge_touches_no_one_on_it(drive, tmp_path):
     low = vehicle("ego", "low", departPos="200", departSpeed="15", departLane="0")
     result, recording, agent = drive("bridge", STANDS_ON_THE_BRIDGE + low, steps=100)
     assert result.outcome is Outcome.SURVIVED
@@ -194,7 +194,7 @@ def test_trains_on_parallel_tracks_pass_each_other_in_a_bend(drive, tmp_path, st
         assert hits > 20
 
 
-def test_an_articulated_bus_clips_who_stands_in_its_bend_and_nobody_beside_it(drive):
+def test_an_articulated_bus_clips_who_stands_in_its_bend_and_no_one_next_to_it(drive):
     # 18 m on a radius of 106 m: the chord is half a metre off the track. A car stands on the inner track.
     bus = TRAIN + vehicle("ego", "outa outb outc", kind="bus", departPos="230", departSpeed="max")
     beside = (
@@ -274,7 +274,7 @@ def test_persons_inside_of_vehicles_and_ghosts_are_no_actors(drive):
 # Long steps.
 
 
-def test_nobody_drives_through_another_between_two_steps(drive):
+def test_no_one_drives_through_another_between_two_steps(drive):
     # The one ahead is slow; with steps of a second the ego is behind it, and then ahead of it.
     between = 0
     for place in (100, 104, 108, 112):

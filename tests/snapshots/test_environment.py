@@ -8,7 +8,7 @@ from importlib import import_module, metadata
 from crashhunt.snapshots import environment, environment_changes, versions
 
 
-def test_distributions_and_those_that_are_loaded_are_what_importlib_says():
+def test_distributions_and_those_that_are_loaded_are_what_importlib_states():
     import_module("numpy")  # which other tests have imported, where there are any
     found = environment()
     assert found["distributions"] == {
@@ -22,7 +22,7 @@ def test_distributions_and_those_that_are_loaded_are_what_importlib_says():
         assert versions()[name] == found["distributions"][name] == metadata.version(name)
 
 
-def test_another_version_than_it_was_is_told():
+def test_another_version_than_it_was_is_reported():
     then = environment()
     assert environment_changes(then) == {}
     then["distributions"]["numpy"] = "1.0"

@@ -19,12 +19,12 @@ def test_in_a_hook_of_another_repository_a_folder_is_still_of_its_own(tmp_path, 
     assert git(tmp_path / "here", "rev-parse", "--absolute-git-dir") == f"{tmp_path}/here/.git\n".encode()
 
 
-def test_a_name_that_would_be_folders_elsewhere_is_left_out_and_told(tmp_path):
+def test_a_name_that_would_be_folders_elsewhere_is_excluded_and_reported(tmp_path):
     """A snapshot is refused that has one, as it might be unpacked anywhere; a hunt is not, as its project has one."""
     for name in ("unit-x2d\\x2d1.service", "kept.txt"):
         (tmp_path / name).write_text("")
     found = find_sources([], roots=[tmp_path])
     assert f"code/@{tmp_path.name}/kept.txt" in found.files
     assert not [place for place in found.files if "\\" in place]
-    (said,) = found.left_out
+    (said,) = found.excluded
     assert said.endswith("unit-x2d\\x2d1.service: its name has a backslash, which elsewhere parts folders")

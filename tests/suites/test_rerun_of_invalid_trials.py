@@ -27,7 +27,7 @@ from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
         ({"only_at_fault": True, "keep_going": True, "distinct": 1}, "all_trials", 1),
     ],
 )
-def test_whoever_has_not_found_what_it_was_after_tries_them_again(tmp_path, run, ended, again):
+def test_the_one_that_has_not_found_what_it_was_after_tries_them_again(tmp_path, run, ended, again):
     settings = HuntSettings(scenario="toy", scenario_digest="0", trials=3, max_steps=9, seed=1, run=RunSettings(**run))
     write_settings(tmp_path / layout.HUNT, settings, ["crashhunt", "run"])
     with closing(Ledger(tmp_path / layout.LEDGER, writable=True)) as ledger:

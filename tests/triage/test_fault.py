@@ -89,7 +89,7 @@ def case_of(data):
 
 
 @pytest.mark.long
-def test_what_is_said_is_what_a_person_says_or_nothing():
+def test_what_is_said_is_what_a_person_states_or_nothing():
     said = [(data, fault_in(case_of(data))) for data in cases()]
     wrong = [
         (data["name"], data["label"], fault.to_json())
@@ -182,7 +182,7 @@ def test_who_changes_lanes_into_a_gap_that_is_too_short():
     assert verdict(drive(straight(25), cuts_in, lanes=Map([], (0.0, 0.0)))) == "nobody can tell"
 
 
-def test_who_moves_sideways_into_who_is_beside():
+def test_who_moves_sideways_into_who_is_next_to():
     def moves(t):
         return 0.0 - 20 * t, 1.9 + min(2.1, 2 * t), -0.1, 20.0
 
@@ -240,7 +240,7 @@ def between(case, lane="road_0"):
     return case
 
 
-def test_who_steps_out_so_late_that_nobody_could_have_stopped():
+def test_who_steps_out_so_late_that_no_one_could_have_stopped():
     found = fault_in(between(drive(straight(12), walks(1.2), name="person 1")))
     assert (found.verdict, found.findings[0].rule) == ("the other", "steps out")
     assert "m ahead of ego, which needs 21.0 m to stop" in found.findings[0].words
@@ -257,7 +257,7 @@ def test_who_steps_out_so_late_that_nobody_could_have_stopped():
     assert verdict(drive(straight(12), walks(1.2), name="person 1")) == "nobody can tell"
 
 
-def test_who_turns_off_behind_somebody_has_changed_no_lanes():
+def test_who_turns_off_behind_an_actor_has_changed_no_lanes():
     """Where it turns into the way of who stands in the junction, it leaves its lane over the side."""
     cases_by_name = {data["name"]: case_of(data) for data in cases()}
     assert not [

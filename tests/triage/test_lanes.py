@@ -40,7 +40,7 @@ TWO = [[(0, 0), (200, 0)], [(0, 3.2), (200, 3.2)]]
 
 @given(st.floats(-3.1, 3.1), st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.booleans(), st.booleans())
 @settings(deadline=None, max_examples=40)
-def test_who_changes_to_the_lane_beside_is_seen_wherever_the_road_lies(angle, x, y, at_once, changes):
+def test_who_changes_to_the_lane_next_to_is_seen_wherever_the_road_lies(angle, x, y, at_once, changes):
     lanes = LaneMap([lane(*turned(points, angle, x, y)) for points in TWO], turned([(100, 0)], angle, x, y)[0])
     side = [0.0] * 5 + ([0.0, 3.2] if at_once else list(np.linspace(0, 3.2, 20))) + [3.2] * 5
     side = side if changes else [0.9 * math.sin(k) for k in range(30)]  # it only drifts
@@ -105,7 +105,7 @@ def test_where_lanes_cross(angle, cross):
     assert not lanes.cross((40, 1.0 if angle < 90 else 0.0)) or angle == 180
 
 
-def test_what_is_far_away_or_no_lane_is_left_out():
+def test_what_is_far_away_or_no_lane_is_excluded():
     assert not LaneMap([lane((1000, 0), (1100, 0)), (np.zeros((1, 2)), np.zeros((1, 2)))], (0, 0))
     assert not LaneMap([], (0, 0)).cross((0, 0))
 

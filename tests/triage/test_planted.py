@@ -61,7 +61,7 @@ def test_each_defect_is_a_kind(shell):
     done = shell.crashhunt("crashes", "h", "--json")
     assert sum(group["count"] for group in done.json["groups"]) == len(bundles) - 1
     assert len(done.json["left_out"]) == 1
-    assert "left out: " in done.err
+    assert "skipped: " in done.err
     assert "log.mcap" in done.err
 
 

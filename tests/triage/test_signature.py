@@ -79,7 +79,7 @@ def test_without_a_stack_what_is_said_counts_but_for_its_numbers():
     assert signature_of(bundle(0, failure=said[0])) != signature_of(bundle(0, failure=Failure("bad action", "nan")))
 
 
-def test_code_of_libraries_is_left_out_where_there_is_other():
+def test_code_of_libraries_is_excluded_where_there_is_other():
     inner = '  File "/v/lib/python3.11/json/decoder.py", line 1, in decode\n'
     own = '  File "/home/me/agent.py", line 5, in read\n'
     text = f"Traceback (most recent call last):\n{own}{inner}ValueError: x"

@@ -34,7 +34,7 @@ disturbances = st.builds(
 
 
 @given(st.lists(disturbances).map(tuple), st.lists(disturbances).map(tuple), st.none() | st.floats(-1e9, 0))
-def test_a_disturbed_trial_survives_json_and_can_be_told(planned, happened, likely):
+def test_a_disturbed_trial_survives_json_and_can_be_reported(planned, happened, likely):
     spec = TrialSpec(3, 1, {}, {}, 9, disturbances=planned)
     result = TrialResult(spec, Outcome.SURVIVED, steps=9, disturbances=happened, log_likelihood=likely)
     data = json.loads(json.dumps(result.to_json(), allow_nan=False))
@@ -68,19 +68,19 @@ def test_data_that_make_no_sense_are_refused(change, says):
     ("disturbance", "words"),
     [
         (Disturbance(1, "ahead", "brake", 4.0, 2.0, "ego", "main.35"), "main.35 brakes with 4 m/s² for 2 s"),
-        (Disturbance(1, "ahead", "brake", 4.0, 2.0, "ego"), "whoever is ahead of ego brakes with 4 m/s² for 2 s"),
+        (Disturbance(1, "ahead", "brake", 4.0, 2.0, "ego"), "the actor ahead of ego brakes with 4 m/s² for 2 s"),
         (Disturbance(1, "left", "cut_in", 0.0, 2.0, "ego", "b"), "b cuts in on ego within 2 s"),
         (Disturbance(1, "left", "cut_in", 2.0, 2.0, "ego", "b"), "b cuts in on ego within 2 s and brakes with 2 m/s²"),
         (Disturbance(1, "behind", "speed", 0.2, 9.0, "ego", "b"), "b wants to drive 20 % faster for 9 s"),
         (Disturbance(1, "itself", "late_action", 0.2, 1.0, "ego"), "what ego does takes effect 0.2 s late for 1 s"),
-        (Disturbance(1, "above", "fly", 2.0, 1.0, "{ego}"), "whoever is above of {ego}: fly 2 for 1 s"),
+        (Disturbance(1, "above", "fly", 2.0, 1.0, "{ego}"), "the actor above of {ego}: fly 2 for 1 s"),
     ],
 )
 def test_words(disturbance, words):
     assert disturbance.words == words
 
 
-def test_what_had_an_effect_began_by_the_end_with_somebody_there():
+def test_what_had_an_effect_began_by_the_end_with_an_actor_there():
     there, nobody = Disturbance(5, "ahead", "brake", 4.0, 2.0, "ego", "b"), Disturbance(3, "ahead", "brake", 4.0, 2.0)
     result = TrialResult(TrialSpec(3, 1, {}, {}, 9), Outcome.COLLISION, steps=5)
     assert in_effect(result, [nobody, there]).disturbances == (there,)

@@ -70,7 +70,7 @@ def test_a_result_survives_strict_json(result):
     assert isinstance(result.summary, str)
 
 
-def test_outcomes_are_told_apart():
+def test_outcomes_are_distinguished():
     assert {str(outcome) for outcome in CRASHES} == {
         "collision", "off_road", "agent_error", "simulator_error", "process_died", "hang",
     }  # fmt: skip

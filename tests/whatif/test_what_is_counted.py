@@ -11,8 +11,8 @@ from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.crashes import wilson
 from crashhunt.episode import TakingOver, _action_override
 from crashhunt.trial import Disturbance, Handover, Outcome, Reseeding, TrialSpec
-from crashhunt.whatif import Counts, Disturb, LeaveOut, Overrule, Reseed, Run, SetArguments
-from crashhunt.whatif._engine import _from_step, future_seed
+from crashhunt.whatif import Counts, Disturb, LeaveOut, Overrule, Reseed, Run, SetArguments, WhatIfOptions
+from crashhunt.whatif._engine import _from_step, _Runs, future_seed
 
 
 def run(number, *, outcome=Outcome.COLLISION, steps=10, digest=None, excluded=""):
@@ -25,7 +25,7 @@ def run(number, *, outcome=Outcome.COLLISION, steps=10, digest=None, excluded=""
 def counts(*runs, **changes):
     given = {
         "crash": "c", "interventions": ("something",), "from_step": 3, "code": "snapshot",
-        "recorded": Outcome.COLLISION, "recorded_steps": 9, "asked": len(runs), "each": runs,
+        "recorded_outcome": Outcome.COLLISION, "recorded_steps": 9, "asked": len(runs), "each": runs,
     }  # fmt: skip
     return Counts(**{**given, **changes})
 
@@ -59,6 +59,16 @@ def test_equal_runs_have_no_interval():
 def test_no_run_that_counts_has_no_share():
     data = counts(run(0, excluded="why")).to_json()
     assert (data["runs"], data["share"], data["interval"], data["median_crash_step"]) == (0, None, None, None)
+
+
+def test_stopped_runs_count_up_to_the_first_unfinished_number():
+    runs = _Runs(_Rerun(TrialSpec(0, 1, {}, {}, 9), None), None, None, WhatIfOptions(), 9)
+    for number in (0, 3, 1, 5):  # crashed runs are short, so later numbers end before earlier ones
+        runs.found[number] = run(number)
+    assert [each.number for each in runs.counted] == [0, 1]
+    assert counts(*runs.counted, asked=9, interrupted="stopped").lines()[-1] == (
+        "  interrupted: stopped, after 2 of 9 runs (those before the first run that had not finished)"
+    )
 
 
 def test_recorded_prefix_ends_where_the_first_change_begins():

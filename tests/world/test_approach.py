@@ -19,7 +19,7 @@ def nearest(*views, agent="ego"):
     ("gap_m", "time_s", "needed"),
     [(99.9, 9.99, 10 / 19.98), (100.0, 10.0, 0.5), (100.1, math.inf, 0.0), (200.0, math.inf, 0.0)],
 )
-def test_a_collision_course_of_more_than_ten_seconds_says_nothing(gap_m, time_s, needed):
+def test_a_collision_course_of_more_than_ten_seconds_states_nothing(gap_m, time_s, needed):
     times, _, brakes = nearest(in_line(gap_m, 20, 10))
     assert times == pytest.approx([time_s])
     assert brakes == pytest.approx([needed])

@@ -59,7 +59,7 @@ def test_a_step_may_be_of_any_length(seconds):
 
 
 @pytest.mark.parametrize("turned", TURNS)
-def test_who_passes_beside_or_stays_behind_touches_nobody(turned):
+def test_who_passes_next_to_or_stays_behind_touches_no_one(turned):
     assert touched(turned, [(0, 0, 0, 20), (12, 2.01, 0, 4)], [(18, 0, 0, 16), (15, 2.01, 0, 2)]) is None
     assert touched(turned, [(0, 0, 0, 20), (12, 2.0, 0, 4)], [(18, 0, 0, 16), (15, 2.0, 0, 2)]) is None
     assert touched(turned, [(0, 0, 0, 20), (12, -1.99, 0, 4)], [(18, 0, 0, 16), (15, -1.99, 0, 2)]) is not None
@@ -72,7 +72,7 @@ def test_who_passes_beside_or_stays_behind_touches_nobody(turned):
 
 
 @pytest.mark.parametrize("turned", TURNS)
-def test_whoever_crosses_is_driven_into_from_the_front(turned):
+def test_the_one_that_crosses_is_driven_into_from_the_front(turned):
     right = math.pi / 2
     before, after = [(0, 0, 0, 10), (8, -8, right, 10)], [(10, 0, 0, 10), (8, 2, right, 10)]
     found = touched(turned, before, after)

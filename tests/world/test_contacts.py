@@ -123,7 +123,7 @@ def test_who_ends_up_ahead_of_the_vehicle_that_it_rear_ended_was_not_hit_by_it(c
     assert found(before, after, agent="other").role == "victim"
 
 
-def test_a_lane_change_at_once_touches_nobody_on_the_way():
+def test_a_lane_change_at_once_touches_no_one_on_the_way():
     # In SUMO a vehicle moves in its old lane first. Driving slantwise it would have met the other one.
     before = scene(0.0, ("ego", 0, 0, 0, 20), ("other", 1, 3.2, 0, 25))
     after = scene(1.0, ("ego", 20, 3.2, 0, 20), ("other", 26, 3.2, 0, 25))

@@ -77,7 +77,7 @@ def test_who_crosses_comes_towards_it_or_is_in_another_lane_does_not_close_in_fr
         assert (steps.max(), total, most.other) == (0.0, 0.0, "")
 
 
-def test_who_cuts_in_ahead_of_somebody_is_closed_in_on():
+def test_who_cuts_in_ahead_of_an_actor_is_closed_in_on():
     time = 0.1 * np.arange(100)
     aside = 3.5 * np.clip(time - 3, 0, 2) / 2
     cutting = np.stack((20 + 10 * time, aside, np.where((time > 3) & (time < 5), math.atan2(1.75, 10), 0)), axis=1)
@@ -120,7 +120,7 @@ def test_an_agent_that_has_to_brake_hard_is_in_danger_though_it_never_gets_there
         assert most.step > 20
 
 
-def test_whoever_reverses_goes_on_backwards():
+def test_the_one_that_reverses_continues_backwards():
     """Where its way ends, it goes straight back: whoever stands there is as near as if it were ahead."""
 
     def stop(speed, at):  # 1 m before somebody who stands there, and stays
@@ -137,7 +137,7 @@ def test_whoever_reverses_goes_on_backwards():
     assert away.max() == 0.0  # who is ahead of one who reverses is behind it
 
 
-def test_nobody_near_is_no_danger_and_nobody_there_is_unknown():
+def test_no_one_near_is_no_danger_and_no_one_there_is_unknown():
     far = frame(straight(0, 0, 0, 10), straight(0, 300, 0, 10))
     steps, most = dangers([far], ("ego",), 0.1)
     assert (steps.max(), most.danger, most.other) == (0.0, 0.0, "")
@@ -224,7 +224,7 @@ def test_heights_count_from_the_front_and_the_lower_one_is_who_has_to_fit():
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_towards_somebody_who_stands_it_is_the_braking_that_it_takes(seed):
+def test_towards_an_actor_who_stands_it_is_the_braking_that_it_takes(seed):
     """Of any size, at any angle: the place of the first touch is found by trying, and the rest is calculated.
 
     The agent stops 5 m before that from one step to the next, so that nothing else is a danger.

@@ -42,7 +42,7 @@ def test_everybody_is_where_it_was_and_who_comes_back_has_two_paths():
     assert found.driven_by(()).names == ("ego", "left.1", "bus")
 
 
-def test_they_come_back_from_json_to_the_bit():
+def test_they_come_back_from_json_bit_by_bit():
     found = paths_of(scenes(), ("ego",))
     assert Paths.from_json(json.loads(json.dumps(found.to_json()))) == found
     flat = paths_of([Scene(0.0, Roster((EGO,)), [(0.1, 0.2)], [0.3], [0.4])], ())

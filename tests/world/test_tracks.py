@@ -128,14 +128,14 @@ def test_of_everybody_it_is_the_centre_and_half_the_size():
     assert tracks([(frame(rows), np.array([0.0, 0.3]))], "nobody", 100.0) is None
 
 
-def test_heights_are_those_of_whoever_is_meant():
+def test_heights_are_those_of_the_one_that_is_meant():
     rows = [((0.0, 0.0, 0.0), (20.0, 0.0, 0.0))] * 2
     heights = np.array([[1.0, 2.0, 0.0, 0.0], [3.0, 5.0, 0.0, 0.0]])
     track, others, _ = tracks([(frame(rows, heights=heights), np.array([0.0, 0.3]))], "ego", 100.0)
     assert (track.z.tolist(), others.z.tolist(), others.height.tolist()) == ([1, 3], [2, 5], [4, 4])
 
 
-def test_only_who_is_near_is_there_and_numbers_of_samples_go_on():
+def test_only_who_is_near_is_there_and_numbers_of_samples_continue():
     near = frame([((0.0, 0, 0), (99.0, 0, 0), (0.0, 170.0, 0))])
     gone = frame([((5.0, 0, 0),)], Roster((OTHER,)))
     again = frame([((40.0, 0, 0), (0.0, 0, 0)), ((41.0, 0, 0), (0.0, 0, 0))], Roster((FAR, EGO)))

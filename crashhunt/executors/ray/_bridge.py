@@ -1,7 +1,7 @@
 """The process between a hunt and Ray: which nodes take part, with how many trials at a time, when one is lost.
 
 Ray ends the process that is connected to a cluster when the cluster goes, prints into its output and takes its signals;
-here none of that reaches the hunt. The hunt tells it by a socket what to run, and hears what came of it.
+here none of that reaches the hunt. The hunt sends trials through a socket, and receives their results.
 """
 
 from __future__ import annotations
@@ -150,10 +150,10 @@ class Roster:
         for node in self.nodes.values():
             if node.ready:
                 none: Figures = {"name": node.name, "parallel": 0, "trials": 0, "rate_per_s": 0.0}
-                told = found.setdefault(node.machine, none)
-                told["parallel"] += node.slots
-                told["trials"] += node.done
-                told["rate_per_s"] += node.rate_per_s
+                figures = found.setdefault(node.machine, none)
+                figures["parallel"] += node.slots
+                figures["trials"] += node.done
+                figures["rate_per_s"] += node.rate_per_s
         return list(found.values())
 
     def parts(self, machine: str) -> list[Node]:
@@ -197,7 +197,7 @@ class Roster:
         return culprits
 
     def cancel(self, above: int) -> None:
-        """Give up trials whose number is greater."""
+        """Cancel trials whose number is greater."""
         self.waiting = deque(trial for trial in self.waiting if trial.number <= above)
         for node in self.nodes.values():
             node.running = {ticket: trial for ticket, trial in node.running.items() if trial.number <= above}
@@ -227,12 +227,12 @@ def _still(left: Mapping[str, int]) -> Iterable[str]:
 
 
 _LOOK_EVERY_S = 1.0  # which nodes there are
-_WAIT_S = 0.2  # for a node to answer, before somebody else is looked at
+_WAIT_S = 0.2  # for a node to answer, before the next node is asked
 _REFILL_S = 0.005  # for the hunt to submit more, which then goes along with the next question
 _RECEIVED = 1 << 18  # bytes at a time
 _TAKE_S = 2.0  # how long a node waits for a trial to end, before it says that there is nothing new
-_FREE_S = 3.0  # for CPUs to become free that somebody else has just left
-_START_S = 30.0  # for an actor to be where it should stand; then whoever came before it, and is no hunt, has the CPUs
+_FREE_S = 3.0  # for CPUs to become free that another job has just released
+_START_S = 30.0  # for an actor to be placed; after that, another job that is no hunt has the CPUs
 _LOOKS = 3  # that show free CPUs, before a node that takes part runs more: Ray is late to say what has been taken
 _CLOSE_S = 1.5  # for nodes to end everything; then they are killed
 _NODE_LOSSES = 3  # of a node without a trial between
@@ -254,7 +254,7 @@ def main() -> None:
         traceback.print_exc()
         sys.stderr.flush()
     finally:
-        os._exit(code)  # whoever is left is ended by the keeper, and by Ray
+        os._exit(code)  # the keeper and Ray end the remaining processes
 
 
 class Bridge:
@@ -295,8 +295,9 @@ class Bridge:
         while not self._closing:
             self.turn()
         with self._lock:
-            ready = [node for node in self._roster.nodes.values() if node.ready]
-            self._cluster.close([node.actor for node in self._roster.nodes.values()], ready, _CLOSE_S)
+            nodes = list(self._roster.nodes.values())
+            ready = [node.actor for node in nodes if node.ready]
+            self._cluster.close([node.actor for node in nodes], ready, _CLOSE_S)
 
     def turn(self, wait_s: float = _WAIT_S) -> None:
         """See who is there, have them work, and hear what they answer, waiting so long for a first one."""
@@ -351,7 +352,7 @@ class Bridge:
         self._control.sendall(json.dumps(message).encode() + b"\n")
 
     def _hand_out(self) -> None:
-        """Give out what waits; whoever is to be asked in a moment gets it then, for each call costs both sides time."""
+        """Submit waiting trials. A node that is asked soon gets them with that call, because each call costs time."""
         for node, trials in self._roster.assign().items():
             given = [(trial.ticket, trial.spec) for trial in trials]
             if node.answer is None:
@@ -376,7 +377,14 @@ class Bridge:
         wanted = max(0, self._job["parallel"] - taken) if self._job["parallel"] else None
         for machine, slots in shares(free, wanted).items():
             name, now = f"{machine}-{next(self._parts)}", time.monotonic()
-            node = Node(name, machine, able[machine].name, slots, self._cluster.stand(machine, slots), now)
+            node = Node(
+                id=name,
+                machine=machine,
+                name=able[machine].name,
+                slots=slots,
+                actor=self._cluster.stand(machine, slots),
+                stood=now,
+            )
             self._roster.nodes[name] = node
             self._ask(node, "differs", self._job["versions"], self._job["code"])
         if self._roster.nodes:
@@ -465,12 +473,12 @@ class Bridge:
         found = [ended for ended in news.ended if self._roster.ended(node, ended.ticket)]
         if found:
             self._losses.pop(node.machine, None)
-            self._tell_figures(now=self._roster.idle)  # before the last result, after which nobody listens
+            self._tell_figures(now=self._roster.idle)  # before the last result, after which the hunt reads no more
         for ended in found:
             if ended.files:
                 self._keep(node, ended)
         self._missing += len(found)
-        for note in news.notes:  # before results, too: after the last one nobody listens
+        for note in news.notes:  # before results, too: after the last one the hunt reads no more
             self._say(note=note)
         self._control.sendall(b"".join(ended.line for ended in found))
         if news.where is not None:
@@ -500,7 +508,7 @@ class Bridge:
             ) from error
 
     def _lose(self, node: Node) -> None:
-        """Go on without a node; what ran there runs again elsewhere."""
+        """Continue without a node; its trials run again elsewhere."""
         count = len(node.running)
         culprits = self._roster.lose(node)
         self._tell_figures(now=True)
@@ -524,7 +532,7 @@ class Bridge:
             self._say(ticket=trial.ticket, result=result.to_json())
 
     def _refuse(self, node: Node, why: str) -> None:
-        """Go on without a node that cannot run trials."""
+        """Continue without a node that cannot run trials."""
         self._refused[node.machine] = f"{node.name}: {why}"
         for trial in node.running.values():
             trial.losses -= 1  # it is not to blame

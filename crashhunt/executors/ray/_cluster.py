@@ -24,8 +24,6 @@ from crashhunt.executors.ray import _node_actor
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from crashhunt.executors.ray._bridge import Node
-
 
 __all__ = [
     "OLDEST",
@@ -42,7 +40,7 @@ __all__ = [
 ]
 
 
-# Which Ray cluster is meant, and whether somebody answers there; Ray itself is not imported.
+# Find the Ray cluster, and check whether it answers, without an import of Ray.
 
 TOKEN = "put the one that the cluster was started with into RAY_AUTH_TOKEN, or into ~/.ray/auth_token"
 """What to do about a token that is asked for."""
@@ -104,7 +102,7 @@ def cluster_of(argument: str) -> Meant:
             that runs here, else one of the hunt's own.
 
     Raises:
-        UsageError: it is none, or nobody answers there.
+        UsageError: the address is invalid, or no cluster answers there.
     """
     wanted = argument if argument not in ("", "auto") else os.environ.get("RAY_ADDRESS", "") or argument
     ours = Meant("", {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}, {})
@@ -143,7 +141,7 @@ def silent(address: str) -> str:
             with socket.create_connection((host.strip("[]"), int(port)), timeout=_PROBE_TIMEOUT_S) as connection:
                 said.put(_greeting(connection))
         except OSError as error:
-            said.put(f"nobody answers there ({error.strerror or error})")
+            said.put(f"no cluster answers there ({error.strerror or error})")
         except UnicodeError:
             said.put("no machine can have that name")
 
@@ -151,11 +149,11 @@ def silent(address: str) -> str:
     try:
         return said.get(timeout=_PROBE_TIMEOUT_S + 1.0)
     except queue.Empty:
-        return "nobody answers there in time"
+        return "no cluster answers there in time"
 
 
 def _greeting(connection: socket.socket) -> str:
-    """Why whoever listens is no head of Ray, which speaks HTTP/2; empty where it may be one."""
+    """Return why the listening process is no head of Ray, which speaks HTTP/2; empty where it may be one."""
     if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):
         return ""
     found = b""
@@ -164,7 +162,7 @@ def _greeting(connection: socket.socket) -> str:
         while len(found) < _FRAME and (data := connection.recv(_FRAME - len(found))):
             found += data
     except TimeoutError:
-        return "somebody listens there and does not answer"
+        return "a process listens there and does not answer"
     except OSError:
         pass  # as those do that speak something else
     speaks = len(found) == _FRAME and found[_KIND] == _SETTINGS
@@ -186,7 +184,7 @@ def _joined(address: str) -> Meant:
 
 
 def _here(address: str) -> bool:
-    """Whether an address is one of this machine: only then somebody can listen there."""
+    """Whether an address is one of this machine: only then a process can listen there."""
     with suppress(OSError):
         kind, *_, place = socket.getaddrinfo(address.rpartition(":")[0].strip("[]"), 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(kind, socket.SOCK_STREAM) as probe:
@@ -206,7 +204,7 @@ def _started_here() -> str:
 
 _ANSWER_S = 5.0  # for a head; it takes milliseconds where it is not very busy
 _STORE_BYTES = 400 * 10**6  # of a cluster of the hunt's own: room for a parcel; memory is taken when it is used
-_ORDERS, _ANSWERS = "orders", "answers"  # calls of one kind run in their order, beside those of the other
+_ORDERS, _ANSWERS = "orders", "answers"  # calls of one kind run in their order, in parallel to those of the other
 _NAME = "crashhunt-"  # of actors; what follows is how many CPUs one has
 _GROUPS = {"differs": _ANSWERS, "begin": _ANSWERS, "deliver": _ANSWERS, "take": _ANSWERS}
 _GROUPS |= {"submit": _ORDERS, "cancel": _ORDERS, "close": _ORDERS}
@@ -232,7 +230,7 @@ class Found:
         id: Ray's.
         name: for people.
         cpus: for work.
-        free: those that nobody has taken.
+        free: those that are not in use.
     """
 
     id: str
@@ -279,7 +277,7 @@ class Cluster:
         for method, group in _GROUPS.items():
             ray.method(concurrency_group=group)(getattr(_node_actor.Site, method))
         groups = {_ORDERS: 1, _ANSWERS: 1}
-        # Nobody looks at what Ray would note of every call; that it does not costs a tenth less.
+        # Without Ray's events of every call, which crashhunt does not use, a call costs a tenth less.
         kind = ray.remote(concurrency_groups=groups, max_restarts=0, max_task_retries=0, enable_task_events=False)
         self._kind: Any = kind(_node_actor.Site)
         self._shared: Any = None
@@ -303,7 +301,7 @@ class Cluster:
             name, host = node["NodeID"], node["NodeManagerHostname"]
             shown = host if hosts[host] == 1 else f"{host}-{name[:6]}"
             cpus = int(node["Resources"].get("CPU", 0))
-            found[name] = Found(name, shown, cpus, min(cpus, int(free.get(name, {}).get("CPU", 0))))
+            found[name] = Found(id=name, name=shown, cpus=cpus, free=min(cpus, int(free.get(name, {}).get("CPU", 0))))
         return found
 
     def stand(self, node: str, slots: int) -> Any:
@@ -325,7 +323,7 @@ class Cluster:
         return found
 
     def waits(self, actor: Any) -> bool:
-        """Whether an actor stands nowhere yet: somebody else has the CPUs, or its process takes long to start."""
+        """Whether an actor is not placed yet: another job has the CPUs, or its process takes long to start."""
         from ray._private.state import actors  # of which there is no public form
 
         with suppress(Exception):
@@ -379,10 +377,16 @@ class Cluster:
         with suppress(Exception):
             self._ray.kill(actor, no_restart=True)
 
-    def close(self, actors: Sequence[Any], ready: Sequence[Node], wait_s: float) -> None:
-        """Have nodes end what they do, and leave."""
+    def close(self, actors: Sequence[Any], ready: Sequence[Any], wait_s: float) -> None:
+        """Have the ready actors end their work, then end all actors.
+
+        Args:
+            actors: all that were started.
+            ready: those that run trials.
+            wait_s: for the ready ones to end their work, in s.
+        """
         with suppress(Exception):
-            closed = [self.order(node.actor, "close") for node in ready]
+            closed = [self.order(actor, "close") for actor in ready]
             self._ray.wait(closed, num_returns=len(closed), timeout=wait_s)
         for actor in actors:
             self.kill(actor)

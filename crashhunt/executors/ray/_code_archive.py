@@ -36,12 +36,12 @@ _SCENARIO, _CODE, _FILES = "scenario", "code", "files"
 
 @dataclass(frozen=True, slots=True)
 class Parcel:
-    """The files that trials need, and the folders here that stand for them.
+    """The files that trials need, and the folders here that they replace.
 
     Args:
         files: place in the parcel to file.
-        folders: folder or file here to the place that stands for it, for `settings_in`.
-        home: the place that stands for the current folder; empty where none does.
+        folders: folder or file here to its place in the parcel, for `settings_in`.
+        home: the place of the current folder; empty where none does.
     """
 
     files: dict[str, Path]
@@ -163,7 +163,7 @@ def _as_sent(place: str) -> str:
 
 
 def _described(path: Path) -> str:
-    """What is in a file, and whether it can be run, as an agent may do with a program that lies beside it."""
+    """What is in a file, and whether it can be run, as an agent may do with a program next to it."""
     return digest_of_file(path) + ("*" if path.stat().st_mode & stat.S_IXUSR else "")
 
 
@@ -196,7 +196,7 @@ class Folder:
         self._lock = owned(self.path / _FOLDER_LOCK)
 
     def fileno(self) -> int:
-        """Return the descriptor of its lock: whoever inherits it owns the folder as well."""
+        """Return the descriptor of its lock: a process that inherits it owns the folder as well."""
         return self._lock.fileno()
 
     def remove(self) -> None:
@@ -206,7 +206,7 @@ class Folder:
 
 
 def owned(lock: Path) -> IO[str]:
-    """Make the lock of a folder, which nobody sees before it is held, and hold it for as long as it is open."""
+    """Make the lock of a folder, which is invisible before it is held, and hold it for as long as it is open."""
     part = lock.with_name(f".{lock.name}")
     file = part.open("w")
     fcntl.flock(file, fcntl.LOCK_EX)
@@ -215,7 +215,7 @@ def owned(lock: Path) -> IO[str]:
 
 
 def remove_if_left(lock: Path) -> None:
-    """Remove the folder of a lock that nobody holds; without one, it is not of ours, or a moment old."""
+    """Remove the folder of a free lock; a folder without a lock is foreign, or a moment old."""
     with suppress(OSError):
         found = lock.parent.lstat()
         if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid():
@@ -248,11 +248,11 @@ class Store:
             mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
         except OSError:
             mine = False
-        if not mine:  # somebody else's; what is in there would be run
+        if not mine:  # foreign; its content would be run
             self._folder = Path(tempfile.mkdtemp(prefix="crashhunt-"))
 
     def find(self, digest: str) -> bytes | None:
-        """Return a parcel, or None where it is not there; whoever unpacks it sees whether it is damaged."""
+        """Return a parcel, or None where it is not there; the unpacking detects damage."""
         file = self._file(digest)
         try:
             packed = file.read_bytes()

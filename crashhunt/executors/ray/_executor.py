@@ -44,8 +44,8 @@ _numbers = itertools.count()
 class RayExecutor:
     """Runs trials on all machines of a Ray cluster, on each in a pool of its own.
 
-    Ray is used by a process beside this one, the bridge (see ``_bridge.py``), and may be lost with it: every trial that
-    was submitted and has not come back is submitted again to the next one.
+    A separate process, the bridge (``_bridge.py``), uses Ray and may be lost. Every submitted trial without a result
+    is then submitted again to the next bridge.
 
     Args:
         settings: of the hunt.
@@ -55,7 +55,7 @@ class RayExecutor:
 
     Raises:
         PluginError: Ray is not installed.
-        UsageError: nobody answers there, or there is more to send than travels well.
+        UsageError: no cluster answers there, or the code is too large to send.
     """
 
     sizes_itself: ClassVar[bool] = True
@@ -89,7 +89,7 @@ class RayExecutor:
 
     @property
     def capacity(self) -> int:
-        """How many trials run at a time, at least 1: where nobody runs any, they are waited for."""
+        """How many trials run at a time, at least 1: without nodes, the hunt waits for them."""
         return max(1, self._parallel if self._slots is None else self._slots)
 
     def submit(self, spec: TrialSpec) -> None:
@@ -113,7 +113,7 @@ class RayExecutor:
                 return
 
     def cancel(self, *, above: int = -1) -> None:
-        """Give up all trials whose number is greater than ``above``, at once."""
+        """Cancel all trials whose number is greater than ``above``, at once."""
         self._open = {ticket: spec for ticket, spec in self._open.items() if spec.number <= above}
         self._found = [result for result in self._found if result.spec.number <= above]
         self._send({"cancel": above})
@@ -129,7 +129,7 @@ class RayExecutor:
         return [NodeFigures(**figures) for figures in self._nodes]
 
     def notes(self) -> list[str]:
-        """Return what people should be told that has not been returned before."""
+        """Return new notices for the user."""
         return self._notes.fresh()
 
     def close(self) -> None:
@@ -249,7 +249,15 @@ class RayExecutor:
             self._nodes = message["nodes"]
         if "where" in message:
             self._where[message["node"]] = {
-                int(number): BlackBoxHeader(pid, trial, started, committed, step, Phase(phase), agent)
+                int(number): BlackBoxHeader(
+                    pid=pid,
+                    trial=trial,
+                    started=started,
+                    committed=committed,
+                    step=step,
+                    phase=Phase(phase),
+                    agent=agent,
+                )
                 for number, (pid, trial, started, committed, step, phase, agent) in message["where"].items()
             }
 
@@ -273,7 +281,7 @@ class RayExecutor:
         self._notes.add(f"the Ray cluster was lost{f' ({why})' if why else ''}; the hunt waits until it is back")
 
     def _is_back(self) -> bool:
-        """Whether a cluster that was lost answers again; then the hunt goes on there."""
+        """Whether a cluster that was lost answers again; the hunt then resumes there."""
         if time.monotonic() - self._lost_at < (_RETRY_S if self._address else 0.0):
             return False
         self._lost_at = time.monotonic()

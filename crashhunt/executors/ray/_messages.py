@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 __all__ = ["BridgeJob", "Ended", "Figures", "FromBridge", "Header", "News", "NodeJob", "Submitted", "ToBridge"]
 
 Submitted = tuple[int, "JsonObject"]
-"""A trial, and its ticket: a number that tells it from another submission of the same trial."""
+"""A trial, and its ticket: a number that identifies this submission of the trial."""
 Header = tuple[int, int, float, int, int, int, int]
 """The values of a `BlackBoxHeader`."""
 
@@ -20,7 +20,7 @@ class BridgeJob(TypedDict):
     """What a bridge needs to know.
 
     ``address`` is empty for a cluster of the hunt's own, which has ``cpus`` CPUs and ``temporary`` files. ``versions``
-    and ``code`` are what nodes must have. ``resumed`` where an earlier bridge of the same hunt had nodes.
+    and ``code`` are the requirements for nodes. ``resumed`` is true if an earlier bridge of the same hunt had nodes.
     """
 
     settings: JsonObject
@@ -67,7 +67,7 @@ class Figures(TypedDict):
 class FromBridge(TypedDict, total=False):
     """What a bridge says: a trial has ended, or what has become of nodes.
 
-    ``passing`` belongs to an error that may be over when somebody tries again, ``token`` to one for want of a token;
+    ``passing`` belongs to an error that may be over at the next attempt, ``token`` to one for want of a token;
     ``where`` belongs to a ``node``.
     """
 
@@ -89,7 +89,7 @@ class Ended(NamedTuple):
     Attributes:
         ticket: under which it was submitted.
         number: of the trial.
-        line: the message for the hunt, which nobody between has to read.
+        line: the message for the hunt, which no process in between reads.
         files: of its scratch folder where it is kept, by name, compressed.
     """
 
@@ -104,7 +104,7 @@ class News(NamedTuple):
 
     Attributes:
         ended: trials.
-        where: number of a running trial to where it is; None where nobody has looked.
+        where: number of a running trial to where it is; None where it was not requested.
         notes: for people.
         error: why no trial can be run here; None where they can.
         map: of all trials, when the first one is kept; compressed.

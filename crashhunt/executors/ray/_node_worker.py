@@ -138,7 +138,13 @@ class Work:
             self._looked = time.monotonic()
             where = {number: _values(header) for number, header in self._pool.where().items()}
         notes = [self._named_as_there(note) for note in self._pool.notes()]
-        return News(ended, where, notes, error, self._map() if any(done.files for done in ended) else b"")
+        return News(
+            ended=ended,
+            where=where,
+            notes=notes,
+            error=error,
+            map=self._map() if any(done.files for done in ended) else b"",
+        )
 
     def _completed(self, wait_s: float) -> Iterator[TrialResult]:
         """Yield what has ended, and what ends soon after it: each call from another machine costs both some time.
@@ -175,7 +181,7 @@ class Work:
                 if path.is_file() and not path.is_symlink():
                     files[path.name] = zlib.compress(self._content(path), 1)
             shutil.rmtree(folder, ignore_errors=True)  # whatever else an agent has put there
-        return Ended(ticket, result.spec.number, line, files)
+        return Ended(ticket=ticket, number=result.spec.number, line=line, files=files)
 
     def _content(self, path: Path) -> bytes:
         with path.open("rb") as file:

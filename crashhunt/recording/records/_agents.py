@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.base.tolerance import known_values
 from crashhunt.recording._divergence import Divergence, first_difference
 from crashhunt.recording.records._type import Form, RecordType, TextForm
 
@@ -17,8 +14,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.base.json_types import Plain
-    from crashhunt.recording._reading import Reading, StepRecord
+    from crashhunt.recording._reading import AgentChannel, Prologue, Reading, StepRecord
     from crashhunt.recording.records._type import Fields, Message
 
 
@@ -26,80 +22,20 @@ __all__ = [
     "ACTION",
     "OBSERVATION",
     "PROLOGUE",
-    "AgentChannel",
     "ArrayForm",
-    "Prologue",
     "array_difference",
     "message_of",
 ]
 
 
-# What the episode consists of: the agents with the shapes of their arrays, the step length. JSON; always the first.
-
-
-@dataclass(frozen=True, slots=True)
-class AgentChannel:
-    """What the arrays of one agent look like.
-
-    Args:
-        id: the agent, which is also the id of its vehicle among the actors.
-        observation_dtype: as NumPy writes it, such as ``<f4``.
-        observation_shape: of one observation.
-        action_dtype: likewise.
-        action_shape: of one action.
-        action_names: what the elements of an action are.
-        observation_names: what the columns of an observation are.
-    """
-
-    id: str
-    observation_dtype: str
-    observation_shape: tuple[int, ...]
-    action_dtype: str
-    action_shape: tuple[int, ...]
-    action_names: tuple[str, ...] = ()
-    observation_names: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Prologue:
-    """What an episode consists of.
-
-    Args:
-        agents: in the order of their numbers.
-        step_length_s: in s of simulation time.
-    """
-
-    agents: tuple[AgentChannel, ...]
-    step_length_s: float
-
-    def encode(self) -> bytes:
-        """Return the payload of the record."""
-        agents = [{name: getattr(agent, name) for name in AgentChannel.__slots__} for agent in self.agents]
-        return json.dumps({"agents": agents, "step_length_s": self.step_length_s}, sort_keys=True).encode()
-
-    @classmethod
-    def decode(cls, payload: bytes) -> Prologue:
-        """Rebuild what `encode` returned; what a later version has added is left out."""
-        data: _Said = json.loads(payload)
-        agents = tuple(AgentChannel(**_columns_prologue(agent)) for agent in data["agents"])
-        return cls(agents, data["step_length_s"])
-
-
-class _Said(TypedDict):
-    agents: list[Plain]
-    step_length_s: float
-
-
-def _columns_prologue(agent: Plain) -> dict[str, Any]:
-    known = known_values(AgentChannel, agent)
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in known.items()}
+# The first record: what the episode consists of, as JSON.
 
 
 def _read_prologue(_reading: Reading, _aux: int, _payload: bytes) -> None:
     raise ValueError("it begins twice")
 
 
-PROLOGUE = RecordType(1, "prologue", "/prologue", TextForm(), _read_prologue)
+PROLOGUE = RecordType(tag=1, name="prologue", topic="/prologue", form=TextForm(), read=_read_prologue)
 
 
 # Arrays of one agent: raw bytes in the black box, numbers in the log.
@@ -155,78 +91,54 @@ def array_difference(
     if was is None and now is None:
         return None
     if was is None or now is None:
-        return Divergence(step, agent, kind, _plain(was), _plain(now))
+        return Divergence(step=step, agent=agent, field=kind, recorded=_plain(was), replayed=_plain(now))
     if was.tobytes() == now.tobytes():
         return None
     where = first_difference(was, now)
     name = ", ".join((*map(str, where[:-1]), columns[where[-1]] if columns else str(where[-1]))) if where else ""
     field = f"{kind}[{name}]" if name else kind
-    return Divergence(step, agent, field, was[where].item(), now[where].item(), (kind, where))
+    return Divergence(
+        step=step, agent=agent, field=field, recorded=was[where].item(), replayed=now[where].item(), place=(kind, where)
+    )
 
 
 def _plain(array: NDArray[np.generic] | None) -> object:
     return None if array is None else array.tolist()
 
 
-# What an agent is shown, as raw bytes; ``aux`` is its number.
+def _array_record(tag: int, what: str) -> RecordType:
+    """Return the type of a record of one array per agent and step, as raw bytes; ``aux`` is the agent's number.
+
+    Args:
+        tag: of the record.
+        what: ``observation`` or ``action``, as in the fields of `AgentChannel` and `StepRecord`.
+    """
+
+    def read(reading: Reading, aux: int, payload: bytes) -> None:
+        channel = reading.prologue.agents[aux]
+        array = np.frombuffer(payload, getattr(channel, f"{what}_dtype"))
+        getattr(reading.current, f"{what}s")[channel.id] = array.reshape(getattr(channel, f"{what}_shape"))
+
+    def difference(left: StepRecord, right: StepRecord, agent: AgentChannel | None) -> Divergence | None:
+        if agent is None:
+            return None
+        was, now = (getattr(step, f"{what}s").get(agent.id) for step in (left, right))
+        return array_difference(left.step, agent.id, what, getattr(agent, f"{what}_names"), was, now)
+
+    def value(step: StepRecord, agent: str, index: tuple[int, ...]) -> object:
+        array = getattr(step, f"{what}s").get(agent)
+        return None if array is None else array[index].item()
+
+    return RecordType(
+        tag=tag,
+        name=what,
+        topic=f"/agents/{{agent}}/{what}",
+        form=ArrayForm(f"{what}_dtype"),
+        read=read,
+        difference=difference,
+        value=value,
+    )
 
 
-def _read_observation(reading: Reading, aux: int, payload: bytes) -> None:
-    channel = reading.prologue.agents[aux]
-    array = np.frombuffer(payload, channel.observation_dtype).reshape(channel.observation_shape)
-    reading.current.observations[channel.id] = array
-
-
-def _difference_observation(left: StepRecord, right: StepRecord, agent: AgentChannel | None) -> Divergence | None:
-    if agent is None:
-        return None
-    was, now = left.observations.get(agent.id), right.observations.get(agent.id)
-    return array_difference(left.step, agent.id, "observation", agent.observation_names, was, now)
-
-
-def _value_observation(step: StepRecord, agent: str, index: tuple[int, ...]) -> object:
-    array = step.observations.get(agent)
-    return None if array is None else array[index].item()
-
-
-OBSERVATION = RecordType(
-    4,
-    "observation",
-    "/agents/{agent}/observation",
-    ArrayForm("observation_dtype"),
-    _read_observation,
-    _difference_observation,
-    _value_observation,
-)
-
-
-# What an agent answers, as raw bytes; ``aux`` is its number.
-
-
-def _read_action(reading: Reading, aux: int, payload: bytes) -> None:
-    channel = reading.prologue.agents[aux]
-    array = np.frombuffer(payload, channel.action_dtype).reshape(channel.action_shape)
-    reading.current.actions[channel.id] = array
-
-
-def _difference_action(left: StepRecord, right: StepRecord, agent: AgentChannel | None) -> Divergence | None:
-    if agent is None:
-        return None
-    was, now = left.actions.get(agent.id), right.actions.get(agent.id)
-    return array_difference(left.step, agent.id, "action", agent.action_names, was, now)
-
-
-def _value_action(step: StepRecord, agent: str, index: tuple[int, ...]) -> object:
-    array = step.actions.get(agent)
-    return None if array is None else array[index].item()
-
-
-ACTION = RecordType(
-    5,
-    "action",
-    "/agents/{agent}/action",
-    ArrayForm("action_dtype"),
-    _read_action,
-    _difference_action,
-    _value_action,
-)
+OBSERVATION = _array_record(4, "observation")
+ACTION = _array_record(5, "action")

@@ -13,8 +13,7 @@ from crashhunt.world import Contact, Event
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from crashhunt.recording._reading import Reading, StepRecord
-    from crashhunt.recording.records._agents import AgentChannel
+    from crashhunt.recording._reading import AgentChannel, Reading, StepRecord
     from crashhunt.world import Scene
 
 
@@ -44,7 +43,14 @@ def _read_events(reading: Reading, _aux: int, payload: bytes) -> None:
     reading.scene["off_road"] = tuple(events.get("off_road", ()))
 
 
-EVENTS = RecordType(8, "events", "/events", TextForm(), _read_events, scene_texts("contacts", "off_road"))
+EVENTS = RecordType(
+    tag=8,
+    name="events",
+    topic="/events",
+    form=TextForm(),
+    read=_read_events,
+    difference=scene_texts("contacts", "off_road"),
+)
 
 
 # Traffic events, as JSON. What we conclude from an episode is no part of it, nor of its digest; nor is it compared.
@@ -59,7 +65,7 @@ def _read_notes(reading: Reading, _aux: int, payload: bytes) -> None:
     reading.events = tuple(Event.from_json(note) for note in json.loads(payload))
 
 
-NOTES = RecordType(11, "notes", "/traffic_events", TextForm(), _read_notes)
+NOTES = RecordType(tag=11, name="notes", topic="/traffic_events", form=TextForm(), read=_read_notes)
 
 
 # A disturbance as it takes place, as JSON: who turned out to be meant is part of the episode, and of its digest.
@@ -86,9 +92,14 @@ def _difference_disturbances(left: StepRecord, right: StepRecord, _: AgentChanne
     was, now = ["; ".join(f"{one.words} ({one.place})" for one in some) or _DISTURBANCES_NOTHING for some in each]
     if was == now:  # such as two strengths that are rounded alike
         was, now = exact
-    return Divergence(left.step, "", _DISTURBANCES_NAME, was, now)
+    return Divergence(step=left.step, agent="", field=_DISTURBANCES_NAME, recorded=was, replayed=now)
 
 
 DISTURBANCES = RecordType(
-    12, _DISTURBANCES_NAME, "/disturbances", TextForm(), _read_disturbances, _difference_disturbances
+    tag=12,
+    name=_DISTURBANCES_NAME,
+    topic="/disturbances",
+    form=TextForm(),
+    read=_read_disturbances,
+    difference=_difference_disturbances,
 )

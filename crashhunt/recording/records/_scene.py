@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.recording._reading import Reading, SceneParts
-    from crashhunt.recording.records._agents import AgentChannel, Prologue
+    from crashhunt.recording._reading import AgentChannel, Prologue, Reading, SceneParts
     from crashhunt.recording.records._type import Fields, Message
     from crashhunt.world import Spine
 
@@ -57,7 +56,7 @@ def _read_actors(reading: Reading, _aux: int, payload: bytes) -> None:
     reading.actors.extend(Actor(*entry[:_ACTORS_FIELDS]) for entry in json.loads(payload))
 
 
-ACTORS = RecordType(2, "actors", "/scene/actor_definitions", TextForm(), _read_actors)
+ACTORS = RecordType(tag=2, name="actors", topic="/scene/actor_definitions", form=TextForm(), read=_read_actors)
 
 
 # The numbers of the actors that are present from here on, as uint32[].
@@ -90,19 +89,21 @@ def roster_difference(step: int, left: Roster, right: Roster) -> Divergence | No
     for was, now in zip(left.actors, right.actors, strict=False):
         if was != now:
             if was.id == now.id:
-                return Divergence(step, was.id, "actor", str(was), str(now))
+                return Divergence(step=step, agent=was.id, field="actor", recorded=str(was), replayed=str(now))
             break
     missing = [actor.id for actor in left.actors if actor.id not in right.index]
     if missing:
-        return Divergence(step, missing[0], "presence", 1, 0)
+        return Divergence(step=step, agent=missing[0], field="presence", recorded=1, replayed=0)
     extra = [actor.id for actor in right.actors if actor.id not in left.index]
     if extra:
-        return Divergence(step, extra[0], "presence", 0, 1)
-    return Divergence(step, "", "order of actors", [a.id for a in left.actors][:5], "another")
+        return Divergence(step=step, agent=extra[0], field="presence", recorded=0, replayed=1)
+    return Divergence(
+        step=step, agent="", field="order of actors", recorded=[a.id for a in left.actors][:5], replayed="another"
+    )
 
 
 # It is compared with the step, whose values stand in the order of the roster.
-ROSTER = RecordType(3, "roster", "/scene/roster", _RosterForm(), _read_roster)
+ROSTER = RecordType(tag=3, name="roster", topic="/scene/roster", form=_RosterForm(), read=_read_roster)
 
 
 # A step that is complete: int64 step, float64 time in s, float64 reward of each agent, and the values of the scene.
@@ -175,12 +176,18 @@ def _read_step(reading: Reading, _aux: int, payload: bytes) -> None:
 def _difference_step(left: StepRecord, right: StepRecord, _: AgentChannel | None) -> Divergence | None:
     step, was, now = left.step, left.scene, right.scene
     if was is None or now is None:
-        return None if was is now else Divergence(step, "", SCENE, was and "present", now and "present")
+        return (
+            None
+            if was is now
+            else Divergence(step=step, agent="", field=SCENE, recorded=was and "present", replayed=now and "present")
+        )
     for name in left.rewards:
         if np.float64(left.rewards[name]).tobytes() != np.float64(right.rewards[name]).tobytes():
-            return Divergence(step, name, "reward", left.rewards[name], right.rewards[name])
+            return Divergence(
+                step=step, agent=name, field="reward", recorded=left.rewards[name], replayed=right.rewards[name]
+            )
     if was.time_s != now.time_s:
-        return Divergence(step, "", "time_s", was.time_s, now.time_s)
+        return Divergence(step=step, agent="", field="time_s", recorded=was.time_s, replayed=now.time_s)
     other = roster_difference(step, was.roster, now.roster)
     if other is not None:
         return other
@@ -199,7 +206,9 @@ def _value_step(step: StepRecord, actor: str, index: tuple[int, ...]) -> object:
     return float(step.scene.data[step.scene.roster.index[actor], index[0]])
 
 
-STEP = RecordType(6, SCENE, "/scene", _StepForm(), _read_step, _difference_step, _value_step)
+STEP = RecordType(
+    tag=6, name=SCENE, topic="/scene", form=_StepForm(), read=_read_step, difference=_difference_step, value=_value_step
+)
 
 
 # How high everybody is, then how steep it is there, as float64[]; only where the map is not flat.
@@ -226,7 +235,14 @@ def _read_heights(reading: Reading, _aux: int, payload: bytes) -> None:
     reading.scene["heights"], reading.scene["grades"] = heights, grades
 
 
-HEIGHTS = RecordType(9, "heights", "/scene/heights", _HeightsForm(), _read_heights, scene_texts("heights", "grades"))
+HEIGHTS = RecordType(
+    tag=9,
+    name="heights",
+    topic="/scene/heights",
+    form=_HeightsForm(),
+    read=_read_heights,
+    difference=scene_texts("heights", "grades"),
+)
 
 
 # Of each long vehicle that is bent: uint32 row, uint32 points, and float64 x, y and z of each point, in m.
@@ -277,7 +293,14 @@ def _read_spines(reading: Reading, _aux: int, payload: bytes) -> None:
     reading.scene["spines"] = _decode_spines(payload)
 
 
-SPINES = RecordType(10, "spines", "/scene/spines", _SpinesForm(), _read_spines, scene_texts("spines"))
+SPINES = RecordType(
+    tag=10,
+    name="spines",
+    topic="/scene/spines",
+    form=_SpinesForm(),
+    read=_read_spines,
+    difference=scene_texts("spines"),
+)
 
 
 # The lane of each actor of the roster, as text, one a line; only in steps that looked.
@@ -292,4 +315,6 @@ def _read_lanes(reading: Reading, _aux: int, payload: bytes) -> None:
     reading.scene["lanes"] = tuple(payload.decode().split("\n"))
 
 
-LANES = RecordType(7, "lanes", "/scene/lanes", TextForm(), _read_lanes, scene_texts("lanes"))
+LANES = RecordType(
+    tag=7, name="lanes", topic="/scene/lanes", form=TextForm(), read=_read_lanes, difference=scene_texts("lanes")
+)

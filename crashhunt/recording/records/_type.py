@@ -10,8 +10,7 @@ from crashhunt.recording._divergence import Divergence
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from crashhunt.recording._reading import Reading, StepRecord
-    from crashhunt.recording.records._agents import AgentChannel, Prologue
+    from crashhunt.recording._reading import AgentChannel, Prologue, Reading, StepRecord
 
     Difference = Callable[[StepRecord, StepRecord, AgentChannel | None], Divergence | None]
 
@@ -90,7 +89,7 @@ class RecordType:
     Args:
         tag: its number in the black box; from `FIRST_ASIDE` on it is no evidence. Never given twice.
         name: for people, and for the place of a value.
-        topic: of its messages in a log; ``{agent}`` stands for the agent whose number is the record's ``aux``.
+        topic: of its messages in a log; ``{agent}`` is replaced by the agent whose number is the record's ``aux``.
         form: how it looks there. A type that came after the first eleven is text or bytes, so that a crashhunt that
             does not know it can read the record and count it in the digest; what people want to see of it is a view.
         read: adds a record, given as ``aux`` and payload, to what has been read so far.
@@ -117,13 +116,13 @@ def scene_texts(*fields: str) -> Difference:
     """Return a comparison of some fields of the scenes."""
 
     def difference(left: StepRecord, right: StepRecord, _: AgentChannel | None) -> Divergence | None:
-        if left.scene is None or right.scene is None:  # which the step tells
+        if left.scene is None or right.scene is None:  # which the step reports
             return None
         for field in fields:
-            # As text, in which a speed that nobody knows, NaN, equals itself.
+            # As text, in which an unknown speed, NaN, equals itself.
             was, now = str(getattr(left.scene, field)), str(getattr(right.scene, field))
             if was != now:
-                return Divergence(left.step, "", f"scene.{field}", was, now)
+                return Divergence(step=left.step, agent="", field=f"scene.{field}", recorded=was, replayed=now)
         return None
 
     return difference

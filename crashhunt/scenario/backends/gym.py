@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
-from crashhunt.scenario._backend import Backend
+from crashhunt.scenario._scenario import Backend
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -89,7 +89,7 @@ BACKEND = Backend(
     check=_check,
     modules=_modules,
     versions=("gymnasium",),
-    told_events=(),
+    reported_events=(),
     disturbances=(),
     side_effect=_side_effect,
 )

@@ -7,8 +7,7 @@ from importlib import metadata
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
-from crashhunt.scenario._backend import Accelerator, Backend
-from crashhunt.scenario._scenario import STEP_LENGTH_S
+from crashhunt.scenario._scenario import STEP_LENGTH_S, Accelerator, Backend
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -91,7 +90,7 @@ BACKEND = Backend(
     versions=("highway-env", "numpy"),
     per_processor=True,
     step_length_s=_step_length,
-    told_events=("wrong_way", "not_moving"),
+    reported_events=("wrong_way", "not_moving"),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "ignore_priority", "unseen"),
     accelerator=Accelerator(switched_off=_as_it_is, note=_not_accelerated),
     side_effect=_side_effect,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from crashhunt.scenario._backend import Backend
+from crashhunt.scenario._scenario import Backend
 
 __all__ = ["BACKEND"]
 
 BACKEND = Backend(
     title="the toy",
-    told_events=(),
+    reported_events=(),
     disturbances=("brake", "stop", "unseen"),
     side_effect=lambda *_: "",
     forkable=True,

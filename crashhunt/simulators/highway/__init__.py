@@ -1,4 +1,4 @@
-"""highway-env, which is imported when a simulator is made."""
+"""The simulator for highway-env; highway-env is imported when a simulator is created."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""What an environment of highway-env is told, and what it must not leave behind."""
+"""The configuration of a highway-env environment, and the reset of class attributes that environments change."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["configured", "mistake", "restore_classes"]
 
 Config: TypeAlias = dict[str, Any]
-"""What an environment of highway-env is told; what each entry may be its classes know."""
+"""The configuration of a highway-env environment; highway-env's classes define its entries."""
 
 _pristine: dict[type, dict[str, int | float | str]] = {}
 
@@ -31,12 +31,12 @@ def configured(default: Config, scenario: Scenario, arguments: Mapping[str, Valu
     """Return the configuration of an environment for one trial.
 
     Args:
-        default: the environment's own.
-        scenario: with what differs from it, and how many vehicles are controlled.
-        arguments: of the scenario.
+        default: The environment's default configuration.
+        scenario: Gives the entries that differ from the default, and the number of controlled vehicles.
+        arguments: The scenario arguments of the trial.
 
     Raises:
-        ScenarioError: an entry does not exist, or values do not go together.
+        ScenarioError: An entry does not exist, or two values contradict each other.
     """
     config = deepcopy(dict(default))
     tables = [deepcopy(scenario.table(HighwaySetup).config), *as_tables(scenario, arguments)]
@@ -47,20 +47,20 @@ def configured(default: Config, scenario: Scenario, arguments: Mapping[str, Valu
         config["duration"] = math.inf
     policy, simulation = config["policy_frequency"], config["simulation_frequency"]
     if not 0 < policy <= simulation:
-        message = f"is not above 0 and at most simulation_frequency, {simulation}"
-        raise mistake(scenario, "config.policy_frequency", policy, message, "change one of the two")
+        message = f"must be above 0 and at most simulation_frequency, {simulation}"
+        raise mistake(scenario, "config.policy_frequency", policy, message, "change one of the two frequencies")
     _let_in(scenario, config)
     _use_tuples(config["observation"])
     return config
 
 
 def mistake(scenario: Scenario, key: str, value: object, message: str, fix: str) -> ScenarioError:
-    """Return the error that says what is wrong in the table ``[highway]``."""
+    """Return the error for a wrong entry of the table ``[highway]``."""
     return ScenarioError(f"highway.{key} = {value!r} {message}", fix=fix, where=scenario.origin)
 
 
 def restore_classes() -> None:
-    """Undo what environments change in classes, such as the jam distance of all drivers, for the next episode."""
+    """Restore class attributes that environments change, such as the jam distance of all drivers."""
     waiting: list[type] = [RoadObject]
     while waiting:
         kind = waiting.pop()
@@ -75,12 +75,12 @@ def restore_classes() -> None:
 
 
 def _let_in(scenario: Scenario, config: Config) -> None:
-    """As many controlled vehicles as the scenario has agents."""
+    """Configure as many controlled vehicles as the scenario has agents."""
     count = len(scenario.agents)
     if "controlled_vehicles" in config:
         config["controlled_vehicles"] = count
     elif count > 1:
-        message = f"has one controlled vehicle, not {count}"
+        message = f"has one controlled vehicle; the scenario has {count} agents"
         raise mistake(scenario, "id", scenario.table(HighwaySetup).id, message, "name one agent")
     if count > 1:
         for key in ("action", "observation"):
@@ -90,13 +90,13 @@ def _let_in(scenario: Scenario, config: Config) -> None:
 
 def _check_keys(scenario: Scenario, config: Config, table: Iterable[str]) -> None:
     for key in table:
-        if key not in config and not key.endswith("_reward"):  # which is 0 where it is not there
-            fix = did_you_mean(key, config) or f"it has {', '.join(config)}"
-            raise mistake(scenario, "config", key, "is no entry of the environment's configuration", fix)
+        if key not in config and not key.endswith("_reward"):  # highway-env takes 0 for a missing reward
+            fix = did_you_mean(key, config) or f"use one of {', '.join(config)}"
+            raise mistake(scenario, "config", key, "does not exist in the environment's configuration", fix)
 
 
 def _use_tuples(table: Config | list[object]) -> None:
-    """Make the shapes in the configuration of an observation tuples, which TOML does not have."""
+    """Turn lists in the observation's configuration into tuples where highway-env needs tuples, which TOML lacks."""
     for inner in table.values() if isinstance(table, dict) else table:
         if isinstance(inner, dict | list):
             _use_tuples(inner)

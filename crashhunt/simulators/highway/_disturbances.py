@@ -1,6 +1,7 @@
-"""Vehicles of highway-env that err: what they have decided is overruled in every sub-step, and then no more.
+"""Fault injection on highway-env: a disturbance overrides the decisions of a vehicle in every sub-step until it ends.
 
-That happens between deciding and moving, so that it makes no difference whether the accelerator decides for them.
+The override happens between `Road.act` and `Road.step`, so that it does not matter whether the accelerator computed the
+decisions.
 """
 
 from __future__ import annotations
@@ -26,18 +27,18 @@ if TYPE_CHECKING:
 __all__ = ["HighwayDisturbances", "crosses", "place_of"]
 
 
-# The ways of vehicles of highway-env through a junction: which of them cross that of the agent.
+# Paths of vehicles through a junction: which paths cross the agent's path.
 
-_REACH_M = 80.0  # what is further on is not looked at
-_STEP_M = 2.0
-_MEETS_M = 2.5  # two ways that come so near to each other meet
-_HALF_LANE_M = 1.6  # half a lane: who is less to the side is ahead
+_REACH_M = 80.0  # length of a path ahead of its vehicle
+_STEP_M = 2.0  # distance between the points of a path
+_MEETS_M = 2.5  # two paths cross if two of their points are nearer than this
+_HALF_LANE_M = 1.6  # a vehicle with a smaller lateral offset is ahead or behind, not to the side
 
 _Road = tuple[str, str]
 
 
 def place_of(agent: Any, other: Any) -> str:
-    """Return the place of another vehicle around an agent, as the crow flies."""
+    """Return the place of a vehicle relative to an agent, such as ``left ahead``, from positions and not from lanes."""
     dx, dy = (other.position - agent.position).tolist()
     c, s = math.cos(agent.heading), math.sin(agent.heading)
     ahead, right = dx * c + dy * s, dy * c - dx * s  # y points down
@@ -47,7 +48,7 @@ def place_of(agent: Any, other: Any) -> str:
 
 
 def crosses(network: RoadNetwork, agent: Any, other: Any) -> bool:
-    """Whether another vehicle's way meets the agent's, and neither comes along the road of the other."""
+    """Whether the paths of two vehicles cross, and neither vehicle is on a road of the other vehicle's path."""
     own_roads, own = _way(network, agent)
     roads, way = _way(network, other)
     if other.lane_index[:2] in own_roads or agent.lane_index[:2] in roads:
@@ -57,7 +58,7 @@ def crosses(network: RoadNetwork, agent: Any, other: Any) -> bool:
 
 
 def _way(network: RoadNetwork, vehicle: Any) -> tuple[set[_Road], NDArray[np.float64]]:
-    """The roads that it comes along, and points 2 m apart."""
+    """Return the roads of a vehicle's path, and the points of the path, 2 m apart."""
     along = float(vehicle.lane.local_coordinates(vehicle.position)[0])
     roads, points, driven = set(), [vehicle.position], 0.0
     for index in _lanes(network, vehicle):
@@ -73,9 +74,12 @@ def _way(network: RoadNetwork, vehicle: Any) -> tuple[set[_Road], NDArray[np.flo
 
 
 def _lanes(network: RoadNetwork, vehicle: Any) -> Iterator[tuple[str, str, int]]:
-    """Its lane and those after it, as far as there is no doubt; `RoadNetwork.next_lane` would draw where there is."""
+    """Yield a vehicle's lane and the lanes after it, up to a fork for which the vehicle has no route.
+
+    At such a fork, `RoadNetwork.next_lane` would draw a lane at random and change the simulation.
+    """
     start, end, number = vehicle.lane_index
-    # Nobody has planned where a vehicle goes that is steered and not told its lanes.
+    # Only a ControlledVehicle has a planned route.
     route = vehicle.route if isinstance(vehicle, ControlledVehicle) else None
     planned = {road[0]: road[1] for road in route or ()}
     seen = set()
@@ -89,49 +93,50 @@ def _lanes(network: RoadNetwork, vehicle: Any) -> Iterator[tuple[str, str, int]]
         start, end, number = end, onward, min(number, len(after[onward]) - 1)
 
 
-_IN_LANE_M, _BESIDE_M, _CROSSING_M = 100.0, 50.0, 80.0  # who is further away than that is not meant
-_GENTLY = 1.5  # m/s²; how a dawdler slows down
+# Vehicles further away are no target: in the same lane, in a neighbouring lane, on a crossing path.
+_IN_LANE_M, _NEIGHBOUR_LANE_M, _CROSSING_M = 100.0, 50.0, 80.0
+_DAWDLING_DECELERATION_MPS2 = 1.5
 
 
 class HighwayDisturbances:
-    """Finds who is meant in one episode, and overrules them.
+    """Finds the target vehicles of disturbances in one episode, and disturbs them.
 
     Args:
-        road: of the episode.
-        controlled: the vehicles that are driven from outside, which are never meant.
+        road: The road of the episode.
+        controlled: The agents' vehicles, which are never a target.
     """
 
     def __init__(self, road: Road, controlled: Collection[Any]) -> None:
         self._road = road
         self._controlled = controlled
-        self._erring: list[_Errs] = []
+        self._active: list[_Active] = []
 
     @property
-    def anybody(self) -> bool:
-        """Whether somebody errs at the moment."""
-        return bool(self._erring)
+    def is_active(self) -> bool:
+        """Whether a vehicle is disturbed at the moment."""
+        return bool(self._active)
 
     def before_moving(self, dt: float) -> None:
-        """Overrule what erring vehicles have decided, in the sub-step that follows."""
-        for errs in self._erring:
-            if not errs.vehicle.crashed:
-                errs.overrule(dt)
+        """Override the decisions of disturbed vehicles for the next sub-step of ``dt`` s."""
+        for active in self._active:
+            if not active.vehicle.crashed:
+                active.override(dt)
 
     def after_moving(self) -> None:
-        """Undo what the rules of the road have told erring vehicles, before they decide again."""
-        for errs in self._erring:
-            errs.after()
+        """Undo the effects of right-of-way rules on disturbed vehicles, before the vehicles decide again."""
+        for active in self._active:
+            active.after()
 
     def resolve_target(self, agent: Any, disturbance: Disturbance) -> Any | None:
-        """Return who is meant; None where nobody is there."""
+        """Return the target vehicle; None if no vehicle is at the place."""
         if disturbance.what == "ignore_priority":
             return self._crossing(agent, disturbance.who)
         return self.at(agent, disturbance.who)
 
     def _crossing(self, agent: Any, who: str) -> Any | None:
-        """The nearest one at a place as the crow flies, on a way that crosses the agent's."""
+        """Return the nearest vehicle at a place around the agent whose path crosses the agent's path."""
         if not isinstance(self._road, RegulatedRoad):
-            return None  # where nobody gives way anyway
+            return None  # without right-of-way rules, vehicles never give way
         near = []
         for other in self._road.vehicles:
             if not isinstance(other, IDMVehicle) or any(other is vehicle for vehicle in self._controlled):
@@ -144,7 +149,7 @@ class HighwayDisturbances:
         return next((other for _, other in near if crosses(self._road.network, agent, other)), None)
 
     def at(self, agent: Any, who: str) -> Any | None:
-        """Return the vehicle at a place around an agent, along its lane and those beside it; None where nobody is."""
+        """Return the vehicle at a place around an agent, in its lane or a neighbouring lane; None if there is none."""
         side, _, along = who.rpartition(" ") if who in ("ahead", "behind") else who.partition(" ")
         start, end, number = agent.lane_index
         lane = (start, end, number + {"left": -1, "right": 1}.get(side, 0))
@@ -155,85 +160,89 @@ class HighwayDisturbances:
             if not isinstance(other, IDMVehicle) or any(other is vehicle for vehicle in self._controlled):
                 continue
             distance = float(agent.lane_distance_to(other))
-            beside = bool(side) and abs(distance) < (agent.LENGTH + other.LENGTH) / 2
-            place = "" if beside else "ahead" if distance > 0 else "behind"
-            if place == along and abs(distance) <= (_BESIDE_M if side else _IN_LANE_M):
+            overlaps = bool(side) and abs(distance) < (agent.LENGTH + other.LENGTH) / 2
+            place = "" if overlaps else "ahead" if distance > 0 else "behind"
+            if place == along and abs(distance) <= (_NEIGHBOUR_LANE_M if side else _IN_LANE_M):
                 near.append((abs(distance), other))
         return min(near, key=lambda found: found[0])[1] if near else None
 
     def disturb(self, vehicle: Any, disturbance: Disturbance, agent: Any) -> ActiveDisturbance | None:
-        """Overrule a vehicle until its disturbance ends; None where it cannot do that."""
+        """Disturb a vehicle until the disturbance ends; return None if the vehicle cannot be disturbed so."""
         strong = disturbance.how_strong
         hardest = min(strong, float(vehicle.ACC_MAX))
-        errs: _Errs
+        active: _Active
         if disturbance.what in ("brake", "stop"):
-            errs = _Slows(vehicle, self._let_go, hardest, hardest)
+            active = _Slows(vehicle, self._let_go, hardest, hardest)
         elif disturbance.what == "dawdle":
-            errs = _Slows(vehicle, self._let_go, strong, _GENTLY, target=max(0.0, 1.0 - strong) * float(vehicle.speed))
+            target = max(0.0, 1.0 - strong) * float(vehicle.speed)
+            active = _Slows(vehicle, self._let_go, strong, _DAWDLING_DECELERATION_MPS2, target=target)
         elif disturbance.what == "speed":
-            errs = _Speeds(vehicle, self._let_go, strong)
+            active = _Speeds(vehicle, self._let_go, strong)
         elif disturbance.what == "ignore_priority":
-            errs = _Ignores(vehicle, self._let_go, 1.0)
+            active = _Ignores(vehicle, self._let_go, 1.0)
         elif disturbance.what == "late_merge":
             left = self._left_of_lane(vehicle)
             if left is None or vehicle.lane_index != vehicle.target_lane_index:
                 return None
-            errs = _MergesLate(vehicle, self._let_go, min(strong, left))
+            active = _MergesLate(vehicle, self._let_go, min(strong, left))
         else:
-            beside = vehicle.lane_index[:2] == agent.lane_index[:2] and vehicle.lane_index != agent.lane_index
-            if not beside or vehicle.lane_index != vehicle.target_lane_index:
-                return None  # as it is on another road, in the lane of the agent, or changes lanes already
-            errs = _CutsIn(vehicle, self._let_go, hardest, agent.lane_index)
-        self._erring.append(errs)
-        return errs
+            in_other_lane = vehicle.lane_index[:2] == agent.lane_index[:2] and vehicle.lane_index != agent.lane_index
+            if not in_other_lane or vehicle.lane_index != vehicle.target_lane_index:
+                return None  # the vehicle is on another road, in the agent's lane, or already changing lanes
+            active = _CutsIn(vehicle, self._let_go, hardest, agent.lane_index)
+        self._active.append(active)
+        return active
 
     def hold(self, vehicle: Any, what: str) -> ActiveDisturbance | None:
-        """Keep a vehicle from something until that ends; None of a thing that drives nowhere."""
+        """Apply a hold to a vehicle until the hold ends; return None for an object that does not drive."""
         if not isinstance(vehicle, IDMVehicle):
             return None
         kind = {"keep_speed": _KeepsSpeed, "keep_lane": _KeepsLane}.get(what)
         if kind is None:
             self._road.vehicles.remove(vehicle)
-            return _Errs(vehicle, lambda _: None, 1.0)
-        errs: _Errs = kind(vehicle, self._let_go, 1.0)
-        self._erring.append(errs)
-        return errs
+            return _Active(vehicle, lambda _: None, 1.0)
+        active: _Active = kind(vehicle, self._let_go, 1.0)
+        self._active.append(active)
+        return active
 
     def _left_of_lane(self, vehicle: Any) -> float | None:
-        """What is left of a lane that ends, in m: lanes are counted from the left, and fewer come after it."""
+        """Return the rest of a vehicle's lane, in m, if the lane ends; None otherwise.
+
+        highway-env numbers lanes from the left. A lane ends if a following road has no lane with its number.
+        """
         _, end, number = vehicle.lane_index
         after = self._road.network.graph.get(end, {})
         if not number or not after or number < min(len(lanes) for lanes in after.values()):
             return None
         return _left(vehicle)
 
-    def _let_go(self, errs: _Errs) -> None:
-        self._erring.remove(errs)
+    def _let_go(self, active: _Active) -> None:
+        self._active.remove(active)
 
 
-class _Errs:
-    """A vehicle that errs, until it is let go."""
+class _Active:
+    """A disturbance or hold of a vehicle, until `end`."""
 
-    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], how_strong: float) -> None:
+    def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], how_strong: float) -> None:
         self.vehicle = vehicle
         self.how_strong = how_strong
         self._let_go = let_go
 
-    def overrule(self, dt: float) -> None:
-        """Change what it has decided for a sub-step of so many s."""
+    def override(self, dt: float) -> None:
+        """Change the vehicle's decision for a sub-step of ``dt`` s."""
 
     def after(self) -> None:
-        """Change what it has been told in a sub-step that is over."""
+        """Undo effects of the sub-step that is over."""
 
     def keep(self) -> None:
-        """Go on; it is overruled in every sub-step anyway."""
+        """Do nothing, because `override` runs in every sub-step."""
 
     def end(self) -> None:
-        """Let it drive by itself again."""
+        """Let the vehicle drive by itself again."""
         self._let_go(self)
 
     def _brake(self, deceleration: float, dt: float, down_to: float = 0.0) -> None:
-        """Brake at least so hard, and down to a speed at most."""
+        """Brake at least with this deceleration, until the speed is ``down_to``."""
         action, speed = self.vehicle.action, float(self.vehicle.speed)
         wanted = max(-deceleration, min(0.0, (down_to - speed) / dt))
         if speed <= down_to:
@@ -241,13 +250,13 @@ class _Errs:
         action["acceleration"] = min(float(action["acceleration"]), wanted)
 
 
-class _Slows(_Errs):
-    """Brakes down to a speed, and keeps to it."""
+class _Slows(_Active):
+    """Makes the vehicle brake to a target speed and keep it."""
 
     def __init__(
         self,
         vehicle: Any,
-        let_go: Callable[[_Errs], None],
+        let_go: Callable[[_Active], None],
         how_strong: float,
         deceleration: float,
         *,
@@ -257,14 +266,14 @@ class _Slows(_Errs):
         self._deceleration = deceleration
         self._target = target
 
-    def overrule(self, dt: float) -> None:
+    def override(self, dt: float) -> None:
         self._brake(self._deceleration, dt, self._target)
 
 
-class _Speeds(_Errs):
-    """Wants to drive faster than before, and keeps its distance as before."""
+class _Speeds(_Active):
+    """Raises the vehicle's desired speed; the vehicle keeps its distance to others as before."""
 
-    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], share: float) -> None:
+    def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], share: float) -> None:
         super().__init__(vehicle, let_go, share)
         self._before = vehicle.target_speed
         vehicle.target_speed = (1.0 + share) * self._before
@@ -274,17 +283,17 @@ class _Speeds(_Errs):
         super().end()
 
 
-class _CutsIn(_Errs):
-    """Changes lanes as soon as nobody is in the very place, and may brake in the new one."""
+class _CutsIn(_Active):
+    """Makes the vehicle change lanes as soon as no vehicle overlaps it there, and brake in the new lane if asked."""
 
-    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], deceleration: float, lane: Any) -> None:
+    def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], deceleration: float, lane: Any) -> None:
         super().__init__(vehicle, let_go, deceleration)
         self._lane = lane
         self._before = vehicle.enable_lane_change
-        vehicle.enable_lane_change = False  # its own mind would have it turn back
+        vehicle.enable_lane_change = False  # the MOBIL model would change back
         self._begin()
 
-    def overrule(self, dt: float) -> None:
+    def override(self, dt: float) -> None:
         if self.vehicle.target_lane_index != self._lane:
             self._begin()
         if self.how_strong and self.vehicle.lane_index == self._lane:
@@ -298,21 +307,21 @@ class _CutsIn(_Errs):
         super().end()
 
 
-class _KeepsSpeed(_Errs):
-    """Drives on at its speed, whoever is in its way."""
+class _KeepsSpeed(_Active):
+    """Makes the vehicle keep its speed, even with an obstacle ahead."""
 
-    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], how_strong: float) -> None:
+    def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], how_strong: float) -> None:
         super().__init__(vehicle, let_go, how_strong)
         self._speed = float(vehicle.speed)
 
-    def overrule(self, dt: float) -> None:
+    def override(self, dt: float) -> None:
         self.vehicle.action["acceleration"] = (self._speed - float(self.vehicle.speed)) / dt
 
 
-class _KeepsLane(_Errs):
-    """Does not leave the lane that it is in."""
+class _KeepsLane(_Active):
+    """Makes the vehicle keep its lane."""
 
-    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], how_strong: float) -> None:
+    def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], how_strong: float) -> None:
         super().__init__(vehicle, let_go, how_strong)
         self._before = vehicle.enable_lane_change
         vehicle.enable_lane_change = False
@@ -323,17 +332,20 @@ class _KeepsLane(_Errs):
         super().end()
 
 
-class _MergesLate(_Errs):
-    """Stays in a lane that ends until little of it is left, and then changes as soon as nobody is in the very place."""
+class _MergesLate(_Active):
+    """Keeps the vehicle in a lane that ends, and lets it change lanes late.
 
-    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], left: float) -> None:
+    The change begins when the rest of the lane is short enough and no vehicle overlaps in the neighbouring lane.
+    """
+
+    def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], left: float) -> None:
         super().__init__(vehicle, let_go, left)
         start, end, number = self._ending = vehicle.lane_index
         self._lane = (start, end, number - 1)
         self._before = vehicle.enable_lane_change
         vehicle.enable_lane_change = False
 
-    def overrule(self, dt: float) -> None:
+    def override(self, dt: float) -> None:
         vehicle = self.vehicle
         if vehicle.target_lane_index == self._ending and _left(vehicle) <= self.how_strong:
             _change(vehicle, self._lane)
@@ -343,28 +355,28 @@ class _MergesLate(_Errs):
         super().end()
 
 
-class _Ignores(_Errs):
-    """Goes on as if it had priority: whenever the rules stop it, it drives on."""
+class _Ignores(_Active):
+    """Makes the vehicle ignore right of way: it drives on whenever the right-of-way rules stop it."""
 
-    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], how_strong: float) -> None:
+    def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], how_strong: float) -> None:
         super().__init__(vehicle, let_go, how_strong)
         self.after()
 
     def after(self) -> None:
         vehicle = self.vehicle
-        if getattr(vehicle, "is_yielding", False):  # as `RegulatedRoad` lets it go
+        if getattr(vehicle, "is_yielding", False):  # as `RegulatedRoad` does when a vehicle need not yield any more
             vehicle.target_speed = vehicle.lane.speed_limit
             del vehicle.color
             vehicle.is_yielding = False
 
 
 def _left(vehicle: Any) -> float:
-    """How far it is to the end of its lane, in m."""
+    """Return the distance of a vehicle to the end of its lane, in m."""
     return float(vehicle.lane.length - vehicle.lane.local_coordinates(vehicle.position)[0])
 
 
 def _change(vehicle: Any, lane: Any) -> None:
-    """Have it change lanes, unless somebody is in the very place."""
+    """Make a vehicle change lanes, unless another vehicle overlaps it in that lane."""
     for other in vehicle.road.neighbour_vehicles(vehicle, lane):
         room = (vehicle.LENGTH + other.LENGTH) / 2 if other is not None else 0.0
         if other is not None and abs(vehicle.lane_distance_to(other)) <= room:

@@ -1,6 +1,7 @@
-"""Imports highway-env without matplotlib and pandas, which take most of that time; whoever uses them has them then.
+"""Imports highway-env without matplotlib and pandas, which take most of its import time.
 
-Of matplotlib it needs nothing in an episode, of pandas what the accelerator does not do in its place.
+Both are imported on first use. An episode needs nothing of matplotlib, and needs pandas only for observations that the
+accelerator does not compute.
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ _LATER = ("matplotlib", "matplotlib.pyplot", "pandas")
 
 
 class _Later(ModuleType):
-    """Stands in highway-env's modules for one that is imported when something of it is first asked for."""
+    """Placeholder for a module in highway-env's modules; imports the module on the first access to an attribute."""
 
     def __getattr__(self, name: str) -> object:
-        _take_back()  # else it would find itself
+        _remove_placeholders()  # otherwise the import would return this placeholder
         return getattr(importlib.import_module(self.__name__), name)
 
 
-def _take_back() -> None:
-    """Have everybody else import the real ones."""
+def _remove_placeholders() -> None:
+    """Remove the placeholders from ``sys.modules``, so that other importers get the real modules."""
     for name in _LATER:
         if isinstance(sys.modules.get(name), _Later):
             del sys.modules[name]
@@ -35,14 +36,14 @@ def _imported() -> ModuleType:
     for name in absent:
         sys.modules[name] = later = _Later(name)
         package, _, module = name.rpartition(".")
-        if package:  # as `import matplotlib.pyplot as plt` asks for it
+        if package:  # `import matplotlib.pyplot as plt` reads the attribute of the package
             setattr(sys.modules[package], module, later)
     try:
         return importlib.import_module("highway_env")
     finally:
-        _take_back()
+        _remove_placeholders()
 
 
-os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # an observation may be a picture; nobody wants a window
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame renders image observations without a window
 os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
 highway_env = sys.modules.get("highway_env") or _imported()

@@ -1,4 +1,4 @@
-"""The shapes of highway-env's lanes, and how far its vehicles are apart."""
+"""Scenes of highway-env: lane shapes, distances, contacts, excluded and hidden vehicles, and traffic events."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 __all__ = ["Hidden", "HighwayEvents", "TakingPart", "contact_of", "gap", "lanes_of"]
 
 
-_LANE_STEP_M = 2.0  # between the points of a bend
+_LANE_STEP_M = 2.0  # distance between the points of a curved lane
 
 
 def lanes_of(network: RoadNetwork, named: Callable[[tuple[str, str, int]], str]) -> list[Lane]:
-    """Return all lanes of a network; those that bend as points 2 m apart."""
+    """Return all lanes of a network; curved lanes have points at most 2 m apart."""
     found = []
     for index, lane in network.lanes_dict().items():
         count = 2 if type(lane).__name__ == "StraightLane" else max(2, math.ceil(lane.length / _LANE_STEP_M) + 1)
@@ -40,7 +40,7 @@ def lanes_of(network: RoadNetwork, named: Callable[[tuple[str, str, int]], str])
 
 
 def gap(one: RoadObject, two: RoadObject) -> float:
-    """Return the distance between two outlines, in m."""
+    """Return the distance between the outlines of two objects, in m."""
     x, y = (two.position - one.position).tolist()
     c, s = math.cos(one.heading), math.sin(one.heading)
     halves = [np.array([[thing.LENGTH / 2, thing.WIDTH / 2]]) for thing in (one, two)]
@@ -55,46 +55,60 @@ def contact_of(
     actor_of: Callable[[RoadObject], Actor],
     lane: str,
 ) -> Contact:
-    """Return whom a controlled vehicle touches that has just crashed.
+    """Return the contact of a controlled vehicle that has just crashed: with the nearest crashed object.
 
     Args:
-        agent: its name.
-        vehicle: itself.
-        things: all that there are.
-        actor_of: returns what does not change about one of them.
-        lane: on which it is.
+        agent: The agent's identifier.
+        vehicle: The agent's vehicle.
+        things: All vehicles and obstacles.
+        actor_of: Returns the actor of an object.
+        lane: The lane of the vehicle.
     """
-    # An obstacle that something is pushed away from does not itself say so.
+    # highway-env does not mark a hit obstacle as crashed, so every obstacle is a candidate.
     others = [other for other in things if other is not vehicle and (other.crashed or isinstance(other, Obstacle))]
     hit = min(others, key=lambda other: gap(vehicle, other), default=None)
     if hit is None:
-        return Contact(agent, "", "crashed", lane, float(vehicle.speed), math.nan)
+        return Contact(
+            collider=agent,
+            victim="",
+            kind="crashed",
+            lane=lane,
+            collider_speed=float(vehicle.speed),
+            victim_speed=math.nan,
+        )
     x, y = (hit.position - vehicle.position).tolist()
     first, second = (agent, vehicle), (actor_of(hit).id, hit)
     ahead = x * math.cos(vehicle.heading) + y * math.sin(vehicle.heading) > 0
     if not ahead and not isinstance(hit, Obstacle):
         first, second = second, first
-    return Contact(first[0], second[0], "crashed", lane, float(first[1].speed), float(second[1].speed))
+    return Contact(
+        collider=first[0],
+        victim=second[0],
+        kind="crashed",
+        lane=lane,
+        collider_speed=float(first[1].speed),
+        victim_speed=float(second[1].speed),
+    )
 
 
-# Vehicles and obstacles that do not take part in an episode, though the environment has them.
+# Vehicles and obstacles that are excluded from an episode.
 
 
 class TakingPart:
-    """Takes them off the road before the step after the one in which they have come.
+    """Removes excluded vehicles and obstacles from the road after the step in which they enter.
 
-    They are named in the order in which they come, whether they stay or not. Where an environment lets others in by
-    and by, it may let other ones in where some are missing.
+    Objects get their names in the order in which they enter, whether they stay or not. An environment that adds
+    vehicles during an episode may add different vehicles when some are missing.
 
     Args:
-        road: of the environment.
-        takes_part: the names of those that stay, as in scenes.
-        agents: those of the controlled vehicles, which stay as well.
-        things: returns all that there are.
-        actor_of: returns what does not change about one, such as its name.
+        road: The road of the environment.
+        takes_part: Identifiers of the objects that stay, as in scenes.
+        agents: Identifiers of the agents, which stay as well.
+        things: Returns all vehicles and obstacles.
+        actor_of: Returns the actor of an object.
 
     Attributes:
-        entered: the names of all that have come, in their order; the agents are not among them.
+        entered: Identifiers of all objects that have entered, in order, without the agents.
     """
 
     def __init__(
@@ -112,7 +126,7 @@ class TakingPart:
         self._seen: set[str] = set()
 
     def remove(self) -> bool:
-        """Remove those that have come; returns whether there were any."""
+        """Remove the excluded objects that have entered; return whether there were any."""
         gone = set()
         for thing in self._things():
             name = self._actor_of(thing).id
@@ -127,16 +141,16 @@ class TakingPart:
         return bool(gone)
 
 
-# A vehicle that an agent does not see for a while, where highway-env itself makes the observation.
+# The disturbance `unseen` where highway-env itself makes the observation.
 
 
 class Hidden:
-    """Takes one vehicle off the road for as long as an agent looks, from the next observation on.
+    """Hides a vehicle from one agent: removes it from the road while the agent's observation is made.
 
     Args:
-        road: of the episode.
-        seeing: what makes the agent's observations, of whatever kind: all of them look at the vehicles of the road.
-        vehicle: whom it does not see.
+        road: The road of the episode.
+        seeing: The agent's observation type; every observation type of highway-env reads the vehicles of the road.
+        vehicle: The vehicle that the agent does not see.
     """
 
     how_strong = 1.0
@@ -149,33 +163,33 @@ class Hidden:
         seeing.observe = self._observe
 
     def keep(self) -> None:
-        """It stays out of sight."""
+        """Do nothing, because the vehicle stays hidden until `end`."""
 
     def end(self) -> None:
-        """Show it again."""
+        """Show the vehicle again."""
         self._vehicle = None
 
     def _observe(self) -> Any:
-        everybody = self._road.vehicles
+        all_vehicles = self._road.vehicles
         if self._vehicle is None:
             return self._look()
-        self._road.vehicles = [vehicle for vehicle in everybody if vehicle is not self._vehicle]
+        self._road.vehicles = [vehicle for vehicle in all_vehicles if vehicle is not self._vehicle]
         try:
             return self._look()
         finally:
-            self._road.vehicles = everybody
+            self._road.vehicles = all_vehicles
 
 
-# Traffic events of highway-env: who stands, and who drives against its lane.
+# Traffic events on highway-env: vehicles that stand still, and vehicles that drive against the direction of their lane.
 
 
 class HighwayEvents:
-    """What is told of the controlled vehicles of one episode.
+    """Detects traffic events of the controlled vehicles in one episode.
 
     Args:
-        step_length_s: of a step.
-        events: `Scenario.events`, which says after how long somebody stands.
-        lanes_are_road: whether lanes are there to be driven along; where they are bays, no way is the wrong one.
+        step_length_s: Step length, in s.
+        events: `Scenario.events`, with the limit for a standstill.
+        lanes_are_road: Whether lanes have a driving direction; parking bays have none.
     """
 
     def __init__(self, step_length_s: float, events: Mapping[str, float], *, lanes_are_road: bool) -> None:
@@ -184,13 +198,13 @@ class HighwayEvents:
         self._wrong: set[str] = set()
 
     def look(self, agent: str, vehicle: Vehicle, point: tuple[float, float], lane: str) -> Iterator[Event]:
-        """Tell what has happened to a vehicle in a step, after which it is at a point of a scene."""
+        """Yield the events of a vehicle in a step; ``point`` is its position in the scene after the step."""
         speed = float(vehicle.speed)
         if stood := self._standstill.look(agent, speed):
             yield Event("not_moving", agent, f"{agent} had stood still for {stood:g} s", (), lane, *point, speed)
         along, _ = vehicle.lane.local_coordinates(vehicle.position)
         turn = float(vehicle.heading) - float(vehicle.lane.heading_at(along))
-        # Of lanes above each other, highway-env takes the one that runs as the vehicle does.
+        # Of two lanes at the same place, highway-env assigns the lane with the heading nearest to the vehicle's.
         if not self._lanes_are_road or abs(speed) < Standstill.SPEED or math.cos(turn) * speed >= -0.5 * abs(speed):
             self._wrong.discard(agent)
         elif agent not in self._wrong:

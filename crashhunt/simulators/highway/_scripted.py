@@ -1,4 +1,4 @@
-"""Others who are moved along recorded ways: puppets on highway-env's road, which heed nobody."""
+"""Playback of recorded paths on highway-env: vehicles that follow their recorded paths and react to nothing."""
 
 from __future__ import annotations
 
@@ -26,13 +26,15 @@ __all__ = ["Puppet", "Puppets"]
 
 
 class Puppet(Vehicle):  # type: ignore[misc]
-    """A vehicle that is where one was recorded, after each step to the bit, and on a straight line in between.
+    """A vehicle that follows a recorded path.
+
+    After each step the state is bit-identical to the recorded state. Between two steps it is interpolated linearly.
 
     Args:
-        road: of the environment.
-        path: the recorded way; past its end it goes straight on.
-        sub_steps: of the simulation in each step.
-        step_length_s: of a step.
+        road: The road of the environment.
+        path: The recorded path; past its end the vehicle drives straight on.
+        sub_steps: Number of sub-steps in each step.
+        step_length_s: Step length, in s.
     """
 
     impact: NDArray[np.float64] | None
@@ -43,26 +45,26 @@ class Puppet(Vehicle):  # type: ignore[misc]
         self.shown = path.states[0]
         self._sub_steps, self._step_length_s = sub_steps, step_length_s
         self._done = path.first * sub_steps
-        self.route = None  # as of who has none, which environments ask for
+        self.route = None  # environments read this attribute
         super().__init__(road, *place_of(path.states[0], path.actor.length))
 
     def begin(self, steps: int) -> None:
-        """Be where it was after so many steps."""
+        """Move to the recorded state after this number of steps."""
         self._done = steps * self._sub_steps
         self._move()
 
     def act(self, action: dict[str, float] | str | None = None) -> None:
-        """Decide nothing."""
+        """Do nothing, because the path is fixed."""
 
     def step(self, dt: float) -> None:
-        """Go on by a sub-step, wherever anybody is."""
+        """Move by a sub-step along the path, whatever is in the way."""
         self._done += 1
         self._move()
 
     def predict_trajectory_constant_speed(
         self, times: NDArray[np.float64]
     ) -> tuple[list[NDArray[np.float64]], list[float]]:
-        """Where it would be if it went straight on, for whoever has right of way to look at."""
+        """Return the positions and headings at constant velocity; highway-env's right-of-way rules read them."""
         return [self.position + time * self.velocity for time in times], [self.heading] * len(times)
 
     def _move(self) -> None:
@@ -71,23 +73,23 @@ class Puppet(Vehicle):  # type: ignore[misc]
         if rest:
             self.shown = _between(self.shown, self.path.at(steps + 1, self._step_length_s), rest / self._sub_steps)
         self.position, self.heading, self.speed = place_of(self.shown, self.path.actor.length)
-        if self.impact is not None:  # it is not pushed aside, but the one that it has touched asks whether it was hit
+        if self.impact is not None:  # the collision does not push this vehicle, but `contact_of` reads `crashed`
             self.crashed, self.impact = True, None
         self.on_state_update()
 
 
 class Puppets:
-    """Has the others of an episode moved.
+    """Moves the other actors of an episode along recorded paths.
 
     Args:
-        road: of the environment; whoever is on it goes.
-        script: who was where.
-        agents: the controlled vehicles that drive, by their names. They are put where they begin.
-        sub_steps: of the simulation in each step.
-        step_length_s: of a step.
+        road: The road of the environment. All other vehicles on it are removed.
+        script: The recorded paths.
+        agents: The controlled vehicles by identifier. They are placed at their recorded start.
+        sub_steps: Number of sub-steps in each step.
+        step_length_s: Step length, in s.
 
     Raises:
-        InvalidEpisodeError: where an agent begins is not known.
+        InvalidEpisodeError: The recording has no start of an agent.
     """
 
     def __init__(
@@ -107,11 +109,11 @@ class Puppets:
 
     @property
     def actors(self) -> list[tuple[RoadObject, Actor]]:
-        """The others, and as whom they were recorded."""
+        """The moved objects, each with its recorded actor."""
         return [(thing, path.actor) for path, thing in self.things]
 
     def enter(self, steps: int) -> None:
-        """Have exactly those on the road who were there after so many steps, and those that nobody can hit."""
+        """Put exactly the actors on the road that were recorded at this step; keep objects that cannot be hit."""
         road = self._road
         there = [thing for path, thing in self.things if self._is_there(path, steps)]
         known = {id(thing) for thing in road.vehicles}
@@ -127,7 +129,7 @@ class Puppets:
 
 
 def place_of(state: State, length: float) -> tuple[NDArray[np.float64], float, float]:
-    """Position of the centre, heading and speed as highway-env has them, of what a scene says."""
+    """Return the centre, heading and speed in highway-env's coordinates of a state in scene coordinates."""
     x = state.x - length / 2 * math.cos(state.heading)
     y = state.y - length / 2 * math.sin(state.heading)
     return np.array([x, -y]), -state.heading, state.speed
@@ -143,7 +145,10 @@ def _thing(road: Road, path: Path, sub_steps: int, step_length_s: float) -> Road
 
 
 def _place(vehicle: Any, state: State, *, late: bool) -> None:
-    """Put a controlled vehicle where it was; what it was about to do is not known, so that it keeps lane and speed."""
+    """Put a controlled vehicle at its recorded state.
+
+    The recording does not hold the vehicle's intention. If the episode begins late, the vehicle keeps lane and speed.
+    """
     vehicle.position, vehicle.heading, vehicle.speed = place_of(state, vehicle.LENGTH)
     vehicle.on_state_update()
     if not late or not isinstance(vehicle, ControlledVehicle):
@@ -156,7 +161,7 @@ def _place(vehicle: Any, state: State, *, late: bool) -> None:
 
 
 def _rest(route: Sequence[Any] | None, lane: Sequence[Any]) -> list[Any] | None:
-    """What is left of a route for somebody on a lane."""
+    """Return the rest of a route from a lane on."""
     if not route:
         return None
     here = [number for number, part in enumerate(route) if tuple(part[:2]) == tuple(lane[:2])]
@@ -166,8 +171,8 @@ def _rest(route: Sequence[Any] | None, lane: Sequence[Any]) -> list[Any] | None:
 def _between(state: State, after: State, share: float) -> State:
     turn = math.remainder(after.heading - state.heading, math.tau)
     return State(
-        state.x + share * (after.x - state.x),
-        state.y + share * (after.y - state.y),
-        state.heading + share * turn,
-        state.speed + share * (after.speed - state.speed),
+        x=state.x + share * (after.x - state.x),
+        y=state.y + share * (after.y - state.y),
+        heading=state.heading + share * turn,
+        speed=state.speed + share * (after.speed - state.speed),
     )

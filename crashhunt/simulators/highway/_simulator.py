@@ -1,6 +1,7 @@
-"""highway-env as a simulator: any of its environments, with any configuration and any number of controlled vehicles.
+"""highway-env as a simulator: any environment, any configuration, any number of controlled vehicles.
 
-Its y axis points down and its headings grow clockwise; a scene has both mirrored, and is what its viewer shows.
+highway-env's y axis points down and its headings grow clockwise. Scenes mirror both, so that they look like the picture
+in highway-env's viewer.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from highway_env.envs.common.observation import MultiAgentObservation
 from highway_env.envs.parking_env import ParkingEnv
 from highway_env.vehicle.objects import Obstacle, RoadObject
 
-from crashhunt.accelerator import Onlooker, Unasked, switch_off, switch_on
+from crashhunt.accelerator import Onlooker, SkippedObservation, switch_off, switch_on
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.highway import BACKEND, HighwaySetup
@@ -53,23 +54,23 @@ if TYPE_CHECKING:
 
 __all__ = ["HighwaySimulator"]
 
-_LANES_EVERY = 10  # steps; how often a scene says the lane of each vehicle
+_LANES_EVERY = 10  # steps between two scenes that contain the lane of each vehicle
 
 assert highway_env  # importing it registers its environments
 
 
 class HighwaySimulator:
-    """Runs the episodes of a scenario on highway-env, each in an environment of its own.
+    """Runs the episodes of a scenario on highway-env, each in a new environment.
 
-    A control step is one of the policy's; an episode has no end in time but ``max_steps``, unless the configuration
-    gives a ``duration``. An agent that is gone while others go on idles.
+    A control step is a step of the policy. Only ``max_steps`` limits the length of an episode, unless the configuration
+    has a ``duration``. A terminated agent idles until the episode ends.
 
     Args:
-        scenario: what to run.
-        stage: not used.
+        scenario: The scenario to run.
+        stage: Not used.
 
     Raises:
-        ScenarioError: there is no such environment, or it has no such entry or not so many vehicles.
+        ScenarioError: The environment or an entry of its configuration does not exist, or it has too few vehicles.
     """
 
     def __init__(self, scenario: Scenario, stage: Path) -> None:
@@ -80,19 +81,19 @@ class HighwaySimulator:
         if not self._setup.accelerate:
             switch_off()
         elif reason := switch_on():
-            logging.getLogger(__name__).warning("the accelerator steps aside: %s", reason)
+            logging.getLogger(__name__).warning("the accelerator is disabled: %s", reason)
         self.agents: list[str] = []
         self._lane_names: dict[tuple[str, str, int], str] = {}
         try:
-            self.reset(seed=0, options={"arguments": argument_values(scenario)})  # which says what the spaces are
+            self.reset(seed=0, options={"arguments": argument_values(scenario)})  # to read its spaces
         except InvalidEpisodeError as error:
-            raise ScenarioError(str(error), fix="see [highway] and the arguments", where=scenario.origin) from error
+            raise ScenarioError(str(error), fix="check [highway] and the arguments", where=scenario.origin) from error
 
-    told_events = BACKEND.told_events
+    reported_events = BACKEND.reported_events
     disturbing_kinds = BACKEND.disturbances or ()
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
-        """Make the environment, and let everybody in."""
+        """Create the environment and begin an episode with all agents."""
         try:
             env = self._make((options or {}).get("arguments", {}))
             shown, _ = env.reset(seed=seed, options={"config": env.config})
@@ -132,19 +133,19 @@ class HighwaySimulator:
     why_no_reseeding = ""
 
     def reseed(self, seed: int) -> None:
-        """Give the environment's generator, which its road and vehicles share, another seed."""
+        """Re-seed the environment's generator, which its road and vehicles share."""
         reseed_in_place(self._env.np_random, seed)
         if self._env.road.np_random is not self._env.np_random:
             reseed_in_place(self._env.road.np_random, seed)
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
-        """Let everybody act; the rewards are the environment's."""
+        """Step the environment with the agents' actions; the rewards are the environment's."""
         given = [
             native(self.actions[agent], actions[agent]) if agent in actions else self._idle(agent)
             for agent in self._possible
         ]
         self._contacts = []
-        with self._unasked:
+        with self._skipping:
             shown, reward, terminated, truncated, info = self._env.step(tuple(given) if self._many_act else given[0])
         self._steps += 1
         if self._taking_part is not None:
@@ -161,7 +162,7 @@ class HighwaySimulator:
             if self._lanes_are_road and agent in actions and was and not self._on_road[agent]:
                 (arrived if self._is_at_an_end(vehicle) else off_road).append(agent)
         self._look(tuple(off_road))
-        self._scene.events = tuple([event for agent in actions for event in self._told(agent)])
+        self._scene.events = tuple([event for agent in actions for event in self._events_of(agent)])
         ended = bool(terminated or truncated)
         rewards = info.get("agents_rewards", (reward,) * len(self._possible))
         arrived += [
@@ -182,23 +183,23 @@ class HighwaySimulator:
         return self._scene
 
     def lanes(self) -> list[Lane]:
-        """Return all lanes; those that bend as points 2 m apart."""
+        """Return all lanes; curved lanes have points at most 2 m apart."""
         return lanes_of(self._env.road.network, self._lane_name)
 
     def full_braking(self, agent: str) -> FullBraking | None:
-        """Return how a vehicle brakes as hard as its actions allow; None where they do not keep it in its lane."""
+        """Return the action for the hardest braking; None if the agent's actions do not keep it in its lane."""
         kind = self._kinds[agent]
         if isinstance(kind, DiscreteMetaAction) and "SLOWER" in kind.actions_indexes:
             return FullBraking(kind.actions_indexes["SLOWER"], "by answering SLOWER in every step")
         return None
 
     def resolve_target(self, disturbance: Disturbance) -> str:
-        """Return who is at a place around an agent, along the lanes; of who crosses its way, as the crow flies."""
+        """Return the identifier of the vehicle at the disturbance's place around its agent; empty if none is there."""
         found = self._disturbances.resolve_target(self._controlled[disturbance.agent], disturbance)
         return "" if found is None else self._actor(found).id
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance | None:
-        """Overrule a vehicle until its disturbance ends."""
+        """Disturb a vehicle until the disturbance ends."""
         thing = next(thing for thing, actor in self._known.values() if actor.id == vehicle)
         if disturbance.what == "unseen":
             if self._kinematics is not None:
@@ -207,23 +208,23 @@ class HighwaySimulator:
         return self._disturbances.disturb(thing, disturbance, self._controlled[disturbance.agent])
 
     def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
-        """Keep a vehicle from something until that ends."""
+        """Apply a hold to a vehicle until the hold ends."""
         present = {id(thing) for thing in self._env.road.vehicles}
         found = (thing for thing, actor in self._known.values() if actor.id == vehicle and id(thing) in present)
         return self._disturbances.hold(next(found, None), what)
 
     @property
     def entered(self) -> list[str]:
-        """Who has come, where somebody may be left out."""
+        """Identifiers of all actors that have entered; empty if no actor is excluded."""
         return [] if self._taking_part is None else self._taking_part.entered
 
     @property
     def scripted(self) -> bool:
-        """Whether the others of this episode are moved along recorded ways."""
+        """Whether the other actors of this episode follow recorded paths."""
         return self._puppets is not None
 
     def tidy(self) -> None:
-        """Undo what the environment has changed in classes."""
+        """Restore class attributes that the environment has changed."""
         restore_classes()
 
     def close(self) -> None:
@@ -231,30 +232,30 @@ class HighwaySimulator:
         self._env.close()
 
     def _make(self, arguments: Mapping[str, Value]) -> AbstractEnv:
-        """Make the environment with its configuration, which the next reset applies."""
+        """Create the environment and set its configuration, which the next reset applies."""
         restore_classes()
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DeprecationWarning)  # of older versions of an id, which are asked for
+                warnings.simplefilter("ignore", DeprecationWarning)  # for an outdated version, which the user chose
                 made = gymnasium.make(self._setup.id, disable_env_checker=True)
         except (gymnasium.error.Error, ImportError) as error:
             message = " ".join(str(error).split())
             raise mistake(
-                self._scenario, "id", self._setup.id, message, "give an id such as 'highway-fast-v0'"
+                self._scenario, "id", self._setup.id, message, "set an id such as 'highway-fast-v0'"
             ) from None
         env = made.unwrapped
         if not isinstance(env, AbstractEnv):
             fix = 'write simulator = "gym"'
-            raise mistake(self._scenario, "id", self._setup.id, "is no environment of highway-env", fix)
+            raise mistake(self._scenario, "id", self._setup.id, "is not an environment of highway-env", fix)
         env.config = configured(env.config, self._scenario, arguments)
         return env
 
     def _adopt(self, env: AbstractEnv) -> None:
-        """Take an environment over: its vehicles, and how its observations and actions are written."""
+        """Read the vehicles, spaces and action forms of a new environment."""
         self._env = env
-        self._unasked = Unasked(env) if self._kinematics is not None else nullcontext()
+        self._skipping = SkippedObservation(env) if self._kinematics is not None else nullcontext()
         rate = env.config["simulation_frequency"]
-        self.step_length_s = int(rate // env.config["policy_frequency"]) / rate  # as long as it simulates
+        self.step_length_s = int(rate // env.config["policy_frequency"]) / rate  # highway-env rounds sub-steps down
         chosen = self._setup.off_road
         self._lanes_are_road = chosen if chosen is not None else not isinstance(env, ParkingEnv)
         self._many_act = isinstance(env.action_type, MultiAgentAction)
@@ -279,7 +280,7 @@ class HighwaySimulator:
             self.observation_names = tuple(getattr(kind, "features", ())) if len(seen[0].shape or ()) == 2 else ()
 
     def _play(self, script: Paths) -> None:
-        """Have the others moved; an agent that is one of them drives no more."""
+        """Move the other actors along recorded paths; an agent whose path is scripted no longer drives."""
         driven = {path.actor.id for path in script.agents}
         self._controlled = {agent: vehicle for agent, vehicle in self._controlled.items() if agent in driven}
         self.agents = list(self._controlled)
@@ -290,7 +291,7 @@ class HighwaySimulator:
         self._known |= {id(thing): (thing, actor) for thing, actor in self._puppets.actors}
 
     def _is_at_an_end(self, vehicle: RoadObject) -> bool:
-        """Whether it has driven straight off the end of a lane that nothing follows."""
+        """Whether a vehicle has driven off the end of a lane without a following lane."""
         along, lateral = vehicle.lane.local_coordinates(vehicle.position)
         inside = abs(lateral) <= vehicle.lane.width_at(along) / 2
         return inside and along > vehicle.lane.length and vehicle.lane_index[1] not in self._env.road.network.graph
@@ -308,7 +309,7 @@ class HighwaySimulator:
         return {agent: self._forms[agent].encode(each[self._possible.index(agent)]) for agent in agents}
 
     def _observe(self, agent: str) -> NDArray[np.float32]:
-        """What the agent sees, in the layout that it has on SUMO too."""
+        """Return the agent's observation in the Kinematics layout that SUMO scenarios use as well."""
         assert self._kinematics is not None
         vehicle = self._controlled[agent]
         along, right = vehicle.lane.local_coordinates(vehicle.position)
@@ -324,11 +325,11 @@ class HighwaySimulator:
         )
 
     def _watch(self) -> None:
-        """Note who hit whom in the very sub-step in which it happens: what moves on is pushed apart, and brakes."""
-        erring = self._disturbances
+        """Record a contact in the sub-step in which it happens, because highway-env then pushes and brakes vehicles."""
+        disturbances = self._disturbances
 
         def after() -> None:
-            erring.after_moving()
+            disturbances.after_moving()
             for agent, vehicle in self._controlled.items():
                 if vehicle.crashed and agent not in self._crashed:
                     self._crashed.add(agent)
@@ -337,11 +338,11 @@ class HighwaySimulator:
 
         road = self._env.road
         road.step = Onlooker(
-            road.step, before=erring.before_moving, after=after, interferes=lambda: erring.anybody
+            road.step, before=disturbances.before_moving, after=after, interferes=lambda: disturbances.is_active
         )  # fmt: skip
 
     def _objects(self) -> list[RoadObject]:
-        """Everybody and everything that can be hit."""
+        """Return all vehicles and obstacles that can be hit."""
         road = self._env.road
         return [*road.vehicles, *(thing for thing in road.objects if thing.solid and thing.collidable)]
 
@@ -353,8 +354,11 @@ class HighwaySimulator:
                 what = "obstacle" if isinstance(thing, Obstacle) else "vehicle"
                 self._counts[what] += 1
                 name = f"{what}.{self._counts[what]}"
-            # Together with the object itself, so that no later one can have its identity.
-            found = thing, Actor(name, type(thing).__name__, float(thing.LENGTH), float(thing.WIDTH))
+            # Keep a reference to the object, so that no later object can get the same id().
+            found = (
+                thing,
+                Actor(id=name, kind=type(thing).__name__, length=float(thing.LENGTH), width=float(thing.WIDTH)),
+            )
             self._known[id(thing)] = found
         return found[1]
 
@@ -372,7 +376,7 @@ class HighwaySimulator:
                 speeds.append(thing.shown.speed)
                 continue
             (x, y), heading, half = thing.position.tolist(), float(thing.heading), actor.length / 2
-            points.append((x + half * math.cos(heading), 0.0 - (y + half * math.sin(heading))))  # no minus zero
+            points.append((x + half * math.cos(heading), 0.0 - (y + half * math.sin(heading))))  # avoids -0.0
             headings.append(0.0 - heading)
             speeds.append(float(thing.speed))
         contacts = tuple(self._contacts)
@@ -384,7 +388,7 @@ class HighwaySimulator:
         for agent, vehicle in self._controlled.items():
             self._scene.agent_lanes[agent] = self._lane_name(vehicle.lane_index)
 
-    def _told(self, agent: str) -> Iterator[Event]:
+    def _events_of(self, agent: str) -> Iterator[Event]:
         vehicle = self._controlled[agent]
         point = self._scene.points[self._scene.roster.index[agent]]
         return self._events.look(agent, vehicle, point, self._lane_name(vehicle.lane_index))

@@ -1,7 +1,7 @@
-"""Vehicles of SUMO's that err: each is commanded as long as its disturbance lasts, and then drives by itself again.
+"""Fault injection on SUMO: a vehicle is commanded while its disturbance lasts, and then drives by itself again.
 
-SUMO's own checks stay on wherever they can: a vehicle that brakes hard still heeds whoever is ahead of it, and never
-brakes harder than the ``decel`` of its type. A cut-in is made however small the gap, but not into the side of somebody.
+SUMO's own checks stay on where possible. A vehicle that brakes hard still keeps a safe speed behind the vehicle ahead,
+and never brakes harder than the ``decel`` of its type. A cut-in uses any gap, but never overlaps another vehicle.
 """
 
 from __future__ import annotations
@@ -29,42 +29,44 @@ if TYPE_CHECKING:
 __all__ = ["JunctionLanes", "SteppingOut", "SumoDisturbances", "can_step_out", "roadside"]
 
 
-# A person of SUMO's who steps out onto the road and back, as nobody does there of their own accord.
+# The disturbance `step_out`: a person steps out onto the road and back, which SUMO's own persons never do.
 #
-# SUMO 1.28 maps a person that is moved to the best lane nearby. Where that is a crossing or a walking area that the
-# person was not on, SUMO guesses a path across it, and the process may die in this step or the next one: 90 of 480
-# step-outs that began on a crossing or a walking area, 121 of 1,860 that began within 12 m of a junction. So a person
-# steps out only where its own lane remains the best one all the way, which `can_step_out` predicts.
+# SUMO 1.28 maps a moved person to the best lane nearby. If that is a crossing or a walking area that the person was not
+# on, SUMO guesses a path across it, and the process may die in this step or the next. That happened in 90 of 480
+# step-outs that began on a crossing or a walking area, and in 121 of 1,860 that began within 12 m of a junction. So a
+# person steps out only if its own lane remains the best lane all the way, which `can_step_out` predicts.
 
-_AHEAD_M, _ASIDE_M = 60.0, 15.0  # who is further away than that is not meant
-_INNER_M = 1.6  # half a lane: who is less to the side is in the way already
-_WALKS = 2  # SUMO's type of a stage
-# How SUMO scores lanes to which it may map a person: weights of distance, in lane widths, and of angle, in half turns.
+_AHEAD_M, _ASIDE_M = 60.0, 15.0  # persons further ahead or further to the side are no target
+_INNER_M = 1.6  # half a lane: persons nearer to the agent's axis are already in its way
+_WALKS = 2  # SUMO's type of a walking stage
+# Weights in SUMO's score of lanes for a moved person: distance in lane widths, angle in half turns.
 _BY_DISTANCE, _BY_ANGLE, _LANE_WIDTH_M = 0.5, 0.35, 3.2
 _MARGIN = 0.05
-"""A lane whose score is by less than this below that of the person's own counts as the better one. SUMO gives up to 0.1
-each to lanes on the person's route and to its own lane, which is left out here: of 981 persons that stepped out with a
-margin of -0.05, two were mapped to a crossing, whose scores were 0.04 and 0.05 above that of their own lane."""
+"""Safety margin of the score comparison: another lane counts as better even if its score is lower by up to this.
+
+SUMO adds up to 0.1 each to lanes on the person's route and to the person's own lane, and this comparison omits both. Of
+981 persons that stepped out with a margin of -0.05, SUMO mapped two to a crossing. The scores of these crossings were
+0.04 and 0.05 above those of the persons' lanes."""
 _END_M, _MARGIN_AT_THE_END = 1.0, 0.2
-"""At the end of its lane the person's own lane may have neither, while another one has both."""
+"""Near the end of its lane a person needs a larger margin: its own lane may get neither bonus, another lane both."""
 _AMBIGUOUS_M, _TOLERANCE_M = 0.1, 0.05
-"""SUMO maps to no lane whose nearest point is by more than that nearer than the foot of a perpendicular."""
-_LOOK_EVERY_M = 0.5
-_WALKING_AREA = re.compile(r"_w\d+_\d+$")  # as netconvert calls them
+"""SUMO ignores lanes whose nearest point is nearer than the foot of a perpendicular by more than 0.1 m."""
+_LOOK_EVERY_M = 0.5  # distance between the points of a person's path at which lanes are compared
+_WALKING_AREA = re.compile(r"_w\d+_\d+$")  # netconvert's names of walking areas
 
 
 def roadside(scene: Scene, agent: str, who: str, reach_m: float, junctions: JunctionLanes) -> str:
-    """Return the nearest person who walks on one side of the road ahead of an agent and can step out there.
+    """Return the nearest person that walks on one side of the road ahead of an agent and can step out.
 
     Args:
-        scene: as it is now.
-        agent: a controlled vehicle.
-        who: ``left ahead`` or ``right ahead``; nobody is anywhere else.
-        reach_m: how far the person gets in half of its time.
-        junctions: of the network.
+        scene: The current scene.
+        agent: Identifier of a controlled vehicle.
+        who: ``left ahead`` or ``right ahead``; other places have no persons.
+        reach_m: The distance that the person can walk in half of the disturbance's duration.
+        junctions: The junction lanes of the network.
 
     Returns:
-        The identifier of the actor; empty where there is none.
+        The identifier of the actor; empty if no person can step out.
     """
     here = scene.roster.index.get(agent)
     if here is None:
@@ -83,16 +85,16 @@ def roadside(scene: Scene, agent: str, who: str, reach_m: float, junctions: Junc
 
 
 def can_step_out(actor: str, agent: str, reach_m: float, junctions: JunctionLanes) -> bool:
-    """Return whether SUMO keeps a person on its own lane while it steps out.
+    """Return whether SUMO keeps a person on its own lane while the person steps out.
 
-    SUMO scores each lane nearby by distance, angle and route (``Helper::moveToXYMap``); here the same score is compared
-    for the person's lane and those of junctions, at points along its way, with what is uncertain held against it.
+    SUMO scores each lane nearby by distance, angle and route (``Helper::moveToXYMap``). This function compares the same
+    score for the person's lane and for junction lanes, at points along the person's path. It returns false in doubt.
 
     Args:
-        actor: a person who walks.
-        agent: whose way it steps into.
-        reach_m: how far it gets.
-        junctions: of the network.
+        actor: Identifier of a walking person.
+        agent: Identifier of the agent whose path the person steps into.
+        reach_m: The distance that the person can walk away from its lane.
+        junctions: The junction lanes of the network.
     """
     person = actor.removeprefix(PERSON)
     if str(sumo.person_getRoadID(person)).startswith(":"):
@@ -111,7 +113,7 @@ def can_step_out(actor: str, agent: str, reach_m: float, junctions: JunctionLane
         for other in nearby:
             theirs = _nearest(other.shape, point)
             if theirs.ambiguous_m > _AMBIGUOUS_M + _TOLERANCE_M:
-                continue  # SUMO does not map to it
+                continue  # SUMO never maps a person to this lane
             if own.ambiguous_m > _AMBIGUOUS_M - _TOLERANCE_M:
                 return False
             for angle in (way.angle, way.angle + 180.0):  # out and back
@@ -124,13 +126,13 @@ def can_step_out(actor: str, agent: str, reach_m: float, junctions: JunctionLane
 
 
 class JunctionLanes:
-    """The lanes inside junctions on which persons may be, of the network that is loaded; they are read once."""
+    """The junction lanes of the loaded network on which persons may walk; they are read once."""
 
     def __init__(self) -> None:
         self._lanes: list[_JunctionLane] | None = None
 
     def near(self, point: tuple[float, float], radius_m: float) -> list[_JunctionLane]:
-        """Return those to which SUMO might map a person that gets so far from a point."""
+        """Return the lanes to which SUMO might map a person within a radius of a point."""
         if self._lanes is None:
             self._lanes = [
                 _JunctionLane(tuple(libsumo.lane.getShape(lane)), walking_area=_is_walking_area(lane))
@@ -146,7 +148,7 @@ class JunctionLanes:
 
 
 class _JunctionLane:
-    """A lane inside a junction, with the box around it."""
+    """A lane inside a junction, with its bounding box."""
 
     __slots__ = ("high", "left", "low", "right", "shape", "walking_area")
 
@@ -158,9 +160,10 @@ class _JunctionLane:
 
 
 class _Nearest(NamedTuple):
-    """The point of a lane that is nearest to another point: distance, direction of the lane in SUMO's degrees.
+    """The nearest point of a lane: its distance in m, and the lane's direction there in SUMO's degrees.
 
-    ``ambiguous_m`` is by how much that point is nearer than the foot of a perpendicular: above 0 beyond the ends.
+    ``ambiguous_m`` is the difference between the distance to the foot of a perpendicular and ``distance_m``. It is
+    above 0 beyond the ends of the lane.
     """
 
     distance_m: float
@@ -186,7 +189,7 @@ def _nearest(shape: Sequence[tuple[float, float]], point: tuple[float, float]) -
 
 
 def _between(one: float, other: float) -> float:
-    """The angle between two directions, 0 to 180."""
+    """Return the angle between two directions, from 0 to 180 degrees."""
     found = abs(one - other) % 360.0
     return min(found, 360.0 - found)
 
@@ -201,7 +204,7 @@ def _may_walk(lane: str) -> bool:
 
 
 class _Way(NamedTuple):
-    """The straight way from where a person is to the middle of an agent's way."""
+    """The straight path from a person to the centre line of an agent's path."""
 
     start: tuple[float, float]
     direction: tuple[float, float]
@@ -209,7 +212,7 @@ class _Way(NamedTuple):
 
     @classmethod
     def of(cls, person: str, agent: str) -> _Way:
-        """Return that of a person and an agent, as they are now."""
+        """Return the path from a person's current position into the path of an agent."""
         start: tuple[float, float] = sumo.person_getPosition(person)
         heading = math.radians(90.0 - sumo.vehicle_getAngle(agent))
         own_x, own_y = sumo.vehicle_getPosition(agent)
@@ -220,11 +223,11 @@ class _Way(NamedTuple):
 
     @property
     def angle(self) -> float:
-        """Its direction, in SUMO's degrees."""
+        """The direction of the path, in SUMO's degrees."""
         return 90.0 - math.degrees(math.atan2(self.direction[1], self.direction[0]))
 
     def at(self, out_m: float) -> tuple[float, float]:
-        """Return the point that is so far out."""
+        """Return the point at a distance from the start."""
         return self.start[0] + out_m * self.direction[0], self.start[1] + out_m * self.direction[1]
 
 
@@ -234,18 +237,18 @@ def _walks(actor: str) -> bool:
 
 
 class SteppingOut:
-    """Walks straight to the middle of the agent's way, stands there, and is back where it began when the time is over.
+    """Makes a person walk straight to the middle of the agent's path, stand there, and be back at the start in time.
 
-    SUMO's persons walk on their sidewalks only: this one is moved, never further in a step than a person walks in it.
-    SUMO has forgotten afterwards where it was going, and is told again.
+    SUMO's persons walk on their sidewalks only, so crashhunt moves this person with ``moveToXY``. In each step the
+    person moves at most as far as it can walk. SUMO forgets the person's walk, so `end` appends the walk again.
 
     Args:
-        actor: a person who walks.
-        agent: whose way it is.
-        speed: in m/s; no more than what the person can do.
-        steps: in how many it goes out and comes back.
-        step_length_s: of the simulation.
-        speeds: of persons of whom SUMO does not know how fast they are, by their ids there; ours is added.
+        actor: Identifier of a walking person.
+        agent: Identifier of the agent into whose path the person walks.
+        speed: The walking speed in m/s, bounded by the person's maximum speed.
+        steps: Number of steps for the way out and back.
+        step_length_s: Step length of the simulation, in s.
+        speeds: Speeds of moved persons by SUMO id, because SUMO reports 0 for them. This person's speed is added.
     """
 
     def __init__(
@@ -264,7 +267,7 @@ class SteppingOut:
         self._command()
 
     def keep(self) -> None:
-        """Go on, where it has not left, and where SUMO has not mapped it to a junction after all."""
+        """Move the person, unless it has left the simulation or SUMO has mapped it to a junction."""
         try:
             if str(sumo.person_getRoadID(self._person)).startswith(":"):
                 self._speeds.pop(self._person, None)
@@ -274,7 +277,7 @@ class SteppingOut:
             self._speeds.pop(self._person, None)
 
     def end(self) -> None:
-        """Have it go on where it was going."""
+        """Let the person resume its walk."""
         self._speeds.pop(self._person, None)
         edges = tuple(self._walk.edges)
         try:
@@ -283,13 +286,13 @@ class SteppingOut:
             if libsumo.person.getRemainingStages(self._person) > 1:
                 libsumo.person.removeStage(self._person, 0)
         except libsumo.TraCIException:
-            pass  # it has left
+            pass  # the person has left the simulation
 
     def _command(self) -> None:
-        self._left -= 1  # steps after this one
+        self._left -= 1  # number of steps after this step
         reach = self.how_strong * self._dt
         before = self._out
-        # As far as it comes, and no further than from where it is back in time.
+        # Walk out at most so far that the remaining steps suffice for the way back.
         self._out = min(self._far, before + reach, self._left * reach)
         away = self._out - before
         towards = self._way if away >= 0 else (-self._way[0], -self._way[1])
@@ -299,26 +302,27 @@ class SteppingOut:
         self._speeds[self._person] = abs(away) / self._dt
 
 
-_IN_LANE_M, _BESIDE_M, _CROSSING_M = 100.0, 50.0, 80.0  # who is further away than that is not meant
+# Vehicles further away are no target: in the same lane, in a neighbouring lane, on a crossing path.
+_IN_LANE_M, _NEIGHBOUR_LANE_M, _CROSSING_M = 100.0, 50.0, 80.0
 _LEFT, _RIGHT, _AHEAD = 0, 1, 2  # bits of SUMO's vehicle.getNeighbors
-_GENTLY = 1.5  # m/s²; how a dawdler slows down
-_NEITHER_RED_NOR_PRIORITY = 7  # speed mode: safe speed and physical limits, and nothing at junctions
-_NOT_AT_ALL = 0  # lane change mode
-_NOT_INTO_OTHERS = 256  # lane change mode: none of its own accord, and a commanded one unless somebody is there
-_FOR_EVER_S = 3600.0  # a command to change lanes holds for so long
-_LATERAL_M = 1.6  # half a lane: who is less to the side is ahead
+_DAWDLING_DECELERATION_MPS2 = 1.5
+_IGNORES_JUNCTIONS = 7  # speed mode: safe speed and physical limits, no checks at junctions
+_NO_LANE_CHANGES = 0  # lane change mode
+_COMMANDED_LANE_CHANGES = 256  # lane change mode: commanded changes only, and not into another vehicle
+_FOR_EVER_S = 3600.0  # how long a command to change lanes holds: longer than any disturbance
+_LATERAL_M = 1.6  # half a lane: a vehicle with a smaller lateral offset is ahead or behind, not to the side
 
 
 class SumoDisturbances:
-    """Finds who is meant, and commands them.
+    """Finds the target actors of disturbances, and disturbs them.
 
     Args:
-        controlled: the vehicles that are driven from outside, which are never meant.
-        step_length_s: of the simulation.
-        driving: knows to which side traffic keeps.
+        controlled: Identifiers of the agents, which are never a target.
+        step_length_s: Step length of the simulation, in s.
+        driving: Knows whether traffic drives on the left.
 
     Attributes:
-        speeds: in m/s, of persons who are moved, by their ids in SUMO, which takes them for standing.
+        speeds: Speeds in m/s of moved persons, by SUMO id, because SUMO reports 0 for them.
     """
 
     def __init__(self, controlled: Collection[str], step_length_s: float, driving: Driving) -> None:
@@ -329,7 +333,7 @@ class SumoDisturbances:
         self._junctions = JunctionLanes()
 
     def resolve_target(self, disturbance: Disturbance, scene: Scene) -> str:
-        """Return who is at a place around an agent; empty where nobody is who is not controlled."""
+        """Return the identifier of the actor at a place around an agent; empty if the place has none or an agent."""
         try:
             if disturbance.what == "ignore_priority":
                 found = self._crossing(disturbance.agent, disturbance.who, scene)
@@ -343,7 +347,7 @@ class SumoDisturbances:
         return "" if found in self._controlled else found
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance | None:
-        """Command a vehicle; None where it cannot do that."""
+        """Disturb an actor; return None if the actor cannot be disturbed so."""
         strong = disturbance.how_strong
         try:
             if disturbance.what == "step_out":
@@ -358,13 +362,15 @@ class SumoDisturbances:
                 return _Slows(vehicle, min(strong, decel), self._dt, how_strong=min(strong, decel))
             if disturbance.what == "dawdle":
                 target = max(0.0, 1.0 - strong) * sumo.vehicle_getSpeed(vehicle)
-                return _Slows(vehicle, min(_GENTLY, decel), self._dt, how_strong=strong, target=target)
+                return _Slows(
+                    vehicle, min(_DAWDLING_DECELERATION_MPS2, decel), self._dt, how_strong=strong, target=target
+                )
             if disturbance.what == "speed":
                 return _Speeds(vehicle, strong)
             if disturbance.what == "cut_in":
                 if disturbance.who in ("ahead", "behind"):
-                    return None  # as it is in the lane of the agent already
-                # Lanes are counted from the side that traffic keeps to.
+                    return None  # the vehicle is already in the agent's lane
+                # SUMO numbers lanes from the side on which traffic drives.
                 side = 1 if disturbance.who.startswith("left") == self._driving.left_hand else -1
                 return _cut_in(vehicle, side, disturbance.how_long, min(strong, decel), self._dt)
             return _Ignores(vehicle, self._dt)
@@ -372,7 +378,7 @@ class SumoDisturbances:
             return None
 
     def _crossing(self, agent: str, who: str, scene: Scene) -> str:
-        """The nearest one on a way that crosses the agent's at the junction that both come to."""
+        """Return the nearest vehicle whose path crosses the agent's path at the next junction of both."""
         here = scene.roster.index.get(agent)
         way = _way(agent)
         if here is None or not way:
@@ -391,7 +397,7 @@ class SumoDisturbances:
 
 
 class _Slows:
-    """Brakes down to a speed, and keeps to it, or to what is possible of it."""
+    """Makes the vehicle brake to a target speed and keep it where that is safe."""
 
     def __init__(self, vehicle: str, deceleration: float, dt: float, *, how_strong: float, target: float = 0.0) -> None:
         self.how_strong = how_strong
@@ -401,23 +407,23 @@ class _Slows:
         self._command()
 
     def keep(self) -> None:
-        with _gone():
+        with _ignore_departed():
             self._command()
 
     def end(self) -> None:
-        with _gone():
+        with _ignore_departed():
             sumo.vehicle_setSpeed(self._vehicle, -1.0)
 
     def _command(self) -> None:
         speed = sumo.vehicle_getSpeed(self._vehicle)
-        if speed < self._target:  # whoever it drives behind was slower; SUMO lets it drive no faster than is safe
+        if speed < self._target:  # a slower vehicle is ahead; SUMO limits the commanded speed to a safe speed
             sumo.vehicle_setSpeed(self._vehicle, min(self._target, sumo.vehicle_getAllowedSpeed(self._vehicle)))
         else:
             sumo.vehicle_setSpeed(self._vehicle, max(self._target, speed - self._change))
 
 
 class _Speeds:
-    """Wants to drive faster than before, and keeps its distance as before."""
+    """Raises the vehicle's desired speed; the vehicle keeps its distance to others as before."""
 
     def __init__(self, vehicle: str, share: float) -> None:
         self.how_strong = share
@@ -429,12 +435,12 @@ class _Speeds:
         pass
 
     def end(self) -> None:
-        with _gone():
+        with _ignore_departed():
             sumo.vehicle_setSpeedFactor(self._vehicle, self._before)
 
 
 class _CutsIn:
-    """Changes lanes as soon as nobody is in the very place, and may brake there."""
+    """Makes the vehicle change lanes as soon as no vehicle overlaps it there, and brake in the new lane if asked."""
 
     def __init__(self, vehicle: str, lane: str, deceleration: float, dt: float, how_long: float) -> None:
         self.how_strong = deceleration
@@ -442,24 +448,27 @@ class _CutsIn:
         self._lane = lane
         self._before = sumo.vehicle_getLaneChangeMode(vehicle)
         self._change = deceleration * dt
-        sumo.vehicle_setLaneChangeMode(vehicle, _NOT_INTO_OTHERS)
+        sumo.vehicle_setLaneChangeMode(vehicle, _COMMANDED_LANE_CHANGES)
         sumo.vehicle_changeLane(vehicle, int(lane.rpartition("_")[2]), how_long)
 
     def keep(self) -> None:
-        with _gone():
+        with _ignore_departed():
             if self._change and sumo.vehicle_getLaneID(self._vehicle) == self._lane:
                 speed = sumo.vehicle_getSpeed(self._vehicle)
                 sumo.vehicle_setSpeed(self._vehicle, max(0.0, speed - self._change))
 
     def end(self) -> None:
-        with _gone():
+        with _ignore_departed():
             sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
             if self._change:
                 sumo.vehicle_setSpeed(self._vehicle, -1.0)
 
 
 class _MergesLate:
-    """Stays in a lane that ends until little of it is left, and then changes as soon as nobody is in the very place."""
+    """Keeps the vehicle in a lane that ends, and lets it change lanes late.
+
+    The change begins when the rest of the lane is short enough and no vehicle overlaps in the neighbouring lane.
+    """
 
     def __init__(self, vehicle: str, target: int, length: float, how_strong: float) -> None:
         self.how_strong = how_strong
@@ -468,29 +477,29 @@ class _MergesLate:
         self._target = target
         self._length = length
         self._before = sumo.vehicle_getLaneChangeMode(vehicle)
-        sumo.vehicle_setLaneChangeMode(vehicle, _NOT_AT_ALL)
+        sumo.vehicle_setLaneChangeMode(vehicle, _NO_LANE_CHANGES)
         self._is_waiting = True
 
     def keep(self) -> None:
-        with _gone():
+        with _ignore_departed():
             if self._is_waiting and (
                 sumo.vehicle_getRoadID(self._vehicle) != self._edge
                 or self._length - sumo.vehicle_getLanePosition(self._vehicle) <= self.how_strong
             ):
                 self._is_waiting = False
-                sumo.vehicle_setLaneChangeMode(self._vehicle, _NOT_INTO_OTHERS)
+                sumo.vehicle_setLaneChangeMode(self._vehicle, _COMMANDED_LANE_CHANGES)
                 if sumo.vehicle_getRoadID(self._vehicle) == self._edge:
                     sumo.vehicle_changeLane(self._vehicle, self._target, _FOR_EVER_S)
 
     def end(self) -> None:
-        with _gone():
+        with _ignore_departed():
             sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
-            if not self._is_waiting:  # the command would hold it in its lane for good
+            if not self._is_waiting:  # otherwise the command would keep the vehicle in its lane for an hour
                 sumo.vehicle_changeLane(self._vehicle, sumo.vehicle_getLaneIndex(self._vehicle), 0.0)
 
 
 class _Ignores:
-    """Drives on at a junction as if it were not there; SUMO wants the speed commanded for that."""
+    """Makes the vehicle ignore red lights and right of way; for that, SUMO needs a commanded speed in every step."""
 
     how_strong = 1.0
 
@@ -498,15 +507,15 @@ class _Ignores:
         self._vehicle = vehicle
         self._dt = dt
         self._before = sumo.vehicle_getSpeedMode(vehicle)
-        sumo.vehicle_setSpeedMode(vehicle, _NEITHER_RED_NOR_PRIORITY)
+        sumo.vehicle_setSpeedMode(vehicle, _IGNORES_JUNCTIONS)
         self._command()
 
     def keep(self) -> None:
-        with _gone():
+        with _ignore_departed():
             self._command()
 
     def end(self) -> None:
-        with _gone():
+        with _ignore_departed():
             sumo.vehicle_setSpeedMode(self._vehicle, self._before)
             sumo.vehicle_setSpeed(self._vehicle, -1.0)
 
@@ -517,8 +526,8 @@ class _Ignores:
         sumo.vehicle_setSpeed(self._vehicle, max(0.0, slower, min(allowed, faster)))
 
 
-class _gone:  # noqa: N801 - it is used as a statement
-    """Passes over that a vehicle has left."""
+class _ignore_departed:  # noqa: N801 - used as a context manager
+    """Suppresses SUMO's error for a vehicle that has left the simulation."""
 
     def __enter__(self) -> None:
         pass
@@ -528,31 +537,31 @@ class _gone:  # noqa: N801 - it is used as a statement
 
 
 def _at(agent: str, who: str, *, left_hand: bool) -> str:
-    """Who is at a place around an agent, along the lanes; empty where nobody is."""
+    """Return the vehicle at a place around an agent, in its lane or a neighbouring lane; empty if there is none."""
     if who in ("ahead", "behind"):
         ask = sumo.vehicle_getLeader if who == "ahead" else sumo.vehicle_getFollower
         found = ask(agent, _IN_LANE_M)
         return str(found[0]) if found is not None and found[0] and found[1] <= _IN_LANE_M else ""
     side, _, along = who.partition(" ")
-    # What SUMO calls left is the lane with the next higher number, wherever that lies.
+    # SUMO's "left" is the lane with the next higher number, which lies to the right in left-hand traffic.
     bit = _LEFT if (side == "left") != left_hand else _RIGHT
     near = []
     for ahead in (0, _AHEAD):
         for vehicle, gap in sumo.vehicle_getNeighbors(agent, bit | ahead):
             gap += _min_gap(vehicle, agent, leads=bool(ahead))
             place = "" if gap < 0 else "ahead" if ahead else "behind"
-            if place == along and gap <= _BESIDE_M:
+            if place == along and gap <= _NEIGHBOUR_LANE_M:
                 near.append((gap, vehicle))
     return min(near)[1] if near else ""
 
 
 def _min_gap(vehicle: str, agent: str, *, leads: bool) -> float:
-    """What SUMO has taken from the distance of bumpers: the gap that the one behind likes to keep, in m."""
+    """Return the minimum gap of the rear vehicle in m, which SUMO has subtracted from the bumper-to-bumper gap."""
     return float(sumo.vehicle_getMinGap(agent if leads else vehicle))
 
 
 def _way(vehicle: str) -> str:
-    """The lane inside the next junction that a vehicle comes to; that on which it is, where it is inside one."""
+    """Return the lane of a vehicle inside its next junction, or its current lane if it is inside a junction."""
     lane = str(sumo.vehicle_getLaneID(vehicle))
     if lane.startswith(":"):
         return lane
@@ -561,7 +570,7 @@ def _way(vehicle: str) -> str:
 
 
 def _place(scene: Scene, here: int, row: int) -> str:
-    """The place of one actor around another, as the crow flies."""
+    """Return the place of one actor relative to another, such as ``left ahead``, from positions and not from lanes."""
     from math import cos, sin
 
     (x, y), (own_x, own_y), heading = scene.points[row], scene.points[here], scene.headings[here]
@@ -574,7 +583,7 @@ def _place(scene: Scene, here: int, row: int) -> str:
 
 
 def _cut_in(vehicle: str, side: int, how_long: float, deceleration: float, dt: float) -> _CutsIn | None:
-    """Have a vehicle change lanes, where there is a lane that it may use."""
+    """Make a vehicle change lanes; return None if there is no lane that it may use."""
     edge, lane = sumo.vehicle_getRoadID(vehicle), sumo.vehicle_getLaneIndex(vehicle) + side
     if edge.startswith(":") or not 0 <= lane < sumo.edge_getLaneNumber(edge):
         return None
@@ -586,9 +595,9 @@ def _cut_in(vehicle: str, side: int, how_long: float, deceleration: float, dt: f
 
 
 def _late_merge(vehicle: str, how_strong: float) -> _MergesLate | None:
-    """Have a vehicle put off that it leaves a lane that ends; None where its lane does not."""
+    """Make a vehicle leave an ending lane late; return None if its lane does not end."""
     lane = sumo.vehicle_getLaneID(vehicle)
-    known = next((one for one in libsumo.vehicle.getBestLanes(vehicle) if one[0] == lane), None)
+    known = next((best for best in libsumo.vehicle.getBestLanes(vehicle) if best[0] == lane), None)
     if known is None or not known[3]:
         return None
     _, length, _, offset, *_ = known

@@ -1,4 +1,4 @@
-"""What an action does to a vehicle of SUMO's."""
+"""Applies actions and holds to SUMO's vehicles."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from crashhunt.simulators._protocol import ActiveDisturbance
 
 
-__all__ = ["Driving", "held_back"]
+__all__ = ["Driving", "hold_vehicle"]
 
 
-# As in _simulator.py: the package's own functions cost twice as much.
+# Calls go to libsumo's extension module, because the wrapper functions of the package cost twice as much.
 
 
 class Driving:
     """Applies actions to vehicles.
 
     Args:
-        setups: of all agents of a scenario, by name.
-        step_length_s: in s.
+        setups: The setups of all agents of a scenario, by agent.
+        step_length_s: Step length, in s.
     """
 
     def __init__(self, setups: Mapping[str, AgentSetup], step_length_s: float) -> None:
@@ -42,7 +42,7 @@ class Driving:
         self._is_left_hand: bool | None = None
 
     def begin(self, agents: Iterable[str]) -> None:
-        """Forget the last episode; the network is the same."""
+        """Forget the last episode, but keep what was read from the network."""
         self._targets = dict.fromkeys(agents, -1)
 
     def apply(self, agent: str, action: NDArray[np.generic]) -> bool:
@@ -56,7 +56,7 @@ class Driving:
         return not change or self._change_lane(agent, int(change))
 
     def _apply_meta(self, agent: str, setup: AgentSetup, action: str) -> None:
-        """As highway-env does it: FASTER and SLOWER step from the nearest of the target speeds."""
+        """Apply a meta-action as highway-env does: FASTER and SLOWER select the next target speed."""
         targets = setup.target_speeds
         if self._targets[agent] < 0:
             speed = sumo.vehicle_getSpeed(agent)
@@ -66,13 +66,13 @@ class Driving:
         sumo.vehicle_setSpeed(agent, targets[self._targets[agent]])
         change = {"LANE_LEFT": 1, "LANE_RIGHT": -1}.get(action, 0)
         if change:
-            self._change_lane(agent, change)  # into nothing is ignored, as in highway-env
+            self._change_lane(agent, change)  # a change without a neighbouring lane does nothing, as in highway-env
 
     def _change_lane(self, agent: str, change: int) -> bool:
-        """Change to a neighbouring lane at once; False where there is none that the vehicle may use."""
+        """Change to a neighbouring lane at once; return False if there is no lane that the vehicle may use."""
         edge = sumo.vehicle_getRoadID(agent)
         if edge.startswith(":"):
-            return True  # inside a junction there is nothing to change to, and nothing to leave either
+            return True  # inside a junction there are no neighbouring lanes, and no road to leave
         lanes, _ = self.edge(edge)
         target = sumo.vehicle_getLaneIndex(agent) + (-change if self.left_hand else change)
         if not 0 <= target < lanes or self._is_closed(f"{edge}_{target}", sumo.vehicle_getVehicleClass(agent)):
@@ -81,7 +81,7 @@ class Driving:
         return True
 
     def edge(self, edge: str) -> tuple[int, float]:
-        """Return the number of lanes of an edge, and the width of its first."""
+        """Return the number of lanes of an edge, and the width of its first lane in m."""
         found = self._edges.get(edge)
         if found is None:
             found = self._edges[edge] = sumo.edge_getLaneNumber(edge), sumo.lane_getWidth(f"{edge}_0")
@@ -89,19 +89,19 @@ class Driving:
 
     @property
     def left_hand(self) -> bool:
-        """Whether traffic keeps to the left: SUMO has such a network mirrored, and counts its lanes from the left."""
+        """Whether traffic drives on the left: SUMO then mirrors the network and numbers lanes from the left."""
         if self._is_left_hand is None:
             wide = (edge for edge in sumo.edge_getIDList() if edge[0] != ":" and sumo.edge_getLaneNumber(edge) > 1)
             self._is_left_hand = any(_is_right_of(f"{edge}_1", f"{edge}_0") for edge in islice(wide, 1))
         return self._is_left_hand
 
     def from_left(self, edge: str, lane: int) -> float:
-        """Return how far right of the middle of the leftmost lane of an edge that of another one is, in m."""
+        """Return the distance in m from the centre line of an edge's leftmost lane to that of the given lane."""
         lanes, width = self.edge(edge)
         return (lane if self.left_hand else lanes - 1 - lane) * width
 
     def aside(self, agent: str) -> tuple[float, float]:
-        """Return how far right of the middle of its lane a vehicle is, in m, and how fast it moves there, in m/s."""
+        """Return how far a vehicle is right of its lane's centre line, in m, and its speed to the right, in m/s."""
         sign = 1.0 if self.left_hand else -1.0
         return sign * sumo.vehicle_getLateralLanePosition(agent), sign * sumo.vehicle_getLateralSpeed(agent)
 
@@ -115,24 +115,24 @@ class Driving:
 
 
 def _is_right_of(lane: str, other: str) -> bool:
-    """Whether a lane lies to the right of another one of its edge."""
+    """Whether a lane lies to the right of another lane of the same edge."""
     (x, y, *_), (to_x, to_y, *_) = sumo.lane_getShape(other)[:2]
     at_x, at_y = sumo.lane_getShape(lane)[0][:2]
     return bool((to_x - x) * (at_y - y) < (to_y - y) * (at_x - x))
 
 
-# Others on SUMO that are kept from something, to see what hangs on it: braking, changing lanes, being there.
+# Holds for counterfactual runs: keep a vehicle's speed or lane, or remove the vehicle.
 
-_HEEDING_NOBODY = 0  # speed mode: what is commanded is driven
-_NOT_AT_ALL = 0  # lane change mode
+_NO_SPEED_CHECKS = 0  # speed mode: the vehicle drives the commanded speed
+_NO_LANE_CHANGES = 0  # lane change mode
 
 
-def held_back(vehicle: str, what: str) -> ActiveDisturbance | None:
-    """Keep a vehicle from something, from the next step on; None where it is not there.
+def hold_vehicle(vehicle: str, what: str) -> ActiveDisturbance | None:
+    """Apply a hold to a vehicle from the next step on; return None if the vehicle is not in the simulation.
 
     Args:
-        vehicle: its name.
-        what: one of `HELD`.
+        vehicle: Identifier of the vehicle.
+        what: One of `HELD`.
     """
     if vehicle not in sumo.vehicle_getIDList():
         return None
@@ -143,51 +143,51 @@ def held_back(vehicle: str, what: str) -> ActiveDisturbance | None:
 
 
 class _Gone:
-    """It is gone, and does not come back."""
+    """The hold of a vehicle that has been removed for the rest of the episode."""
 
     how_strong = 1.0
 
     def keep(self) -> None:
-        """Stay away."""
+        """Do nothing, because the vehicle is gone."""
 
     def end(self) -> None:
-        """Stay away."""
+        """Do nothing, because the vehicle does not return."""
 
 
 class _KeepsSpeed:
-    """Drives on at its speed, whoever is in its way."""
+    """Makes the vehicle keep its speed, even with an obstacle ahead."""
 
     def __init__(self, vehicle: str) -> None:
         self.how_strong = float(sumo.vehicle_getSpeed(vehicle))
         self._vehicle = vehicle
         self._before = sumo.vehicle_getSpeedMode(vehicle)
-        sumo.vehicle_setSpeedMode(vehicle, _HEEDING_NOBODY)
+        sumo.vehicle_setSpeedMode(vehicle, _NO_SPEED_CHECKS)
         sumo.vehicle_setSpeed(vehicle, self.how_strong)
 
     def keep(self) -> None:
-        """Go on; SUMO holds what has been commanded."""
+        """Do nothing, because SUMO keeps the command."""
 
     def end(self) -> None:
-        """Drive by itself again."""
+        """Let the vehicle drive by itself again."""
         if self._vehicle in sumo.vehicle_getIDList():
             sumo.vehicle_setSpeedMode(self._vehicle, self._before)
             sumo.vehicle_setSpeed(self._vehicle, -1.0)
 
 
 class _KeepsLane:
-    """Does not leave its lane."""
+    """Makes the vehicle keep its lane."""
 
     how_strong = 1.0
 
     def __init__(self, vehicle: str) -> None:
         self._vehicle = vehicle
         self._before = sumo.vehicle_getLaneChangeMode(vehicle)
-        sumo.vehicle_setLaneChangeMode(vehicle, _NOT_AT_ALL)
+        sumo.vehicle_setLaneChangeMode(vehicle, _NO_LANE_CHANGES)
 
     def keep(self) -> None:
-        """Go on; SUMO holds what has been commanded."""
+        """Do nothing, because SUMO keeps the command."""
 
     def end(self) -> None:
-        """Change lanes by itself again."""
+        """Let the vehicle change lanes by itself again."""
         if self._vehicle in sumo.vehicle_getIDList():
             sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)

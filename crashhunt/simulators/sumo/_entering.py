@@ -1,4 +1,4 @@
-"""How controlled vehicles get onto the road: after the warm-up, added, taken over, or in the place of another."""
+"""Brings the controlled vehicles onto the road: warm-up, insertion of new vehicles, and ego replacement."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ __all__ = ["TakingPart", "enter", "replaced_by", "steps_counted"]
 
 
 def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]) -> dict[str, str]:
-    """Return the vehicles of the traffic whose places are taken, each with the agent that takes it.
+    """Return the vehicles of the traffic that agents replace, each with its agent.
 
     Raises:
-        InvalidEpisodeError: two agents would take the same place.
+        InvalidEpisodeError: Two agents replace the same vehicle.
     """
     found: dict[str, str] = {}
     for agent, setup in agents.items():
@@ -45,28 +45,28 @@ def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]
 
 @contextmanager
 def steps_counted(simulator: CountsSetUp, step_length_s: float) -> Iterator[None]:
-    """Count the steps that are simulated meanwhile, whatever becomes of them."""
+    """Count the steps that are simulated in the block, even if the block fails."""
     began = libsumo.simulation.getTime()
     try:
         yield
     finally:
-        with suppress(libsumo.TraCIException, libsumo.FatalTraCIError):  # of a simulation that has ended
+        with suppress(libsumo.TraCIException, libsumo.FatalTraCIError):  # the simulation may have ended
             simulator.setup_steps = round((libsumo.simulation.getTime() - began) / step_length_s)
 
 
 def enter(
     scenario: Scenario, setups: Mapping[str, AgentSetup], replaced: Mapping[str, str], taking_part: TakingPart | None
 ) -> None:
-    """Warm up, add the vehicles that are not part of the traffic, and wait until all are on the road.
+    """Warm up, add the agents' vehicles that the traffic does not have, and wait until all are on the road.
 
     Args:
-        scenario: how long it warms up, and how long is waited.
-        setups: of the agents that drive.
-        replaced: vehicles of the traffic to the agents that take their places.
-        taking_part: who of the traffic takes part; None where all do.
+        scenario: Gives the length of the warm-up and the longest wait.
+        setups: The setups of the agents that drive.
+        replaced: The vehicles of the traffic that are replaced, each with its agent.
+        taking_part: Removes excluded actors; None if all actors take part.
 
     Raises:
-        InvalidEpisodeError: one of them did not enter in time, or had left again.
+        InvalidEpisodeError: A controlled vehicle did not enter in time, or had left again.
     """
     begin = libsumo.simulation.getTime()
     if scenario.warmup_s > 0:
@@ -135,11 +135,11 @@ def _add(agent: str, setup: AgentSetup) -> None:
 
 
 def _replace(vehicle: str, agent: str) -> None:
-    """Let an agent drive on from where a vehicle of the traffic is, from the next step on."""
+    """Replace a vehicle of the traffic by an agent's vehicle with the same position, speed, type and route."""
     route, kind = f"crashhunt.{agent}", libsumo.vehicle.getTypeID(vehicle)
     lane, place = libsumo.vehicle.getLaneIndex(vehicle), libsumo.vehicle.getLanePosition(vehicle)
     speed = libsumo.vehicle.getSpeed(vehicle)
-    # One with a departEdge begins somewhere on its route.
+    # A vehicle with a departEdge begins in the middle of its route, so use the rest of the route.
     libsumo.route.add(route, libsumo.vehicle.getRoute(vehicle)[libsumo.vehicle.getRouteIndex(vehicle) :])
     libsumo.vehicle.remove(vehicle)
     libsumo.vehicle.add(
@@ -147,44 +147,44 @@ def _replace(vehicle: str, agent: str) -> None:
     )
 
 
-# Vehicles and persons that do not take part in an episode, though the scenario has them.
+# Vehicles and persons that are excluded from an episode.
 
 
 class TakingPart:
-    """Takes vehicles off the road at the end of the step in which they enter, before anybody has seen them.
+    """Removes excluded actors at the end of the step in which they enter, before a scene contains them.
 
-    Only then are they known by name: those of a flow are made one after another as time goes on. A person leaves with
-    the next step, and is not to be seen until then.
+    SUMO creates the vehicles of a flow one after another, so their names are known only when they enter. SUMO removes a
+    person in the next step, so scenes hide the person until then.
 
     Args:
-        takes_part: the names of those that stay, as in scenes.
-        leaving: the ids of persons who are not to be seen any more are put in here.
+        takes_part: Identifiers of the actors that stay, as in scenes.
+        leaving: Receives the SUMO ids of removed persons, which scenes must hide.
 
     Attributes:
-        entered: the names of all that have entered, in their order.
+        entered: Identifiers of all actors that have entered, in order.
     """
 
     def __init__(self, takes_part: Iterable[str], leaving: set[str]) -> None:
         self._takes_part = frozenset(takes_part)
-        self._everybody = EVERYBODY in self._takes_part
+        self._all_take_part = EVERYBODY in self._takes_part
         self._leaving = leaving
         self.entered: list[str] = []
 
     def remove(self) -> None:
-        """Remove those that have entered in the last step."""
+        """Remove the excluded actors that entered in the last step."""
         for vehicle in libsumo.simulation.getDepartedIDList():
             self.entered.append(vehicle)
-            if not self._everybody and vehicle not in self._takes_part:
+            if not self._all_take_part and vehicle not in self._takes_part:
                 libsumo.vehicle.remove(vehicle)
         for person in libsumo.simulation.getDepartedPersonIDList():
             name = PERSON + person
             self.entered.append(name)
-            if not self._everybody and name not in self._takes_part:
+            if not self._all_take_part and name not in self._takes_part:
                 libsumo.person.removeStages(person)
                 self._leaving.add(person)
 
     def warm_up(self, until_s: float) -> None:
-        """Simulate up to a time, in s, step by step."""
+        """Simulate step by step until a simulation time, in s."""
         while libsumo.simulation.getTime() < until_s:
             libsumo.simulationStep()
             self.remove()

@@ -1,4 +1,4 @@
-"""Steps on SUMO in which nothing happens, which the compiled core takes by itself, each in one call."""
+"""The fast path on SUMO: the compiled core runs uneventful steps by itself, each in one call."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["Present", "UsualSteps"]
 
 
-_ROSTERS = 3  # of the last scene and the one before; that of the next may not come to be
+_ROSTERS = 3  # rosters to keep: of the last scene, the scene before it, and the next scene, which may not be needed
 _OBSERVED = np.dtype("<f4")
 
 
@@ -34,20 +34,20 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-class MakesPart(Protocol):
-    """Makes of what does a part of a step one that raises what a step does."""
+class WrapsPartOfStep(Protocol):
+    """Wraps a function that does a part of a step, so that it raises the same errors as a whole step."""
 
     def __call__(self, do: Callable[P, T], /) -> Callable[P, T]:
-        """Return it."""
+        """Return the wrapped function."""
 
 
 class Present(NamedTuple):
-    """Where a simulator is.
+    """The state of a simulator between two steps.
 
     Args:
-        scene: after the last step.
-        observations: what the agents are shown next.
-        steps: how many are complete.
+        scene: The scene after the last step.
+        observations: The observations that the agents get next.
+        steps: Number of completed steps.
     """
 
     scene: Scene
@@ -56,29 +56,29 @@ class Present(NamedTuple):
 
 
 class UsualSteps:
-    """Takes the steps of one episode in which nothing happens; as `AtOnce` says.
+    """Implements `AtOnce`: runs uneventful steps of one episode in the compiled core.
 
-    While the core goes ahead, everybody else stays where they were: the simulator, its sight and its events. `catch_up`
-    brings them to where the core is, `resume` brings the core to where they are.
+    While the core runs steps, the simulator, its sight and its events keep an older state. The method `catch_up` brings
+    them to the state of the core. The method `resume` brings the core to their state.
 
     Args:
-        core: the compiled part.
-        agent: the only one of the episode.
-        sight: what scenes are read by.
-        events: what looks for events.
-        kinematics: what observations are made by.
-        simulate: simulates a step.
-        part: makes of what does a part of a step one that raises what a step does.
-        present: returns where the simulator is.
-        arrive: called with where the core has come to.
-        apply: applies an action; returns whether there is nothing about it to look into.
-        finish: does what is left of a step that has been simulated.
-        from_left: returns how far right of the middle of an edge's leftmost lane that of another one is, in m.
-        start_m: how far the agent had driven at the start, in m.
-        step_length_s: in s.
-        lateral: whether vehicles may be elsewhere than in the middle of a lane.
-        takes_speed: whether actions are a speed and a change of lane.
-        instead_of: what it does without calling it, as a simulator has it.
+        core: The compiled core.
+        agent: The only agent of the episode.
+        sight: Reads scenes from SUMO.
+        events: Detects traffic events.
+        kinematics: Makes observations.
+        simulate: Simulates a step.
+        part: Wraps a function that does a part of a step, so that it raises the same errors as a whole step.
+        present: Returns the state of the simulator.
+        arrive: Called with the new state of the simulator.
+        apply: Applies an action; returns whether the step can stay uneventful.
+        finish: Completes a step that SUMO has simulated and that is not uneventful.
+        from_left: Returns the distance in m from the centre line of an edge's leftmost lane to that of another lane.
+        start_m: The distance that the agent had driven at the start, in m.
+        step_length_s: Step length, in s.
+        lateral: Whether vehicles may leave the centre line of a lane.
+        takes_speed: Whether actions are `SpeedAndLaneChange`.
+        instead_of: Attributes of the simulator that the core bypasses, by name.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class UsualSteps:
         kinematics: Kinematics,
         *,
         simulate: Callable[[], None],
-        part: MakesPart,
+        part: WrapsPartOfStep,
         present: Callable[[], Present],
         arrive: Callable[[Present], None],
         apply: Callable[[str, NDArray[np.generic]], bool],
@@ -113,24 +113,24 @@ class UsualSteps:
         )  # fmt: skip
         self._from_left, self._instead_of = from_left, instead_of
         self._last: StepResult = ({}, {}, {}, {}, {})
-        self._rosters: dict[Vehicles, Roster] = {}  # of the scenes that may be asked for
+        self._rosters: dict[Vehicles, Roster] = {}  # of the scenes that `catch_up` may need
 
     def is_unpatched(self, simulator: Simulator) -> bool:
-        """Whether nothing that it does is somebody else's in a simulator, such as in a wrapper around this one."""
+        """Whether the simulator still has the attributes that the core bypasses: false for a wrapper or a patch."""
         return all(getattr(simulator, name) == own for name, own in self._instead_of.items())
 
     def begin(self) -> None:
-        """Take what is counted in this episode, which is about to begin."""
+        """Give the core the counters of the episode that is about to begin."""
         self.core.heed(*self._events.counted)
         self._controlled = self._events.controlled
 
     @property
     def roster(self) -> Roster:
-        """Who is in sight, or will be after the step that the core takes."""
+        """The actors in sight, which may already be those after the step that the core runs."""
         return self._sight.roster
 
     def _enter(self, ids: tuple[str, ...]) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:
-        """Take note of who is in sight; None where there is more about them than the core knows."""
+        """Set the vehicles in sight; return None if they have properties that the core does not read."""
         self._sight.see(ids)
         seen, row = self._sight.plain, self.roster.index.get(self._agent)
         if seen is None or row is None:
@@ -141,7 +141,7 @@ class UsualSteps:
         return *seen, row, self._controlled
 
     def resume(self) -> Scene | None:
-        """Have the core go on from here; return the scene, None where that has to wait."""
+        """Let the core continue from the simulator's state; return the scene, or None if that is not possible yet."""
         self.catch_up()
         (scene, observations, steps), seen = self._present(), self._sight.plain
         lane, columns, agent = scene.agent_lanes.get(self._agent, ""), scene.columns, self._agent
@@ -159,23 +159,23 @@ class UsualSteps:
         return scene
 
     def catch_up(self) -> StepResult:
-        """Bring everybody else to where the core is; return what the last step would have returned."""
-        told = self.core.told()
+        """Bring the simulator to the state of the core; return the result that its last step would have returned."""
+        state = self.core.told()
         before, agent = self._present(), self._agent
-        if told is None or told[0] <= before.steps:
+        if state is None or state[0] <= before.steps:
             return self._last
-        step, observation, reward, follower, now, last = told
+        step, observation, reward, follower, now, last = state
         previous = before.scene if step == before.steps + 1 else self._scene(before.scene, True, *last)
         scene = self._scene(before.scene, False, *now)
         scene.follow(previous)
         observations: Observations = {agent: observation}  # type: ignore[dict-item]
-        self._events.go_on(scene, step, {agent: follower})
+        self._events.resume(scene, step, {agent: follower})
         self._arrive(Present(scene, observations, step))
         self._last = observations, {agent: reward}, {agent: False}, {agent: False}, {agent: {}}
         return self._last
 
     def reads_right(self) -> bool:
-        """Whether the core reads what libsumo's getters return, to the bit."""
+        """Whether the core's values are bit-identical to those of libsumo's getters."""
         if self._sight.plain is None:
             return True
         vehicles, ids = self._sight.plain
@@ -190,7 +190,7 @@ class UsualSteps:
             along,
             sumo.lane_getAngle(lane, along),
             sumo.vehicle_getDecel(agent),
-            "".join(f"{sumo.vehicle_getLaneID(one)}\n" for one in ids),
+            "".join(f"{sumo.vehicle_getLaneID(vehicle)}\n" for vehicle in ids),
             sumo.vehicle_getFollower(agent)[0],
             sumo.vehicle_getStopState(agent),
             sumo.simulation_getTime(),

@@ -1,4 +1,4 @@
-"""How a simulation is loaded: in the process's only simulator, with the links of its network in a fixed order."""
+"""Loads simulations into the process's only SUMO instance, with the links of the network in a fixed order."""
 
 from __future__ import annotations
 
@@ -19,22 +19,26 @@ if TYPE_CHECKING:
 __all__ = ["VERSION", "Loading", "keep_xml_ready", "ready_xml"]
 
 
-# SUMO's XML library, kept ready between trials.
+# SUMO's XML library, which stays initialized between trials.
 
 # xercesc_3_2::XMLPlatformUtils::Initialize(locale, nls_home, panic_handler, memory_manager)
 _INITIALIZE = "_ZN11xercesc_3_216XMLPlatformUtils10InitializeEPKcS2_PNS_12PanicHandlerEPNS_13MemoryManagerE"
 
 
 def keep_xml_ready() -> bool:
-    """Have SUMO's XML library outlive the simulation that runs; return whether that was possible.
+    """Keep SUMO's XML library (Xerces) initialized after the simulation that runs; return whether that was possible.
 
-    SUMO ends it after each simulation, and begins it anew with the next, tables of Unicode and all, which is a third
-    of the time that a small network takes to load. The library counts who has begun it: with one that never ends, the
-    others only count. Called once a process, while a simulation runs: then it does nothing else.
+    SUMO terminates the library after each simulation and initializes it again for the next one. That takes a third of
+    the time for loading a small network, because the library builds its Unicode tables. The library counts its
+    initializations: with one more initialization, the count never reaches 0. Call this function once per process, while
+    a simulation runs.
     """
     try:
         initialize = getattr(ctypes.CDLL(sumo.__file__), _INITIALIZE)
-    except (OSError, AttributeError):  # another version of it, or built into libsumo: it costs time, and nothing else
+    except (
+        OSError,
+        AttributeError,
+    ):  # another version, or linked statically into libsumo: loading is slower, but correct
         return False
     initialize.argtypes = [ctypes.c_void_p] * 4
     initialize.restype = None
@@ -42,18 +46,18 @@ def keep_xml_ready() -> bool:
     return True
 
 
-VERSION = metadata.version("libsumo")  # the module itself has had it since 1.26
+VERSION = metadata.version("libsumo")  # libsumo before 1.26 has no version attribute
 _UNORDERED = "the order of SUMO's links is not fixed, and trials may differ between processes"
 ready_xml = cache(keep_xml_ready)
-"""Keep SUMO's XML library ready, once a process."""
+"""Keep SUMO's XML library initialized; runs once per process."""
 
 
 class Loading:
     """Loads simulations.
 
     Args:
-        fix_link_order: whether the links of a network are processed in the order of their construction; otherwise in
-            the order of their addresses, as SUMO does by itself.
+        fix_link_order: Whether SUMO processes the links of a network in the order of their construction. By itself,
+            SUMO processes them in the order of their addresses, which differs between processes.
     """
 
     def __init__(self, *, fix_link_order: bool) -> None:
@@ -64,12 +68,12 @@ class Loading:
         """Load a simulation.
 
         Args:
-            program: the program and its options, which count for the first simulation of a process only.
+            program: The program and its options, which only the first simulation of a process uses.
             command: SUMO's options for the simulation.
 
         Returns:
-            What to report where the order of links is not fixed, though its library is installed; otherwise empty.
-            A library that is not installed is reported when the hunt begins.
+            A notice if the order of links is not fixed although the library for it is installed; otherwise empty. The
+            hunt reports a missing library when it begins.
         """
         self._order.use(self._fix_link_order)
         if libsumo.isLoaded():

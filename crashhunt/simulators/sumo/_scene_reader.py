@@ -1,4 +1,4 @@
-"""What a scene of SUMO has: the vehicles and persons near the controlled ones, at which height, and how bent."""
+"""Reads scenes from SUMO: actors near the controlled vehicles, their heights, and the bends of long vehicles."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ if TYPE_CHECKING:
 __all__ = ["LOOK_AROUND_EVERY", "SIGHT_M", "Bends", "Sight", "height_at", "is_articulated"]
 
 
-# How long vehicles of SUMO are bent: along the lanes that they are on, as SUMO itself has them.
+# Long vehicles bend along the lanes that they occupy, as SUMO's own geometry does.
 
 _RAILS = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
-_RIGID_M = 15.0  # no longer bus or lorry may be built in one piece (Directive 96/53/EC); what is longer has a joint
-_JOINT_M = 6.0  # between two joints of what has any: a shorter one is drawn as one piece
-_PIECE_M = 5.0  # a car's length; the corner of a piece in the tightest bend is off by centimetres
-_STRAIGHT_M = 0.05  # off the straight line is as good as straight
-_MISPLACED_M = 1.0  # from its lane; who has been put beside it, with moveToXY, is taken as straight
+_RIGID_M = 15.0  # longest rigid bus in the EU (Directive 96/53/EC, Annex I); a longer vehicle has a joint
+_JOINT_M = 6.0  # a shorter rail vehicle or trailer is treated as rigid
+_PIECE_M = 5.0  # longest straight piece of a bent vehicle: a car's length
+_STRAIGHT_M = 0.05  # a vehicle that deviates less from a straight line is treated as straight
+_MISPLACED_M = 1.0  # a vehicle further from its lane, as after moveToXY, is treated as straight
 
 Point = tuple[float, float]
 
 
 def is_articulated(actor: Actor) -> bool:
-    """Whether a vehicle is made of parts that follow each other: what runs on rails, trailers, and what is too long."""
+    """Whether a vehicle has joints: rail vehicles, trailers, and vehicles longer than a rigid bus."""
     jointed = actor.kind in _RAILS or actor.kind == "trailer"
     return actor.length > (_JOINT_M if jointed else _RIGID_M)
 
 
 class Bends:
-    """Finds the centre lines of long vehicles.
+    """Computes the centre lines of long vehicles.
 
-    SUMO moves the front of a vehicle along its lanes, and its back along the same ones; after a change of lanes all of
-    it is in the new one. So its centre line is that of the lanes from its front back along its route.
+    SUMO moves the front and the back of a vehicle along the same lanes. After a lane change, the whole vehicle is in
+    the new lane. Therefore a vehicle's centre line follows the lanes from its front backwards along its route.
 
     Args:
-        lateral: whether vehicles may be beside the middle of a lane.
+        lateral: Whether vehicles may leave the centre line of a lane.
     """
 
     def __init__(self, *, lateral: bool) -> None:
@@ -62,14 +62,14 @@ class Bends:
         self._used.clear()
 
     def spine(self, vehicle: str, length: float, front: Point, heading: float, *, high: bool) -> Spine | None:
-        """Return the centre line of a vehicle; None where it is straight.
+        """Return the centre line of a vehicle; None if the vehicle is straight.
 
         Args:
-            vehicle: its id.
-            length: in m.
-            front: its front bumper's centre.
-            heading: SUMO's, in rad; of a train it is that of its first carriage.
-            high: whether the map has heights; otherwise z is 0.
+            vehicle: Identifier of the vehicle.
+            length: Length of the vehicle, in m.
+            front: Centre of the front bumper.
+            heading: SUMO's heading, in rad; for a train, the heading of its first carriage.
+            high: Whether the map has heights; otherwise z is 0.
         """
         lane = sumo.vehicle_getLaneID(vehicle)
         if not lane:
@@ -90,15 +90,15 @@ class Bends:
             (x, y), _, _ = line[index - 1]
             (back_x, back_y), on, at = line[index]
             share = (place - distances[index - 1]) / max(distances[index] - distances[index - 1], 1e-9)
-            # Beyond the beginning of its route, it goes straight on.
+            # Behind the beginning of its route, the vehicle is straight.
             x, y = x + share * (back_x - x), y + share * (back_y - y)
             found.append((x, y, height_at(on, at) if high else 0.0))
         return None if _is_straight(found, length, heading) else tuple(found)
 
     def _behind(self, vehicle: str, lane: str, position: float, length: float) -> Iterator[tuple[Point, str, float]]:
-        """The points of the lanes from the front of a vehicle backwards, each with its lane and position there."""
+        """Yield the points of the lanes from a vehicle's front backwards, each with its lane and position on it."""
         route = sumo.vehicle_getRoute(vehicle)
-        edge = sumo.vehicle_getRouteIndex(vehicle) - (not lane.startswith(":"))  # the one before this lane
+        edge = sumo.vehicle_getRouteIndex(vehicle) - (not lane.startswith(":"))  # index of the edge before this lane
         driven = 0.0
         while True:
             points, places, scale = self._shape(lane)
@@ -120,7 +120,7 @@ class Bends:
             edge -= not lane.startswith(":")
 
     def _before(self, vehicle: str, lane: str, edge: str) -> str:
-        """The lane from which a vehicle came onto another one, from an edge; nothing where there is none."""
+        """Return the lane on ``edge`` from which a vehicle came onto ``lane``; empty if there is none."""
         if not self._sources:
             self._find_sources()
         used = self._used[vehicle].get(edge)
@@ -128,7 +128,7 @@ class Bends:
         for source in self._sources.get(lane, ()):
             start = source
             while start.startswith(":") and start in self._sources:
-                (start, *_) = self._sources[start]  # an internal lane comes from one place only
+                (start, *_) = self._sources[start]  # an internal lane has exactly one predecessor
             if start.rpartition("_")[0] == edge:
                 found.append((start != used, source))
         return min(found)[1] if found else ""
@@ -140,7 +140,7 @@ class Bends:
                 self._sources.setdefault(target, []).append(lane)
 
     def _shape(self, lane: str) -> tuple[list[Point], list[float], float]:
-        """Its points, how far along each is (m), and how much longer they are than SUMO takes the lane to be."""
+        """Return a lane's points, their distances along it (m), and the ratio of its drawn length to SUMO's length."""
         found = self._shapes.get(lane)
         if found is None:
             points = [(x, y) for x, y, *_ in sumo.lane_getShape(lane)]
@@ -150,7 +150,7 @@ class Bends:
 
 
 def _shifted(line: list[tuple[Point, str, float]], left: float) -> list[tuple[Point, str, float]]:
-    """A line that is followed backwards, moved to the left of those who drive along it."""
+    """Return a line, whose points run backwards, moved to the left as seen in driving direction."""
     moved = []
     for index, ((x, y), lane, place) in enumerate(line):
         (ax, ay), (bx, by) = line[max(index - 1, 0)][0], line[min(index + 1, len(line) - 1)][0]
@@ -161,16 +161,16 @@ def _shifted(line: list[tuple[Point, str, float]], left: float) -> list[tuple[Po
 
 
 def height_at(lane: str, position: float) -> float:
-    """Return z of the middle of a lane, in m; positions beyond its ends count as these."""
+    """Return z of the centre line of a lane at a position, in m; a position beyond an end is moved to that end."""
     edge, _, index = lane.rpartition("_")
-    # SUMO refuses what is longer than the lane by a rounding error.
+    # SUMO refuses a position that exceeds the length of the lane by a rounding error.
     position = max(0.0, min(position, sumo.lane_getLength(lane) - 1e-6))
     place = sumo.simulation_convert3D(edge, position, int(index), False)
     return float(place[2]) if len(place) > 2 else 0.0
 
 
 def _is_straight(spine: Sequence[tuple[float, float, float]], length: float, heading: float) -> bool:
-    """Whether one rectangle with this heading is as good."""
+    """Whether one rectangle with this heading covers the vehicle within `_STRAIGHT_M`."""
     (x, y, _), c, s = spine[0], math.cos(heading), math.sin(heading)
     if math.dist(spine[-1][:2], (x - length * c, y - length * s)) > _STRAIGHT_M:
         return False
@@ -178,37 +178,40 @@ def _is_straight(spine: Sequence[tuple[float, float, float]], length: float, hea
 
 
 SIGHT_M = 150.0
-"""A scene has the vehicles and persons that were within this distance of a controlled one when it last looked around.
-What is further away has no part in a crash, and a town has thousands of them."""
+"""A scene contains the actors that were within this distance of a controlled vehicle at the last look around.
+
+Actors further away take no part in a crash, and a town has thousands of them."""
 
 LOOK_AROUND_EVERY = 10
-"""Steps from one look around to the next, and whenever a vehicle enters or leaves; with long steps once a second. Also
-how often a scene says the lane of each vehicle: a string each is too dear for every step."""
+"""Steps between two looks around. A further look follows when a vehicle enters or leaves.
 
-_LOOK_AROUND_S = 1.0  # in which two that come towards each other do not get through half of what is in sight
+With steps above 0.1 s, a look around happens every second. Every 10th scene contains the lane of each vehicle, because
+reading a string per vehicle is expensive."""
+
+_LOOK_AROUND_S = 1.0  # at a closing speed of 75 m/s, two vehicles approach by half of `SIGHT_M` in this time
 _SIGHT_SQUARED = SIGHT_M**2
 _RADIANS = math.pi / 180.0
-_HEIGHT_EVERY_M = 20.0  # along each lane, to see whether the map is flat
-_FLAT_M = 0.5  # a map that rises less has no bridges
+_HEIGHT_EVERY_M = 20.0  # distance between the points of a lane at which heights are read
+_FLAT_M = 0.5  # a map with smaller height differences has no bridges and is treated as flat
 _WITH_PERSONS = frozenset({"sharedLane", "junctionPedestrian", "crossing", "walkingarea"})
-"""SUMO's types of collision in which the victim is a person, who may have the id of a vehicle."""
+"""SUMO's collision types with a person as victim; a person may have the same id as a vehicle."""
 
 
 class Sight:
     """Reads scenes from SUMO.
 
-    Persons are actors where they walk, ride a bicycle as persons do, or wait at the roadside; not inside of vehicles.
-    With SUMO's model ``nonInteracting`` they walk through vehicles and have no part in the traffic, nor in a scene.
+    Persons are actors while they walk, ride a bicycle as a person, or wait at the roadside, but not inside vehicles.
+    With SUMO's pedestrian model ``nonInteracting``, persons walk through vehicles, so scenes omit them.
 
     Args:
-        controlled: the vehicles around which to look.
-        step_length_s: in s.
-        lateral: whether vehicles may be elsewhere than in the middle of a lane.
-        speeds: in m/s, of persons who are moved, by their ids in SUMO, which takes them for standing.
-        core: what reads faster, where it is there.
+        controlled: Identifiers of the vehicles around which to look.
+        step_length_s: Step length, in s.
+        lateral: Whether vehicles may leave the centre line of a lane.
+        speeds: Speeds in m/s of moved persons, by SUMO id, because SUMO reports 0 for them.
+        core: The compiled core, which reads faster; None if it is not available.
 
     Attributes:
-        leaving: the ids of persons who are there and have no part any more.
+        leaving: SUMO ids of persons that SUMO still has, but that scenes must hide.
     """
 
     def __init__(
@@ -232,8 +235,8 @@ class Sight:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the previous episode; the network is the same."""
-        self._known.clear()  # the same id may be another vehicle now
+        """Forget the previous episode, but keep what was read from the network."""
+        self._known.clear()  # in the next episode, the same id may be another vehicle
         self._articulated: set[str] = set()
         self._bends.reset()
         self._speeds.clear()
@@ -243,13 +246,13 @@ class Sight:
         self._persons_count: bool | None = None
 
     def look(self, steps: int, off_road: Sequence[str]) -> Scene:
-        """Return the scene after so many steps."""
+        """Return the scene after this number of steps."""
         if self._persons_count is None:
             self._persons_count = sumo.simulation_getOption("pedestrian.model") != "nonInteracting"
             self._high = self._is_high() if self._high is None else self._high
         time_to_look = steps % self._every == 0
         if steps and self._plain is not None and self._eyes is not None and not (self._high or self._all_persons):
-            # What most steps come to, in one call.
+            # Most steps need only this one call of the core.
             columns = self._plain.look(self._eyes, _SIGHT_SQUARED if time_to_look else 0.0)
             if isinstance(columns, tuple):
                 self._see(columns, ())
@@ -276,7 +279,7 @@ class Sight:
         columns = self._vehicles.read() if self._vehicles is not None else None
         points, headings, speeds = self._columns() if columns is None else _lists(columns)
         if persons:
-            # As with vehicles, the position is that of the front.
+            # For persons as for vehicles, the position is that of the front.
             points += map(sumo.person_getPosition, persons)
             headings += [(90.0 - angle) * _RADIANS for angle in map(sumo.person_getAngle, persons)]
             speeds += map(sumo.person_getSpeed, persons)
@@ -300,28 +303,28 @@ class Sight:
 
     @property
     def around(self) -> tuple[Vehicles, int, float]:
-        """For the core: around which vehicles it looks, every how many steps, how far (m, squared)."""
+        """The controlled vehicles, the steps between two looks around, and the squared range (m²); for the core."""
         assert self._eyes is not None
         return self._eyes, self._every, _SIGHT_SQUARED
 
     @property
     def plain(self) -> tuple[Vehicles, tuple[str, ...]] | None:
-        """Who is in sight, for the core and by their ids; None where there is more about them than it knows."""
+        """The vehicles in sight, for the core, and their ids; None if the scene has more than the core reads."""
         if self._plain is None or self._high or self._all_persons:
             return None
         return self._plain, self._ids
 
     @property
     def roster(self) -> Roster:
-        """Who is in sight."""
+        """The actors in sight."""
         return self._roster
 
     def see(self, ids: tuple[str, ...]) -> None:
-        """Take note of who is in sight, and that there is no person."""
+        """Set the vehicles in sight, without persons."""
         self._see(ids, ())
 
     def reads_right(self) -> bool:
-        """Whether the core reads what libsumo's getters return, to the bit."""
+        """Whether the core's values are bit-identical to those of libsumo's getters."""
         if self.core is None or self._vehicles is None:
             return True
         seen = self.core.in_sight(self._eyes, _SIGHT_SQUARED) if self._eyes is not None else self._in_sight()
@@ -334,10 +337,10 @@ class Sight:
         else:
             quiet = not (found[1] or sumo.person_getIDCount() or sumo.simulation_getCollisions())
             right = at_once is None or (quiet and self._ids == found[2][0] and repr(_lists(at_once)) == repr(found[0]))
-        return right and repr(read) == repr(found)  # all digits of each number
+        return right and repr(read) == repr(found)  # repr() has all digits of each number
 
     def distrust(self) -> None:
-        """Do without the core from now on, and forget the episode."""
+        """Stop using the core, and forget the episode."""
         self.core = None
         self.reset()
 
@@ -370,7 +373,7 @@ class Sight:
         return found
 
     def _persons_changed(self) -> bool:
-        """Whether a person came or left, or got into a vehicle."""
+        """Whether a person entered, left, or got into a vehicle."""
         if not (sumo.person_getIDCount() or self._all_persons):
             return False
         if sumo.person_getIDList() != self._all_persons:
@@ -378,28 +381,28 @@ class Sight:
         return any(map(sumo.person_getVehicle, self._persons))
 
     def _look_around(self) -> None:
-        """Choose who is in sight: those near a controlled vehicle, and the controlled ones themselves."""
+        """Select the actors in sight: the controlled vehicles and all actors near them."""
         found = self.core.in_sight(self._eyes, _SIGHT_SQUARED) if self.core is not None and self._eyes else None
         ids, eyes = found or self._in_sight()
         persons: tuple[str, ...] = ()
         if self._persons_count and (sumo.person_getIDCount() or self._all_persons):
             self._all_persons = sumo.person_getIDList()
             near = _near(self._all_persons, list(map(sumo.person_getPosition, self._all_persons)), eyes)
-            persons = tuple([one for one in near if one not in self.leaving and not sumo.person_getVehicle(one)])
+            persons = tuple([id_ for id_ in near if id_ not in self.leaving and not sumo.person_getVehicle(id_)])
         if ids != self._ids or persons != self._persons:
             self._see(ids, persons)
 
     def lose(self, vehicle: str) -> None:
-        """Take note that somebody has been taken off the road, which SUMO tells of only after the next step."""
+        """Remove a vehicle that has been taken off the road, which SUMO reports only after the next step."""
         if vehicle in self._ids:
             self._see(tuple(name for name in self._ids if name != vehicle), self._persons)
 
     def _in_sight(self) -> tuple[tuple[str, ...], list[tuple[float, float]]]:
-        """The vehicles in sight, and where the controlled ones are that are there."""
-        everybody = sumo.vehicle_getIDList()
-        points = list(map(sumo.vehicle_getPosition, everybody))
-        eyes = [points[everybody.index(eye)] for eye in self._controlled if eye in everybody]
-        return _near(everybody, points, eyes), eyes
+        """Return the vehicles in sight, and the positions of the controlled vehicles that are present."""
+        present = sumo.vehicle_getIDList()
+        points = list(map(sumo.vehicle_getPosition, present))
+        eyes = [points[present.index(eye)] for eye in self._controlled if eye in present]
+        return _near(present, points, eyes), eyes
 
     def _actor(self, vehicle: str) -> Actor:
         found = self._known.get(vehicle)
@@ -423,7 +426,7 @@ class Sight:
         return found
 
     def _contacts(self) -> tuple[Contact, ...]:
-        """The collisions that began in this step; SUMO repeats one as long as it lasts."""
+        """Return the collisions that began in this step; SUMO reports a collision in every step while it lasts."""
         found = []
         for collision in sumo.simulation_getCollisions():
             victim = collision.victim
@@ -436,18 +439,18 @@ class Sight:
                 self._touched.add(pair)
                 found.append(
                     Contact(
-                        collision.collider,
-                        victim,
-                        collision.type,
-                        collision.lane,
-                        collision.colliderSpeed,
-                        collision.victimSpeed,
+                        collider=collision.collider,
+                        victim=victim,
+                        kind=collision.type,
+                        lane=collision.lane,
+                        collider_speed=collision.colliderSpeed,
+                        victim_speed=collision.victimSpeed,
                     )
                 )
         return tuple(found)
 
     def _is_high(self) -> bool:
-        """Whether the lanes of the network are not all on one plane."""
+        """Whether heights in the network differ by more than `_FLAT_M`."""
         low = high = None
         for lane in sumo.lane_getIDList():
             length = sumo.lane_getLength(lane)
@@ -464,7 +467,7 @@ def _lists(columns: Columns) -> Lists:
 
 
 def _is_coming_or_going() -> bool:
-    """Whether a vehicle has entered or left in the last step."""
+    """Whether a vehicle entered or left in the last step."""
     return bool(
         sumo.simulation_getDepartedNumber()
         or sumo.simulation_getArrivedNumber()
@@ -476,7 +479,7 @@ def _is_coming_or_going() -> bool:
 def _near(
     names: Sequence[str], points: Sequence[tuple[float, float]], eyes: Sequence[tuple[float, float]]
 ) -> tuple[str, ...]:
-    """Those within sight of an eye, in their order."""
+    """Return the names of the points within `SIGHT_M` of a controlled vehicle, in their order."""
     seen: set[str] = set()
     for ex, ey in eyes:
         seen.update(

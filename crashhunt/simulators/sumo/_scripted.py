@@ -1,8 +1,8 @@
-"""Others who are moved along recorded ways: SUMO has the controlled vehicles only, and scenes have both.
+"""Playback of recorded paths on SUMO: SUMO simulates the controlled vehicles, and scenes add the recorded actors.
 
-A vehicle that SUMO is told to move to a place is somewhere on a lane near it, and drives as fast as that comes to. So
-the others are not in SUMO: where they were is put into the scenes as it was recorded, to the bit. What agents see and
-whom they touch is made of scenes. A controlled vehicle whose speed mode has it heed others does not heed these.
+When SUMO moves a vehicle to a position, it maps the vehicle to a lane nearby and derives the speed from the distance.
+Therefore the recorded actors are not in SUMO: this module copies their recorded states into the scenes, bit-identical.
+Observations and contacts are computed from scenes. SUMO's own safe-speed checks do not see the recorded actors.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ __all__ = ["ScriptedSight", "place_agents"]
 
 
 class ScriptedSight:
-    """Looks at the controlled vehicles, and adds the others.
+    """Reads the controlled vehicles from SUMO, and adds the recorded actors.
 
     Args:
-        sight: looks at SUMO.
-        script: who was where; the steps are those of the episode. Who was in sight to the end goes straight on.
+        sight: Reads scenes from SUMO.
+        script: The recorded paths by step of the episode. Actors in sight at the end of the recording drive straight
+            on afterwards.
     """
 
     def __init__(self, sight: Sight, script: Paths) -> None:
@@ -42,7 +43,7 @@ class ScriptedSight:
         self._roster = Roster(())
 
     def look(self, steps: int, off_road: Sequence[str]) -> Scene:
-        """Return the scene after so many steps."""
+        """Return the scene after this number of steps."""
         scene = self._sight.look(steps, off_road)
         rows = [
             self._agent(scene, row, steps) for row, actor in enumerate(scene.roster.actors) if actor.id in self._agents
@@ -71,7 +72,7 @@ class ScriptedSight:
     def _agent(self, scene: Scene, row: int, steps: int) -> Row:
         actor = scene.roster.actors[row]
         lane = scene.lanes[row] if scene.lanes else ""
-        if steps == 0:  # SUMO says only after the next step where somebody is whom it has moved
+        if steps == 0:  # SUMO reports the new position of a moved vehicle only after the next step
             return actor, self._agents[actor.id].states[0], lane, None
         high = (scene.heights[row], scene.grades[row]) if scene.heights else ()
         state = State(*scene.points[row], scene.headings[row], scene.speeds[row], *high)
@@ -88,15 +89,15 @@ class ScriptedSight:
 
 
 def place_agents(script: Paths) -> None:
-    """Wait until the script begins, and move the controlled vehicles to where it says.
+    """Simulate until the recording begins, and move the controlled vehicles to their recorded start.
 
     Raises:
-        InvalidEpisodeError: they cannot get there.
+        InvalidEpisodeError: The recording has no start of a controlled vehicle.
     """
     step_s = sumo.simulation_getDeltaT()
     while sumo.simulation_getTime() < script.time_s - step_s / 2:
         for path in script.agents:
-            sumo.vehicle_setSpeed(path.actor.id, 0.0)  # nobody is in the way of anybody, and nobody is to get far
+            sumo.vehicle_setSpeed(path.actor.id, 0.0)  # stops early vehicles from driving away
         libsumo.simulationStep()
     for path in script.agents:
         agent, state = path.actor.id, path.states[0]
@@ -109,7 +110,7 @@ def place_agents(script: Paths) -> None:
 
 
 def _along(lane: str, point: tuple[float, float]) -> float:
-    """How far along a lane the nearest point of it is, in m."""
+    """Return the position along a lane, in m, of the lane's point that is nearest to a point."""
     shape = [(x, y) for x, y, *_ in sumo.lane_getShape(lane)]
     best = done = 0.0
     least = math.inf

@@ -1,4 +1,4 @@
-"""SUMO as a simulator, through libsumo. Import this in a worker only: libsumo is one simulation per process."""
+"""SUMO as a simulator, through libsumo. Import this module in worker processes only: libsumo has no second instance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLane
 from crashhunt.simulators._kinematics import Kinematics, Unseen
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators.sumo._disturbances import SumoDisturbances
-from crashhunt.simulators.sumo._driving import Driving, held_back
+from crashhunt.simulators.sumo._driving import Driving, hold_vehicle
 from crashhunt.simulators.sumo._entering import TakingPart, enter, replaced_by, steps_counted
 from crashhunt.simulators.sumo._fast_step import Present, UsualSteps
 from crashhunt.simulators.sumo._loading import VERSION, Loading, ready_xml
@@ -44,21 +44,21 @@ if TYPE_CHECKING:
 __all__ = ["SumoSimulator"]
 
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
-_SEEN_M = 150.0  # of the network, in a window that follows a vehicle
+_WINDOW_WIDTH_M = 150.0  # width of the visible part of the network when the window follows a vehicle
 _KEEPS_DECELERATION = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
-_DISTRUSTED = "the compiled core says something else than libsumo's own getters, and is not used"
+_DISTRUSTED = "the compiled core is disabled: its values differ from those of libsumo's getters"
 P = ParamSpec("P")
 T = TypeVar("T")
 _TRACI_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
-_current: weakref.ref[SumoSimulator] | None = None  # libsumo's own state is the process's; this says whose it is
+_current: weakref.ref[SumoSimulator] | None = None  # the simulator that owns the process's libsumo
 
 
 class SumoSimulator:
-    """Runs the episodes of a scenario on SUMO, one after another in one warm process.
+    """Runs the episodes of a scenario on SUMO, one after another in one process.
 
     Args:
-        scenario: what to run.
-        stage: a folder for the files of this process; it must exist.
+        scenario: The scenario to run.
+        stage: An existing folder for the files of this process.
     """
 
     def __init__(self, scenario: Scenario, stage: Path) -> None:
@@ -73,7 +73,7 @@ class SumoSimulator:
             for agent, setup in scenario.agents.items()
         }
         self.agents: list[str] = []
-        # Without these options of SUMO a vehicle is always in the middle of a lane.
+        # Only with these options of SUMO can a vehicle leave the centre line of its lane.
         options = scenario.table(SumoSetup).options
         self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
         self._driving = Driving(scenario.agents, scenario.step_length_s)
@@ -100,24 +100,24 @@ class SumoSimulator:
         self._scene: Scene
         self.at_once: UsualSteps | None = None
 
-    told_events = BACKEND.told_events
+    reported_events = BACKEND.reported_events
     disturbing_kinds = BACKEND.disturbances or ()
 
     def ready_process(self) -> None:
-        """Load the tables of SUMO's XML library."""
+        """Initialize SUMO's XML library."""
         ready_xml()
 
     def open_window(self) -> None:
-        """Show the episodes in sumo-gui, which libsumo brings along."""
+        """Show the episodes in sumo-gui, which libsumo contains."""
         self._program = ["sumo-gui", "--start", "--delay", "0", "--window-size", "1200,800"]
 
     @property
     def window_open(self) -> bool:
-        """Whether nobody has closed the window."""
+        """Whether the window is still open."""
         return bool(libsumo.isLoaded())
 
     def follow(self, agent: str, other: str) -> None:
-        """Mark two actors in the window, and keep the first in view."""
+        """Colour two actors in the window, and keep the first in view."""
         present = sumo.vehicle_getIDList()
         for name, color in ((agent, _FOLLOWED), (other, _MARKED)):
             if name in present:
@@ -128,12 +128,12 @@ class SumoSimulator:
             (view, *_) = libsumo.gui.getIDList()
             if libsumo.gui.getTrackedVehicle(view) != agent:
                 libsumo.gui.trackVehicle(view, agent)
-                libsumo.gui.setZoom(view, libsumo.gui.getZoom(view) * max(1.0, self._span_m() / _SEEN_M))
+                libsumo.gui.setZoom(view, libsumo.gui.getZoom(view) * max(1.0, self._span_m() / _WINDOW_WIDTH_M))
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
-        """Load the scenario, let the traffic warm up, and put the controlled vehicles on the road."""
+        """Load the scenario, warm up the traffic, and put the controlled vehicles on the road."""
         global _current
-        self._stop_going_ahead()
+        self._stop_fast_path()
         options = options or {}
         arguments = options.get("arguments", {})
         self.setup_steps = 0
@@ -172,11 +172,11 @@ class SumoSimulator:
 
     @property
     def why_no_reseeding(self) -> str:
-        """Why SUMO's generators cannot be re-seeded; empty where they can."""
+        """Why SUMO's random generators cannot be re-seeded; empty if they can."""
         return why_no_reseeding(VERSION, sumo.__file__)
 
     def reseed(self, seed: int) -> None:
-        """Give the generators of drivers, types and devices other seeds; when vehicles depart stays as planned."""
+        """Re-seed the generators of drivers, types and devices; departure times stay as planned."""
         reseed_generators(sumo.__file__, seed)
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
@@ -199,7 +199,7 @@ class SumoSimulator:
             raise _gave_up(error) from error
 
     def _finish(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
-        """See what has come of a step that has been simulated."""
+        """Return the result of a step that SUMO has simulated."""
         if self.at_once is not None:
             self.at_once.core.pause()
         if self._taking_part is not None:
@@ -231,7 +231,7 @@ class SumoSimulator:
         return self._scene
 
     def lanes(self) -> list[Lane]:
-        """Return all lanes of the network, those inside junctions too."""
+        """Return all lanes of the network, including those inside junctions."""
         if self._lanes is None:
             self._lanes = [
                 Lane(lane, sumo.lane_getWidth(lane), tuple(tuple(point) for point in sumo.lane_getShape(lane)))
@@ -240,7 +240,7 @@ class SumoSimulator:
         return self._lanes
 
     def full_braking(self, agent: str) -> FullBraking:
-        """Return how a vehicle brakes as hard as it can: as its speed mode allows."""
+        """Return the action for the hardest braking that the speed mode of the vehicle allows."""
         setup = self._scenario.agents[agent]
         if setup.action == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
@@ -249,25 +249,25 @@ class SumoSimulator:
         return FullBraking((0.0, 0), f"as hard as its speed mode {setup.speed_mode} allows")
 
     def resolve_target(self, disturbance: Disturbance) -> str:
-        """Return who is at a place around an agent, along the lanes."""
+        """Return the identifier of the actor at the disturbance's place around its agent; empty if none is there."""
         return self._disturbances.resolve_target(disturbance, self.scene())
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance | None:
-        """Command a vehicle until its disturbance ends."""
+        """Disturb a vehicle until the disturbance ends."""
         if disturbance.what == "unseen":
             return Unseen(self._kinematics, disturbance.agent, vehicle)
         return self._disturbances.disturb(vehicle, disturbance)
 
     def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
-        """Keep a vehicle from something until that ends; for a person there is nothing."""
-        found = held_back(vehicle, what)
+        """Apply a hold to a vehicle until the hold ends; return None for a person."""
+        found = hold_vehicle(vehicle, what)
         if what == "gone":
             self._sight.lose(vehicle)
         return found
 
     @property
     def entered(self) -> list[str]:
-        """Who has entered, where somebody may be left out."""
+        """Identifiers of all actors that have entered; empty if no actor is excluded."""
         return [] if self._taking_part is None else self._taking_part.entered
 
     def close(self) -> None:
@@ -276,12 +276,12 @@ class SumoSimulator:
             libsumo.close()
 
     def _span_m(self) -> float:
-        """How wide the network is, which the window shows whole at first."""
+        """Return the width of the network in m, which is the initial view of the window."""
         (left, _), (right, _) = libsumo.simulation.getNetBoundary()
         return float(right - left)
 
     def _begin(self, only: Sequence[str] | None, script: Paths | None, arguments: Mapping[str, Value]) -> None:
-        """Forget the last episode, and note who takes part in this one."""
+        """Forget the last episode, and set the actors that take part in the next episode."""
         self._sight.reset()
         self._sight.leaving.clear()
         self._look_with, setups = self._sight, self._scenario.agents
@@ -295,25 +295,25 @@ class SumoSimulator:
         stay = (*(only or ()), *setups, *self._replaced)
         self._taking_part = None if only is None else TakingPart(stay, self._sight.leaving)
 
-    def _stop_going_ahead(self) -> None:
-        """Another episode begins in this process, whoever's the last one was."""
+    def _stop_fast_path(self) -> None:
+        """Stop the fast path of the last episode in this process, because another episode begins."""
         last = _current() if _current is not None else None
         if last is not None and last.at_once is not None:
             last.at_once.core.stop()
         self.at_once = None
 
     def _usual_steps(self) -> UsualSteps | None:
-        """What lets the core take steps by itself, where it knows everything that belongs to one."""
+        """Return the fast path of this episode; None if the core cannot run whole steps of it."""
         core, plain = self._sight.core, type(self) is SumoSimulator and not self.scripted and self._taking_part is None
         if core is None or not plain or len(self.agents) != 1 or not self._kinematics.usual:
             return None
         if self._lateral and self._driving.left_hand:
-            return None  # the core has it the other way round
+            return None  # the core computes lateral offsets for right-hand traffic only
         (agent,) = self.agents
-        # Not as attributes of this one, which somebody may have set.
+        # Take the methods of the class, because a caller may have replaced attributes of this object.
         own = {
-            one.__name__: MethodType(one, self)
-            for one in (SumoSimulator.reset, SumoSimulator.step, SumoSimulator.scene)
+            method.__name__: MethodType(method, self)
+            for method in (SumoSimulator.reset, SumoSimulator.step, SumoSimulator.scene)
         }
         return UsualSteps(
             core,
@@ -336,16 +336,16 @@ class SumoSimulator:
         )
 
     def _arrive(self, present: Present) -> None:
-        """Be where the core has come to."""
+        """Adopt the state of the core."""
         self._scene, self._shown, self._steps = present
 
     def _apply_alone(self, agent: str, action: NDArray[np.generic]) -> bool:
-        """Apply an action; return whether there is nothing about it to look into."""
+        """Apply an action; return whether the vehicle stays on the road, so that the step can stay uneventful."""
         self._off_road = [] if self._driving.apply(agent, action) else [agent]
         return not self._off_road
 
     def _is_core_wrong(self, observations: Observations, usual: UsualSteps | None) -> bool:
-        """Whether the compiled core says anything else than the Python that it stands for."""
+        """Whether the compiled core returns different values than the Python code that it replaces."""
         core, self._scene.core = self._scene.core, None
         plain = self._observe_all()
         self._scene.core = core
@@ -356,7 +356,7 @@ class SumoSimulator:
         return {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}
 
     def _look(self) -> None:
-        """Read the state of everybody in sight."""
+        """Read the scene."""
         self._scene = self._look_with.look(self._steps, self._off_road)
 
     def _observe(self, agent: str, row: int) -> NDArray[np.float32]:
@@ -377,8 +377,8 @@ class SumoSimulator:
         )
 
 
-# By the calls that a fault has come through it is told from others: a part of a step is in a frame called as that of a
-# whole one is.
+# Crash signatures contain the function names of an error's frames. So both wrappers name their function `step`, like
+# the method that runs a whole step.
 def _part(do: Callable[P, T]) -> Callable[P, T]:
     def step(*given: P.args, **named: P.kwargs) -> T:
         try:

@@ -1,7 +1,7 @@
-"""What SUMO knows about the traffic around the controlled vehicles, told as events.
+"""Detects traffic events around the controlled vehicles on SUMO.
 
-It costs a few microseconds a step: what happens seldom is looked into only once something cheap has changed, such as
-the lane of a controlled vehicle or the least of all accelerations.
+A step costs a few microseconds. Expensive checks run only after a cheap check has found a change, such as a new lane of
+a controlled vehicle or a strong deceleration of any vehicle.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
 __all__ = ["HardBraking", "SumoEvents"]
 
 
-# Others on SUMO that brake hard with a controlled vehicle ahead of them.
+# Vehicles that brake hard because of a controlled vehicle ahead.
 
-_LOOKED_INTO = 2.0  # m/s²; a weaker braking is nobody's limit
-_TOLERANCE = 0.01  # m/s²
-_LEADER_M = 100.0  # nobody brakes hard for who is further ahead
+_MIN_CHECKED_DECELERATION_MPS2 = 2.0  # weaker braking is never an event, whatever the limit
+_TOLERANCE_MPS2 = 0.01
+_MAX_LEADER_GAP_M = 100.0
 
 
 class HardBraking:
-    """Looks at one episode after another.
+    """Detects vehicles that brake hard because of a controlled vehicle.
 
-    SUMO decides a step by who was ahead at its beginning. So it must have been the controlled vehicle then: the braking
-    one was its follower, or had to heed it when it braked hard in the step before as well.
+    SUMO computes a step from the state at its beginning, so the controlled vehicle must have been ahead then. Either
+    the braking vehicle was its follower, or it braked hard because of the same controlled vehicle in the step before.
 
     Args:
-        step_length_s: of the simulation.
-        limit: what counts, in m/s²; None for what the braking vehicle's type calls comfortable.
+        step_length_s: Step length of the simulation, in s.
+        limit: The deceleration that counts as hard, in m/s²; None for the ``decel`` of the braking vehicle's type.
     """
 
     def __init__(self, step_length_s: float, limit: float | None) -> None:
@@ -51,39 +51,39 @@ class HardBraking:
         """Forget the last episode.
 
         Args:
-            agents: those that act.
-            controlled: all vehicles that are driven from outside.
+            agents: Identifiers of the agents that act.
+            controlled: All controlled vehicles, by identifier.
         """
         self._controlled = controlled
         self._limits: dict[str, float] = {}
         self._followers = {agent: sumo.vehicle_getFollower(agent)[0] for agent in agents}
-        self._wary: dict[str, str] = {}  # who braked hard in the last step, with which controlled vehicle ahead
-        self._told: set[str] = set()  # those of them that have been told
-        self.lately: dict[str, tuple[str, float]] = {}  # who has braked hard for whom, and when last, in s
+        self._wary: dict[str, str] = {}  # vehicles that braked hard in the last step: the controlled vehicle ahead
+        self._reported: set[str] = set()  # vehicles whose current braking is already an event
+        self.lately: dict[str, tuple[str, float]] = {}  # vehicles that braked hard: the agent ahead, last time in s
 
     @property
     def followers(self) -> dict[str, str]:
-        """Who is behind each controlled vehicle after the last step; empty where nobody is."""
+        """The follower of each controlled vehicle after the last step; empty if it has none."""
         return self._followers
 
     @property
     def counted(self) -> tuple[dict[str, float], float]:
-        """For the core: what counts as hard, by vehicle, and for all of them or 0, in m/s²."""
+        """The limits in m/s²: by vehicle, and for all vehicles (0 if there is none); for the core."""
         return self._limits, self._limit or 0.0
 
     @property
     def is_quiet(self) -> bool:
-        """Whether nobody braked hard in the last step."""
+        """Whether no vehicle braked hard in the last step."""
         return not self._wary
 
-    def go_on(self, followers: dict[str, str]) -> None:
-        """Go on from a step since which nobody has braked hard."""
+    def resume(self, followers: dict[str, str]) -> None:
+        """Resume after uneventful steps, in which no vehicle braked hard."""
         self._followers = followers
 
     def look(
         self, last: Scene, scene: Scene, agents: Sequence[str], lanes: Mapping[str, str]
     ) -> list[tuple[str, str, str]]:
-        """Return who began to brake hard between two scenes: the controlled vehicle, the other one, what it did."""
+        """Return each agent for which a vehicle began to brake hard between two scenes, the vehicle, and the text."""
         hard = self._braking_hard(last, scene)
         found = self._because_of_agents(hard, scene, lanes) if hard or self._wary else []
         index = scene.roster.index
@@ -105,15 +105,15 @@ class HardBraking:
                 continue
             braking.add(vehicle)
             self.lately[vehicle] = (agent, scene.time_s)
-            if vehicle not in self._told:
+            if vehicle not in self._reported:
                 what = f"{vehicle} braked at {deceleration:.1f} m/s² with {agent} {where}"
                 found.append((agent, vehicle, what))
-        self._wary, self._told = wary, braking
+        self._wary, self._reported = wary, braking
         return found
 
     def _ahead_of(self, vehicle: str, lanes: Mapping[str, str]) -> tuple[str, str]:
-        """Which controlled vehicle one has to heed, and where that is; empty where there is none or somebody else."""
-        leader = sumo.vehicle_getLeader(vehicle, _LEADER_M)
+        """Return the agent's vehicle that a vehicle must react to, and its place; empty if it is another vehicle."""
+        leader = sumo.vehicle_getLeader(vehicle, _MAX_LEADER_GAP_M)
         if leader is not None and leader[0]:
             return (leader[0], "ahead of it") if leader[0] in self._followers else ("", "")
         crossing = sumo.vehicle_getLaneID(vehicle)
@@ -127,7 +127,7 @@ class HardBraking:
         return "", ""
 
     def _braking_hard(self, last: Scene, scene: Scene) -> list[tuple[str, float]]:
-        """Who braked harder than its limit in the last step, and how hard in m/s²."""
+        """Return the vehicles that braked harder than their limit in the last step, and their decelerations in m/s²."""
         rows: Iterable[tuple[Actor, float, float]]
         if scene.roster is last.roster:
             least = None
@@ -135,7 +135,7 @@ class HardBraking:
                 least = scene.core.least_change(last.columns, scene.columns)
             if least is None:
                 least = min(map(sub, scene.speeds, last.speeds), default=0.0)
-            if least > -_LOOKED_INTO * self._dt:
+            if least > -_MIN_CHECKED_DECELERATION_MPS2 * self._dt:
                 return []
             rows = zip(scene.roster.actors, last.speeds, scene.speeds, strict=True)
         else:
@@ -148,30 +148,30 @@ class HardBraking:
         found = []
         for actor, was, now in rows:
             deceleration = (was - now) / self._dt
-            if deceleration < _LOOKED_INTO or actor.id in self._controlled or is_person(actor.id):
+            if deceleration < _MIN_CHECKED_DECELERATION_MPS2 or actor.id in self._controlled or is_person(actor.id):
                 continue
             limit = self._limits.get(actor.id)
             if limit is None:
                 limit = self._limits[actor.id] = self._limit or sumo.vehicle_getDecel(actor.id)
-            if deceleration > limit + _TOLERANCE:
+            if deceleration > limit + _TOLERANCE_MPS2:
                 found.append((actor.id, deceleration))
         return found
 
 
-_RED = ("r", "u")  # red, and red with yellow; after a stop, "s" may be passed
-_LINKS_AT_ONCE = 6  # that a vehicle crosses in one long step
-_DIRECTION_EVERY = 10  # steps; how often a vehicle that stays on its lane is asked which way it drives
-_AGAINST = -0.5  # cosine of the angle between a course and a lane
-_NEAR_M = 150.0  # a collision further away has nothing to do with the agent
-_CONSEQUENCE_S = 5.0  # after hard braking for the agent, a collision may be its consequence
+_RED = ("r", "u")  # red, and red with yellow; vehicles may pass "s" after a stop
+_LINKS_AT_ONCE = 6  # most links that a vehicle can cross in one long step
+_DIRECTION_EVERY = 10  # steps between two checks of the driving direction on the same lane
+_AGAINST = -0.5  # cosine of the angle between course and lane below which a vehicle drives the wrong way
+_NEAR_M = 150.0  # events further from every agent are not reported
+_CONSEQUENCE_S = 5.0  # a collision within this time after hard braking may be its consequence
 
 
 class SumoEvents:
-    """Looks at one episode after another.
+    """Detects the traffic events of one episode after another.
 
     Args:
-        step_length_s: of the simulation.
-        limits: what counts as a standstill (in s) and as hard braking (in m/s²) where it is not the default.
+        step_length_s: Step length of the simulation, in s.
+        limits: Limits that differ from the default: of a standstill (in s) and of hard braking (in m/s²).
     """
 
     def __init__(self, step_length_s: float, limits: Mapping[str, float]) -> None:
@@ -183,9 +183,9 @@ class SumoEvents:
         """Forget the last episode.
 
         Args:
-            scene: before the first step.
-            agents: those that act.
-            controlled: all vehicles that are driven from outside.
+            scene: The scene before the first step.
+            agents: Identifiers of the agents that act.
+            controlled: All controlled vehicles, by identifier.
         """
         self._controlled = controlled
         self._last = scene
@@ -198,34 +198,34 @@ class SumoEvents:
 
     @property
     def controlled(self) -> dict[str, object]:
-        """All vehicles that are driven from outside."""
+        """All controlled vehicles, by identifier."""
         return dict(self._controlled)
 
     @property
     def followers(self) -> dict[str, str]:
-        """Who is behind each agent; empty where nobody is."""
+        """The follower of each agent; empty if it has none."""
         return self._braking.followers
 
     @property
     def counted(self) -> tuple[dict[str, float], float, dict[str, int], int]:
-        """For the core: what `HardBraking` and `Standstill` count."""
+        """The counters of `HardBraking` and `Standstill`, for the core."""
         return *self._braking.counted, *self._standstill.counted
 
     def is_quiet(self, agent: str) -> bool:
-        """Whether nothing goes on that the next step has to be looked at for."""
+        """Whether no event of the agent is in progress, so that the core may run the next step."""
         return self._braking.is_quiet and agent not in self._wrong
 
-    def go_on(self, scene: Scene, steps: int, followers: dict[str, str]) -> None:
-        """Go on from a scene, after so many steps, since which there has been no event."""
+    def resume(self, scene: Scene, steps: int, followers: dict[str, str]) -> None:
+        """Resume after uneventful steps: set the scene, the number of steps, and the agents' followers."""
         self._last, self._steps = scene, steps
-        self._braking.go_on(followers)
+        self._braking.resume(followers)
 
     def look(self, scene: Scene, agents: Sequence[str]) -> tuple[Event, ...]:
-        """Return what happened in the step to this scene.
+        """Return the events of the step that led to this scene.
 
         Args:
-            scene: with the lanes of the controlled vehicles that are on the road.
-            agents: those that acted in it.
+            scene: The scene, with the lanes of the controlled vehicles that are on the road.
+            agents: Identifiers of the agents that acted in the step.
         """
         self._steps += 1
         last, found = self._last, list[Event]()
@@ -242,7 +242,7 @@ class SumoEvents:
             row = scene.roster.index[agent]
             speed = scene.speed(row)
             if speed < Standstill.SPEED and sumo.vehicle_getStopState(agent) & 1:
-                self._standstill.move(agent)  # at a stop of its schedule
+                self._standstill.move(agent)  # at a planned stop
             elif stood := self._standstill.look(agent, speed):
                 found.append(self._of(scene, agent, "not_moving", f"{agent} had stood still for {stood:g} s"))
         if sumo.simulation_getEmergencyStoppingVehiclesNumber():
@@ -259,15 +259,24 @@ class SumoEvents:
     def _of(self, scene: Scene, agent: str, kind: str, what: str, others: tuple[str, ...] = ()) -> Event:
         row = scene.roster.index.get(agent)
         if row is None:
-            return Event(kind, agent, what, others)
+            return Event(kind=kind, agent=agent, what=what, others=others)
         x, y = scene.points[row]
-        return Event(kind, agent, what, others, self._lanes.get(agent, ""), x, y, scene.speeds[row])
+        return Event(
+            kind=kind,
+            agent=agent,
+            what=what,
+            others=others,
+            lane=self._lanes.get(agent, ""),
+            x=x,
+            y=y,
+            speed=scene.speeds[row],
+        )
 
     def _entered(self, agent: str, before: str, lane: str, scene: Scene, found: list[Event]) -> None:
-        """A controlled vehicle is on another lane than a step before."""
+        """Add an event if a controlled vehicle that entered a new lane ran a red light."""
         left, edge = before.rpartition("_")[0], lane.rpartition("_")[0]
         if left == edge or left.startswith(":"):
-            return  # it has changed lanes, or passed the signal before
+            return  # the vehicle has changed lanes, or passed the signal in an earlier step
         states = _states(before, edge)
         if states and states.issubset(_RED):
             speed = scene.speeds[scene.roster.index[agent]]
@@ -275,7 +284,7 @@ class SumoEvents:
             found.append(self._of(scene, agent, "red_light", what))
 
     def _ask_direction(self, agent: str, lane: str, last: Scene, scene: Scene, found: list[Event]) -> None:
-        """Whether it drives with its lane."""
+        """Add an event if the agent drives against the direction of its lane."""
         row, earlier = scene.roster.index[agent], last.roster.index.get(agent)
         if earlier is None or lane.startswith(":"):
             return
@@ -283,7 +292,7 @@ class SumoEvents:
         driven = math.hypot(x - was_x, y - was_y)
         if driven < Standstill.SPEED * self._dt:
             return
-        # The course, not the heading: that of a long vehicle turns late. SUMO's angles are clockwise from north.
+        # Use the course, because the heading of a long vehicle turns late. SUMO's angles are clockwise from north.
         angle = math.radians(sumo.lane_getAngle(lane, sumo.vehicle_getLanePosition(agent)))
         along = ((x - was_x) * math.sin(angle) + (y - was_y) * math.cos(angle)) / driven
         if along >= _AGAINST:
@@ -293,7 +302,7 @@ class SumoEvents:
             found.append(self._of(scene, agent, "wrong_way", f"{agent} drove the wrong way on lane {lane}"))
 
     def _at_dead_ends(self, scene: Scene, agents: Sequence[str], found: list[Event]) -> None:
-        """SUMO stops a vehicle by force at the end of a lane from which its route does not go on."""
+        """Add an event for agents at the end of a lane that does not lead along their route, where SUMO stops them."""
         for agent in set(sumo.simulation_getEmergencyStoppingVehiclesIDList()).intersection(agents):
             lane = scene.agent_lanes.get(agent, "")
             if not lane or lane.startswith(":") or (agent, lane) in self._stuck:
@@ -326,7 +335,7 @@ class SumoEvents:
             found.append(self._of(scene, agent, "others_collided", what, pair))
 
     def _teleports(self, last: Scene, scene: Scene, agents: Sequence[str], found: list[Event]) -> None:
-        """A vehicle that SUMO has begun to teleport is not in the scene any more."""
+        """Add events for vehicles that SUMO began to teleport, which the new scene no longer contains."""
         for vehicle in sumo.simulation_getStartingTeleportIDList():
             if vehicle in agents:
                 found.append(self._of(last, vehicle, "teleport", f"SUMO teleported {vehicle}"))
@@ -345,9 +354,9 @@ class SumoEvents:
 
 
 def _states(lane: str, edge: str) -> set[str]:
-    """What the signals of the links from a lane show by which a vehicle came to an edge in one step."""
+    """Return the signal states of the links by which a vehicle can get from a lane to an edge in one step."""
     links = sumo.lane_getLinks(lane)
-    for reach in range(_LINKS_AT_ONCE):  # the shortest way: it has not driven around the block
+    for reach in range(_LINKS_AT_ONCE):  # shortest path first, because a vehicle cannot drive a detour in one step
         states = {link[5] for link in links if _leads_to(link[4] or link[0], edge, reach)}
         if states:
             return states
@@ -355,14 +364,14 @@ def _states(lane: str, edge: str) -> set[str]:
 
 
 def _leads_to(lane: str, edge: str, links: int) -> bool:
-    """Whether a lane is of an edge, or leads to it over so many links."""
+    """Whether a lane belongs to an edge, or leads to it over at most this number of links."""
     if lane.rpartition("_")[0] == edge:
         return True
     return links > 0 and any(_leads_to(link[4] or link[0], edge, links - 1) for link in sumo.lane_getLinks(lane))
 
 
 def _gap(scene: Scene, one: str, two: str) -> float:
-    """The distance between two outlines, seen from above, in m."""
+    """Return the distance between the outlines of two actors, seen from above, in m."""
     index = scene.roster.index
     nearest = math.inf
     for x, y, heading, length, width in outlines(scene, index[one]):

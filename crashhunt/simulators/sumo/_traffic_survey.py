@@ -1,8 +1,8 @@
 """Simulates the plain traffic of a scenario, without a controlled vehicle, and reports which vehicles enter and when.
 
-libsumo holds one simulation per process, so this module runs in a process of its own:
-``python -m crashhunt.simulators.sumo._traffic_survey JOB`` reads the job from a JSON file, writes the answer to another
-one, and SUMO's own output goes to standard output.
+libsumo holds one simulation per process, so this module runs in a process of its own, with this command:
+``python -m crashhunt.simulators.sumo._traffic_survey JOB``. It reads the job from the JSON file JOB and writes the
+answer to another JSON file. SUMO's own output goes to standard output.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MAX_VEHICLE_STEPS = 1_500_000
 so that every machine finds the same candidates."""
 LOOK_EVERY_S = 5.0
 GRIDLOCK_S = 120.0
-"""Longer than a usual cycle of a traffic light, so that a red phase in a small network is no gridlock."""
+"""Standstill that counts as a gridlock. SUMO's generated traffic lights have cycles of 90 s, so a red phase is none."""
 GRIDLOCK_SHARE = 0.95
 MIN_VEHICLES_IN_GRIDLOCK = 5
 STANDING_MPS = 0.1
@@ -44,7 +44,7 @@ STOPPED = 1  # bit of SUMO's stop state
 
 
 def main() -> None:
-    """Run what the job asks for; the answer holds the runs that were completed."""
+    """Simulate the runs of the job; the answer holds the completed runs."""
     job: SurveyJob = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     # Processor time: on a busy machine, a limit of wall time would change the candidates, and with them the hunt.
     deadline_s = time.process_time() + job["processor_time_limit_s"]
@@ -89,7 +89,7 @@ def _run(files: StagedFiles, seed: int, values: dict[str, Value], deadline_s: fl
         on_the_road = set(sumo.vehicle_getIDList()) if (departed := libsumo.simulation.getDepartedIDList()) else ()
         for vehicle in departed:
             if vehicle not in on_the_road:
-                continue  # it left in the step in which it entered
+                continue  # the vehicle left in the step in which it entered
             vehicle_class = sumo.vehicle_getVehicleClass(vehicle)
             parked = libsumo.vehicle.isStoppedParking(vehicle)
             found["entries"].append((vehicle, now, vehicle_class, parked))
@@ -125,7 +125,7 @@ def _run(files: StagedFiles, seed: int, values: dict[str, Value], deadline_s: fl
 
 
 def _standing(present: tuple[str, ...]) -> tuple[int, int]:
-    """Return how many vehicles stand still, and of how many: those at a planned stop do not count."""
+    """Return the number of vehicles that stand still, and of all vehicles, both without vehicles at a planned stop."""
     free = [vehicle for vehicle in present if not sumo.vehicle_getStopState(vehicle) & STOPPED]
     return sum(sumo.vehicle_getSpeed(vehicle) < STANDING_MPS for vehicle in free), len(free)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from importlib import metadata
 from typing import TYPE_CHECKING
 
-from crashhunt.scenario._backend import Backend, CompiledCore, Configuration, LoadOrder, TrafficSurvey
+from crashhunt.scenario._scenario import Backend, CompiledCore, Configuration, LoadOrder, TrafficSurvey
 from crashhunt.scenario.backends.sumo._options import INPUTS, SumoSetup, canonical, writes
 from crashhunt.world import EVENT_WORDS
 
@@ -151,7 +151,7 @@ BACKEND = Backend(
     notes=_notes,
     versions=("libsumo",),
     variables=("SUMO_HOME",),
-    told_events=tuple(EVENT_WORDS),
+    reported_events=tuple(EVENT_WORDS),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "step_out", "ignore_priority", "unseen"),
     actions=("continuous", "meta"),
     configurations=(Configuration(endings=(".sumocfg", ".sumo.cfg"), load=_load, arguments=("scale", "vehicle")),),

@@ -117,15 +117,23 @@ def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
     if not value:
         kind, value = "vehicle", ego
     if kind == "route":
-        return Ego(_EGO, AgentSetup(route=value), f"the controlled vehicle is added on the route {value!r}", {})
+        return Ego(
+            agent=_EGO,
+            setup=AgentSetup(route=value),
+            note=f"the controlled vehicle is added on the route {value!r}",
+            arguments={},
+        )
     if kind == "edges":
         edges = tuple(edge for edge in value.split(",") if edge)
         note = f"the controlled vehicle is added on the edges {', '.join(edges)}"
-        return Ego(_EGO, AgentSetup(edges=edges), note, {})
+        return Ego(agent=_EGO, setup=AgentSetup(edges=edges), note=note, arguments={})
     if kind == "vehicle":
         depart = _departure_of(value, files)
         return Ego(
-            value, AgentSetup(existing=True, depart_s=depart), f"the controlled vehicle is the vehicle {value!r}", {}
+            agent=value,
+            setup=AgentSetup(existing=True, depart_s=depart),
+            note=f"the controlled vehicle is the vehicle {value!r}",
+            arguments={},
         )
     raise ScenarioError(
         f"--ego {ego!r} is not understood", fix="write VEHICLE, route=ID, edges=FROM,TO or any", where=str(path)
@@ -167,7 +175,7 @@ def draw_among(
         depart = next(one.depart_s for one in known if one.vehicle == names[0])
         when = "" if len(known) == 1 else f" from {since:.0f} to {since + _WINDOW_S:.0f} s"
         note = f"{why}the controlled vehicle is {names[0]!r}, the only one that {verb}s{when}"
-        return Ego(names[0], AgentSetup(existing=True, depart_s=depart), note, {})
+        return Ego(agent=names[0], setup=AgentSetup(existing=True, depart_s=depart), note=note, arguments={})
     if count > _AT_MOST:
         names = [names[index * count // _AT_MOST] for index in range(_AT_MOST)]
     others = {one.vehicle for one in known}
@@ -177,10 +185,10 @@ def draw_among(
         f"{verb}ing at {found[0].depart_s:.0f}-{found[-1].depart_s:.0f} s)"
     )
     return Ego(
-        agent,
-        AgentSetup(replaces=EGO_VEHICLE, depart_s=found[-1].depart_s),
-        note,
-        {
+        agent=agent,
+        setup=AgentSetup(replaces=EGO_VEHICLE, depart_s=found[-1].depart_s),
+        note=note,
+        arguments={
             EGO_VEHICLE: ArgumentSetup(
                 range="|".join(names) if len(names) > 1 else "",
                 default=names[0],
@@ -199,7 +207,7 @@ def _on_any_route(files: list[Path], path: Path) -> Ego:
     for route in _elements(files, "route"):
         if route.get("id"):
             note = f"no vehicle departs that the files name: one is added on the route {route.get('id')!r}"
-            return Ego(_EGO, AgentSetup(route=str(route.get("id"))), note, {})
+            return Ego(agent=_EGO, setup=AgentSetup(route=str(route.get("id"))), note=note, arguments={})
     raise ScenarioError(
         "no vehicle and no route is defined in its files", fix="give --ego edges=FROM,TO", where=str(path)
     )

@@ -125,11 +125,23 @@ def references(content: bytes, where: str) -> list[Reference]:
         for name, value in attributes.items():
             if (tag, name) in READ:
                 if value:
-                    found.append(Reference(tag, name, value, "read", parser.CurrentByteIndex))
+                    found.append(
+                        Reference(tag=tag, attribute=name, value=value, kind="read", offset=parser.CurrentByteIndex)
+                    )
             elif name in WRITTEN and value not in _NOWHERE:
-                found.append(Reference(tag, name, value, "written", parser.CurrentByteIndex))
+                found.append(
+                    Reference(tag=tag, attribute=name, value=value, kind="written", offset=parser.CurrentByteIndex)
+                )
         if tag == "param" and _is_written(attributes.get("key", "")) and attributes.get("value", "") not in _NOWHERE:
-            found.append(Reference(tag, "value", attributes["value"], "written", parser.CurrentByteIndex))
+            found.append(
+                Reference(
+                    tag=tag,
+                    attribute="value",
+                    value=attributes["value"],
+                    kind="written",
+                    offset=parser.CurrentByteIndex,
+                )
+            )
 
     parser.StartElementHandler = start
     try:

@@ -56,7 +56,16 @@ def _read(path: Path, _changed: int) -> RightOfWay | None:
         points = tuple(point for lane in inside for point in shapes.get(lane, ()))
         source, target = (f"{one.attrib[end]}_{one.attrib[f'{end}Lane']}" for end in ("from", "to"))
         junction = via[1:].rpartition("_")[0].rpartition("_")[0]
-        links.append(Link(junction, source, target, tuple(inside), bool(one.get("tl")), points))
+        links.append(
+            Link(
+                junction=junction,
+                source=source,
+                target=target,
+                inside=tuple(inside),
+                signalised=bool(one.get("tl")),
+                shape=points,
+            )
+        )
     gives_way = set()
     for node in root.iter("junction"):
         if node.get("type", "") in _SILENT:

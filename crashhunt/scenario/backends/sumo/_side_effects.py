@@ -138,13 +138,13 @@ def _check_text(file: str, content: bytes, *, reads: bool) -> None:
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         if tag not in ELEMENTS:
-            raise _SideEffectError(f"{file} has <{tag}>, of which nobody knows what SUMO does with it")
+            raise _SideEffectError(f"{file} has <{tag}>, which has an unknown effect in SUMO")
         for name, value in attributes.items():
             if (tag, name) in READ:
                 if not reads or value.startswith("/") or "${" in value:
                     raise _SideEffectError(f"{file} has <{tag} {name}={value!r}>, and SUMO would read that file")
             elif name not in ATTRIBUTES and name not in WRITTEN:  # these are turned away from where they point
-                raise _SideEffectError(f"{file} has <{tag} {name}=…>, of which nobody knows what SUMO does with it")
+                raise _SideEffectError(f"{file} has <{tag} {name}=…>, which has an unknown effect in SUMO")
         key, value = attributes.get("key", ""), attributes.get("value", "")
         if tag == "param" and key not in LABELS and {"/", "\\", ":"}.intersection(value):
             raise _SideEffectError(f"{file} has the parameter {key} = {value!r}, which might name a file")

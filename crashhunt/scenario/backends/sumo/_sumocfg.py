@@ -107,7 +107,7 @@ def changes(options: Mapping[str, str]) -> list[str]:
         elif name == "load-state":
             found.append(f"load-state {value} (a trial begins with an empty road)")
         elif name == "end" and not value.startswith("-"):
-            found.append(f"end {value} (until then traffic is added; a trial goes on to its last step)")
+            found.append(f"end {value} (until then traffic is added; a trial continues to its last step)")
     written = [name for name in options if writes(name) and not is_shown(name)]
     if written:
         found.append(f"{', '.join(written)} (nothing is written)")

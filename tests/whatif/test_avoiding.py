@@ -7,7 +7,7 @@ import random
 import pytest
 
 from crashhunt.crashes import Attempt, Judgement
-from crashhunt.replays._avoidability import CannotError, Search, Tried
+from crashhunt.whatif._avoidability import CannotError, Search, Tried
 
 
 class Runs:
@@ -71,7 +71,7 @@ def test_changing_lanes_is_tried_only_where_braking_helps_no_more():
 
 
 @pytest.mark.parametrize(("most", "verdict"), [(1, "unknown"), (2, "unknown"), (3, "invalid")])
-def test_nobody_is_said_to_have_been_put_there_where_no_runs_were_left_to_change_lanes(most, verdict):
+def test_no_verdict_of_invalid_where_no_runs_remain_for_lane_changes(most, verdict):
     helpless = {"brake": (), "left": (), "right": ()}
     judgement = found(Runs(helpless), end=1, start=0, most=most)
     assert judgement.verdict == verdict
@@ -103,7 +103,7 @@ def test_what_cannot_be_known_is_not_known():
     assert found(Runs({"brake": ()}), end=0).why_not == "it crashed in its first step"
 
 
-def test_json_says_what_was_run():
+def test_json_lists_the_runs():
     data = Judgement((Attempt("brake", 9, {7: "avoided", 8: "hit"}, 8.0),)).to_json()
     assert data == {
         "avoidable": True, "manoeuvre": "brake", "last_step": 7, "runs": 2, "why_not": "",
@@ -128,6 +128,6 @@ def test_json_says_what_was_run():
         ({8: "hit"}, None, "unknown"),
     ],
 )
-def test_what_came_too_late_to_be_seen_is_told_apart(endings, visible, verdict):
+def test_too_late_when_visible_is_a_verdict_of_its_own(endings, visible, verdict):
     judgement = Judgement((Attempt("brake", 9, endings),), visible_step=visible)
     assert judgement.verdict == verdict

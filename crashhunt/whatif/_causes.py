@@ -1,15 +1,14 @@
-"""What a crash hangs on: its trial is run again with one thing left out at a time.
+"""Finds the causes of a crash: reruns its trial without one candidate cause at a time.
 
-What was done in the episode is left out from just before it began: up to there, every such run is the same to the bit,
-or it says nothing. Arguments and seeds are of the whole trial, and with them the traffic is another one from the
-beginning. What is run, and in which order, does not depend on how many run at a time.
+A manoeuvre is suppressed from just before it began. Up to there, every such run must be bit-identical, or its result
+does not count. Arguments and seeds affect the whole trial, so other values change the traffic from the beginning. The
+runs and their order do not depend on how many run at a time.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,9 +17,9 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why, partner, signature_of_fault
 from crashhunt.plans import read_settings
-from crashhunt.recording import read_lanes
-from crashhunt.replays._prepare import StoppedError
+from crashhunt.recording import has_same_scenes, read_lanes
 from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled
+from crashhunt.whatif._reruns import StoppedError
 from crashhunt.world import first_contact
 
 if TYPE_CHECKING:
@@ -30,8 +29,9 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Without
     from crashhunt.recording import Recording
-    from crashhunt.replays._prepare import Ended, Rerun, Reruns
+    from crashhunt.replays import Rerun
     from crashhunt.trial import Distribution, TrialResult, TrialSpec, Value
+    from crashhunt.whatif._reruns import Ended, Reruns
     from crashhunt.world import Scene
 
 
@@ -40,17 +40,17 @@ __all__ = ["Doing", "find_why", "maneuvers_of", "relevant_actors"]
 
 # What agent and others did before a collision that it may hang on: braking, speeding up, changing lanes.
 
-_BEFORE_S = 10.0  # nobody asks what somebody did longer ago
+_BEFORE_S = 10.0  # manoeuvres longer before the collision are not examined
 _NEAR_S, _NEAR_M = 5.0, 60.0  # who is further away than that is not asked about
 _BRAKES, _SPEEDS_UP = -1.5, 1.0  # m/s²; less is driving along
 _BEGINS = 0.3  # m/s²; from here on, it belongs to what follows
-_PAUSE_S = 0.5  # who goes on after it has not stopped
+_PAUSE_S = 0.5  # a shorter interruption does not end a manoeuvre
 _CHANGED = 1.0  # m/s in all; less makes no difference
 
 
 @dataclass(frozen=True, slots=True)
 class Doing:
-    """Something that somebody did.
+    """A manoeuvre of an actor.
 
     Args:
         actor: who.
@@ -71,7 +71,7 @@ def relevant_actors(recording: Recording, agent: str, other: str, most: int) -> 
     Args:
         recording: of the collision.
         agent: the controlled vehicle.
-        other: whom it collided with; empty for nobody.
+        other: The collision partner; empty if there was none.
         most: how many at most.
     """
     scenes = recording.scenes()
@@ -93,13 +93,13 @@ def relevant_actors(recording: Recording, agent: str, other: str, most: int) -> 
 
 
 def maneuvers_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> list[Doing]:
-    """Return what somebody did in the last seconds before a step, the last of each sort.
+    """Return an actor's manoeuvres in the last seconds before a step: the last one of each type.
 
     Args:
         recording: of the collision.
         actor: who.
         lanes: around the place.
-        end: the step of the collision; what happens in it is left out, as it changes speeds by itself.
+        end: The step of the collision, which is excluded, because a collision changes speeds.
     """
     dt = recording.prologue.step_length_s
     first = max(0, end - round(_BEFORE_S / dt))
@@ -116,15 +116,19 @@ def maneuvers_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> 
     for what, limit in (("braked", _BRAKES), ("sped up", _SPEEDS_UP)):
         place = _onset(np.diff(speeds) / dt, limit, max(1, round(_PAUSE_S / dt)), dt)
         if place is not None:
-            found.append(Doing(actor, what, steps[place], float(speeds[place])))
+            found.append(Doing(actor=actor, what=what, step=steps[place], speed=float(speeds[place])))
     place = _change(recording, scenes, actor, lanes)
     if place is not None:
-        found.append(Doing(actor, "changed lanes", steps[place], float(speeds[min(place, len(speeds) - 1)])))
+        found.append(
+            Doing(
+                actor=actor, what="changed lanes", step=steps[place], speed=float(speeds[min(place, len(speeds) - 1)])
+            )
+        )
     return found
 
 
 def _onset(changes: NDArray[np.float64], limit: float, pause: int, dt: float) -> int | None:
-    """The scene after which somebody last began to brake, or to speed up; None where nobody did."""
+    """Return the scene after which the actor last began to brake, or to speed up; None if it never did."""
     way = 1.0 if limit > 0 else -1.0
     hard = np.flatnonzero(way * changes >= abs(limit))
     while len(hard):
@@ -151,8 +155,8 @@ def _change(recording: Recording, scenes: Sequence[Scene], actor: str, lanes: La
 
 _OTHERS = 5  # who is asked about, besides the agent
 _DRAWS, _SEEDS = 8, 8
-_EARLIER_S = (0.0, 0.5, 1.0)  # before it began, what somebody did is left out
-_GONE_S = (3.0, 4.0, 5.0)  # before the collision, somebody is taken off the road
+_EARLIER_S = (0.0, 0.5, 1.0)  # a manoeuvre is suppressed from these times before its beginning
+_GONE_S = (3.0, 4.0, 5.0)  # an actor is removed at these times before the collision
 _LONGER_S = 5.0  # simulation time past the collision, so that one that only comes later is seen
 _TRAFFIC = 0x776879  # apart from what else is drawn of a trial's seed
 _SAYS_NOTHING = (Outcome.INVALID, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
@@ -162,13 +166,13 @@ _KEEPS = {"braked": "speed", "sped up": "speed", "changed lanes": "lane"}
 
 @dataclass(slots=True)
 class _Asked:
-    """Something to leave out, and the runs without it.
+    """A candidate cause, and the runs without it.
 
     Args:
         factor: what it is.
         runs: each with what is given in it, and how.
-        inside: whether it is left out within the episode, from the step that is given on.
-        held: who is held to its speed in them; empty for nobody.
+        inside: Whether the cause is suppressed within the episode, from the given step on.
+        held: The actor that is held to its speed in the runs; empty if there is none.
     """
 
     factor: Factor
@@ -203,7 +207,7 @@ def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], Non
         (same,) = runs.run([rerun.spec], recorded=False)
         if same.result.digest != rerun.bundle.result.digest:
             return Why(steps=search.steps, left=len(turns), why_not="the trial was not the same when it was run again")
-        # An older crashhunt in the snapshot knows arguments, and nothing of what is left out within an episode.
+        # An older crashhunt in the snapshot supports arguments, but no holds within an episode.
         for inside in (False, True):
             batch = [(one, place) for one, place in chosen if one.inside is inside]
             try:
@@ -220,11 +224,13 @@ def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], Non
                 why_not = error.message
     except StoppedError:
         why_not = INTERRUPTED
-    return Why(tuple(one.answered for one in asked if one.endings), search.steps, left, why_not)
+    return Why(
+        factors=tuple(one.answered for one in asked if one.endings), steps=search.steps, left=left, why_not=why_not
+    )
 
 
 class _Search:
-    """What there is to leave out of one crash."""
+    """The candidate causes of one crash."""
 
     def __init__(self, rerun: Rerun) -> None:
         result = rerun.bundle.result
@@ -269,13 +275,13 @@ class _Search:
         into = ""
         if asked.inside:
             step = int(given)
-            if recording is None or not self._alike(recording, step):
+            if recording is None or not has_same_scenes(self._recording, recording, step):
                 return LeftOut(given, "unclear")
             if asked.factor.kind == "other":
                 held = asked.runs[place][1].disturbances[-1]
-                told = [(one.step, one.what, one.vehicle) for one in recording.disturbances]
-                if (held.step, held.what, held.vehicle) not in told:
-                    return LeftOut(given, "unclear")  # it could not be done
+                recorded = [(one.step, one.what, one.vehicle) for one in recording.disturbances]
+                if (held.step, held.what, held.vehicle) not in recorded:
+                    return LeftOut(given, "unclear")  # the simulator could not apply the hold
             into = self._into(recording, asked.held, step) if asked.held else ""
         ending: Without = "none"
         if result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
@@ -291,19 +297,8 @@ class _Search:
             return was is now and signature_of_fault(result) == signature_of_fault(self._result)
         return {was.collider, was.victim} == {now.collider, now.victim}
 
-    def _alike(self, recording: Recording, step: int) -> bool:
-        """Whether a run was the same to the bit up to a step."""
-        return recording.steps >= step and all(
-            self._states[number] == recording.scene(number).frame[1].tobytes() for number in range(step + 1)
-        )
-
-    @cached_property
-    def _states(self) -> list[bytes]:
-        """The scene after each step, as raw bytes."""
-        return [scene.frame[1].tobytes() for scene in self._recording.scenes()]
-
     def _into(self, recording: Recording, held: str, step: int) -> str:
-        """Whom somebody drove into who was held to its speed; the collision itself is left out."""
+        """Return the actor into which a vehicle with held speed drove, except in the examined collision."""
         for scene in recording.scenes()[step + 1 :]:
             row = scene.roster.index.get(held)
             if row is None:
@@ -318,12 +313,16 @@ class _Search:
     def _disturbances(self) -> Iterator[_Asked]:
         """What the trial was disturbed by."""
         planned = self._spec.disturbances
-        told = {(one.step, one.agent, one.what): one.vehicle for one in self._rerun.bundle.result.disturbances}
+        targets = {(one.step, one.agent, one.what): one.vehicle for one in self._rerun.bundle.result.disturbances}
         for one in planned:
-            if who := told.get((one.step, one.agent, one.what)):
+            if who := targets.get((one.step, one.agent, one.what)):
                 spec = replace(self._spec, disturbances=tuple(each for each in planned if each is not one))
                 longer = replace(spec, max_steps=self._inside.max_steps)
-                yield _Asked(Factor("disturbance", who, one.what, one.step), [(one.step - 1, longer)], inside=True)
+                yield _Asked(
+                    Factor(kind="disturbance", name=who, what=one.what, step=one.step),
+                    [(one.step - 1, longer)],
+                    inside=True,
+                )
 
     def _agents(self) -> Iterator[_Asked]:
         """What the agent decided; and the other one, where that is one too."""
@@ -333,19 +332,30 @@ class _Search:
                 (step, replace(self._inside, overruled=Overruled(doing.actor, step, keeps=_KEEPS[doing.what])))
                 for step in self._earlier(doing.step, _EARLIER_S)
             ]
-            yield _Asked(Factor("agent", doing.actor, doing.what, doing.step, doing.speed), runs, inside=True)
+            yield _Asked(
+                Factor(kind="agent", name=doing.actor, what=doing.what, step=doing.step, was=doing.speed),
+                runs,
+                inside=True,
+            )
 
     def _others(self, name: str) -> list[_Asked]:
-        """What somebody else did, and that it was there."""
+        """Return another actor's manoeuvres and its presence as candidate causes."""
         found = []
         for doing in self._doings(name):
             what = _HOLDS[doing.what]
             held = name if what == "keep_speed" else ""
             runs = [(step, self._held(name, what, step)) for step in self._earlier(doing.step, _EARLIER_S)]
-            found.append(_Asked(Factor("other", name, doing.what, doing.step, doing.speed), runs, True, held))
+            found.append(
+                _Asked(
+                    factor=Factor(kind="other", name=name, what=doing.what, step=doing.step, was=doing.speed),
+                    runs=runs,
+                    inside=True,
+                    held=held,
+                )
+            )
         steps = [step for step in self._earlier(self._end, _GONE_S) if self._is_there(name, step)]
         runs = [(step, self._held(name, "gone", step)) for step in steps]
-        found.append(_Asked(Factor("other", name, "there", self._end), runs, True))
+        found.append(_Asked(Factor(kind="other", name=name, what="there", step=self._end), runs, True))
         return found
 
     def _doings(self, actor: str) -> list[Doing]:
@@ -358,9 +368,11 @@ class _Search:
         return list(dict.fromkeys(max(0, step - round(each / self._dt)) for each in ago_s))
 
     def _held(self, name: str, what: str, step: int) -> TrialSpec:
-        """The trial with somebody kept from something after a step."""
+        """Return the trial with a hold of an actor after a step."""
         how_long = (self._inside.max_steps - step) * self._dt
-        held = Disturbance(step + 1, "itself", what, 0.0, how_long, self._agent, name)
+        held = Disturbance(
+            step=step + 1, who="itself", what=what, how_strong=0.0, how_long=how_long, agent=self._agent, vehicle=name
+        )
         return replace(self._inside, disturbances=(*self._inside.disturbances, held))
 
     def _arguments(self) -> Iterator[_Asked]:

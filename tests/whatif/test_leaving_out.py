@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from crashhunt.crashes import Factor
-from crashhunt.replays._causes import _Asked, _Search
 from crashhunt.trial import Choice, Disturbance, Outcome, Range, TrialSpec
+from crashhunt.whatif._causes import _Asked, _Search
 
 SPEC = TrialSpec(7, 1, {"ego": {}}, {}, 99)
 
@@ -19,7 +19,7 @@ def search():
     found = object.__new__(_Search)
     found._spec = SPEC
     found._hit = SimpleNamespace(collider="ego", victim="x")
-    found.__dict__["_states"] = [b"\0" * 8] * 9
+    found._recording = Recorded()
     return found
 
 
@@ -48,7 +48,7 @@ def told(step, what, vehicle):
         ([], "unclear"),
     ],
 )
-def test_somebody_who_was_not_held_says_nothing(disturbances, ending):
+def test_run_in_which_the_actor_was_not_held_is_unclear(disturbances, ending):
     held = Disturbance(5, "itself", "gone", 0.0, 1.0, "ego", "x")
     spec = TrialSpec(7, 1, {"ego": {}}, {}, 99, disturbances=(held,))
     asked = _Asked(Factor("other", "x", "there", 8), [(4, spec)], inside=True)

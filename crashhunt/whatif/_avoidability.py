@@ -1,4 +1,4 @@
-"""Judging a crash: its trial is run again, overruled or with something left out, to see what avoids it."""
+"""Counterfactual analysis of a crash: reruns its trial with overridden actions, or without one cause at a time."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from crashhunt.crashes import (
     slowing,
     visible_from,
 )
-from crashhunt.replays._causes import find_why
-from crashhunt.replays._prepare import NotUnderstoodError, ReplayOptions, Reruns, StoppedError, prepare
+from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Outcome
+from crashhunt.whatif._causes import find_why
+from crashhunt.whatif._reruns import NotUnderstoodError, Reruns, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -27,8 +28,9 @@ if TYPE_CHECKING:
     from crashhunt.base.watching import Watch
     from crashhunt.crashes import Bundle, Ending
     from crashhunt.recording import Recording
-    from crashhunt.replays._prepare import Ended, Rerun
+    from crashhunt.replays import Rerun
     from crashhunt.trial import TrialResult
+    from crashhunt.whatif._reruns import Ended
 
 
 __all__ = ["CannotError", "Search", "Tried", "judge"]
@@ -120,10 +122,10 @@ class Search:
         """Return what has been found so far."""
         attempts = [
             Attempt(
-                tried.manoeuvre,
-                self._end,
-                dict(tried.endings),
-                max((value for value in tried.decelerations if value > _STANDS), default=None),
+                manoeuvre=tried.manoeuvre,
+                end=self._end,
+                endings=dict(tried.endings),
+                deceleration=max((value for value in tried.decelerations if value > _STANDS), default=None),
             )
             for tried in self._tries
             if tried.endings
@@ -213,13 +215,13 @@ def judge(
     late after the next. What it hangs on is found by leaving one thing out at a time.
 
     Args:
-        bundle: of a crash; of one that is no collision with somebody, only what it hangs on is run.
+        bundle: The bundle of a crash. Without a collision partner, only the runs for causes are possible.
         options: of the replays; only whose code drives, and whether it is trusted.
         runs: the most trials to run to avoid it.
         why: the most trials to run for what it hangs on; 0 leaves that out.
         parallel: how many at a time.
         watch: called with how many have been run, and the most.
-        stopped: asked now and then whether to give up; what has been found by then is returned.
+        stopped: Returns whether to stop; called repeatedly. The results until then are returned.
 
     Raises:
         UsageError: it is a near miss or a hang, there is nothing to run, or ``runs`` is below 1.
@@ -240,7 +242,7 @@ def judge(
             if watch is not None:
                 watch(done, runs + why)
 
-        trials = _Trials(result, rerun.recorded, reruns, tell)
+        trials = _Trials(result=result, recorded=rerun.recorded, reruns=reruns, tell=tell)
         search = Search(result.steps, _start(rerun) if of_two else 0, trials.run, runs=runs, parallel=parallel)
         found = None
         try:
@@ -272,8 +274,8 @@ def _see_that_it_can_be_judged(bundle: Bundle, *, of_two: bool, why: int) -> Non
         )
     if not of_two and why == 0:
         raise UsageError(
-            f"{bundle.id} is no collision with somebody else, so that only what it hangs on can be run",
-            fix="leave --why out, or give at least 1",
+            f"{bundle.id} is not a collision with another actor, so only its causes can be analysed",
+            fix="omit --why, or give at least 1",
         )
 
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from crashhunt.crashes import find_bundle, open_archive
-from crashhunt.replays import judge
-from crashhunt.replays._prepare import NotUnderstoodError, _see_that_it_was_run
 from crashhunt.trial import Disturbance, Overruled, TrialSpec
+from crashhunt.whatif import judge
+from crashhunt.whatif._reruns import NotUnderstoodError, _require_same_trial
 
 SPEC = TrialSpec(1, 2, {"ego": {"speed": 3.0}}, {}, 9)
 
@@ -23,11 +23,11 @@ SPEC = TrialSpec(1, 2, {"ego": {"speed": 3.0}}, {}, 9)
         {"only": ()},
     ],
 )
-def test_another_trial_than_was_asked_for_says_nothing(asked):
+def test_another_trial_than_was_asked_for_is_refused(asked):
     spec = replace(SPEC, **asked)
-    _see_that_it_was_run(spec, TrialSpec.from_json(spec.to_json()))
+    _require_same_trial(spec, TrialSpec.from_json(spec.to_json()))
     with pytest.raises(NotUnderstoodError, match="too old"):
-        _see_that_it_was_run(spec, SPEC)
+        _require_same_trial(spec, SPEC)
 
 
 @pytest.mark.nightly

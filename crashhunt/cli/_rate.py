@@ -1,0 +1,94 @@
+"""``crashhunt rate``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import UsageError
+from crashhunt.cli._common import DONE, NO_ANSWER, THE_ANSWER_IS_NO, add_json, number, say
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Iterable
+
+    from crashhunt.cli._common import Commands
+    from crashhunt.rates import Per
+
+__all__ = ["add_rate", "exit_code_of"]
+
+_PERS = ("trial", "hour", "1000km")
+
+
+def add_rate(commands: Commands) -> None:
+    """Add the command."""
+    rate = commands.add_parser(
+        "rate",
+        help="report how often an agent crashes, with a guarantee",
+        description="Report how often an agent crashes: per trial, per hour and per 1,000 km in its traffic. "
+        "The interval is valid whenever you look, also of a hunt that runs, was killed or stopped at its first crash.",
+    )
+    rate.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of hunts or suites")
+    rate.add_argument(
+        "--per", metavar="UNIT", choices=_PERS, help="trial, hour or 1000km; default: all three, or that of --bar"
+    )
+    rate.add_argument(
+        "--confidence", metavar="PERCENT", type=number, default=95.0, help="of the intervals; default: 95"
+    )
+    rate.add_argument(
+        "--by", metavar="PART", default="",
+        help="divide the rate by kind, fault, disturbance or ARG[:BINS], an argument in so many bins (default: 4)",
+    )  # fmt: skip
+    rate.add_argument(
+        "--bar", metavar="RATE", default="",
+        help="compare with a rate, such as 1e-3/trial, 2/hour or 5/1000km: exit with 0 if the rate is certainly below, "
+        "1 if it is certainly above, 3 if it is undecided",
+    )  # fmt: skip
+    rate.add_argument("--csv", action="store_true", help="print a line per rate as CSV")
+    rate.add_argument("--html", metavar="FILE", type=Path, help="write a page")
+    add_json(rate)
+    rate.set_defaults(command=_rate)
+
+
+def _rate(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.estimation import measure_rates
+    from crashhunt.hunts import find_hunts
+    from crashhunt.plans import check_rate, rate_of
+    from crashhunt.report import describe_rates, rates_page, write_rates_csv
+
+    per: Per | None = options.per
+    bar = None
+    if options.bar:
+        if fix := check_rate(options.bar):
+            raise UsageError(f"--bar is {options.bar}", fix=fix)
+        bar, unit = rate_of(options.bar)
+        if per not in (None, unit):
+            raise UsageError(f"--per is {per} and --bar is {options.bar}", fix=f"give --per {unit}, or no --per")
+        per = unit
+    per = per or ("trial" if options.by else None)
+    hunts = dict.fromkeys(hunt for directory in options.directories for hunt in find_hunts(directory))
+    rates = [
+        rate
+        for hunt in hunts
+        for rate in measure_rates(hunt, per=per, confidence=options.confidence, by=options.by, bar=bar)
+    ]
+    if options.csv:
+        write_rates_csv(rates, sys.stdout)
+    else:
+        say(describe_rates(rates), as_json=options.json)
+    if options.html is not None:
+        rates_page(rates, options.html)
+        say(f"{options.html} has the page", as_json=options.json or options.csv)
+    if options.json:
+        print(json.dumps({"rates": [rate.to_json() for rate in rates]}))
+    return DONE if bar is None else exit_code_of(rate.verdict for rate in rates)
+
+
+def exit_code_of(verdicts: Iterable[str]) -> int:
+    """Return 1 where a rate is above its bar, else 3 where a rate is undecided, else 0."""
+    found = set(verdicts)
+    if "above" in found:
+        return THE_ANSWER_IS_NO
+    return NO_ANSWER if found != {"below"} else DONE

@@ -1,0 +1,332 @@
+"""What a hunt reports: the report itself, and those of its audit, its probes and its branches."""
+
+from __future__ import annotations
+
+import statistics
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+from crashhunt.base.codec import Serializable
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.crashes import Bundle, Group
+    from crashhunt.ledger import KindData
+    from crashhunt.plans import HuntSettings
+    from crashhunt.rates import CrashRate, RareEstimate
+    from crashhunt.trial import Disturbance
+
+__all__ = [
+    "AuditReport",
+    "BranchReport",
+    "Difference",
+    "HuntReport",
+    "ProbeReport",
+    "RareReport",
+    "StoppedBecause",
+    "kind_data",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference(Serializable):
+    """Where a trial differs when it is run again in a new process.
+
+    Args:
+        trial: number of the trial.
+        step: the first step that differs; None where no recording was kept, so that only the digest was compared.
+        agent: identifier of the agent or actor; empty where the difference concerns neither.
+        field: name of the value that differs.
+        recorded: the value in the hunt.
+        replayed: the value in the new process.
+    """
+
+    trial: int
+    step: int | None
+    agent: str
+    field: str
+    recorded: object
+    replayed: object
+
+    def __str__(self) -> str:
+        whose = f" of {self.agent}" if self.agent else ""
+        where = "" if self.step is None else f"at step {self.step}, "
+        return (
+            f"trial {self.trial} is another one in a fresh process: {where}{self.field}{whose} was "
+            f"{self.recorded} and is {self.replayed}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class AuditReport(Serializable):
+    """The result of an audit, which runs trials without a crash again in new processes.
+
+    Args:
+        trials: number of trials that were run again to their end.
+        differences: one for each trial that differed.
+        not_finished: number of trials whose second run did not reach its end.
+    """
+
+    trials: int = 0
+    differences: tuple[Difference, ...] = ()
+    not_finished: int = 0
+
+    json_keys = ("trials", "not_finished", "differences")
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeReport:
+    """The result of the probes of a hunt.
+
+    Args:
+        margins: the stress margin of each trial whose probes were all evaluated.
+        not_fully_asked: number of further trials, in which a probe has no result.
+        why_unasked: the reason for the first of these trials; empty where there is none.
+        probes: number of copies that were run.
+        steps: number of steps of the copies.
+        skipped: number of probes that were skipped because the copies had used up their steps.
+        run_again: number of crashes with the mildest disturbance that were run again from the start.
+        not_finished: number of these runs that did not reach their end, for example because they were killed.
+        crashes: runs that crashed in the same way at the same step, and again bit-identically.
+        by: for each of these, the disturbance as it took place. The trial may have drawn others in addition.
+    """
+
+    margins: tuple[float, ...]
+    not_fully_asked: int
+    why_unasked: str
+    probes: int
+    steps: int
+    skipped: int
+    run_again: int
+    not_finished: int
+    crashes: tuple[Bundle, ...]
+    by: tuple[Disturbance, ...]
+
+    def to_json(self) -> JsonObject:
+        """Return the shape that ``run --json`` prints."""
+        return {
+            "trials": len(self.margins),
+            "not_fully_asked": self.not_fully_asked,
+            "least": min(self.margins, default=None),
+            "median": statistics.median(self.margins) if self.margins else None,
+            "probes": self.probes,
+            "steps": self.steps,
+            "left_out": self.skipped,
+            "run_again": self.run_again,
+            "not_finished": self.not_finished,
+            "confirmed": len(self.crashes),
+            "crashes": [bundle.summary() for bundle in self.crashes],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class BranchReport:
+    """The result of the branches of a hunt.
+
+    Args:
+        trials: number of trials that could have branches.
+        moments: number of steps from which copies continued.
+        branches: number of copies.
+        steps: number of steps of the copies.
+        skipped: number of branches that were skipped because the copies had used up their steps.
+        crashed: number of branches that crashed.
+        crashed_trials: number of trials with a branch that crashed.
+        not_fully_asked: number of trials in which a branch has no result.
+        why_unanswered: the reason for the first of these trials; empty where there is none.
+        run_again: number of crashed branches that were run again from the start: the likeliest of each trial.
+        not_finished: number of these runs that did not reach their end, for example because they were killed.
+        crashes: runs that crashed in the same way at the same step, and again bit-identically.
+    """
+
+    trials: int
+    moments: int
+    branches: int
+    steps: int
+    skipped: int
+    crashed: int
+    crashed_trials: int
+    not_fully_asked: int
+    why_unanswered: str
+    run_again: int
+    not_finished: int
+    crashes: tuple[Bundle, ...]
+
+    def to_json(self) -> JsonObject:
+        """Return the shape that ``run --json`` prints."""
+        return {
+            "trials": self.trials,
+            "moments": self.moments,
+            "branches": self.branches,
+            "steps": self.steps,
+            "left_out": self.skipped,
+            "crashed": self.crashed,
+            "crashed_trials": self.crashed_trials,
+            "not_fully_asked": self.not_fully_asked,
+            "run_again": self.run_again,
+            "not_finished": self.not_finished,
+            "confirmed": len(self.crashes),
+            "crashes": [bundle.summary() for bundle in self.crashes],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class RareReport:
+    """What came of a hunt in rare mode.
+
+    Args:
+        estimate: of the crash probability per trial.
+        verified: how many of the weightiest crashes of copies were run from the start.
+        not_finished: how many of these could not be run to their end.
+        crashes: those of them that crashed in the same way at the same step, and once more bit-identically.
+    """
+
+    estimate: RareEstimate
+    verified: int
+    not_finished: int
+    crashes: tuple[Bundle, ...]
+
+    @property
+    def is_verified(self) -> bool:
+        """Whether every crash that was run to its end from the start came again."""
+        return len(self.crashes) == self.verified - self.not_finished
+
+    def to_json(self) -> JsonObject:
+        """Return the shape that ``run --json`` prints."""
+        return {
+            **self.estimate.to_json(),
+            "run_again": self.verified,
+            "not_finished": self.not_finished,
+            "confirmed": len(self.crashes),
+            "crashes": [bundle.summary() for bundle in self.crashes],
+        }
+
+    @property
+    def lines(self) -> list[str]:
+        """The answer, its evidence and what is missing, for the user."""
+        found = self.estimate
+        if found.estimate is None:
+            return [f"rare: no estimate: {found.why_not or 'no root has ended'}"]
+        answer = f"rare: {found.estimate:.2g} per trial"
+        if found.estimated is not None:
+            one = found.estimated
+            answer += (
+                f" ({one.low:.2g} to {one.high:.2g}, estimated from {found.roots} roots; "
+                f"effective sample size {one.effective:.0f})"
+            )
+        lines = [answer]
+        if found.estimated is None:
+            more = f"; about {found.more_roots} more roots are needed" if found.more_roots is not None else ""
+            lines.append(f"  no interval from {found.roots} roots: {found.why_not}{more}")
+        shares = [
+            f"{cell} {part:.2g} ({part / found.disturbed:.0%})" for cell, part in found.parts.items() if found.disturbed
+        ]
+        lines.append("  " + "; ".join([f"undisturbed {found.undisturbed_crashes} of {found.roots}", *shares[:5]]))
+        if found.plain_equivalent_steps is not None:
+            lines.append(
+                f"  {found.steps} steps; plain trials need about {found.plain_equivalent_steps:.2g} for the same error"
+            )
+        if self.verified:
+            lines.append(f"  of the {self.verified} weightiest crashes, {len(self.crashes)} came again from the start")
+        lines.append("  an estimate says nothing about failures that no copy has met")
+        return lines
+
+
+def kind_data(group: Group) -> KindData:
+    """Return a crash type in a few words, with the identifiers of its crashes."""
+    return {
+        "words": str(group.signature),
+        "count": group.count,
+        "first": group.first.id,
+        "shortest": group.shortest.id,
+    }
+
+
+StoppedBecause = Literal["crash", "distinct", "rate", "all_trials", "interrupted", "no_valid_trial", "time", "precise"]
+
+
+@dataclass(frozen=True, slots=True)
+class HuntReport:
+    """The result of a hunt.
+
+    Args:
+        directory: of the hunt.
+        settings: the settings that it ran with.
+        stopped_because: the reason why it ended.
+        outcomes: number of trials with each outcome.
+        trial_steps: number of steps of the trials.
+        steps_total: number of simulated steps. It includes warm-up traffic, copies, and confirmations that failed.
+        wall_s: wall time of this run, in s.
+        crashes: the crashes that were found, the one with the fewest steps first.
+        reason: in words, where no trial was valid.
+        notes: facts about the run that users should know, such as trials that were run again.
+        events: traffic events of all trials: kind to their number, and the number of trials that had one.
+        audit: the result of the audit; None without ``--audit``.
+        kinds: crash types, the most frequent first; None where the first crash ended the hunt.
+        near_misses: the near misses that were kept, the most critical first.
+        probes: the result of the probes; None without ``--probe``.
+        at_fault: numbers of the trials whose crash is the agent's fault; None without ``--at-fault``.
+        branches: the result of the branches; None without ``--branch``.
+        copied: the crash of a copy that ended the hunt. It was confirmed by a run from the start.
+        rare: the result of rare mode; None without ``--rare``.
+        unanswered: number of trials that the same command runs again, because they or their copies were killed.
+        rate: the rate, compared with the bar of ``until_rate``; None where there is no bar.
+    """
+
+    directory: Path
+    settings: HuntSettings
+    stopped_because: StoppedBecause
+    outcomes: dict[str, int]
+    trial_steps: int
+    steps_total: int
+    wall_s: float
+    crashes: tuple[Bundle, ...]
+    reason: str = ""
+    notes: tuple[str, ...] = ()
+    events: dict[str, tuple[int, int]] = field(default_factory=dict)
+    audit: AuditReport | None = None
+    kinds: tuple[Group, ...] | None = None
+    near_misses: tuple[Bundle, ...] = ()
+    probes: ProbeReport | None = None
+    at_fault: tuple[int, ...] | None = None
+    branches: BranchReport | None = None
+    copied: Bundle | None = None
+    unanswered: int = 0
+    rate: CrashRate | None = None
+    rare: RareReport | None = None
+
+    def to_json(self) -> JsonObject:
+        """Return the shape that ``run --json`` prints."""
+        found: JsonObject = {
+            "dir": str(self.directory),
+            "hunt_seed": self.settings.seed,
+            "trials_planned": self.settings.trials,
+            "trials_run": sum(self.outcomes.values()),
+            "outcomes": self.outcomes,
+            "stopped_because": self.stopped_because,
+            "wall_s": round(self.wall_s, 3),
+            "steps_total": self.steps_total,
+            "events": {kind: {"count": count, "trials": trials} for kind, (count, trials) in self.events.items()},
+            "crashes": [bundle.summary() for bundle in self.crashes],
+            "notes": list(self.notes),
+            "audit": self.audit.to_json() if self.audit is not None else None,
+            "unanswered": self.unanswered,
+        }
+        if self.probes is not None:
+            found["probes"] = self.probes.to_json()
+        if self.branches is not None:
+            found["branches"] = self.branches.to_json()
+        if self.kinds is not None:
+            found["kinds"] = list(map(kind_data, self.kinds))
+        if self.settings.run.near_misses:
+            found["near_misses"] = [bundle.summary() for bundle in self.near_misses]
+        if self.at_fault is not None:
+            found["at_fault"] = list(self.at_fault)
+        if self.copied is not None:
+            found["copied"] = str(self.copied.path)
+        if self.rare is not None:
+            found["rare"] = self.rare.to_json()
+        if self.rate is not None:
+            found["rate"] = self.rate.to_json()
+        return found

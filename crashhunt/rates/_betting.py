@@ -1,0 +1,223 @@
+"""Intervals for a rate that are valid whenever you look at them, and a test whether two rates differ.
+
+Each unit has Y events (0 to b) and an exposure D (above 0, at most Dmax). The rate is E[Y] / E[D]. Computes for each
+possible rate r the capital of bets against r, and returns the rates whose capital is below 1 / alpha:
+
+    E(r) = sum_j w_j prod_i (1 + k_j(r) (Y_i - r D_i)),    k_j(r) = clip(q_j / r - 1, -0.999 / b, 0.999 / (r Dmax)).
+
+Component j bets as if the rate were q_j. A quarter of the weight is on q = 0, because most agents crash rarely. Without
+an event the upper end is at about 3.5 / n. Clopper and Pearson's is at 3.7 / n, and valid at one fixed n only.
+
+Invariant: at the true rate each factor is positive and has mean 1 given the past. So E is a non-negative martingale
+that begins at 1. By Ville's inequality it ever reaches 1 / alpha with probability alpha at most. You may look at the
+interval after every trial, and stop because of what it shows. This needs independent units of one distribution, in an
+order that does not depend on their results. It needs b, Dmax, w and q that are fixed before the first unit.
+
+Why components below 1 do not count: each component is at most 1 at the observed rate, because log(1 + x) <= x. On
+either side of that rate, a component that exceeds 1 keeps growing. So the sum over the components above 1 grows to both
+sides, and bisection finds where it crosses 1 / alpha. The sum is smaller than E, so the interval stays valid.
+
+Sources:
+J. Ville, Étude critique de la notion de collectif (1939).
+H. Robbins, Statistical methods related to the law of the iterated logarithm (1970), for mixtures.
+I. Waudby-Smith and A. Ramdas, Estimating means of bounded random variables by betting, JRSS B 86(1), 2024, for the
+bets.
+P. Grünwald, R. de Heide and W. Koolen, Safe testing, JRSS B 86(5), 2024, for e-values.
+
+Cost: a unit adds to a counter. A capital takes as many logarithms as there are components times different units. With
+trials as exposure there are two different units.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+__all__ = ["Bets", "Interval", "RateTest", "discordance_evidence"]
+
+_WEIGHT_OF_ZERO = 0.25
+_LEAST_RATE, _GREATEST_RATE = 1e-7, 0.98  # of the grid, in events per greatest exposure
+_COMPONENTS = 40  # between them, evenly spaced in the logarithm
+_GREATEST_UNBOUNDED_RATE = 1e3  # of the grid where a unit may have less than the greatest exposure
+_SHARE_AT_STAKE = 0.999  # of the capital in one bet, at most
+_PRECISION = 1e-9  # relative, of both ends
+
+
+class Interval(NamedTuple):
+    """The rates that the units are compatible with.
+
+    Args:
+        low: the least.
+        high: the greatest; infinite where there is no exposure.
+    """
+
+    low: float
+    high: float
+
+
+class Bets:
+    """What is bet against a rate, before the first unit.
+
+    Args:
+        most_events: that one unit can have.
+        most_exposure: that one unit can have, in any measure; rates are per one of it.
+        fixed_exposure: whether every unit has the greatest exposure and one event at most, as trials do.
+    """
+
+    def __init__(
+        self, most_events: float = 1.0, most_exposure: float = 1.0, *, fixed_exposure: bool | None = None
+    ) -> None:
+        if not (0 < most_events < math.inf and 0 < most_exposure < math.inf):
+            raise ValueError(f"bounds are {most_events} and {most_exposure}; must be finite and above 0")
+        self.most_events, self.most_exposure = float(most_events), float(most_exposure)
+        self.fixed_exposure = most_events == most_exposure == 1.0 if fixed_exposure is None else fixed_exposure
+        ratio = (_GREATEST_RATE / _LEAST_RATE) ** (1 / (_COMPONENTS - 1))
+        count = _COMPONENTS
+        if not self.fixed_exposure:
+            count += math.ceil(math.log(_GREATEST_UNBOUNDED_RATE / _GREATEST_RATE) / math.log(ratio))
+        grid = _LEAST_RATE * ratio ** np.arange(count)
+        self._alternatives = np.concatenate(([0.0], grid)) / self.most_exposure
+        shares = np.concatenate(([_WEIGHT_OF_ZERO], np.full(count, (1 - _WEIGHT_OF_ZERO) / count)))
+        self._log_weights: NDArray[np.float64] = np.log(shares)
+
+    def stakes(self, rate: float) -> NDArray[np.float64]:
+        """Return the share of the capital that each component bets on more events than at a rate."""
+        least = -_SHARE_AT_STAKE / self.most_events
+        most = _SHARE_AT_STAKE / (rate * self.most_exposure)
+        found: NDArray[np.float64] = np.clip(self._alternatives / rate - 1.0, least, most)
+        return found
+
+    def log_evidence(self, log_capitals: NDArray[np.float64]) -> float:
+        """Return the logarithm of the sum of the components that have won; minus infinity where no component has."""
+        won = log_capitals > 0
+        if not won.any():
+            return -math.inf
+        logs = (self._log_weights + log_capitals)[won]
+        top = float(logs.max())
+        return top + math.log(float(np.exp(logs - top).sum()))
+
+    def log_mixture(self, log_capitals: NDArray[np.float64]) -> float:
+        """Return the logarithm of the sum of all components: the martingale itself."""
+        logs = self._log_weights + log_capitals
+        top = float(logs.max())
+        return top + math.log(float(np.exp(logs - top).sum()))
+
+
+class RateTest:
+    """Counts units, and returns what they say of the rate at any time.
+
+    Args:
+        bets: fixed before the first unit.
+    """
+
+    def __init__(self, bets: Bets | None = None) -> None:
+        self.bets = bets or Bets()
+        self.count, self.events, self.exposure = 0, 0.0, 0.0
+        self._units: Counter[tuple[float, float]] = Counter()
+        self._as_arrays: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None = None
+
+    def add(self, events: float, exposure: float = 1.0, times: int = 1) -> None:
+        """Add units.
+
+        Args:
+            events: of each, from 0 to the greatest number.
+            exposure: of each, from 0 to the greatest.
+            times: how many such units.
+
+        Raises:
+            ValueError: a unit is beyond the bounds that the bets rely on.
+        """
+        bets = self.bets
+        if not (0 <= events <= bets.most_events and 0 <= exposure <= bets.most_exposure * (1 + _PRECISION)):
+            raise ValueError(
+                f"a unit has {events:g} events and exposure {exposure:g}; "
+                f"must be at most {bets.most_events:g} and {bets.most_exposure:g}"
+            )
+        if times:
+            self.count += times
+            self.events += events * times
+            self.exposure += exposure * times
+            self._units[(float(events), float(exposure))] += times
+            self._as_arrays = None
+
+    def extend(self, units: Iterable[tuple[float, float]]) -> None:
+        """Add units, each as events and exposure."""
+        for events, exposure in units:
+            self.add(events, exposure)
+
+    @property
+    def observed(self) -> float | None:
+        """Events by exposure; None where there is no exposure."""
+        return self.events / self.exposure if self.exposure > 0 else None
+
+    def log_capitals(self, rate: float) -> NDArray[np.float64]:
+        """Return the logarithm of the capital of each component that bets against a rate."""
+        if self._as_arrays is None:
+            units = np.array(list(self._units), float).reshape(-1, 2)
+            self._as_arrays = units[:, 0], units[:, 1], np.array(list(self._units.values()), float)
+        events, exposure, times = self._as_arrays
+        found: NDArray[np.float64] = np.log1p(np.outer(self.bets.stakes(rate), events - rate * exposure)) @ times
+        return found
+
+    def log_evidence(self, rate: float) -> float:
+        """Return the logarithm of the evidence against a rate."""
+        return self.bets.log_evidence(self.log_capitals(rate))
+
+    def interval(self, alpha: float = 0.05) -> Interval:
+        """Return the rates with less evidence against them than 1 / alpha.
+
+        The probability that it ever excludes the true rate, after any number of units, is `alpha` at most.
+        """
+        greatest = 1 / self.bets.most_exposure if self.bets.fixed_exposure else math.inf
+        if self.exposure <= 0:
+            return Interval(0.0, greatest)
+        threshold = -math.log(alpha)
+        observed = self.events / self.exposure
+        low = self._crossing(observed, 0.5, threshold) if self.events > 0 else 0.0
+        high = self._crossing(observed or 1e-3 / self.exposure, 2.0, threshold, greatest)
+        return Interval(low, high)
+
+    def _crossing(self, inside: float, factor: float, threshold: float, bound: float = math.inf) -> float:
+        """Return where the evidence reaches a threshold, on the way from a rate by a factor; at most the bound."""
+        outside = inside * factor
+        while self.log_evidence(min(outside, bound)) < threshold:
+            if outside >= bound:
+                return bound
+            inside, outside = outside, outside * factor
+        outside = min(outside, bound)
+        while abs(outside - inside) > _PRECISION * outside:
+            middle = math.sqrt(inside * outside)
+            if self.log_evidence(middle) < threshold:
+                inside = middle
+            else:
+                outside = middle
+        return outside
+
+    def verdict(self, bar: float, alpha: float = 0.05) -> str:
+        """Return ``below`` or ``above`` where the interval lies on one side of a bar, else ``undecided``."""
+        if self.exposure <= 0 or self.log_evidence(bar) < -math.log(alpha):
+            return "undecided"
+        return "below" if self.events < bar * self.exposure else "above"
+
+
+def discordance_evidence(only_first: int, only_second: int) -> float:
+    """Return the logarithm of the evidence that two paired runs do not have events equally often.
+
+    Only discordant pairs count, as in McNemar's test (1947): without a difference each is a fair coin. The evidence is
+    the capital of a mixture of bets on that coin, with the weights of R. E. Krichevsky and V. K. Trofimov (1981). It is
+    a martingale that begins at 1, so it may be looked at after every pair; 1 / evidence is a p-value at any time.
+
+    >>> round(discordance_evidence(0, 0), 9)
+    0.0
+    """
+    a, b = only_first, only_second
+    beta = math.lgamma(a + 0.5) + math.lgamma(b + 0.5) - math.lgamma(a + b + 1.0)
+    return beta - math.log(math.pi) + (a + b) * math.log(2.0)

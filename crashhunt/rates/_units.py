@@ -1,0 +1,352 @@
+"""What counts as a unit of a hunt, in which order, and how much exposure it has.
+
+A unit is a trial, or with ``--seeds`` a traffic with all its trials, because trials of one traffic are not independent.
+
+Invariant: units count in the order of their numbers, up to the first trial that has not ended. Trials that crash early
+end early, so the trials that happen to have ended are not a fair sample. The first k trials are. So the interval stays
+valid where a hunt stopped at its first crash, was killed, ran out of time, or used many workers.
+
+Invalid trials leave both sides of the rate. More than 5 % of them make the rate one of other traffic than described, so
+no rate is reported. A trial whose process was killed from outside has not ended: a resumed hunt runs it again.
+
+Cost: constant for each trial; trials wait in memory only until those of lower numbers have ended.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, get_args
+
+from crashhunt.rates._betting import Bets, Interval, RateTest
+from crashhunt.trial import KILLED, Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from typing import Any
+
+    from crashhunt.ledger import UntilRate
+    from crashhunt.trial import TrialResult
+
+__all__ = [
+    "MAX_INVALID_SHARE",
+    "PERS",
+    "BarWatch",
+    "CountingRule",
+    "Per",
+    "RateCounter",
+    "TrialFacts",
+    "Unit",
+    "UnitSequence",
+    "facts_of",
+    "facts_of_plain",
+]
+
+Per = Literal["trial", "hour", "1000km"]
+"""What a rate is per."""
+
+PERS: tuple[Per, ...] = get_args(Per)
+MAX_INVALID_SHARE = 0.05  # of the trials that have ended
+MAX_SPEED_MPS = 100.0  # 360 km/h: no trial's vehicle is faster, so the exposure in km has a bound before it begins
+_S_PER_HOUR, _M_PER_1000KM = 3600.0, 1e6
+_SPARE_STEPS = 1  # of the bound: exposures are rounded
+_SHARE_OF_TIME = 0.05  # that running intervals may take
+
+
+class TrialFacts(NamedTuple):
+    """What a rate needs to know of a trial.
+
+    Args:
+        number: its place in the hunt.
+        has_ended: False where its process was killed from outside, so that a resumed hunt runs it again.
+        valid: whether it could be set up.
+        crashed: whether it ended with an outcome that the hunt counts as a crash.
+        steps: how many it took.
+        driven_s: time that the agents drove, in s; None where it is not known.
+        driven_m: distance, in m; None where it is not known.
+        step_length_s: of the simulator; None where it is not known.
+        origin: the strategy that proposed it; empty for none.
+        tags: what it belongs to, such as the bin of an argument; for parts of a rate.
+    """
+
+    number: int
+    has_ended: bool
+    valid: bool
+    crashed: bool
+    steps: int
+    driven_s: float | None
+    driven_m: float | None
+    step_length_s: float | None
+    origin: str
+    tags: tuple[str, ...] = ()
+
+
+Unit: TypeAlias = tuple[TrialFacts, ...]
+"""The valid trials of a unit: one, or all of a traffic."""
+
+
+def facts_of(result: TrialResult, crash_on: Sequence[str]) -> TrialFacts:
+    """Return what a rate needs to know of a result."""
+    return TrialFacts(
+        number=result.spec.number,
+        has_ended=not result.was_killed_from_outside,
+        valid=result.outcome is not Outcome.INVALID,
+        crashed=result.outcome in crash_on,
+        steps=result.steps,
+        driven_s=result.driven_s,
+        driven_m=result.driven_m,
+        step_length_s=result.step_length_s,
+        origin=result.spec.origin,
+    )
+
+
+def facts_of_plain(data: Mapping[str, Any], crash_on: Sequence[str], tags: tuple[str, ...] = ()) -> TrialFacts:
+    """Return the same of a trial as a ledger has it."""
+    spec, failure = data["spec"], data.get("failure") or {}
+    return TrialFacts(
+        number=spec["number"],
+        has_ended=failure.get("kind") != KILLED,
+        valid=data["outcome"] != Outcome.INVALID,
+        crashed=data["outcome"] in crash_on,
+        steps=data["steps"],
+        driven_s=data.get("driven_s"),
+        driven_m=data.get("driven_m"),
+        step_length_s=data.get("step_length_s"),
+        origin=spec.get("origin", ""),
+        tags=tags,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CountingRule:
+    """How trials count, fixed before the first of them.
+
+    Args:
+        max_steps: the bound on each trial, in steps.
+        agents: how many controlled vehicles there are.
+        plain_origin: the origin of the trials that were drawn independently; empty where all were.
+        traffics: how many traffics the hunt has; 0 where each trial has its own.
+        planned: how many trials; 0 for no limit.
+    """
+
+    max_steps: int
+    agents: int = 1
+    plain_origin: str = ""
+    traffics: int = 0
+    planned: int = 0
+
+    @property
+    def trials_per_unit(self) -> int:
+        """How many trials a unit has: one, or as many as every traffic has."""
+        return self.planned // self.traffics if self.traffics else 1
+
+    def bets(self, per: Per, step_length_s: float | None) -> Bets:
+        """Return the bets on units, with the greatest exposure that one can have."""
+        most = self.trials_per_unit
+        if per == "trial":
+            return Bets(most, most)
+        seconds = (self.max_steps + _SPARE_STEPS) * self.agents * (step_length_s or 1.0)
+        exposure = seconds / _S_PER_HOUR if per == "hour" else seconds * MAX_SPEED_MPS / _M_PER_1000KM
+        return Bets(most, most * exposure, fixed_exposure=False)
+
+
+class UnitSequence:
+    """Puts trials that end in any order into units in the order of their numbers.
+
+    Args:
+        rule: how they count.
+    """
+
+    def __init__(self, rule: CountingRule) -> None:
+        self._rule = rule
+        self._waiting: dict[int, TrialFacts] = {}
+        self._traffics: dict[int, list[TrialFacts]] = {}
+        self._next = 0  # trial, or traffic
+        self.valid = self.invalid = self.not_random = 0  # of the trials in the sequence
+
+    def add(self, trial: TrialFacts) -> Iterator[Unit]:
+        """Add a trial, and yield the units that are complete now."""
+        if not trial.has_ended:
+            return
+        if self._rule.traffics:
+            yield from self._add_to_traffic(trial)
+            return
+        self._waiting[trial.number] = trial
+        while (found := self._waiting.pop(self._next, None)) is not None:
+            self._next += 1
+            if unit := self._counted([found]):
+                yield unit
+
+    def _add_to_traffic(self, trial: TrialFacts) -> Iterator[Unit]:
+        turns, rounds = self._rule.traffics, self._rule.trials_per_unit
+        if trial.number < turns * rounds:  # an incomplete last round would give some traffics more trials than others
+            self._traffics.setdefault(trial.number % turns, []).append(trial)
+        while len(self._traffics.get(self._next, ())) == rounds > 0:
+            unit = self._counted(self._traffics.pop(self._next))
+            self._next += 1
+            if unit:
+                yield unit
+
+    def _counted(self, trials: list[TrialFacts]) -> Unit:
+        """Return the trials that count."""
+        origin = self._rule.plain_origin
+        plain = [trial for trial in trials if not origin or trial.origin == origin]
+        counted = tuple(trial for trial in plain if trial.valid)
+        self.not_random += len(trials) - len(plain)
+        self.invalid += len(plain) - len(counted)
+        self.valid += len(counted)
+        return counted
+
+    @property
+    def position(self) -> int:
+        """How many trials, or traffics, have ended in a row."""
+        return self._next
+
+    @property
+    def excluded(self) -> int:
+        """How many trials have ended, but a trial of a lower number has not."""
+        return len(self._waiting) + sum(map(len, self._traffics.values()))
+
+    @property
+    def invalid_share(self) -> float:
+        """The share of invalid trials among those in the sequence."""
+        return self.invalid / (self.invalid + self.valid) if self.invalid else 0.0
+
+
+class RateCounter:
+    """Counts units for one measure of exposure, of all trials or of a part of them.
+
+    Args:
+        rule: how trials count.
+        per: what the rate is per.
+        within: whether a trial belongs to the part; all do where it is None.
+        matches: whether a crash belongs to the part; all do where it is None.
+    """
+
+    def __init__(
+        self,
+        rule: CountingRule,
+        per: Per,
+        *,
+        within: Callable[[TrialFacts], bool] | None = None,
+        matches: Callable[[TrialFacts], bool] | None = None,
+    ) -> None:
+        self._rule, self._per = rule, per
+        self._within, self._matches = within, matches
+        self.test: RateTest | None = None
+        self._early = 0  # units with a crash before the step length was known
+        self.units = self.trials = self.crashes = self.steps = 0
+        self.driven_s = self.driven_m = 0.0
+        self.why_not = ""
+
+    def add(self, unit: Unit) -> tuple[float, float] | None:
+        """Add a unit; return its crashes and exposure, or None where it does not belong to the part."""
+        trials = [trial for trial in unit if self._within(trial)] if self._within is not None else unit
+        if not trials:
+            return None
+        crashed = [trial for trial in trials if trial.crashed and (self._matches is None or self._matches(trial))]
+        exposure = math.fsum(map(self._exposure, trials))
+        self.units += 1
+        self.trials += len(trials)
+        self.crashes += len(crashed)
+        self.steps += sum(trial.steps for trial in trials)
+        self.driven_s += sum(trial.driven_s or 0.0 for trial in trials)
+        self.driven_m += sum(trial.driven_m or 0.0 for trial in trials)
+        if self.test is None:
+            step_length_s = next((trial.step_length_s for trial in trials if trial.step_length_s), None)
+            if step_length_s is None and self._per != "trial":
+                self.why_not = self.why_not or f"trial {trials[0].number} has no driven distance and time"
+            self.test = RateTest(self._rule.bets(self._per, step_length_s))
+        try:
+            self.test.add(len(crashed), exposure)
+        except ValueError as error:
+            self.why_not = self.why_not or f"trial {trials[0].number} is beyond the bounds of the hunt: {error}"
+        return len(crashed), exposure
+
+    def _exposure(self, trial: TrialFacts) -> float:
+        if self._per == "trial":
+            return 1.0
+        driven = trial.driven_s if self._per == "hour" else trial.driven_m
+        if driven is None:
+            if not trial.crashed:  # a crash whose recording is damaged counts with exposure 0
+                self.why_not = self.why_not or f"trial {trial.number} has no driven distance and time"
+            return 0.0
+        return driven / (_S_PER_HOUR if self._per == "hour" else _M_PER_1000KM)
+
+    def interval(self, alpha: float) -> Interval | None:
+        """Return the certain interval; None where there is no unit, or an exposure is not known."""
+        return None if self.test is None or self.why_not else self.test.interval(alpha)
+
+    @property
+    def observed(self) -> float | None:
+        """Crashes by exposure; None where that is not known."""
+        return None if self.test is None or self.why_not else self.test.observed
+
+
+class BarWatch:
+    """Watches a hunt until its rate is certainly below or above a bar.
+
+    The evidence against the bar is updated with each unit, at constant cost. Once it decides, later units do not count.
+    So any number of workers gives the same decision, the same interval and the same estimate.
+
+    Args:
+        rule: how trials count.
+        bar: the rate.
+        per: what it is per.
+        crash_on: the outcomes that count as a crash.
+        alpha: the probability of a wrong decision, at most.
+    """
+
+    def __init__(self, rule: CountingRule, bar: float, per: Per, crash_on: Sequence[str], alpha: float = 0.05) -> None:
+        self.rule, self.bar, self.per, self.alpha = rule, bar, per, alpha
+        self._crash_on = crash_on
+        self.sequence, self.counter = UnitSequence(rule), RateCounter(rule, per)
+        self._log_capitals: Any = 0.0
+        self.verdict: Literal["below", "above", "undecided"] = "undecided"
+        self.decided_at: int | None = None
+        self._interval: tuple[int, Interval] | None = None
+        self._due = 0.0
+
+    def add(self, result: TrialResult | Mapping[str, Any]) -> None:
+        """Add a trial that has ended, in any order, as a result or as a ledger has it."""
+        if self.decided_at is not None:
+            return
+        make = facts_of_plain if isinstance(result, dict) else facts_of
+        for unit in self.sequence.add(make(result, self._crash_on)):  # type: ignore[arg-type]
+            self._count(unit)
+            if self.decided_at is not None:
+                return
+
+    def _count(self, unit: Unit) -> None:
+        import numpy as np
+
+        found = self.counter.add(unit)
+        test = self.counter.test
+        if found is None or test is None or self.counter.why_not:
+            return
+        events, exposure = found
+        self._log_capitals = self._log_capitals + np.log1p(test.bets.stakes(self.bar) * (events - self.bar * exposure))
+        decided = test.bets.log_evidence(self._log_capitals) >= -math.log(self.alpha)
+        if decided and self.sequence.invalid_share <= MAX_INVALID_SHARE:
+            self.verdict = "below" if test.events < self.bar * test.exposure else "above"
+            self.decided_at = unit[-1].number
+
+    def noted(self) -> UntilRate:
+        """Return what the ledger says of it."""
+        return {"bar": f"{self.bar!r}/{self.per}", "decided_at": self.decided_at, "verdict": self.verdict}
+
+    def interval(self, *, running: bool = False) -> Interval | None:
+        """Return the certain interval.
+
+        Args:
+            running: for people who watch: that of some moments ago where a new one would take too much of the time.
+        """
+        began, before = time.monotonic(), self._interval
+        if running and before is not None and (before[0] == self.counter.units or began < self._due):
+            return before[1]
+        found = self.counter.interval(self.alpha)
+        if found is not None:
+            ended = time.monotonic()
+            self._interval, self._due = (self.counter.units, found), ended + (ended - began) / _SHARE_OF_TIME
+        return found

@@ -1,0 +1,194 @@
+"""Rates of crashes for people: lines for the terminal, a line per rate as CSV, and a page."""
+
+from __future__ import annotations
+
+import csv
+import html
+import math
+from itertools import groupby
+from typing import TYPE_CHECKING, TextIO
+
+from crashhunt.base.files import whole_file
+from crashhunt.base.text import in_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from crashhunt.rates import BarWatch, CrashRate, Interval, RatePart
+
+__all__ = ["describe_rates", "describe_watch", "format_interval", "format_rate", "rates_page", "write_rates_csv"]
+
+_PER = {"trial": "per trial", "hour": "per hour", "1000km": "per 1,000 km"}
+_REASONS = {
+    "invalid": "invalid",
+    "not_random": "not drawn at random",
+    "after_unfinished": "after a trial that has not ended",
+}
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 60rem; padding: 0 1rem; }
+table { border-collapse: collapse; width: 100%; }
+th, td { text-align: left; padding: .4rem .7rem; border: 1px solid #ccc; }
+.wide { overflow-x: auto; } .faint { color: #5d6b7d; }
+@media (prefers-color-scheme: dark) { body { color: #e6ebf2; background: #131a23; } th, td { border-color: #38465a; } }
+"""
+
+
+def format_rate(rate: float) -> str:
+    """Return a rate with two significant digits: ``0.36``, ``1,200``, ``1.0e-3``.
+
+    >>> format_rate(0.0010014)
+    '1.0e-3'
+    """
+    if not math.isfinite(rate):
+        return "any number"
+    if rate == 0:
+        return "0"
+    exponent = math.floor(math.log10(rate))
+    rounded = round(rate, 1 - exponent)
+    if 0.01 <= rounded < 1e6:
+        digits = max(0, 1 - math.floor(math.log10(rounded)))
+        return f"{rounded:,.{digits}f}"
+    mantissa, _, power = f"{rate:.1e}".partition("e")
+    return f"{mantissa}e{int(power)}"
+
+
+def format_interval(interval: Interval) -> str:
+    """Return an interval in words: ``at least 0.19, at most 0.52``."""
+    least = f"at least {format_rate(interval.low)}, " if interval.low > 0 else ""
+    return f"{least}at most {format_rate(interval.high)}"
+
+
+def describe_watch(watch: BarWatch) -> str:
+    """Return the running interval of a hunt with a bar, in a line."""
+    bar = f"bar {format_rate(watch.bar)} {_PER[watch.per]}: {watch.verdict}"
+    found = watch.interval(running=True)
+    if found is None:
+        return f"rate: not known yet; {bar}"
+    trials = f"{_count(watch.counter.crashes, 'crash', 'crashes')} in {_count(watch.counter.trials, 'trial', 'trials')}"
+    return f"rate: {format_interval(found)} {_PER[watch.per]} ({trials}); {bar}"
+
+
+def describe_rates(rates: Sequence[CrashRate]) -> str:
+    """Return rates for people: the answer first, then what it rests on."""
+    lines: list[str] = []
+    for _, group in groupby(rates, key=lambda rate: rate.dir):
+        lines += _of_hunt(list(group))
+    return in_lines(lines)
+
+
+def _of_hunt(rates: list[CrashRate]) -> list[str]:
+    first = rates[0]
+    head = f"{first.dir}: {_count(first.crashes, 'crash', 'crashes')} in {_count(first.trials, 'trial', 'trials')}"
+    if first.units != first.trials:
+        head += f" of {_count(first.units, 'traffic', 'traffics')}"
+    confidence = f"({first.confidence:g} %, valid whenever you look)"
+    known = [rate for rate in rates if rate.certain is not None]
+    lines: list[str]
+    if known and not first.crashes:
+        each = [f"{format_rate(rate.certain.high)} {_PER[rate.per]}" for rate in known if rate.certain is not None]
+        lines = [f"{head}: at most {', '.join(each)} {confidence}"]
+    elif known:
+        lines = [f"{head} {confidence}", *(f"  {_PER[rate.per]}: {_answer(rate)}" for rate in known)]
+    else:
+        lines = [head]
+    for why in dict.fromkeys(rate.why_not for rate in rates if rate.why_not):
+        concerned = [rate for rate in rates if rate.why_not == why]
+        missing = "no rate" if concerned[0].certain is None else "no estimate"
+        which = "" if len(concerned) == len(rates) else f" {' and '.join(_PER[rate.per] for rate in concerned)}"
+        lines.append(f"  {missing}{which}: {why}")
+    if first.excluded:
+        each = [f"{count} {_REASONS[reason]}" for reason, count in first.excluded.items()]
+        lines.append(f"  not counted: {', '.join(each)}")
+    lines += [line for rate in rates for line in _part_lines(rate)]
+    lines += [f"  {_verdict(rate.verdict, rate.bar)} {_PER[rate.per]}" for rate in rates if rate.bar is not None]
+    return lines
+
+
+def _verdict(verdict: str, bar: float) -> str:
+    if verdict == "undecided":
+        return f"undecided: more trials are needed to compare with the bar of {format_rate(bar)}"
+    return f"certainly {verdict} the bar of {format_rate(bar)}"
+
+
+def _answer(rate: CrashRate | RatePart) -> str:
+    if rate.certain is None:
+        return "not known"
+    estimate = "" if rate.estimate is None else f"{format_rate(rate.estimate)}, "
+    return f"{estimate}{format_interval(rate.certain)}"
+
+
+def _part_lines(rate: CrashRate) -> list[str]:
+    if not rate.parts:
+        return []
+    parts = len(rate.parts)
+    together = f"all {parts} together {rate.confidence:g} %" if parts > 1 else f"{rate.confidence:g} %"
+    return [
+        f"  {_PER[rate.per]}, by {rate.parts[0].by} ({together}):",
+        *(f"    {part.name}: {part.crashes} of {part.trials:,} trials, {_answer(part)}" for part in rate.parts),
+    ]
+
+
+def _count(count: int, one: str, many: str) -> str:
+    return f"{count:,} {one if count == 1 else many}"
+
+
+_COLUMNS = (
+    "dir", "per", "by", "part", "units", "trials", "crashes", "hours", "km", "estimate", "low", "high", "confidence",
+    "bar", "verdict", "why_not",
+)  # fmt: skip
+
+
+def write_rates_csv(rates: Sequence[CrashRate], out: TextIO) -> None:
+    """Write a line per rate, and one per part."""
+    writer = csv.DictWriter(out, _COLUMNS, restval="")
+    writer.writeheader()
+    for rate in rates:
+        data = rate.to_json()
+        data |= {"hours": data["exposure"]["hours"], "km": data["exposure"]["km"], "trials": rate.trials}
+        writer.writerow(_cells(data, rate.certain))
+        for part in rate.parts:
+            named = {"dir": rate.dir, "per": rate.per, "part": part.name, "confidence": rate.confidence}
+            writer.writerow(_cells({**part.to_json(), **named}, part.certain))
+
+
+def _cells(data: dict[str, object], certain: Interval | None) -> dict[str, object]:
+    low, high = ("", "") if certain is None else certain
+    found = {**data, "low": low, "high": high if high != math.inf else ""}
+    return {name: "" if found.get(name) is None else found[name] for name in _COLUMNS}
+
+
+def rates_page(rates: Sequence[CrashRate], path: Path) -> None:
+    """Write a page that works without a network: the rates of all hunts in a table.
+
+    Raises:
+        HuntDirectoryError: it cannot be written.
+    """
+    rows = []
+    for rate in rates:
+        exposure = f"{rate.trials:,} trials, {rate.driven_s / 3600:,.2f} h, {rate.driven_m / 1000:,.1f} km"
+        rows.append((rate.dir, _PER[rate.per], str(rate.crashes), exposure, *_numbers(rate), rate.why_not))
+        for part in rate.parts:
+            name = f"{part.by} {part.name}" if part.by != part.name else part.name
+            rows.append((rate.dir, f"{_PER[rate.per]}, {name}", str(part.crashes), f"{part.trials:,} trials",
+                         *_numbers(part), ""))  # fmt: skip
+    header = ("hunt", "rate", "crashes", "in", "estimate", "at least", "at most", "remarks")
+    head = "".join(f"<th>{name}</th>" for name in header)
+    body = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+    confidence = f"{rates[0].confidence:g}" if rates else "95"
+    page = (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1"><title>Crash rates</title>'
+        f"<style>{_STYLE}</style></head><body><h1>Crash rates</h1>"
+        f'<p class="faint">At least and at most: {confidence} % confidence, valid whenever you look.</p>'
+        f'<div class="wide"><table><tr>{head}</tr>{body}</table></div></body></html>\n'
+    )
+    with whole_file(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def _numbers(rate: CrashRate | RatePart) -> tuple[str, str, str]:
+    estimate = "" if rate.estimate is None else format_rate(rate.estimate)
+    if rate.certain is None:
+        return estimate, "", ""
+    return estimate, format_rate(rate.certain.low), format_rate(rate.certain.high)

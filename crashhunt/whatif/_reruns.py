@@ -1,0 +1,156 @@
+"""Runs of the trial of a crash with changes: many, several at a time, each compared with the recording.
+
+Everything that asks "what if" about a crash runs its trials here: `what_if`, the search for the last avoidable step,
+the search for causes, and the minimization of a crash. A change is a changed `TrialSpec`. Each caller decides which
+specifications to run next and what the results mean.
+
+Invariant: the place of a run among the specifications identifies it. Which runs end first, and how many run at a time,
+changes no result.
+
+Cost: with today's crashhunt, each run is a fork of a process that has imported the agents. Where the traffic is the
+same, it is a fork of a simulator that has been set up. A snapshot with another crashhunt needs a new Python process for
+each run.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError, CrashhuntError
+from crashhunt.episode import scratch_of
+from crashhunt.executors import FreshProcessExecutor, PoolExecutor, run_trials
+from crashhunt.recording import Recording, read_black_box
+from crashhunt.replays import is_todays
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from crashhunt.executors import Executor
+    from crashhunt.replays import Rerun
+    from crashhunt.trial import TrialResult, TrialSpec
+
+
+__all__ = ["Ended", "NotUnderstoodError", "Reruns", "StoppedError"]
+
+_WARM_COPIES = 2  # suspended set-ups of each worker: most runs begin as the crash did
+
+
+class StoppedError(Exception):
+    """The user has stopped the runs."""
+
+
+class NotUnderstoodError(CrashhuntError):
+    """The crashhunt in a snapshot ignored a part of a specification, and so ran another trial."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """A run that has ended.
+
+    Args:
+        place: of its specification among those of the call.
+        result: of the trial.
+        recording: of the trial; None where it was not wanted, or where the process died before there was one.
+        folder: with the files of the trial, until the next run is asked for.
+        entered: the ids of all actors that entered, where the specification asked for them (`EVERYBODY`).
+    """
+
+    place: int
+    result: TrialResult
+    recording: Recording | None
+    folder: Path
+    entered: tuple[str, ...] = ()
+
+
+class Reruns:
+    """Runs trials like that of a crash.
+
+    Args:
+        rerun: the crash.
+        scratch: a folder for the workers.
+        parallel: trials at a time.
+        stopped: called before each wait for results, about twice a second; returns whether to stop, or raises.
+        keep_all: whether trials without a crash leave a recording too.
+        warm_copies: suspended set-ups of the simulator per worker.
+    """
+
+    def __init__(
+        self,
+        rerun: Rerun,
+        scratch: Path,
+        *,
+        parallel: int,
+        stopped: Callable[[], bool],
+        keep_all: bool = True,
+        warm_copies: int = _WARM_COPIES,
+    ) -> None:
+        self._scratch, self._stopped = scratch, stopped
+        worker = replace(rerun.worker, scratch=scratch, keep_trials=keep_all, warm_copies=warm_copies)
+        kind = PoolExecutor if is_todays(rerun) else FreshProcessExecutor
+        self._executor: Executor = kind(worker, parallel=parallel)
+        self._keep_all = keep_all
+        self._numbers = itertools.count(1)  # folders of their own
+
+    def run(
+        self, specs: Sequence[TrialSpec], *, recorded: bool = True, needed: Callable[[int], bool] = lambda _: True
+    ) -> Iterator[Ended]:
+        """Yield trials as they end; those that have not ended when the caller stops asking are cancelled.
+
+        Args:
+            specs: the trials.
+            recorded: whether their recordings are wanted.
+            needed: as of `run_trials`.
+
+        Raises:
+            StoppedError: the user has stopped the runs.
+            NotUnderstoodError: the crashhunt that runs them does not know a part of a specification.
+            CrashhuntError: the trials could not be run.
+        """
+        numbered = [replace(spec, number=number) for spec, number in zip(specs, self._numbers, strict=False)]
+        for place, result in run_trials(self._executor, numbered, stopped=self._raise_stop, needed=needed):
+            folder = scratch_of(self._scratch, result.spec.number)
+            try:
+                _require_same_trial(specs[place], result.spec)
+                yield self._ended(place, result, folder, recorded=recorded)
+            finally:
+                if self._keep_all or result.kept:  # otherwise the worker removes its folder
+                    shutil.rmtree(folder, ignore_errors=True)
+
+    def close(self) -> None:
+        """End every process."""
+        self._executor.close()
+
+    def _raise_stop(self) -> bool:
+        if self._stopped():
+            raise StoppedError
+        return False
+
+    def _ended(self, place: int, result: TrialResult, folder: Path, *, recorded: bool) -> Ended:
+        recording = None
+        if recorded:
+            with suppress(BundleError):  # its process died
+                recording = Recording(read_black_box(folder / layout.BLACK_BOX))
+        entered: list[str] = []
+        if result.spec.only is not None:
+            with suppress(OSError, ValueError):
+                entered = json.loads((folder / layout.ENTERED).read_text(encoding="utf-8"))
+        return Ended(place=place, result=result, recording=recording, folder=folder, entered=tuple(entered))
+
+
+def _require_same_trial(asked: TrialSpec, run: TrialSpec) -> None:
+    """Check that all that determines a trial came back as it was asked: early versions ignore what they do not know.
+
+    Raises:
+        NotUnderstoodError: a part did not.
+    """
+    named = attrgetter("overruled", "disturbances", "only", "handover", "reseeding")
+    if named(asked) != named(run):
+        raise NotUnderstoodError("the crashhunt in its snapshot is too old for that")

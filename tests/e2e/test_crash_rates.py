@@ -1,0 +1,181 @@
+"""How often an agent crashes: distances in ledgers, `rate`, `run --until-rate`."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing
+
+import pytest
+
+
+def results(folder):
+    with closing(sqlite3.connect(folder / "ledger.sqlite")) as database:
+        rows = database.execute("SELECT result FROM trials ORDER BY number").fetchall()
+    return [json.loads(text) for (text,) in rows]
+
+
+def test_ledger_has_the_distance_and_time_of_each_valid_trial(toy):
+    toy.crashhunt("run", "h", "2", "6", "60", "--scenario", "toy", "--seed", "3", "--keep-going")
+    found = results(toy.folder / "h")
+    assert len(found) == 6
+    for trial in found:
+        assert trial["step_length_s"] == 0.1
+        assert trial["driven_s"] == pytest.approx(trial["steps"] * 0.1)
+        assert 0 < trial["driven_m"] < 60 * trial["driven_s"]
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("scenario", "slow"),
+    [("loop", "--no-native"), ("highway", "--no-accelerate"), ("intersection-two-agents", "--no-accelerate")],
+)
+def test_compiled_core_and_accelerator_measure_the_same_distances(shell, scenario, slow):
+    found = []
+    for folder, options in (("fast", ()), ("slow", (slow,))):
+        shell.crashhunt("run", folder, "1", "3", "200", "--scenario", scenario, "--seed", "5", "--keep-going", *options)
+        found.append([(one["driven_m"], one["driven_s"], one["digest"]) for one in results(shell.folder / folder)])
+    assert found[0] == found[1]
+    assert all(meters > 10 for meters, *_ in found[0])
+
+
+def rates(toy, *words, expect=0):
+    return toy.crashhunt("rate", *words, "--json", expect=expect).json["rates"]
+
+
+HUNT = ("60", "--scenario", "toy", "--seed", "4", "--arg", "speed=8:14", "--set", "gap_m=10:30")
+
+
+def test_rate_counts_trials_and_divides_them_by_an_argument(toy):
+    toy.crashhunt("run", "h", "2", "40", *HUNT, "--keep-going")
+    crashes = sum(trial["outcome"] == "collision" for trial in results(toy.folder / "h"))
+    assert crashes > 2
+    by_trial, by_hour, by_km = rates(toy, "h")
+    assert (by_trial["units"], by_trial["crashes"], by_trial["estimate"]) == (40, crashes, crashes / 40)
+    for rate in (by_trial, by_hour, by_km):
+        assert 0 < rate["certain"]["low"] < rate["estimate"] < rate["certain"]["high"]
+    (parts,) = rates(toy, "h", "--by", "speed:3")
+    assert sum(part["trials"] for part in parts["parts"]) == 40
+    assert sum(part["crashes"] for part in parts["parts"]) == crashes
+    said = toy.crashhunt("rate", "h", "--by", "kind", "--html", "page.html").out
+    assert f"h: {crashes} crashes in 40 trials (95 %, valid whenever you look)" in said
+    assert "Crash rates" in (toy.folder / "page.html").read_text(encoding="utf-8")
+    lines = toy.crashhunt("rate", "h", "--csv", "--by", "fault").out.splitlines()
+    assert lines[0].startswith("dir,per,by,part")
+    assert len(lines) >= 3
+
+
+def test_bar_decides_the_exit_code(toy):
+    toy.crashhunt("run", "h", "2", "40", *HUNT, "--keep-going")
+    assert rates(toy, "h", "--bar", "0.99/trial")[0]["verdict"] == "below"
+    assert rates(toy, "h", "--bar", "1e-6/trial", expect=1)[0]["verdict"] == "above"
+    (close,) = rates(toy, "h", "--per", "trial")
+    assert rates(toy, "h", "--bar", f"{close['estimate']}/trial", expect=3)[0]["verdict"] == "undecided"
+
+
+def test_hunt_that_stops_at_its_first_crash_has_an_interval_and_no_estimate(toy):
+    toy.crashhunt("run", "h", "1", "40", *HUNT)
+    (rate,) = rates(toy, "h", "--per", "trial")
+    assert rate["estimate"] is None
+    assert "stops at its first crash" in rate["why_not"]
+    assert 0 < rate["certain"]["low"] < rate["certain"]["high"] <= 1
+
+
+def test_workers_change_no_rate(toy):
+    found = []
+    for workers in ("1", "2"):
+        toy.crashhunt("run", workers, workers, "30", *HUNT, "--keep-going")
+        found.append([{**rate, "dir": ""} for rate in rates(toy, workers)])
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--bar", "7/mile"), "--bar is 7/mile; give a rate above 0"),
+        (("--bar", "2/hour", "--per", "trial"), "give --per hour, or no --per"),
+        (("--confidence", "100"), "--confidence is 100; give percent from 50 to below 100"),
+        (("--by", "sped"), "--by: there is no argument 'sped'"),
+        (("--by", "speed:0"), "'0' bins; give 1 to 50 bins"),
+    ],
+)
+def test_bad_input_is_one_line(toy, words, says):
+    toy.crashhunt("run", "h", "1", "2", *HUNT, "--keep-going")
+    done = toy.crashhunt("rate", "h", *words, expect=2)
+    assert says in done.err
+    assert done.err.count("\n") == 1
+
+
+def test_sampler_that_does_not_draw_independently_has_no_rate(toy):
+    toy.crashhunt("run", "h", "1", "4", *HUNT, "--keep-going", "--sampler", "halton")
+    (rate,) = rates(toy, "h", "--per", "trial")
+    assert rate["certain"] is None
+    assert "the sampler halton does not draw trials independently" in rate["why_not"]
+
+
+def test_disturbed_and_undisturbed_crashes_are_reported_apart(toy):
+    toy.crashhunt("run", "h", "2", "30", *HUNT, "--keep-going", "--disturb", "brake=0.5")
+    (rate,) = rates(toy, "h", "--per", "trial")
+    assert {part["name"] for part in rate["parts"]} == {"undisturbed", "disturbed"}
+    assert sum(part["crashes"] for part in rate["parts"]) == rate["crashes"]
+    (rate,) = rates(toy, "h", "--by", "disturbance")
+    assert {part["name"] for part in rate["parts"]} <= {"undisturbed", "brake"}
+
+
+# --- run --until-rate
+
+
+def until(toy, folder, workers, trials, rate, *words, expect):
+    options = ("--until-rate", rate, "--json", *words)
+    return toy.crashhunt("run", folder, workers, trials, *HUNT, *options, expect=expect).json
+
+
+def test_hunt_ends_once_the_rate_is_certainly_below_or_above(toy):
+    calm = ("--arg", "speed=2", "--set", "gap_m=40")
+    done = toy.crashhunt("run", "calm", "2", "0", "20", "--scenario", "toy", *calm, "--until-rate", "0.1/trial")
+    assert "certainly below the bar of 0.10 per trial" in done.out
+    (rate,) = rates(toy, "calm", "--bar", "0.1/trial")
+    assert (rate["crashes"], rate["estimate"], rate["verdict"]) == (0, 0.0, "below")
+    assert rate["units"] * 0.1 < 3.6
+    found = until(toy, "wild", "2", "0", "0.001/trial", expect=1)
+    assert (found["stopped_because"], found["rate"]["verdict"]) == ("rate", "above")
+    assert found["rate"]["certain"]["low"] >= 0.001
+
+
+def test_hunt_that_cannot_decide_ends_at_most_and_exits_with_3(toy):
+    found = until(toy, "h", "2", "0", "0.3/trial", "--most", "6", expect=3)
+    assert (found["stopped_because"], found["trials_run"], found["rate"]["verdict"]) == ("all_trials", 6, "undecided")
+
+
+def test_workers_decide_at_the_same_trial(toy):
+    found = []
+    for workers in ("1", "3"):
+        until(toy, workers, workers, "0", "40/hour", expect=1)
+        found.append([{**rate, "dir": ""} for rate in rates(toy, workers, "--per", "hour")])
+    assert found[0] == found[1]
+    assert found[0][0]["crashes"] > 0
+
+
+def test_resumed_hunt_decides_as_one_that_was_never_interrupted(toy):
+    whole = until(toy, "whole", "1", "0", "0.02/trial", expect=1)["rate"]
+    first = until(toy, "parts", "2", "0", "0.02/trial", "--most", "1", expect=3)["rate"]
+    assert first["units"] == 1
+    assert until(toy, "parts", "2", "0", "0.02/trial", expect=1)["rate"] == {**whole, "dir": "parts"}
+    trials = len(results(toy.folder / "parts"))
+    assert until(toy, "parts", "2", "0", "0.02/trial", expect=1)["rate"] == {**whole, "dir": "parts"}
+    assert len(results(toy.folder / "parts")) == trials  # decided before, so nothing runs
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--until-rate", "3/trial"), "--until-rate is 3/trial; give a rate above 0"),
+        (("--until-rate", "3/hour", "--sampler", "guided"), "leave --sampler guided out"),
+        (("--until-rate", "3/hour", "--seeds", "2"), "leave --seeds out"),
+        (("--until-rate", "3/hour", "--distinct", "2"), "leave --distinct out"),
+        (("--most", "9"), "--most is 9 without --until-rate"),
+    ],
+)
+def test_option_that_contradicts_a_bar_is_refused(toy, words, says):
+    done = toy.crashhunt("run", "h", "1", "5", *HUNT, *words, expect=2)
+    assert says in done.err
