@@ -93,7 +93,7 @@ def bisect(
     }
     tried: dict[str, Got] = {}
     token = f"crashhunt-{this_process().token}"  # git gives the name of the work tree to what it writes about it
-    known = Path(actor=top, first=_git(top, "rev-parse", "--git-common-dir"), states="worktrees", lanes=token)
+    known = Path(top, _git(top, "rev-parse", "--git-common-dir")) / "worktrees" / token
     with temporary_folder("bisect") as scratch, temporary_beside(known, name=token):
         tree, case = scratch.resolve() / token, add_case(bundle, scratch / "corpus").case.path.resolve()
         _git(top, "worktree", "add", "--detach", "--quiet", str(tree), ends[1])
