@@ -237,6 +237,8 @@ def _figures(hunt: HuntResults, table: NDArray[np.void]) -> HuntFigures:
 
 def _why_no_interval(hunt: HuntResults) -> str:
     settings = hunt.settings
+    if settings.rare:
+        return "in rare mode, trials run without the hunt's disturbances"
     if settings.seeds:
         return f"its trials take place in {settings.seeds} traffics (--seeds), and are not independent of each other"
     if not (hunt.independent or hunt.plain_origin):
@@ -303,6 +305,8 @@ def _other_traffic(one: HuntSettings, other: HuntSettings) -> str:
         for name in sorted(one.scenario_arguments.keys() | other.scenario_arguments.keys())
         if one.scenario_arguments.get(name) != other.scenario_arguments.get(name)
     ]
+    if one.rare != other.rare:
+        return "one is in rare mode, in which trials run without disturbances, so that the same seed is another traffic"
     if one.disturb != other.disturb:
         return f"they have {_disturbances(one)} and {_disturbances(other)}, so that the same seed is another traffic"
     if differing:

@@ -114,6 +114,8 @@ def counting_rule(settings: HuntSettings, facts: Facts) -> CountingRule:
 
 def why_no_interval(settings: HuntSettings, facts: Facts) -> str:
     """Return why the trials of a hunt say nothing about a rate; empty where they do."""
+    if settings.rare:
+        return "in rare mode, trials run without the hunt's disturbances; the hunt itself reports the rate"
     if settings.seeds:
         if settings.sampler != "random":
             return f"the sampler {settings.sampler} does not draw trials independently"

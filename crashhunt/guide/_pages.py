@@ -29,7 +29,7 @@ _ORDER = [
     "first-hunt", "your-town", "highway-env", "gymnasium", "ci",
     "agent", "scenario", "searching", "disturbances", "probes", "branches", "look-into-a-crash", "kinds-of-crashes",
     "fault", "judge", "causes", "what-if", "shrink", "film", "near-misses", "hand-over", "corpus", "suites", "warm-up",
-    "cluster", "rate", "compare", "train",
+    "cluster", "rate", "rare", "compare", "train",
     "commands", "api", "toml", "outcomes", "files", "json", "determinism", "security",
     "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip

@@ -457,7 +457,7 @@ def _check_rare(settings: HuntSettings, scenario: Scenario) -> None:
         raise UsageError(message, fix="use --sampler random")
     excluded = {
         "--seeds": settings.seeds, "--probe": settings.probe, "--branch": settings.branch, "--distinct": run.distinct,
-        "--only-at-fault": run.only_at_fault,
+        "--only-at-fault": run.only_at_fault, "--until-rate": run.until_rate,
     }  # fmt: skip
     if given := next((flag for flag, value in excluded.items() if value), None):
         raise UsageError(f"--rare and {given} exclude each other", fix=f"omit {given}")

@@ -179,3 +179,22 @@ def test_resumed_hunt_decides_as_one_that_was_never_interrupted(toy):
 def test_option_that_contradicts_a_bar_is_refused(toy, words, says):
     done = toy.crashhunt("run", "h", "1", "5", *HUNT, *words, expect=2)
     assert says in done.err
+
+
+RARE = ("60", "--scenario", "toy", "--agent", "crashhunt.agents:CarFollowing", "--disturb", "stop=0.1", "--rare")
+
+
+def test_trials_of_rare_mode_have_no_rate_because_they_run_undisturbed(toy):
+    report = toy.crashhunt("run", "h", "2", "4", *RARE, "--seed", "3", "--json").json
+    assert report["rare"]["units"] == 4
+    (per_trial,) = rates(toy, "h", "--per", "trial")
+    assert (per_trial["estimate"], per_trial["certain"]) == (None, None)
+    assert (
+        per_trial["why_not"]
+        == "in rare mode, trials run without the hunt's disturbances; the hunt itself reports the rate"
+    )
+
+
+def test_rare_mode_and_a_bar_exclude_each_other(toy):
+    done = toy.crashhunt("run", "h", "2", "4", *RARE, "--until-rate", "1e-3/trial", expect=2)
+    assert done.err == "crashhunt: --rare and --until-rate exclude each other; omit --until-rate\n"
