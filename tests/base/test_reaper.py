@@ -59,10 +59,10 @@ def test_other_missing_module_of_a_snapshot_ends_its_process(tmp_path):
 def test_signal_of_a_terminal_does_not_end_a_reaper_while_its_python_starts(tmp_path, number):
     (tmp_path / "waits.py").write_text("import time\ndef main():\n    time.sleep(0.3)\n")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    for attempt in range(20):
+    for attempt in range(8):
         kept = Kept("waits", environment=environment, stdin=subprocess.DEVNULL)
         try:
-            time.sleep(attempt * 0.004)  # Python needs 10 to 80 ms to start
+            time.sleep(attempt * 0.01)  # Python needs 10 to 80 ms to start
             os.kill(kept.process.pid, number)
             assert kept.process.wait(60) == 0
         finally:

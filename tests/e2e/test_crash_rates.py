@@ -147,6 +147,7 @@ def test_hunt_that_cannot_decide_ends_at_most_and_exits_with_3(toy):
     assert (found["stopped_because"], found["trials_run"], found["rate"]["verdict"]) == ("all_trials", 6, "undecided")
 
 
+@pytest.mark.nightly  # half a minute: every crash is confirmed
 def test_workers_decide_at_the_same_trial(toy):
     found = []
     for workers in ("1", "3"):
