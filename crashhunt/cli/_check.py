@@ -33,8 +33,8 @@ def add_check(commands: Commands) -> None:
     )  # fmt: skip
     check.add_argument(
         "--salvage", metavar="TO", type=Path,
-        help="copy the intact parts of a hunt into this new directory, where the hunt can resume; damaged trials are "
-        "excluded, and run again then. If this command was killed, run it again",
+        help="copy the intact parts of a hunt into this new directory, where the hunt can resume. Damaged trials are "
+        "excluded, and the resumed hunt runs them again. If this command was killed, run it again",
     )  # fmt: skip
     add_json(check)
     check.set_defaults(command=_check)

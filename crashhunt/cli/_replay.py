@@ -245,7 +245,8 @@ def add_replay(commands: Commands) -> None:
         help="the verdict for which the exit code is 0; default: reproduced",
     )  # fmt: skip
     look = replay.add_argument_group(
-        "to look into it", "The agent then runs with the terminal at hand, so that breakpoints in its code work."
+        "to look into it",
+        "With these options, the agent runs attached to the terminal, so breakpoints in its code work.",
     )
     stop = look.add_mutually_exclusive_group()
     stop.add_argument("--until", metavar="STEP", type=integer, help="stop after this step")
@@ -338,7 +339,9 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
     if film is not None and options.from_log:
         look |= {"--print": options.fields, "--set": options.sets, "--times": options.times != 1}
         for name in [name for name, given in look.items() if given]:
-            raise UsageError(f"{name}: a film --from-log simulates nothing", fix=f"leave {name} or --from-log out")
+            raise UsageError(
+                f"{name} cannot be used with --from-log, which simulates nothing", fix=f"leave {name} or --from-log out"
+            )
     if options.times != 1:
         if film is not None:
             look |= {"a film": True}

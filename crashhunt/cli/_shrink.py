@@ -78,7 +78,7 @@ def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
         raise UsageError(f"--for is {options.time!r}", fix="give a time above 0, such as 90s, 1m or 1h30m") from None
     if options.directory.is_file():
         raise UsageError(
-            "shrink writes the minimized crash next to the crash, and cannot write into an exported file",
+            "shrink writes its result next to the crash, so it cannot work on an exported file",
             fix="unpack it (a zip file) into a new folder and give that folder; shrink asks before it runs the code",
             where=str(options.directory),
         )

@@ -73,7 +73,7 @@ class Finding:
 
 
 def safe_gap_m(speed: float, ahead: float) -> float:
-    """Return the gap to who is ahead that RSS calls safe, in m; speeds in m/s (RSS, lemma 2)."""
+    """Return the safe gap to the vehicle ahead, in m, by lemma 2 of RSS; speeds are in m/s."""
     then = speed + _RESPONSE_S * _SPEEDS_UP
     driven = speed * _RESPONSE_S + _SPEEDS_UP * _RESPONSE_S**2 / 2
     return float(max(0.0, driven + then * then / (2 * _BRAKES) - ahead * ahead / (2 * _BRAKES_HARD)))

@@ -2,7 +2,7 @@
 
 A root is a trial in which no disturbance begins after step 1. Each trial of the hunt has either no effective onset
 before it ends, or a first one, of a model in a step. For independent chances per step the probability of each case has
-a closed form. Copies of the root cover the second case. Each begins with one first onset, and every later disturbance
+a closed form. Copies of the root cover the second case. Each copy begins with one forced onset. Every later disturbance
 is drawn as in any trial.
 
 Let S be the probability that no onset is effective so far, and c the chance of a model per step. Let a be the

@@ -72,7 +72,7 @@ def why_no_link_order(libsumo: str) -> str:
 
 @cache
 def link_order(libsumo: str, library: str) -> LinkOrder:
-    """Return the library, bound to libsumo.
+    """Load the library that fixes the link order, connect it with libsumo, and return it.
 
     Args:
         libsumo: The version of libsumo.

@@ -218,7 +218,8 @@ class Owners:
 def agent_of(word: str, agents: Collection[str]) -> str:
     """Return the agent whose id a word begins with, and a dot; empty where it is a bare name.
 
-    Ids may have dots themselves, and one may be the beginning of another: the longest is meant.
+    Identifiers may contain dots, and one may be a
+    prefix of another. If several match, the longest is used.
     """
     return next((agent for agent in sorted(agents, key=len, reverse=True) if word.startswith(f"{agent}.")), "")
 

@@ -442,7 +442,7 @@ def _module_in(code: Sequence[str]) -> str:
 
 
 def main() -> None:
-    """Run the trial that a file in a folder describes, with the terminal at hand."""
+    """Run the trial that a file in a folder describes, attached to the terminal."""
     folder = Path(sys.argv[1])
     job: _Job = json.loads((folder / layout.JOB).read_text(encoding="utf-8"))
     if not job["stop_at"]:  # only the debugger handles Ctrl-C; without it, a traceback of the replay helps no user

@@ -76,7 +76,9 @@ def edited_disturbances(
     if len(meant) > 1:
         several = [word_of(one, agents).partition("=")[0] for one in meant]
         fix = f"write {NAME}.{several[0]}.{asked.field}"
-        raise ArgumentError(f"{where}: {' and '.join(several)} begin there", fix=fix)
+        raise ArgumentError(
+            f"{where}: {' and '.join(several)} begin at this step, and the edit means one of them", fix=fix
+        )
     before, value = meant[0], _value(where, asked.field, text)
     now = replace(before, **{asked.field: value})
     if reason := why_not(now):

@@ -339,7 +339,7 @@ def _run(
 
 
 def _look_into(rerun: Rerun, look: Look) -> ReplayReport:
-    """Run the first steps with the terminal at hand, and compare them with those of the log."""
+    """Run the first steps attached to the terminal, and compare them with those of the log."""
     from crashhunt.replays._debugger import debug
 
     result, replayed = debug(rerun, look)

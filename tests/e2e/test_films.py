@@ -166,8 +166,14 @@ def test_film_of_a_replay_that_is_killed_once_is_made(toy, number):
         (("--video", "a.mp4", "--last-seconds", "nan"), "--last-seconds is nan"),
         (("--video", "a.mp4", "--times", "3"), "--times 3: a film looks at one run"),
         (("--until", "5", "--times", "3"), "--times 3: --until looks at one run"),
-        (("--video", "a.mp4", "--from-log", "--until", "5"), "--until: a film --from-log simulates nothing"),
-        (("--gif", "a.gif", "--from-log", "--set", "speed=3"), "--set: a film --from-log simulates nothing"),
+        (
+            ("--video", "a.mp4", "--from-log", "--until", "5"),
+            "--until cannot be used with --from-log, which simulates nothing",
+        ),
+        (
+            ("--gif", "a.gif", "--from-log", "--set", "speed=3"),
+            "--set cannot be used with --from-log, which simulates nothing",
+        ),
     ],
 )
 def test_bad_options_are_reported_before_anything_is_run(crash, words, message):
