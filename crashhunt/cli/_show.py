@@ -23,9 +23,9 @@ def add_show(commands: Commands) -> None:
         "show",
         help="describe the last seconds of a crash or a near miss",
         description="Describe the last seconds before a crash, in words and a table. For a near miss, describe the "
-        "seconds around its closest moment. The table has the positions, speeds and closing speeds of the vehicles, "
-        "and the decisions of the agent. The text gives the last step from which braking avoids the crash, which the hunt "
-        "determined by simulation. Runs no code of the bundle.",
+        "seconds around its closest moment. The table has the positions, speeds and closing speeds of the "
+        "vehicles, and the decisions of the agent. The text gives the last step from which braking avoids the "
+        "crash, which the hunt determined by simulation. Runs no code of the bundle.",
     )
     add_crash(show)
     show.add_argument("--last-seconds", metavar="S", type=number, default=5.0, help="how much of it; default: 5")
