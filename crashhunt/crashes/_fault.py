@@ -340,10 +340,10 @@ def fault_of(bundle: Bundle, recording: Recording | None = None) -> Fault:
     if result.outcome is Outcome.AGENT_ERROR:
         words = "the code of the agent failed"
         return Fault(
-            "ego", (Finding(rule="agent error", blames="ego", words=words, source="whoever drives answers for it"),)
+            "ego", (Finding(rule="agent error", blames="ego", words=words, source="the agent controls the vehicle"),)
         )
     if result.outcome is Outcome.OFF_ROAD and hit is not None and not hit.other:
-        words = "it left the road, and nobody touched it"
+        words = "it left the road without contact"
         return Fault(
             "ego",
             (Finding(rule="off the road", blames="ego", words=words, source="Vienna, article 13 (1); StVO § 3 (1)"),),

@@ -10,7 +10,7 @@ may have ended by then. They do not count, because that they have ended depends 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from crashhunt.disturbances import first_forcing
 from crashhunt.plans import share_of
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Forced, ForcedCopy, Forcing, TrialResult
 
 __all__ = ["Forcings", "PrecisionRule", "crashed_copies", "greatest_weight"]
-
-_WEIGHTIEST: Final = 5  # roots; a crash of a copy is a crash only where it comes again from the start
 
 
 class Forcings:
@@ -104,14 +102,15 @@ class PrecisionRule:
                 self.excluded += 1
             else:
                 self.roots.append(root)
-                if any(copy.crash for copy in result.forced.copies if result.forced):  # type: ignore[union-attr]
+                if any(crashed_copies(result)):
                     self.results.append(result)
             if self._until and self._next % BLOCK == 0:
                 self.is_met = self.estimate().relative_error <= self._until
 
     def estimate(self) -> RareEstimate:
         """Return the estimate of the roots that were read."""
-        return rare_estimate(self.roots, excluded=self.excluded)
+        least_bound = min(1.0, self._hazard * self._settings.max_steps)
+        return rare_estimate(self.roots, least_bound=least_bound, excluded=self.excluded)
 
 
 def crashed_copies(result: TrialResult) -> Iterator[ForcedCopy]:

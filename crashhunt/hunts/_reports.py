@@ -229,7 +229,10 @@ class RareReport:
             )
         if self.verified:
             lines.append(f"  of the {self.verified} weightiest crashes, {len(self.crashes)} came again from the start")
-        lines.append("  an estimate says nothing about failures that no copy has met")
+        if found.certain is not None:
+            low, high = found.certain
+            lines.append(f"  certain: at least {low:.2g}, at most {high:.2g} ({found.confidence:.0%})")
+        lines.append("  the estimate omits failures that no copy has met; the certain bounds include them")
         return lines
 
 

@@ -6,7 +6,6 @@ from ._betting import (
 )
 from ._rare import (
     BLOCK as BLOCK,
-    CertainInterval as CertainInterval,
     Estimated as Estimated,
     RareEstimate as RareEstimate,
     Root as Root,

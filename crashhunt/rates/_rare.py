@@ -12,8 +12,10 @@ independent copies of equal cost; the 10 % bound all weights.
 The interval is that of Student's t, reported only where the data can carry it. The effective sample size and the number
 of roots with a crash are at least 20, and no root has more than 20 % of the sum. The same interval on the logarithm was
 tried and covered less: where an interval is seldom reported, it is reported of estimates that are too high. No interval
-from weighted copies can exclude a failure mode that no copy has met. The certain interval is for that, and its function
-is a parameter.
+from weighted copies can exclude a failure mode that no copy has met. The certain interval is for that: it is the one of
+`crashhunt.rates._betting`, so it is valid at any number of roots. The part of the roots themselves and that of their
+copies are bounded apart and added, by Bonferroni's inequality. A copies' sum Y is at most b, which the forcing of its
+root fixes before the root begins. So Y / b counts as events and 1 / b as exposure: their ratio of means is the rate.
 
 Source: Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 to 9; Kish, Survey sampling, 1965, for the
 effective sample size.
@@ -24,21 +26,21 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from crashhunt.disturbances import COPIES_PER_ROOT
+from crashhunt.rates._betting import Bets, RateTest
 from crashhunt.trial import Forcing, Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.trial import Forced, TrialResult
 
 __all__ = [
-    "BLOCK", "CertainInterval", "Estimated", "RareEstimate", "Root", "learn_forcing", "rare_estimate", "root_of",
+    "BLOCK", "Estimated", "RareEstimate", "Root", "learn_forcing", "rare_estimate", "root_of",
 ]  # fmt: skip
 
 BLOCK: Final = 32
@@ -52,10 +54,6 @@ MAX_SHARE: Final = 0.2
 MAX_EXCLUDED: Final = 0.05
 """Share of roots without a complete result above which nothing is estimated."""
 
-CertainInterval = Callable[[Sequence[float], float, float], tuple[float, float]]
-"""Returns an interval for the mean of values in the order of their numbers: called (values, bound, confidence), where
-all values are in [0, bound]. It has to be valid for a mean given the past, at any number of values."""
-
 
 @dataclass(frozen=True, slots=True)
 class Root:
@@ -68,7 +66,7 @@ class Root:
         by: by cell, the part of ``disturbed`` that is of copies.
         steps: simulated for it, those of copies included.
         own_steps: its own steps.
-        bound: the largest possible part of copies.
+        bound: the largest possible part of copies, known before the root begins.
         crashed: whether the root itself crashed undisturbed.
     """
 
@@ -120,7 +118,7 @@ class RareEstimate:
         why_not: why there is no interval for ``estimate``; empty where there is.
         why_not_disturbed: the same for ``disturbed``.
         more_roots: how many more roots are probably needed for ``estimated``; None where that cannot be predicted.
-        certain: bounds that hold whatever the roots have not met; None where no function for them was given.
+        certain: bounds that hold whatever the roots have not met; None where they were not asked for.
         excluded: how many roots have no complete result.
         parts: by cell, the part of ``disturbed`` whose first onset is of that cell.
         undisturbed_crashes: how many roots crashed undisturbed.
@@ -269,15 +267,15 @@ def learn_forcing(earlier: Iterable[Forced], start: Forcing) -> Forcing:
 
 
 def rare_estimate(
-    roots: Sequence[Root], *, excluded: int = 0, confidence: float = 0.95, certain: CertainInterval | None = None
+    roots: Sequence[Root], *, least_bound: float | None = None, excluded: int = 0, confidence: float = 0.95
 ) -> RareEstimate:
     """Return the crash probability per trial with its intervals.
 
     Args:
         roots: with a complete result, in the order of their numbers.
+        least_bound: lower limit of all `Root.bound`, fixed before the first root; None for no certain interval.
         excluded: how many roots have none.
         confidence: of all intervals, in (0, 1).
-        certain: returns an interval for the mean of bounded values.
     """
     values = [root.value for root in roots]
     count = len(roots)
@@ -305,7 +303,7 @@ def rare_estimate(
         why_not=why or why_not,
         why_not_disturbed=why or why_not_part,
         more_roots=None if why or whole is not None else more,
-        certain=None if why or certain is None or not count else _certain(roots, certain, confidence),
+        certain=None if why or least_bound is None or not count else _certain(roots, least_bound, confidence),
         excluded=excluded,
         parts=dict(sorted(parts.items(), key=lambda item: (-item[1], item[0]))),
         undisturbed_crashes=sum(root.crashed for root in roots),
@@ -315,16 +313,15 @@ def rare_estimate(
     )
 
 
-def _certain(roots: Sequence[Root], certain: CertainInterval, confidence: float) -> tuple[float, float]:
-    """Return bounds on the sum of the two means, by Bonferroni's inequality.
-
-    The part of the roots themselves is bounded apart, because its values are at most 1. So the upper bound is as good
-    as that of as many plain trials.
-    """
-    each = (1.0 + confidence) / 2
-    own = certain([root.own for root in roots], 1.0, each)
-    copies = certain([root.value - root.own for root in roots], max(root.bound for root in roots), each)
-    return max(0.0, own[0] + copies[0]), min(1.0, own[1] + copies[1])
+def _certain(roots: Sequence[Root], least_bound: float, confidence: float) -> tuple[float, float]:
+    """Return bounds on the sum of the part of the roots themselves and the part of their copies."""
+    own, copies = RateTest(), RateTest(Bets(1.0, 1.0 / least_bound, fixed_exposure=False))
+    for root in roots:
+        own.add(root.own, 1.0)
+        copies.add((root.value - root.own) / root.bound, 1.0 / root.bound)
+    alpha = (1.0 - confidence) / 2
+    found = [test.interval(alpha) for test in (own, copies)]
+    return math.fsum(one.low for one in found), min(1.0, math.fsum(one.high for one in found))
 
 
 def _standard_error(values: Sequence[float]) -> float:
