@@ -59,7 +59,37 @@ def _register_environment() -> None:
         register(id="crashhunt/SUMO-v0", entry_point="crashhunt.envs:SumoEnv")
 
 
+class _GymnasiumFinder:
+    """Registers the environment once Gymnasium is imported after crashhunt; imports nothing itself.
+
+    ``gymnasium.make("crashhunt:…")`` imports this module, which does nothing if it was imported before.
+    """
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
+        """Return the spec of Gymnasium's registry, with a loader that also registers; None for other modules."""
+        if name != _REGISTRY or self not in sys.meta_path:
+            return None
+        sys.meta_path.remove(self)
+        from importlib.util import find_spec
+
+        spec = find_spec(name)
+        if spec is not None and spec.loader is not None:
+            loader: Any = spec.loader
+            execute = loader.exec_module
+
+            def execute_and_register(module: Any) -> None:
+                execute(module)
+                _register_environment()
+
+            loader.exec_module = execute_and_register
+        return spec
+
+
+_REGISTRY = "gymnasium.envs.registration"
+
 # gymnasium.make("crashhunt:crashhunt/SUMO-v0") imports this module. Other users must not wait for Gymnasium's import,
 # the command line least of all.
-if "gymnasium" in sys.modules:
+if _REGISTRY in sys.modules:
     _register_environment()
+else:
+    sys.meta_path.insert(0, _GymnasiumFinder())

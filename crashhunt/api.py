@@ -191,7 +191,8 @@ def what_if(
         agent: ``module:Name`` of an agent that takes over after that step.
         arguments: of that agent.
         futures: give the simulator's random generators another seed after that step, a different one in each run.
-        overrule: ``brake``, ``left``, ``right``, ``keep_lane`` or ``keep_speed``, after that step.
+        overrule: ``brake``, ``left``, ``right``, ``keep_lane``, ``keep_speed``, ``reference_speed``,
+            ``reference_lanes`` or ``reference``, after that step.
         leave_out: ids of actors that do not take part.
         interventions: further ones, of `crashhunt.whatif`.
         code: who drives: the code of the ``snapshot``, or the ``current`` code, which is the default with ``agent``.

@@ -995,7 +995,7 @@ def bench_accelerator() -> Iterator[Figure]:
     import highway_env
 
     assert highway_env
-    for name, target in (("highway-v0", 8.0), ("highway-fast-v0", 4.0)):
+    for name, target in (("highway-v0", 120.0), ("highway-fast-v0", 40.0)):
         found = in_child("child_accelerator", name, "0", "5")
         note = f"{found['slow']:.1f} steps a second become {found['fast']:.0f}"
         yield Figure(
@@ -1200,6 +1200,60 @@ def bench_ray() -> Iterator[Figure]:
         yield Figure(name="ray_crash_to_stop_s", value=found["last"], unit="s", better="lower", target=1.0, note=note)
 
 
+def bench_dashboard() -> Iterator[Figure]:
+    """What the dashboard costs: a million trials, 200 hunts, a hunt that runs, a crash that plays."""
+    if shutil.which("chromium") is None or shutil.which("chromedriver") is None:
+        print("scripts/bench: dashboard needs chromium and chromedriver, and is left out", file=sys.stderr)
+        return
+    import bench_dashboard as board
+
+    load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+    pages, memory, idle = {}, {}, {}
+    with folder() as place:
+        for trials in (10_000, 1_000_000):
+            made = board.make_hunt(place, str(trials), trials)
+            with board.browser(place) as opened:  # the first page of a browser pays for its start
+                with board.dashboard(made) as (url, _):
+                    board.page_complete_s(opened, f"{url}/hunts/{board.get(f'{url}/api/hunts')[1]['ids'][0]}")
+                with board.dashboard(made) as (url, pid):
+                    identifier = board.identifier_of(made)
+                    pages[trials] = board.page_complete_s(opened, f"{url}/hunts/{identifier}")
+                    idle[trials] = board.idle_refresh(pid, f"{url}/api/hunts/{identifier}")
+                    memory[trials] = board.memory_mib(pid)
+        note = f"{pages[10_000]:.2f} s with 10,000; from the request until all is drawn; {load}"
+        yield Figure(
+            name="dashboard_million_s", value=pages[1_000_000], unit="s", better="lower", target=1.5, note=note
+        )
+        note = f"{memory[1_000_000]:.0f} MiB against {memory[10_000]:.0f} with 10,000"
+        growth = memory[1_000_000] / memory[10_000]
+        yield Figure(name="dashboard_memory", value=growth, unit="times", better="lower", target=1.2, note=note)
+        note = f"CPU of the server; {idle[10_000]:.2f} ms with 10,000 trials"
+        yield Figure(name="dashboard_idle_ms", value=idle[1_000_000], unit="ms", better="lower", target=5.0, note=note)
+    with folder() as place:
+        made = board.make_hunt(place, "hunt", 100)
+        for number in range(200):
+            shutil.copytree(made, place / "all" / f"hunt-{number}")
+        with board.dashboard(place / "all") as (url, _):
+            began = time.perf_counter()
+            assert len(board.get(f"{url}/api/hunts")[1]["hunts"]) == 200
+            listed = time.perf_counter() - began
+    yield Figure(name="dashboard_200_hunts_s", value=listed, unit="s", better="lower", target=1.0, note=load)
+    with folder() as place:
+        ratios = board.with_and_without_page(place, 6)
+    note = f"trials/s with the page of a hunt open by those without; median of {len(ratios)} pairs in turns; {load}"
+    value = statistics.median(ratios)
+    yield Figure(name="dashboard_hunt_speed", value=value, unit="times", better="higher", target=0.97, note=note)
+    with folder() as place:
+        hunt(place / "h", 1, 1, 1, "--scenario", str(_toy(place)), "--crash-on", "hang")
+        _large_bundle(place / "h", actors=200, steps=3000)
+        with board.dashboard(place / "h") as (url, _), board.browser(place) as opened:
+            crash = next((place / "h" / "crashes").iterdir()).name
+            rate = board.frames_per_second(opened, f"{url}/hunts/{board.identifier_of(place / 'h')}/crashes/{crash}")
+            drawn = board.draw_ms(opened)
+    note = f"drawn while it plays, 3,000 steps and 200 actors without a GPU; a step takes {drawn:.1f} ms; {load}"
+    yield Figure(name="dashboard_frames", value=rate, unit="/s", better="higher", target=60.0, note=note)
+
+
 BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "step": bench_step,
     "core": bench_core,
@@ -1220,6 +1274,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "panels": bench_panels,
     "scale": bench_scale,
     "report": bench_report,
+    "dashboard": bench_dashboard,
     "ray": bench_ray,
     "accelerator": bench_accelerator,
     "search": bench_search,

@@ -1,7 +1,7 @@
 """Builds the compiled parts into wheels and editable installations, where that can be done; crashhunt goes without.
 
-They are the compiled core and the library that fixes the order of SUMO's links. CRASHHUNT_CORE=0 leaves both out;
-CRASHHUNT_CORE=1, for the wheels of a release, fails where one of them cannot be built.
+They are the compiled core, the kernel for highway-env, and the library that fixes the order of SUMO's links.
+CRASHHUNT_CORE=0 leaves all out; CRASHHUNT_CORE=1, for the wheels of a release, fails where one of them cannot be built.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LINK_ORDER = "_crashhunt_link_order.so"  # a library, not a module, and so of an
 
 
 class CoreHook(BuildHookInterface):  # type: ignore[type-arg]  # older ones take none
-    """Adds the module ``_crashhunt_core`` and the library ``_crashhunt_link_order`` beside the package."""
+    """Adds the modules ``_crashhunt_core`` and ``_crashhunt_highway`` and the library ``_crashhunt_link_order``."""
 
     PLUGIN_NAME = "custom"
 
@@ -37,7 +37,12 @@ class CoreHook(BuildHookInterface):  # type: ignore[type-arg]  # older ones take
         if self.target_name != "wheel" or asked == "0":
             return
         self._folder = Path(tempfile.mkdtemp(prefix="crashhunt-core-"))
-        for what, compile_part in (("compiled core", build), ("fixed order of SUMO's links", build_link_order)):
+        parts = (
+            ("compiled core", build),
+            ("kernel for highway-env", build_kernel),
+            ("fixed order of SUMO's links", build_link_order),
+        )
+        for what, compile_part in parts:
             try:
                 built = compile_part(Path(self.root), self._folder)
             except (OSError, subprocess.SubprocessError, ValueError) as error:
@@ -63,10 +68,20 @@ def build(root: Path, folder: Path) -> Path:
         OSError: there is no compiler.
         subprocess.SubprocessError: it fails, such as where Python's headers are missing.
     """
+    return _compile(root / "crashhunt" / "native", "core.cpp", "_core.py", folder / _module("_crashhunt_core"))
+
+
+def build_kernel(root: Path, folder: Path) -> Path:
+    """Compile the kernel for highway-env into a folder; return the file. Raises as `build` does."""
+    source = root / "crashhunt" / "accelerator"
+    return _compile(source, "kernel.cpp", "_kernel.py", folder / _module("_crashhunt_highway"))
+
+
+def _module(name: str) -> str:
+    """Return the file name of a compiled module for this Python."""
     if sys.implementation.name != "cpython" or sys.byteorder != "little":
         raise ValueError("it is for CPython on Linux")
-    built = folder / f"_crashhunt_core{sysconfig.get_config_var('EXT_SUFFIX')}"
-    return _compile(root / "crashhunt" / "native", "core.cpp", "_core.py", built)
+    return f"{name}{sysconfig.get_config_var('EXT_SUFFIX')}"
 
 
 def build_link_order(root: Path, folder: Path) -> Path:
@@ -88,7 +103,7 @@ def _compile(folder: Path, source: str, interface: str, built: Path) -> Path:
         raise FileNotFoundError("there is no C++ compiler")
     match = INTERFACE.search((folder / interface).read_text())
     if match is None:
-        raise ValueError(f"crashhunt/native/{interface} does not say which interface it has")
+        raise ValueError(f"{interface} does not say which interface it has")
     words = [*shlex.split(compiler), *FLAGS, *shlex.split(os.environ.get("CXXFLAGS", ""))]
     words += [f"-DCRASHHUNT_INTERFACE={match[1]}", f"-I{sysconfig.get_path('include')}", str(folder / source)]
     done = subprocess.run([*words, "-o", str(built), "-ldl"], capture_output=True, text=True, timeout=600, check=False)

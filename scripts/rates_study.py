@@ -1,18 +1,42 @@
-"""Measure the certain intervals of rates: coverage, width, and how soon a bar is decided.
+"""Measure the intervals of rates where the true rate is known: coverage, width, and how soon a bar is decided.
 
-Prints the tables of crashhunt/guide/reference/rates.md. Every run is looked at after every trial.
-usage: scripts/rates_study.py [REPETITIONS]   (2000, unless another number is given; about a minute)
+Prints the tables of crashhunt/guide/reference/evaluation/rates-evaluation.md.
+usage: scripts/rates_study.py intervals [REPETITIONS]   certain intervals, looked at after every trial (2000)
+       scripts/rates_study.py hunts [REPETITIONS]       the same, of hunts that end in different ways (2000)
+       scripts/rates_study.py rare [REPETITIONS] [CASE] rare mode, with 200 and 400 roots (500); minutes for each case
 """
 
 from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import beta
 
-from crashhunt.rates import Bets, RateTest
+from crashhunt.disturbances import first_forcing
+from crashhunt.rates import (
+    BLOCK,
+    TRIALS_PER_ROOT,
+    BarWatch,
+    Bets,
+    CountingRule,
+    RareCounter,
+    RareEstimate,
+    RateTest,
+    TrialFacts,
+    learn_forcing,
+    root_of,
+)
+from crashhunt.trial import CRASHES, Forced
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "rates"))
 
 ALPHA = 0.05
 BETS = Bets()
@@ -57,8 +81,8 @@ def counted(crashes: int, trials: int) -> RateTest:
     return test
 
 
-def main(repetitions: int) -> None:
-    """Print the tables."""
+def intervals(repetitions: int) -> None:
+    """Print the tables of certain intervals."""
     rng = np.random.default_rng(26)
     print("rate    trials     ever outside")
     for rate in (1e-2, 1e-3, 1e-4):
@@ -82,5 +106,186 @@ def main(repetitions: int) -> None:
         print(f"{share:<15.2f} {np.median([n for n, _ in ends]) * bar:<26.1f} {wrong} of {len(ends):,}")
 
 
+# Hunts that end in different ways. Each yields trials in the order in which they end.
+
+
+def _trial(number: int, *, crashed: bool, origin: str = "random") -> TrialFacts:
+    return TrialFacts(number, True, True, crashed, 1, None, None, None, origin)
+
+
+def _whole(rng: np.random.Generator, rate: float) -> Iterable[TrialFacts]:
+    return (_trial(number, crashed=bool(rng.random() < rate)) for number in range(1000))
+
+
+def _until_first_crash(rng: np.random.Generator, rate: float) -> Iterable[TrialFacts]:
+    for number in range(1000):
+        crashed = bool(rng.random() < rate)
+        yield _trial(number, crashed=crashed)
+        if crashed:
+            return
+
+
+def _killed_and_resumed(rng: np.random.Generator, rate: float) -> Iterable[TrialFacts]:
+    """Of the first run, trials that take long have not ended; those that crash take shorter."""
+    crashed = rng.random(1000) < rate
+    ended = np.where(crashed, rng.random(1000) < 0.95, rng.random(1000) < 0.5) & (np.arange(1000) < 500)
+    for number in [*np.flatnonzero(ended), *np.flatnonzero(~ended)]:
+        yield _trial(int(number), crashed=bool(crashed[number]))
+
+
+def _two_workers(rng: np.random.Generator, rate: float) -> Iterable[TrialFacts]:
+    """Trials that crash take a tenth of the time; the hunt ends at once when one has crashed twice in all."""
+    crashed = rng.random(1000) < rate
+    free, ends = [0.0, 0.0], []
+    for number in range(1000):
+        worker = int(np.argmin(free))
+        free[worker] += 0.1 if crashed[number] else 1.0
+        ends.append((free[worker], number))
+    seen = 0
+    for _, number in sorted(ends):
+        yield _trial(number, crashed=bool(crashed[number]))
+        seen += bool(crashed[number])
+        if seen == 2:
+            return
+
+
+def _guided(rng: np.random.Generator, rate: float) -> Iterable[TrialFacts]:
+    """Of a sampler that learns, a fifth of the trials is drawn at random; the others crash ten times as often."""
+    for number in range(1000):
+        plain = number % 5 == 0
+        crashed = bool(rng.random() < (rate if plain else 10 * rate))
+        yield _trial(number, crashed=crashed, origin="random" if plain else "mutation")
+
+
+def _few_traffics(rng: np.random.Generator, rate: float) -> Iterable[TrialFacts]:
+    """Trials of one traffic crash together: a fifth of the traffics has all crashes."""
+    hard = rng.random(200) < 0.2
+    return (_trial(n, crashed=bool(hard[n % 200] and rng.random() < 5 * rate)) for n in range(1000))
+
+
+PLAIN = CountingRule(max_steps=1, planned=1000)
+HUNTS = {
+    "1,000 trials": (_whole, PLAIN),
+    "stopped at the first crash": (_until_first_crash, PLAIN),
+    "killed and resumed": (_killed_and_resumed, PLAIN),
+    "two workers, stopped at two crashes": (_two_workers, PLAIN),
+    "guided": (_guided, replace(PLAIN, plain_origin="random")),
+    "--seeds 200": (_few_traffics, replace(PLAIN, traffics=200)),
+}
+
+
+def hunts(repetitions: int, rate: float = 0.02) -> None:
+    """Print how often the interval ever excludes the true rate, by how the hunt ends."""
+    print(f"hunt, rate {rate:g}                        ever outside")
+    for name, (run, rule) in HUNTS.items():
+        rng, out = np.random.default_rng(27), 0
+        for _ in range(repetitions):
+            watch = BarWatch(rule, rate, "trial", CRASHES, ALPHA)
+            for trial in run(rng, rate):
+                watch.add_facts(trial)
+            out += watch.decided_at is not None
+        print(f"{name:<40} {out / repetitions:.2%} of {repetitions:,}", flush=True)
+
+
+# Rare mode, against a Markov model whose crash probability is known by dynamic programming.
+
+CASES: dict[str, dict[str, Any]] = {
+    "one onset, 1e-2": {"chances": {"stop": 5e-3}},
+    "one onset, 1e-3": {"chances": {"stop": 5e-4}},
+    "one onset, 1e-4": {"chances": {"stop": 5e-5}},
+    "one onset, 1e-5": {"chances": {"stop": 5e-6}},
+    "one onset, 1e-6": {"chances": {"stop": 5e-7}},
+    "three kinds, 1e-4": {"chances": {"late_action": 5e-5, "brake": 1e-4, "stop": 5e-5}},
+    "two onsets, 1e-2": {"chances": {"late_action": 5e-3, "brake": 1e-2}},
+    "two onsets, 1e-4": {"chances": {"late_action": 5e-4, "brake": 1e-3}},
+    "undisturbed 1e-2, one onset 1e-4": {"chances": {"stop": 5e-5}, "hidden": 2.5e-4},
+    "undisturbed 1e-4, one onset 1e-4": {"chances": {"stop": 5e-5}, "hidden": 2.5e-6},
+}
+ROOTS = 200
+
+
+def rare_run(case: dict[str, Any], seed: int, *, roots: int) -> list[RareEstimate]:
+    """Return the estimates after 200 roots, and after all of them.
+
+    The plain trials are drawn with the known probabilities, because nothing else counts of them.
+    """
+    from markov import Model, run_root  # type: ignore[import-not-found]
+
+    model = Model(**case)
+    sampler, (undisturbed, disturbed) = model.sampler(), model.truth()
+    rng = np.random.default_rng([28, seed])
+    start = first_forcing(sampler, model.steps)
+    counter = RareCounter(min(1.0, model.hazard * model.steps))
+    earlier: list[Forced] = []
+    found, forcing = [], start
+    for number in range(roots):
+        if number % BLOCK == 0:
+            forcing = learn_forcing(earlier[: max(0, number // BLOCK - 1) * BLOCK], start)
+        result = run_root(model, sampler, forcing, int(rng.integers(2**40)))
+        earlier.append(result.forced)
+        root = root_of(result, CRASHES, model.hazard)
+        assert root is not None
+        plain = rng.random(TRIALS_PER_ROOT - 1)
+        alone = int((plain < undisturbed).sum())
+        root = replace(
+            root,
+            undisturbed=(root.undisturbed + alone) / TRIALS_PER_ROOT,
+            plain=len(plain),
+            plain_undisturbed=alone,
+            plain_crashes=int((plain < undisturbed + disturbed).sum()),
+            plain_steps=model.steps * len(plain),
+        )
+        counter.add(root)
+        if number + 1 in (ROOTS, roots):
+            found.append(counter.estimate())
+    return found
+
+
+def rare(repetitions: int, name: str) -> None:
+    """Run a case of rare mode, and print its line of the table after every 50 repetitions."""
+    runs: list[list[RareEstimate]] = []
+    for seed in range(repetitions):
+        # Every fifth run has 400 roots.
+        runs.append(rare_run(CASES[name], seed, roots=2 * ROOTS if seed % 5 == 0 else ROOTS))
+        if (seed + 1) % 50 == 0 or seed + 1 == repetitions:
+            _print_rare(name, runs)
+
+
+def _print_rare(name: str, runs: list[list[RareEstimate]]) -> None:
+    from markov import Model
+
+    repetitions = len(runs)
+    truth = math.fsum(Model(**CASES[name]).truth())
+    values = np.array([run[0].estimate for run in runs], float)
+    z = (values.mean() - truth) / (values.std(ddof=1) / math.sqrt(repetitions))
+    told = [run[0].estimated for run in runs if run[0].estimated is not None]
+    covered = [one.low <= truth <= one.high for one in told]
+    later = [run[1].estimated is not None for run in runs if len(run) > 1]
+    low, high = np.transpose([run[0].certain for run in runs if run[0].certain is not None])
+    gain = np.median([(run[0].plain_equivalent_steps or 0.0) / run[0].steps for run in runs])
+    covers = f"{np.mean(covered):.1%}" if covered else "-"
+    print(
+        f"{name:<34} {repetitions} repetitions  truth {truth:.3g}  mean {values.mean():.3g}  z {z:+.2f}  "
+        f"reported {len(told) / repetitions:.0%}, with 400 roots {np.mean(later):.0%}  covers {covers}  "
+        f"at most covers {np.mean(high >= truth):.1%}  at least covers {np.mean(low <= truth):.1%}  "
+        f"median at most {np.median(high):.2g}  median at least {np.median(low):.2g}  steps saved {gain:.0f} times",
+        flush=True,
+    )
+
+
+def main(words: list[str]) -> None:
+    """Print the tables that were asked for."""
+    part = words[0] if words else "intervals"
+    repetitions = int(words[1]) if len(words) > 1 else (500 if part == "rare" else 2000)
+    if part == "intervals":
+        intervals(repetitions)
+    elif part == "hunts":
+        hunts(repetitions)
+    else:
+        for name in CASES:
+            if len(words) < 3 or words[2] in name:
+                rare(repetitions, name)
+
+
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 2000)
+    main(sys.argv[1:])

@@ -87,7 +87,7 @@ def _sumo_home() -> Path:
         return Path(home)
     found = find_spec("sumo")
     if found is None or found.origin is None:
-        sys.exit("towns need eclipse-sumo: pip install 'crashhunt[networks]', or set SUMO_HOME")
+        sys.exit("towns need eclipse-sumo: pip install 'crashhunt[maps]', or set SUMO_HOME")
     return Path(found.origin).parent
 
 

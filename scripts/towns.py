@@ -63,7 +63,7 @@ def make_town(name: str, folder: Path) -> Path:
     """
     program = shutil.which("netgenerate")
     if program is None:
-        raise FileNotFoundError("netgenerate is missing: pip install 'crashhunt[networks]', and have it on the PATH")
+        raise FileNotFoundError("netgenerate is missing: pip install 'crashhunt[maps]', and have it on the PATH")
     folder.mkdir(parents=True, exist_ok=True)
     network = folder / "town.net.xml"
     words = [program, *TOWNS[name], "--no-turnarounds", "true", "--output-file", str(network)]

@@ -205,7 +205,9 @@ def _be_command(request: dict, typed: int, out: int, err: int) -> NoReturn:
 class Hunt:
     """The process of a hunt of a suite: a fork of the command, as far as `run_all` uses a `subprocess.Popen`."""
 
-    def __init__(self, words: Sequence[str], *, cwd: str | None, stdout: IO[bytes], **_: object) -> None:
+    def __init__(
+        self, words: Sequence[str], *, cwd: str | None, stdout: IO[bytes], env: Mapping[str, str] | None, **_: object
+    ) -> None:
         sys.stdout.flush()
         sys.stderr.flush()
         self.pid = os.fork()
@@ -218,6 +220,9 @@ class Hunt:
             for name in sys.modules.keys() - AT_FIRST:
                 if not name.startswith("crashhunt."):
                     del sys.modules[name]  # what the command itself has imported for its user
+            if env is not None:
+                os.environ.clear()
+                os.environ.update(env)
             sys.path[:] = [place for place in map(os.path.abspath, path_of(os.environ)) if place not in PATH] + PATH
             os.chdir(cwd or ".")
             for descriptor in (1, 2):

@@ -79,6 +79,7 @@ def test_optional_faculties_are_protocols():
 SIMULATORS = re.compile("sumo|highway|gym(?!nasium)", re.IGNORECASE)  # gymnasium is the library of spaces
 HOMES = (
     "scenario/backends/",
+    "maps/",
     "simulators/sumo/",
     "simulators/highway/",
     "accelerator/",
@@ -88,6 +89,7 @@ NAMED_ALL_THE_SAME = {
     "__init__.py": "tells Gymnasium of crashhunt/SUMO-v0, which is an id that people write",
     "envs/": "is that environment, which is SUMO and nothing else",
     "cli/__init__.py": "has an example for people",
+    "cli/_init.py": "says to people which maps it takes",
     "guide/": "has the names of pages",
     "native/": "is compiled for libsumo, and finds its functions by name",
     "plans/_options.py": "says to people what an option is for",

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     Path = tuple[list[NDArray[np.float64]], list[float]]  # positions and headings that are predicted
 
 
-__all__ = ["as_numpy", "collide", "collide_one_by_one", "enforce", "move"]
+__all__ = ["as_numpy", "collide", "collide_one_by_one", "enforce", "finish", "move"]
 
 
 _DICTS, _FLOATS = frozenset((dict,)), frozenset((float,))
@@ -210,6 +210,13 @@ def collide(road: Road, dt: float, crowd: Crowd) -> bool:
             if not _stay_apart(one, two, dt):
                 one.handle_collisions(two, dt)
     return True
+
+
+def finish(road: Road, dt: float) -> None:
+    """Finish a sub-step after the kernel has moved the vehicles: with numbers that are not finite, in highway-env."""
+    for vehicle in road.vehicles:
+        vehicle.on_state_update()
+    collide_one_by_one(road, dt)
 
 
 def collide_one_by_one(road: Road, dt: float) -> None:

@@ -53,6 +53,8 @@ class Network:
         self._contents = [array.tobytes() for array in self._arrays]
         self._reach = _reach()
         self.index = {key: number for number, key in enumerate(self.keys)}
+        #: the lanes in the kernel, by whether the road also searches connected lanes for neighbours
+        self.compiled: dict[bool, object] = {}
         self.number = {id(lane): number for number, lane in enumerate(self.lanes)}
         self.plain = type(network) is RoadNetwork and all(map(_is_known, self.lanes)) and bool(self.lanes)
         if not self.plain:

@@ -1,4 +1,4 @@
-"""Observations: `KinematicObservation.observe` without data frames, and the search for close objects."""
+"""Observations: `KinematicObservation.observe` and its like without data frames, and the search for close objects."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from crashhunt.accelerator._versions import are_numbers, kind_of
 
 if TYPE_CHECKING:
     from highway_env.envs.common.observation import (
+        ExitObservation,
         KinematicObservation,
         KinematicsGoalObservation,
         OccupancyGridObservation,
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from crashhunt.accelerator._vehicle_arrays import Frame
 
 
-__all__ = ["close_objects", "fill_lanes", "observe", "observe_goal"]
+__all__ = ["close_objects", "fill_lanes", "observe", "observe_exit", "observe_goal"]
 
 
 _KNOWN = frozenset(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))
@@ -73,8 +74,8 @@ def close_objects(
 
 def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.generic] | None:
     """Return the result of `KinematicObservation.observe`; None if highway-env's own code must run."""
-    env, vehicle, features = kinematic.env, kinematic.observer_vehicle, kinematic.features
-    if frame is None or not _are_known(features) or not _is_plain(vehicle, features):
+    env, vehicle = kinematic.env, kinematic.observer_vehicle
+    if frame is None or not _is_known(kinematic):
         return None
     close = env.road.close_objects_to(
         vehicle,
@@ -83,11 +84,45 @@ def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.
         see_behind=kinematic.see_behind,
         sort=kinematic.order == "sorted",
         vehicles_only=not kinematic.include_obstacles,
-    )[-kinematic.vehicles_count + 1 :]
+    )
+    shown = _show(kinematic, frame, close, {})
+    return None if shown is None else shown.astype(np.float32)
+
+
+def observe_exit(kinematic: ExitObservation, frame: Frame | None) -> NDArray[np.generic] | None:
+    """Return the result of `ExitObservation.observe`; None if highway-env's own code must run."""
+    env, vehicle = kinematic.env, kinematic.observer_vehicle
+    if frame is None or not env.road or not _is_known(kinematic):
+        return None
+    before_exit = env.road.network.get_lane(("1", "2", -1)).local_coordinates(vehicle.position)[0]
+    close = env.road.close_vehicles_to(
+        vehicle, env.PERCEPTION_DISTANCE, count=kinematic.vehicles_count - 1, see_behind=kinematic.see_behind
+    )
+    shown = _show(kinematic, frame, close, {"x": float(before_exit)})
+    return None if shown is None else shown.astype(kinematic.space().dtype)
+
+
+def _is_known(kinematic: KinematicObservation) -> bool:
+    return _are_known(kinematic.features) and _is_plain(kinematic.observer_vehicle, kinematic.features)
+
+
+def _show(
+    kinematic: KinematicObservation, frame: Frame, close: list[RoadObject], replaced: dict[str, float]
+) -> NDArray[np.float64] | None:
+    """Return the rows of the agent and of close objects; None if highway-env's own code must run.
+
+    Args:
+        kinematic: The observation.
+        frame: The positions on the road.
+        close: The close objects, nearest first; the last ones count.
+        replaced: Features of the agent that differ from its own.
+    """
+    vehicle, features = kinematic.observer_vehicle, kinematic.features
+    close = close[-kinematic.vehicles_count + 1 :]
     if not all(_is_plain(thing, features) and _arrives(thing, frame.network) for thing in (vehicle, *close)):
         return None
     own = _values(vehicle)
-    rows = [own]
+    rows = [own | replaced]
     for thing in close:
         values = _values(thing)
         if not kinematic.absolute:
@@ -100,8 +135,8 @@ def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.
     if kinematic.normalize:
         _normalize(kinematic, shown, len(rows))
     if kinematic.order == "shuffled":
-        env.np_random.shuffle(shown[1:])
-    return shown.astype(np.float32)
+        kinematic.env.np_random.shuffle(shown[1:])
+    return shown
 
 
 def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.float64]] | None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
+from crashhunt.accelerator._kernel import Roster, kernel
 from crashhunt.accelerator._move import as_numpy, move
 from crashhunt.accelerator._network import Network
 from crashhunt.accelerator._vehicle_arrays import Crowd, Frame
@@ -15,6 +16,8 @@ from crashhunt.accelerator._versions import Own, Watch, is_plain, kinds_of
 
 if TYPE_CHECKING:
     from highway_env.vehicle.kinematics import Vehicle
+
+    from crashhunt.accelerator._kernel import Traffic
 
     Everybody = tuple["Prepared", Crowd, Frame]
 
@@ -25,10 +28,12 @@ __all__ = [
     "frame_of",
     "is_known",
     "look",
+    "look_traffic",
     "methods_of",
     "network_of",
     "prepared",
     "take",
+    "take_traffic",
     "watches",
 ]
 
@@ -54,6 +59,8 @@ class Prepared:
         self.frame: Frame | None = None
         self.alone = False
         self._crowd: Crowd | None = None
+        self._roster: Roster | None = None
+        self._traffic: Traffic | None = None
         self._moved: list[Vehicle] = []
 
     def move(self, crowd: Crowd, dt: float, before: Frame | None) -> Frame | None:
@@ -62,6 +69,30 @@ class Prepared:
         if self.alone and frame is not None:
             self._moved = crowd.vehicles
         return frame
+
+    def traffic(self) -> Traffic | None:
+        """Return all vehicles in the kernel, with their current state; None if the kernel does not know them."""
+        road = self.road
+        if road.record_history or kernel() is None:
+            return None
+        things = road.vehicles + road.objects
+        kinds = kinds_of(things)
+        if self._roster is None or not self._roster.is_of(road, things, kinds):
+            if not all(kind.drives for kind in kinds[: len(road.vehicles)]):
+                return None
+            self._roster = Roster(Crowd(road), self.network)
+        traffic = self._roster.traffic
+        return traffic if traffic is not None and traffic.read() else None
+
+    def keep_traffic(self, traffic: Traffic) -> None:
+        """Keep the state of all vehicles in the kernel until foreign code runs."""
+        self._crowd = None
+        self._traffic = traffic if self.alone else None
+
+    def trusted_traffic(self) -> Traffic | None:
+        """Return the kept state in the kernel and discard it; None if none has been kept since the last call."""
+        traffic, self._traffic = self._traffic, None
+        return traffic
 
     def keep(self, crowd: Crowd, frame: Frame) -> None:
         """Keep the state of all vehicles until foreign code runs."""
@@ -75,7 +106,7 @@ class Prepared:
 
     def distrust(self) -> None:
         """Prepare for foreign code: restore highway-env's types, and discard the kept state."""
-        self._crowd = None
+        self._crowd = self._traffic = None
         as_numpy(self._moved)
         self._moved = []
 
@@ -97,6 +128,20 @@ def take(road: Road) -> Everybody | None:
     """Return the kept state of a road; None if foreign code may have run since."""
     found = _roads.get(id(road))
     return found.trusted() if found is not None and found.road is road else None
+
+
+def take_traffic(road: Road) -> tuple[Prepared, Traffic] | None:
+    """Return the kept state of a road in the kernel; None if foreign code may have run since."""
+    found = _roads.get(id(road))
+    traffic = found.trusted_traffic() if found is not None and found.road is road else None
+    return (found, traffic) if found is not None and traffic is not None else None
+
+
+def look_traffic(road: Road, *, known: bool = False) -> tuple[Prepared, Traffic] | None:
+    """Return the current state of a road in the kernel; None if the kernel cannot be used for the road."""
+    found = prepared(road, known=known) if kernel() is not None else None
+    traffic = found.traffic() if found is not None else None
+    return (found, traffic) if found is not None and traffic is not None else None
 
 
 def forget() -> None:

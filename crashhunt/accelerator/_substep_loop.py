@@ -23,7 +23,8 @@ from highway_env.envs.parking_env import ParkingEnv
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from crashhunt.accelerator._roads import methods_of, prepared, watches
+from crashhunt.accelerator._move import finish
+from crashhunt.accelerator._roads import look_traffic, methods_of, prepared, watches
 from crashhunt.accelerator._versions import Own, is_genuine, kinds_of, originals
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from highway_env.envs.common.observation import ObservationType
 
+    from crashhunt.accelerator._roads import Prepared
 
 __all__ = ["Onlooker", "SkippedObservation", "can_run_alone", "simulate"]
 
@@ -104,13 +106,21 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[type, st
         originals["AbstractEnv._simulate"](env, action)
         return
     frames = _frames(env)
+    can_fuse = type(road) is Road and "step" not in vars(road)
     found.alone = True
+    frame = -1
     try:
-        for frame in range(frames):
+        while (frame := frame + 1) < frames:
             if action is not None and not env.config["manual_control"] and env.steps % _frames(env) == 0:
                 found.distrust()
                 env.action_type.act(action)
                 found.distrust()
+            if can_fuse:
+                due = frames if action is None else _frames(env) - env.steps % _frames(env)
+                done = _run(env, found, min(frames - frame, due))
+                if done:
+                    frame += done - 1
+                    continue
             env.road.act()
             if _interferes(road):
                 found.distrust()
@@ -124,6 +134,26 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[type, st
         found.alone = False
         found.distrust()
     env.enable_auto_render = False
+
+
+def _run(env: AbstractEnv, found: Prepared, count: int) -> int:
+    """Let the kernel do several sub-steps; return how many it has done."""
+    road = env.road
+    compiled = look_traffic(road)
+    traffic = compiled[1] if compiled is not None and compiled[0] is found else None
+    dt = 1 / env.config["simulation_frequency"]
+    if traffic is None or type(dt) is not float:
+        return 0
+    try:
+        done, unfinished = traffic.run(count, dt)
+    except BaseException:
+        env.steps += traffic.completed()
+        raise
+    if unfinished:
+        finish(road, dt)
+        done += 1
+    env.steps += done
+    return done
 
 
 def _frames(env: AbstractEnv) -> int:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.observation import (
+    ExitObservation,
     KinematicObservation,
     KinematicsGoalObservation,
     OccupancyGridObservation,
@@ -17,18 +18,21 @@ from highway_env.envs.common.observation import (
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
+from crashhunt.accelerator import _kernel
 from crashhunt.accelerator._drive import decide
-from crashhunt.accelerator._move import collide, collide_one_by_one, enforce
-from crashhunt.accelerator._observe import close_objects, fill_lanes, observe, observe_goal
+from crashhunt.accelerator._move import collide, collide_one_by_one, enforce, finish
+from crashhunt.accelerator._observe import close_objects, fill_lanes, observe, observe_exit, observe_goal
 from crashhunt.accelerator._roads import (
     forget,
     frame_of,
     is_known,
     look,
+    look_traffic,
     methods_of,
     network_of,
     prepared,
     take,
+    take_traffic,
     watches,
 )
 from crashhunt.accelerator._substep_loop import can_run_alone, simulate
@@ -101,6 +105,12 @@ def _act(self: Road) -> None:
         for vehicle in self.vehicles:
             vehicle.act()
         return
+    compiled = take_traffic(self) or look_traffic(self)
+    if compiled is not None:
+        found, traffic = compiled
+        traffic.act()
+        found.keep_traffic(traffic)
+        return
     state = take(self) or look(self)
     if state is not None:
         found, crowd, frame = state
@@ -117,9 +127,19 @@ def _step(self: Road, dt: float) -> None:
         if len(self.vehicles) + len(self.objects) > 1:
             collide_one_by_one(self, dt)
         return
+    compiled = take_traffic(self)
     state = take(self)
-    if state is None and not is_known(self):
-        originals["Road.step"](self, dt)
+    if compiled is None and state is None:
+        if not is_known(self):
+            originals["Road.step"](self, dt)
+            return
+        compiled = look_traffic(self, known=True)
+    if compiled is not None and type(dt) is float:
+        owner, traffic = compiled
+        if traffic.step(dt):
+            owner.keep_traffic(traffic)
+        else:
+            finish(self, dt)
         return
     found, crowd, before = state or (prepared(self, known=True), Crowd(self), None)
     frame = None
@@ -171,9 +191,11 @@ def _close_objects_to(
 
 
 def _enforce_road_rules(self: RegulatedRoad) -> None:
-    state = take(self)
-    if (state is not None or prepared(self) is not None) and enforce(self):
-        if state is not None:
+    compiled, state = take_traffic(self), take(self)
+    if (compiled is not None or state is not None or prepared(self) is not None) and enforce(self):
+        if compiled is not None and compiled[1].read():
+            compiled[0].keep_traffic(compiled[1])
+        elif state is not None:
             found, crowd, frame = state
             found.keep(crowd, frame)
     else:
@@ -186,6 +208,14 @@ def _observe(self: KinematicObservation) -> object:
         if found is not None:
             return found
     return originals["KinematicObservation.observe"](self)
+
+
+def _observe_exit(self: ExitObservation) -> object:
+    if _is_plain(self, ExitObservation):
+        found = observe_exit(self, frame_of(self.env.road))
+        if found is not None:
+            return found
+    return originals["ExitObservation.observe"](self)
 
 
 def _observe_goal(self: KinematicsGoalObservation) -> object:
@@ -214,7 +244,7 @@ def _is_plain(observation: KinematicObservation | OccupancyGridObservation, kind
     )
 
 
-_OBSERVATIONS = (KinematicObservation, KinematicsGoalObservation, OccupancyGridObservation)
+_OBSERVATIONS = (KinematicObservation, ExitObservation, KinematicsGoalObservation, OccupancyGridObservation)
 _SHOWN = {kind: methods_of(kind) for kind in _OBSERVATIONS}
 _REPLACED: tuple[tuple[type, str, Callable[..., object]], ...] = (
     (Road, "act", _act),
@@ -224,6 +254,7 @@ _REPLACED: tuple[tuple[type, str, Callable[..., object]], ...] = (
     (RegulatedRoad, "enforce_road_rules", _enforce_road_rules),
     (AbstractEnv, "_simulate", _simulate),
     (KinematicObservation, "observe", _observe),
+    (ExitObservation, "observe", _observe_exit),
     (KinematicsGoalObservation, "observe", _observe_goal),
     (OccupancyGridObservation, "fill_road_layer_by_lanes", _fill_road_layer_by_lanes),
 )
@@ -249,6 +280,11 @@ class Acceleration:
         if self._reason:
             return self._reason
         return why_not() if is_on() else "it has been undone"
+
+    @property
+    def why_not_compiled(self) -> str:
+        """Why the compiled kernel is not used, and Python code on arrays is slower; empty if the kernel is used."""
+        return _kernel.why_not()
 
     @property
     def left_alone(self) -> dict[str, tuple[str, ...]]:
@@ -291,7 +327,7 @@ def accelerate() -> Acceleration:
     Returns:
         The state of the acceleration. Its truth value says whether highway-env is accelerated. ``reason`` says why not.
         ``left_alone`` lists classes that are not accelerated. ``undo()``, or the end of a ``with`` block, switches the
-        accelerator off.
+        accelerator off. ``why_not_compiled`` says why the compiled kernel is not used.
 
     Example:
         >>> import crashhunt

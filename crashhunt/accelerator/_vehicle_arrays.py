@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     Pairs = tuple[NDArray[np.bool_], NDArray[np.float64]]  # who may touch which, and within which distance
 
 
-__all__ = ["ASK", "MANY", "NO_VEHICLE", "Crowd", "Frame", "are_plain"]
+__all__ = ["ASK", "MANY", "NO_VEHICLE", "PARAMETERS_OF", "Crowd", "Frame", "are_plain", "connected_lanes"]
 
 
 MANY = 12  # from this number of vehicles on, arrays are used in place of a loop
@@ -204,7 +204,7 @@ class Frame:
         else:
             found = []
             seen: set[int] = set()
-            for other, offset in self._connected(lane):
+            for other, offset in connected_lanes(self.network, lane):
                 for s, row in self._on_lane(other):
                     if row not in seen:  # the first lane of an object decides
                         seen.add(row)
@@ -233,21 +233,22 @@ class Frame:
                 found.append((place[0], row))
         return found
 
-    def _connected(self, lane: int) -> list[tuple[int, float]]:
-        """Return the lane, its successors and its predecessors, each with the offset of its coordinates, in m."""
-        graph, network = self.road.network.graph, self.network
-        start, end, number = network.keys[lane]
-        found = [(lane, 0.0)]
-        for after, lanes in graph.get(end, {}).items():
-            if lanes:
-                chosen = number if number < len(lanes) else 0
-                found.append((network.index[end, after, chosen], network.lanes[lane].length))
-        for before, ends in graph.items():
-            lanes = ends.get(start, [])
-            if lanes:
-                chosen = network.index[before, start, number if number < len(lanes) else 0]
-                found.append((chosen, -network.lanes[chosen].length))
-        return found
+
+def connected_lanes(network: Network, lane: int) -> list[tuple[int, float]]:
+    """Return a lane, its successors and its predecessors, each with the offset of its coordinates, in m."""
+    graph = network.network.graph
+    start, end, number = network.keys[lane]
+    found = [(lane, 0.0)]
+    for after, lanes in graph.get(end, {}).items():
+        if lanes:
+            chosen = number if number < len(lanes) else 0
+            found.append((network.index[end, after, chosen], network.lanes[lane].length))
+    for before, ends in graph.items():
+        lanes = ends.get(start, [])
+        if lanes:
+            chosen = network.index[before, start, number if number < len(lanes) else 0]
+            found.append((chosen, -network.lanes[chosen].length))
+    return found
 
 
 def are_plain(things: list[RoadObject], kinds: list[Kind] | None = None) -> bool:
@@ -278,7 +279,7 @@ _COLLIDES, _MOVES = attrgetter("collides"), attrgetter("moves")
 _STEEP = 20.0  # with a larger IDM exponent, an acceleration may overflow
 _POSE = attrgetter("heading", "speed")
 _NAMES = NUMBERS_OF["idm"]  # the names of all other bases are a prefix of these
-_READ = {how: attrgetter(*names) for how, names in NUMBERS_OF.items()}
+PARAMETERS_OF = {how: attrgetter(*names) for how, names in NUMBERS_OF.items()}
 
 
 class Crowd:
@@ -342,7 +343,7 @@ class Crowd:
                 number = None if own else shared.get(id(kind))
                 if number is None:
                     number = len(found)
-                    found.append(_READ[kind.base](thing))
+                    found.append(PARAMETERS_OF[kind.base](thing))
                     if not own:
                         shared[id(kind)] = number
                 which.append(number)
@@ -351,6 +352,8 @@ class Crowd:
             return False
         if not are_numbers(chain.from_iterable(found)) or not are_numbers(deltas):
             return False
+        #: whether the limits of speeds are NumPy floats, which speeds then become
+        self.numpy_limits = any(type(number) is np.float64 for row in found for number in row[2:4])
         whole = [row + (np.nan,) * (len(_NAMES) - len(row)) for row in found]
         self.numbers = dict(zip(_NAMES, np.array(whole, float).reshape(-1, len(_NAMES))[which].T, strict=True))
         self.numbers["DELTA"] = delta = np.full(len(kinds), np.nan)

@@ -16,6 +16,7 @@
     ├── SnapshotError              the code of a hunt cannot be captured: too large, unreadable
     ├── RecorderError              a trial could not be recorded: a full disk
     ├── WorkerError                the process of a trial refused it, or ended before it began
+    ├── InternalError              crashhunt itself failed, not the code of a user
     └── EpisodeError               raised inside an episode; becomes the trial's outcome
         ├── InvalidEpisodeError    the episode could not be set up
         ├── ActionError            the agent returned something outside its action space
@@ -41,6 +42,7 @@ __all__ = [
     "CrashhuntError",
     "EpisodeError",
     "HuntDirectoryError",
+    "InternalError",
     "InvalidEpisodeError",
     "NoValidTrialError",
     "PluginError",
@@ -95,7 +97,12 @@ class CrashhuntError(Exception):
     def from_json(cls, data: ErrorData) -> CrashhuntError:
         """Rebuild the error that `to_json` of any version returned."""
         said = data["error"]
-        return cls(str(said.get("message", "")), fix=str(said.get("fix", "")), where=str(said.get("where", "")))
+        parts = {"fix": str(said.get("fix", "")), "where": str(said.get("where", ""))}
+        if said.get("traceback"):
+            fault = InternalError(str(said.get("message", "")), **parts)
+            fault.traceback = str(said["traceback"])
+            return fault
+        return cls(str(said.get("message", "")), **parts)
 
 
 def _rebuild(kind: type[CrashhuntError], message: str, fix: str, where: str) -> CrashhuntError:
@@ -154,6 +161,26 @@ class RecorderError(CrashhuntError):
 
 class WorkerError(CrashhuntError):
     """The process of a trial refused the trial, or ended before it began."""
+
+
+class InternalError(CrashhuntError):
+    """crashhunt itself failed: a fault to report, which ends a hunt.
+
+    Attributes:
+        traceback: The traceback, for the report.
+    """
+
+    traceback = ""
+
+    def to_json(self) -> ErrorData:
+        """Return the shape of every error, with the traceback."""
+        data = super().to_json()
+        data["error"]["traceback"] = self.traceback
+        return data
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Keep the traceback when the error crosses a process boundary."""
+        return _rebuild, (type(self), self.message, self.fix, self.where), {"traceback": self.traceback}
 
 
 class EpisodeError(CrashhuntError):

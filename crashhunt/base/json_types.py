@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TypeAlias, TypedDict, final
+from typing import NotRequired, TypeAlias, TypedDict, final
 
 __all__ = ["ErrorData", "ErrorWords", "Json", "Plain", "finite", "finite_values"]
 
@@ -21,11 +21,12 @@ Plain: TypeAlias = Mapping[str, object]
 
 
 class ErrorWords(TypedDict):
-    """What an error says."""
+    """What an error says; the traceback is that of a failure of crashhunt itself."""
 
     message: str
     fix: str
     where: str
+    traceback: NotRequired[str]
 
 
 @final

@@ -37,6 +37,7 @@ __all__ = [
     "REPLACED",
     "REPORT",
     "REQUEST",
+    "RESPONSES",
     "RUN_LOG",
     "SCENARIO",
     "SCENARIO_FILES",
@@ -94,6 +95,7 @@ ARCHIVE_KEY: Final = "archive-key"
 # Of the scratch folder of a trial that runs; of the whole hunt's, the last one.
 BLACK_BOX: Final = "blackbox.bin"
 ENTERED: Final = "entered.json"  # of a trial that can exclude other vehicles
+RESPONSES: Final = "responses.json"  # of a trial with a reference driver
 STACK: Final = "stack.txt"
 MAP: Final = "map.json"
 NOTICES: Final = "notices.txt"

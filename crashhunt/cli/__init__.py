@@ -12,7 +12,7 @@ import traceback
 from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
-from crashhunt.base.errors import DISK, CrashhuntError, UsageError, remedy
+from crashhunt.base.errors import DISK, CrashhuntError, InternalError, UsageError, remedy
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import ended_by_signals
 from crashhunt.base.temporary import remove_leftovers
@@ -25,8 +25,11 @@ from crashhunt.cli._compare import add_compare
 from crashhunt.cli._completion import add_completion, complete
 from crashhunt.cli._corpus import add_corpus
 from crashhunt.cli._crashes import add_crashes
+from crashhunt.cli._dashboard import add_dashboard
 from crashhunt.cli._export import add_export
+from crashhunt.cli._gate import add_gate
 from crashhunt.cli._guide import add_guide
+from crashhunt.cli._init import add_init
 from crashhunt.cli._judge import add_judge
 from crashhunt.cli._list import add_lists
 from crashhunt.cli._logs import add_logs
@@ -100,6 +103,9 @@ def _run(words: Sequence[str]) -> int:
 
 
 def _report(error: CrashhuntError, *, as_json: bool) -> int:
+    if isinstance(error, InternalError) and os.environ.get("CRASHHUNT_TRACEBACK"):
+        with suppress(OSError):
+            print(error.traceback, file=sys.stderr, flush=True)
     with suppress(OSError):
         print(one_line(f"crashhunt: {error}"), file=sys.stderr, flush=True)
     if as_json:
@@ -157,9 +163,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.set_defaults(parser=parser)  # `guide` describes all of it
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
-        add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
-        add_crashes, add_judge, add_whatif, add_shrink, add_corpus, add_bisect, add_trust_command, add_check,
-        add_compare, add_rate, add_lists, add_guide, add_completion,
+        add_run, add_init, add_replay, add_show, add_report, add_dashboard, add_export, add_suite, add_status, add_logs,
+        add_rerun, add_trials, add_crashes, add_judge, add_whatif, add_shrink, add_corpus, add_bisect,
+        add_trust_command, add_check, add_compare, add_gate, add_rate, add_lists, add_guide, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

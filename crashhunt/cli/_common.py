@@ -16,7 +16,7 @@ from crashhunt.base.text import did_you_mean, one_of, visible
 from crashhunt.plans import hunt_options
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from _typeshed import SupportsWrite
 
@@ -356,20 +356,28 @@ def tell(options: argparse.Namespace, summary: str, annotations: Sequence[str]) 
 # The options of a hunt on the command line, as the list has them.
 
 
-def add_options(groups: Mapping[str, argparse._ArgumentGroup]) -> None:
-    """Add every option that has a flag to its group of the help."""
-    for option in hunt_options():
-        if option.about.flag:
-            _add(groups[option.about.group], option)
+def add_options(groups: Mapping[str, argparse._ArgumentGroup], names: Collection[str] = ()) -> None:
+    """Add every option that has a flag to its group of the help.
+
+    Args:
+        groups: of the help, by name.
+        names: of the options, where not all are for this command.
+    """
+    for option in _options(names):
+        _add(groups[option.about.group], option)
 
 
-def chosen_options(given: argparse.Namespace) -> Given:
+def chosen_options(given: argparse.Namespace, names: Collection[str] = ()) -> Given:
     """Return the options that were given, as `crashhunt.prepare` takes them.
 
     Raises:
         UsageError: a value has no name, or a name comes twice.
     """
-    return {option.name: _value(option, getattr(given, option.name)) for option in hunt_options() if option.about.flag}
+    return {option.name: _value(option, getattr(given, option.name)) for option in _options(names)}
+
+
+def _options(names: Collection[str]) -> list[HuntOption]:
+    return [option for option in hunt_options() if option.about.flag and (not names or option.name in names)]
 
 
 def add_options_of_machine(parser: argparse.ArgumentParser) -> None:

@@ -53,8 +53,8 @@ def _add_add(commands: Commands) -> None:
     add = commands.add_parser(
         "add",
         help="put crashes into a corpus",
-        description="Put crashes into a corpus: seed, arguments, scenario, and the log if it is small. The code of "
-        "crashhunt and of the agent is excluded, because a corpus tests the current code.",
+        description="Put crashes into a corpus: seed, arguments, scenario, and the log, which is compact if it would "
+        "be large. The code of crashhunt and of the agent is excluded, because a corpus tests the current code.",
     )
     add.add_argument(
         "bundles", metavar="BUNDLE", type=Path, nargs="+",
@@ -105,7 +105,8 @@ def _add(options: argparse.Namespace, _words: list[str]) -> int:
             added = add_case(bundle, options.to, expect=options.expect, note=options.note)
             data = added.case.to_json()
             answers.append({**data, "new": added.new})
-            say(_added(data["path"], data["bytes"], log=data["log"], new=added.new), as_json=options.json)
+            log = added.case.kind_of_log()
+            say(_added(data["path"], data["bytes"], log=log, new=added.new), as_json=options.json)
             if bundle.confirmed is False:
                 say("  warning: it is flaky, so that it may be fixed by luck", as_json=options.json)
     if options.json:
@@ -113,8 +114,8 @@ def _add(options: argparse.Namespace, _words: list[str]) -> int:
     return 0
 
 
-def _added(path: str, size: int, *, log: bool, new: bool) -> str:
-    said = f"{size / 1024:.0f} KiB" + ("" if log else ", without its log, which would make it large")
+def _added(path: str, size: int, *, log: str, new: bool) -> str:
+    said = f"{size / 1024:.0f} KiB" + {"whole": "", "compact": ", with a compact log"}.get(log, ", without a log")
     return in_lines([f"{path} {'is new' if new else 'was there already'} ({said})"])
 
 

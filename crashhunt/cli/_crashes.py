@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.cli._common import add_ci_options, add_json, say, tell
+from crashhunt.base.errors import UsageError
+from crashhunt.cli._common import add_ci_options, add_json, add_trust, check_trust, integer, say, tell
 
 if TYPE_CHECKING:
     import argparse
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 
     from crashhunt.cli._common import Commands
     from crashhunt.corpus import Case
-    from crashhunt.crashes import Group, Signature
+    from crashhunt.crashes import CauseGroup, Group, Signature
 
 __all__ = ["add_crashes"]
 
@@ -36,6 +38,12 @@ def add_crashes(commands: Commands) -> None:
     crashes.add_argument(
         "--sarif", metavar="FILE", type=Path, help="write the crash types as SARIF 2.1.0, for code scanning and editors"
     )
+    crashes.add_argument(
+        "--by-cause", metavar="N", type=integer, nargs="?", const=-1, default=0,
+        help="divide each type by cause: run up to N of its crashes again, as judge does; the others have the cause of "
+        "the nearest one; default: 8",
+    )  # fmt: skip
+    add_trust(crashes)
     add_ci_options(crashes)
     add_json(crashes)
     crashes.set_defaults(command=_crashes)
@@ -44,23 +52,53 @@ def add_crashes(commands: Commands) -> None:
 def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.crashes import group_crashes, list_bundles
     from crashhunt.hunts import dropped_crashes, find_hunts
-    from crashhunt.report import describe_groups
+    from crashhunt.report import describe_causes, describe_groups
 
     cases = _cases(options.known)
     hunts = list(dict.fromkeys(hunt for directory in options.directories for hunt in find_hunts(directory)))
     bundles = (bundle for hunt in hunts for bundle in list_bundles(hunt))
     found = group_crashes(bundles, dropped_crashes(hunts))
     known = _known(found.groups, cases)
+    causes = _divided(options, found.groups) if options.by_cause else None
     say(describe_groups(found.groups, known), as_json=options.json)
+    if causes is not None:
+        say(describe_causes(found.groups, causes), as_json=options.json)
     for why in found.left_out:
         say(f"skipped: {why}", as_json=True)
     _tell(options, found.groups, known)
     if options.json:
         groups = [dict(group.to_json()) for group in found.groups]
+        if causes is not None:
+            pairs = zip(groups, causes, strict=True)
+            groups = [{**one, "causes": [each.to_json() for each in of]} for one, of in pairs]
         if known is not None:
             groups = [{**one, "known": known.get(of.signature)} for one, of in zip(groups, found.groups, strict=True)]
         print(json.dumps({"groups": groups, "left_out": list(found.left_out)}))
     return 0
+
+
+def _divided(options: argparse.Namespace, groups: Sequence[Group]) -> list[tuple[CauseGroup, ...]]:
+    """Return the crashes of each type, divided by cause."""
+    from crashhunt.base.signals import stop_requests
+    from crashhunt.replays import ReplayOptions
+    from crashhunt.whatif import REPRESENTATIVES, divide_by_cause
+
+    if options.by_cause < -1:
+        raise UsageError(f"--by-cause is {options.by_cause}", fix="give at least 1")
+    most = REPRESENTATIVES if options.by_cause == -1 else options.by_cause
+    for first in {group.first.hunt: group.first for group in groups}.values():  # before the first one runs
+        check_trust(first, options.trust or None)
+    with stop_requests() as stops:
+        return [
+            divide_by_cause(
+                group,
+                ReplayOptions(force=True, trusted=True),
+                most=most,
+                parallel=len(os.sched_getaffinity(0)),
+                stopped=lambda: bool(stops),
+            )
+            for group in groups
+        ]
 
 
 def _cases(corpus: Path | None) -> list[Case] | None:

@@ -56,6 +56,10 @@ def add_judge(commands: Commands) -> None:
         help="the most trials to run for what one crash hangs on; 0: none; default: 80",
     )  # fmt: skip
     judge.add_argument(
+        "--reference", metavar="N", type=integer, default=20,
+        help="the most trials to run with a reference driver, which finds what the agent omitted; 0: none; default: 20",
+    )  # fmt: skip
+    judge.add_argument(
         "--parallel", metavar="N", type=integer, default=0, help="trials at a time; default: one per core"
     )
     add_trust(judge)
@@ -70,6 +74,8 @@ def _judge(options: argparse.Namespace, _words: list[str]) -> int:
         raise UsageError(f"--runs is {options.runs}", fix="give at least 1")
     if options.why < 0:
         raise UsageError(f"--why is {options.why}", fix="give at least 0 (0: do not ask what it hangs on)")
+    if options.reference < 0:
+        raise UsageError(f"--reference is {options.reference}", fix="give at least 0 (0: no reference driver)")
     if options.parallel < 0:
         raise UsageError(f"--parallel is {options.parallel}", fix="give at least 0 (0: one per core)")
     if options.all and options.crash:
@@ -106,7 +112,7 @@ def _unjudged(options: argparse.Namespace) -> list[Bundle]:
         bundle
         for bundle in bundles
         if (partner(bundle.result) or (options.why and bundle.result.outcome is not Outcome.HANG))
-        and ((known := judgement_of(bundle)) is None or known.is_interrupted)
+        and ((known := judgement_of(bundle)) is None or known.is_interrupted or not (known.attempts or known.why))
     ]
 
 
@@ -124,14 +130,17 @@ def _judge_one(
             ReplayOptions(force=True, trusted=trusted),
             runs=options.runs,
             why=options.why,
+            reference=options.reference,
             parallel=options.parallel or len(os.sched_getaffinity(0)),
             watch=watch,
             stopped=lambda: bool(stops),
         )
     known = judgement_of(bundle)
-    ran = found.runs or (found.why is not None and found.why.runs)
+    ran = found.runs or (found.why is not None and found.why.runs) or found.reference is not None
     if found.why is None and known is not None:  # not asked for this time
         found = replace(found, why=known.why)
+    if found.reference is None and known is not None:
+        found = replace(found, reference=known.reference)
     bundle = with_judgement(bundle, found)
     if write and ran and (not stops or known is None):  # half an answer does not replace a whole one
         bundle.write()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import DONE, NO_ANSWER, THE_ANSWER_IS_NO, add_json, number, say
+from crashhunt.plans import RATE_PERS
 
 if TYPE_CHECKING:
     import argparse
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.rates import Per
 
 __all__ = ["add_rate", "exit_code_of"]
-
-_PERS = ("trial", "hour", "1000km")
 
 
 def add_rate(commands: Commands) -> None:
@@ -32,7 +31,7 @@ def add_rate(commands: Commands) -> None:
     )
     rate.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of hunts or suites")
     rate.add_argument(
-        "--per", metavar="UNIT", choices=_PERS, help="trial, hour or 1000km; default: all three, or that of --bar"
+        "--per", metavar="UNIT", choices=RATE_PERS, help="trial, hour or 1000km; default: all three, or that of --bar"
     )
     rate.add_argument(
         "--confidence", metavar="PERCENT", type=number, default=95.0, help="of the intervals; default: 95"

@@ -12,8 +12,11 @@ from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, say
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Sequence
 
     from crashhunt.cli._common import Commands
+    from crashhunt.crashes import Bundle
+    from crashhunt.hunts import FoundCrashes
 
 __all__ = ["add_report"]
 
@@ -40,29 +43,52 @@ def add_report(commands: Commands) -> None:
 
 
 def _report(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.crashes import find_bundle, list_bundles, list_near_misses
-    from crashhunt.hunts import hunt_state
+    from crashhunt.crashes import find_bundle, list_near_misses
+    from crashhunt.hunts import find_crashes, hunt_state
     from crashhunt.report import write_report
 
     if options.crashes < 0:
         raise UsageError(f"--crashes is {options.crashes}", fix="give at least 0")
     with opened_hunt(options.directory) as (hunt, exported):
         state = hunt_state(hunt)
-        if state.damaged and not exported and not options.crash:  # a page without its trials would pass for all of it
+        alone = exported or (hunt / layout.CASE).is_file()  # one crash, which never had a ledger
+        if state.damaged and not alone and not options.crash:  # a page without its trials would pass for all of it
             raise HuntDirectoryError(state.detail)
-        bundles = [find_bundle(hunt, options.crash)] if options.crash else list_bundles(hunt)
-        bundles.sort(key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
-        shown = bundles[: options.crashes]
-        near = [] if options.crash else list_near_misses(hunt)[: options.crashes]
+        found = find_crashes(hunt, 0 if options.crash else options.crashes)
+        shown = [find_bundle(hunt, options.crash)] if options.crash else list(found.shown)
+        near_misses = [] if options.crash else list_near_misses(hunt)
+        near = near_misses[: options.crashes]
         target = options.output or (Path(f"{options.directory}.html") if exported else hunt / layout.REPORT)
         with shown_progress(f"writing {target}", as_json=options.json) as watch:
-            size = write_report(hunt, [*shown, *near], target, name=options.directory.resolve().name, watch=watch)
-    also = f", and the {len(near)} most dangerous near misses" if near else ""
-    left = f", the {len(shown)} with the fewest steps" if len(shown) < len(bundles) else ""
-    say(
-        f"{target} ({size / 1e6:.1f} MB) shows {len(shown)} of {len(bundles)} crashes{left}{also}", as_json=options.json
-    )
+            size = write_report(
+                hunt,
+                [*shown, *near],
+                target,
+                found=found,
+                near_misses=len(near_misses),
+                name=options.directory.resolve().name,
+                watch=watch,
+            )
+    also = f", and the {len(near)} most critical of {len(near_misses)} near misses" if near else ""
+    count = f"{len(shown)} of {found.tally.found} crashes"
+    say(f"{target} ({size / 1e6:.1f} MB) shows {count}{_which(found, shown)}{also}", as_json=options.json)
     if options.json:
-        also_json = {"near_misses": [bundle.id for bundle in near]} if near else {}
-        print(json.dumps({"file": str(target), "bytes": size, "crashes": [bundle.id for bundle in shown], **also_json}))
+        data: dict[str, object] = {
+            "file": str(target),
+            "bytes": size,
+            "crashes": [bundle.id for bundle in shown],
+            "crashes_found": found.tally.found,
+            "crashes_saved": found.saved,
+        }
+        if near:
+            data |= {"near_misses": [bundle.id for bundle in near], "near_misses_saved": len(near_misses)}
+        print(json.dumps(data))
     return 0
+
+
+def _which(found: FoundCrashes, shown: Sequence[Bundle]) -> str:
+    """Return in words which of the crashes are shown; empty where all are, or where the user has named one."""
+    if not found.shown:
+        return ""
+    chosen = ": the shortest of each type, then the shortest of all" if len(shown) < found.saved else ""
+    return chosen + (f" ({found.saved} have a bundle)" if found.saved < found.tally.found else "")

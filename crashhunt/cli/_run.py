@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
+import shlex
 import signal
 import sys
+import textwrap
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.cli._common import (
@@ -22,15 +25,60 @@ from crashhunt.cli._common import (
     integer,
 )
 from crashhunt.cli._rate import exit_code_of
+from crashhunt.plans import hunt_options
 
 if TYPE_CHECKING:
-    import argparse
-
     from crashhunt.cli._common import Commands
 
-__all__ = ["add_run"]
+__all__ = ["add_run", "short_help"]
 
 _LONG_WAIT_S = 3.0  # after which people wonder
+
+
+_GROUPS = {
+    "what": "what is tested",
+    "search": "search",
+    "faults": "faults and probes",
+    "kept": "what is kept",
+    "run": "how it runs",
+    "output": "output",
+}
+
+
+class _ShortHelp(argparse.Action):
+    """Prints the most used options, and the names of all others by their group."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        """Print the help and leave."""
+        parser._print_message(short_help(parser), sys.stdout)
+        parser.exit()
+
+
+def short_help(parser: argparse.ArgumentParser) -> str:
+    """Return the short help of ``crashhunt run``, for the width of the terminal."""
+    briefs = {option.name: option.about.brief for option in hunt_options() if option.about.brief}
+    short = argparse.ArgumentParser(
+        parser.prog, usage=parser.usage, description=parser.description, add_help=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    width = short._get_formatter()._width
+    short.description = textwrap.fill(parser.description or "", width)
+    most_used, others = short.add_argument_group("most used options"), []
+    for group in parser._action_groups:
+        names = []
+        for action in group._group_actions:
+            if not action.option_strings:
+                short.add_argument(action.dest, metavar=action.metavar, help=action.help)
+            elif action.dest in briefs:
+                takes = {"action": "store_true"} if action.nargs == 0 else {"metavar": action.metavar}
+                most_used.add_argument(action.option_strings[-1], help=briefs[action.dest], **takes)
+            else:
+                names.append(action.option_strings[-1])
+        if names and group.title in _GROUPS.values():
+            line = f"  {group.title}: {' '.join(names)}"
+            others.append(textwrap.fill(line, width, subsequent_indent="    ", break_on_hyphens=False))
+    short.epilog = "\n".join(["other options:", *others, "", f"{parser.prog} --help-all describes all options."])
+    return short.format_help()
 
 
 def add_run(commands: Commands) -> None:
@@ -40,17 +88,23 @@ def add_run(commands: Commands) -> None:
         help="hunt for a crash",
         description="Hunt for a crash: run trials in parallel, each with its own seed and arguments, and stop as soon "
         "as one crashes. The same command on the same DIR resumes the hunt.",
+        usage="%(prog)s [option]... DIR PARALLEL TRIALS MAX_STEPS",
+        add_help=False,
     )
+    hidden: dict[str, Any] = {"nargs": 0, "default": argparse.SUPPRESS}
+    run.add_argument("-h", "--help", action=_ShortHelp, **hidden, help="show the most used options")
+    run.add_argument("--help-all", action="help", help="show all options")
     run.add_argument("directory", metavar="DIR", type=Path, help="where everything is kept; made if it is not there")
     run.add_argument("parallel", metavar="PARALLEL", type=integer, help="trials at a time; 0: one per core")
     run.add_argument("trials", metavar="TRIALS", type=integer, help="how many trials at most; 0: no limit, with --for")
     run.add_argument("max_steps", metavar="MAX_STEPS", type=integer, help="the bound on each trial, in steps")
-    what = run.add_argument_group("what is hunted")
-    how = run.add_argument_group("how it is hunted")
-    add_options({"what": what, "how": how})
-    how.add_argument("--overwrite", action="store_true", help="start a new hunt, even if DIR holds another one")
-    how.add_argument("--fail-on-crash", action="store_true", help="exit with 1 if a crash was found")
-    add_json(how)
+    groups = {name: run.add_argument_group(title) for name, title in _GROUPS.items()}
+    add_options(groups)
+    groups["kept"].add_argument(
+        "--overwrite", action="store_true", help="start a new hunt, even if DIR holds another one"
+    )
+    groups["output"].add_argument("--fail-on-crash", action="store_true", help="exit with 1 if a crash was found")
+    add_json(groups["output"])
     run.set_defaults(command=_run)
 
 
@@ -60,7 +114,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     signal.signal(signal.SIGINT, lambda *_: _leave_at_once(as_json=options.json))
     from crashhunt.api import prepare
 
-    waiting = _tell_of_the_survey(options)
+    waiting = _tell_of_the_wait(options)
     try:
         hunt = prepare(
             options.directory,
@@ -75,6 +129,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         waiting.cancel()
     from rich.console import Console
 
+    from crashhunt.dashboard import has_dashboard
     from crashhunt.report import Watcher, describe_hunt
 
     console = Console(stderr=options.json, highlight=False)
@@ -83,11 +138,17 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         report = hunt.run(watcher)
         watcher.tell_notes()  # where there was nothing to run
     console.print(describe_hunt(report), markup=False, soft_wrap=True)
+    if console.is_terminal and report.crashes and has_dashboard():
+        console.print(
+            f"Look at it: crashhunt dashboard {shlex.quote(str(options.directory))}", markup=False, soft_wrap=True
+        )
     if options.json:
         print(json.dumps(report.to_json()))
     if report.stopped_because == "no_valid_trial":
         return NO_VALID_TRIAL
     if report.stopped_because == "interrupted":
+        return INTERRUPTED
+    if report.unconfirmed:
         return INTERRUPTED
     if report.rate is not None:
         return exit_code_of([report.rate.verdict])
@@ -95,14 +156,16 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     return THE_ANSWER_IS_NO if found and options.fail_on_crash else DONE
 
 
-def _tell_of_the_survey(options: argparse.Namespace) -> threading.Timer:
+def _tell_of_the_wait(options: argparse.Namespace) -> threading.Timer:
     """Return a timer that explains a long wait; the caller cancels it."""
 
     def tell() -> None:
+        from crashhunt.scenario import configurations
+
         scenario = Path(str(options.scenario))
-        if scenario.is_file() and scenario.suffix != ".toml":  # only a simulator's own configuration is surveyed
-            limit = "60 s of processor time at most"
-            print(f"simulating the plain traffic, to find vehicles that enter ({limit})", file=sys.stderr, flush=True)
+        found = (known.waiting for known in configurations() if scenario.name.endswith(known.endings))
+        if (waiting := next(found, "")) and scenario.is_file():
+            print(waiting, file=sys.stderr, flush=True)
 
     timer = threading.Timer(_LONG_WAIT_S, tell)
     timer.daemon = True

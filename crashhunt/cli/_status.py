@@ -79,21 +79,21 @@ def states_table(states: list[HuntState]) -> Table:
     from rich.table import Table
     from rich.text import Text
 
-    from crashhunt.report import format_seconds
+    from crashhunt.report import describe_running, format_pace, format_seconds
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("hunt", no_wrap=True)
     table.add_column("state")
-    for name in ("trials", "per s", "left", "crashes", "errors"):
+    for name in ("trials", "rate", "left", "crashes", "errors"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("outcomes", overflow="fold")
     for state in states:
         said = ", ".join(f"{name} {count}" for name, count in state.outcomes.items())
         table.add_row(
             Text(one_line(state.dir)),
-            Text(state.state, style=_COLORS.get(state.state, "")),
+            Text(_state(state), style=_COLORS.get(state.state, ""), no_wrap=True),
             f"{state.trials_run}/{state.trials_planned}" if state.trials_planned else str(state.trials_run),
-            f"{state.rate_per_s:.1f}" if state.rate_per_s else "-",
+            format_pace(state.rate_per_s) if state.rate_per_s else "-",
             format_seconds(state.seconds_left) if state.seconds_left is not None else "-",
             _crashes(state),
             str(state.errors),
@@ -101,14 +101,25 @@ def states_table(states: list[HuntState]) -> Table:
         )
         for line in fork_lines(state):
             table.add_row(*[""] * 7, Text(line))
+        if state.rate is not None:
+            table.add_row(*[""] * 7, Text(describe_running(state.rate)))
         if state.core is not None:
             table.add_row(Text(one_line(f"  compiled core {state.core}")))
         for node in (state.nodes or [])[:_NODES]:
             name = one_line(f"  {node['name']} ({node['parallel']} at a time)")
-            table.add_row(Text(name), "", str(node["trials"]), f"{node['rate_per_s']:.1f}")
+            table.add_row(Text(name), "", str(node["trials"]), format_pace(node["rate_per_s"]))
         if len(state.nodes or []) > _NODES:
             table.add_row(f"  and {len(state.nodes or []) - _NODES} more")
     return table
+
+
+def _state(state: HuntState) -> str:
+    """Return the state or, after the last trial of a running hunt, its phase."""
+    from crashhunt.report import describe_phase
+
+    if state.phase is None:
+        return state.state
+    return describe_phase(state.phase["name"], state.phase["done"], state.phase["total"], None)
 
 
 def fork_lines(state: HuntState) -> list[str]:
@@ -141,7 +152,8 @@ def _crashes(state: HuntState) -> str:
     """Return the number of crashes and crash types and, if the hunt runs, the age of the last new type."""
     from crashhunt.report import format_seconds
 
-    said = [] if state.disturbed is None else [f"{state.disturbed} disturbed"]
+    said = [] if state.crashes_saved is None else [f"{state.crashes_saved} saved"]
+    said += [] if state.disturbed is None else [f"{state.disturbed} disturbed"]
     if state.kinds:
         said.append(f"{len(state.kinds)} {'type' if len(state.kinds) == 1 else 'types'}")
         if state.state == "running" and state.newest_kind_s is not None:

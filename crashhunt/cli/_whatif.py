@@ -67,7 +67,8 @@ def add_whatif(commands: Commands) -> None:
     )  # fmt: skip
     whatif.add_argument(
         "--overrule", metavar="HOW", choices=get_args(Manoeuvre), default="",
-        help="from step K on, have the vehicle brake, change lanes and brake, or keep its lane or its speed",
+        help="from step K on, have the vehicle brake, change lanes and brake, keep its lane or its speed, or have a "
+        "reference driver correct its speed, its lane changes, or both, where they are not safe",
     )  # fmt: skip
     whatif.add_argument("--leave-out", metavar="ID,…", default="", help="actors that do not take part, from the start")
     whatif.add_argument(

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
 import sys
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, UsageError
-from crashhunt.base.git import environment_of_git
-from crashhunt.base.processes import die_with
-from crashhunt.base.temporary import temporary_beside, temporary_folder, this_process
+from crashhunt.base.temporary import temporary_folder
+from crashhunt.base.work_trees import checked_out, commit_of, git, import_environment, run_to_end, top_of
 from crashhunt.corpus._cases import add_case
 from crashhunt.plans import read_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.corpus._run import Got
@@ -84,53 +80,47 @@ def bisect(
         CrashhuntError: git fails.
     """
     folder = (folder or Path.cwd()).resolve()
-    top = Path(_git(folder, "rev-parse", "--show-toplevel"))
-    ends = [_git(folder, "rev-parse", "--verify", "--quiet", f"{name}^{{commit}}", what=name) for name in (good, bad)]
+    top = top_of(folder)
+    ends = [commit_of(folder, name) for name in (good, bad)]
     modules = {
         agent.agent.partition(":")[0]
         for agent in read_settings(bundle.hunt / layout.HUNT).agents.values()
         if not agent.agent.startswith("crashhunt.")
     }
     tried: dict[str, Got] = {}
-    token = f"crashhunt-{this_process().token}"  # git gives the name of the work tree to what it writes about it
-    known = Path(top, _git(top, "rev-parse", "--git-common-dir")) / "worktrees" / token
-    with temporary_folder("bisect") as scratch, temporary_beside(known, name=token):
-        tree, case = scratch.resolve() / token, add_case(bundle, scratch / "corpus").case.path.resolve()
-        _git(top, "worktree", "add", "--detach", "--quiet", str(tree), ends[1])
-        try:
+    with temporary_folder("bisect") as scratch, checked_out(top, ends[1], purpose="bisect") as tree:
+        case = add_case(bundle, scratch / "corpus").case.path.resolve()
 
-            def run() -> Got:
-                revision = _git(tree, "rev-parse", "HEAD")
-                tried[revision] = got = _run(case, tree / folder.relative_to(top), tree, modules)
-                watch(revision, got)
-                return got
+        def run() -> Got:
+            revision = git(tree, "rev-parse", "HEAD")
+            tried[revision] = got = _run(case, tree / folder.relative_to(top), tree, modules)
+            watch(revision, got)
+            return got
 
-            _require_status(run(), "still", bad, "--bad")
-            _git(tree, "checkout", "--quiet", "--detach", ends[0])
-            _require_status(run(), "fixed", good, "--good")
-            said = _git(tree, "bisect", "start", ends[1], ends[0])
-            judged = set()
-            while not (found := _FOUND.search(said)) and "only 'skip'ped commits left" not in said:
-                head = _git(tree, "rev-parse", "HEAD")
-                if head in judged:  # git proposes the same revision again if it finds no path
-                    raise _no_way(good, bad, head)
-                judged.add(head)
-                said = _git(tree, "bisect", _WORDS[tried[head] if head in tried else run()], skipped=True)
-            if found is not None:
-                return Bisected(
-                    commit=found[1],
-                    subject=_git(tree, "log", "-1", "--format=%s", found[1]),
-                    candidates=(),
-                    tried=tried,
-                )
+        _require_status(run(), "still", bad, "--bad")
+        git(tree, "checkout", "--quiet", "--detach", ends[0])
+        _require_status(run(), "fixed", good, "--good")
+        said = git(tree, "bisect", "start", ends[1], ends[0])
+        judged = set()
+        while not (found := _FOUND.search(said)) and "only 'skip'ped commits left" not in said:
+            head = git(tree, "rev-parse", "HEAD")
+            if head in judged:  # git proposes the same revision again if it finds no path
+                raise _no_way(good, bad, head)
+            judged.add(head)
+            said = git(tree, "bisect", _WORDS[tried[head] if head in tried else run()], skipped=True)
+        if found is not None:
             return Bisected(
-                commit="",
-                subject="",
-                candidates=tuple(re.findall(r"^[0-9a-f]{40,64}$", said, re.MULTILINE)),
+                commit=found[1],
+                subject=git(tree, "log", "-1", "--format=%s", found[1]),
+                candidates=(),
                 tried=tried,
             )
-        finally:
-            _git(top, "worktree", "remove", "--force", str(tree), skipped=True)
+        return Bisected(
+            commit="",
+            subject="",
+            candidates=tuple(re.findall(r"^[0-9a-f]{40,64}$", said, re.MULTILINE)),
+            tried=tried,
+        )
 
 
 def _no_way(good: str, bad: str, parts: str) -> UsageError:
@@ -147,10 +137,10 @@ def _require_status(got: Got, expected: Got, revision: str, option: str) -> None
 
 def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
     """Run a case with the code of a work tree, in a new process."""
-    environment = _environment(folder, tree)
+    environment = import_environment(folder, tree)
     for module in sorted(modules):
         place = [sys.executable, "-c", _ORIGIN, module]
-        found = _ran(place, folder, environment)
+        found = run_to_end(place, folder, environment)
         origin = found.stdout.strip()
         if found.returncode == 0 and not Path(origin).resolve().is_relative_to(tree):
             raise UsageError(
@@ -160,41 +150,9 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
         if found.returncode != 0:
             return "cannot_run"
     command = [sys.executable, "-m", "crashhunt", "corpus", "run", str(case), "--json"]
-    done = _ran(command, folder, environment)
+    done = run_to_end(command, folder, environment)
     try:
         got: Got = json.loads(done.stdout)["cases"][0]["got"]
     except (ValueError, KeyError, IndexError):
         raise CrashhuntError(f"the case could not be run: {done.stderr.strip()[-300:]}", fix="see why") from None
     return got
-
-
-def _ran(
-    command: Sequence[str], folder: Path | None, environment: Mapping[str, str]
-) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end and return its output; if this process is killed, the command is killed too."""
-    return subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, check=False,
-        preexec_fn=partial(die_with, os.getpid()),
-    )  # fmt: skip
-
-
-def _environment(folder: Path, tree: Path) -> dict[str, str]:
-    places = dict.fromkeys(map(str, (folder, tree, tree / "src")))
-    paths = [*places, *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {**environment_of_git(), "PYTHONPATH": os.pathsep.join(paths), "PYTHONDONTWRITEBYTECODE": "1"}
-
-
-def _git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str:
-    """Return git's output; with ``skipped``, also if git ends with an error."""
-    command: Sequence[str] = ["git", "-C", str(folder), *words]
-    try:
-        environment = {**environment_of_git(), "LC_ALL": "C"}
-        done = _ran(command, None, environment)
-    except OSError as error:
-        raise CrashhuntError(f"git cannot be run: {error.strerror}", fix="install git") from None
-    if done.returncode and not skipped:
-        if what:
-            raise UsageError(f"{what!r} is no commit of {folder}", fix="give a revision as git knows it")
-        said = " ".join(done.stderr.split()) or f"git {words[0]} failed"
-        raise CrashhuntError(said, fix="run it in the repository of the agent", where=str(folder))
-    return done.stdout.strip()

@@ -6,6 +6,7 @@ addition it has the file ``crashhunt-case.toml``, which users edit.
 
 from __future__ import annotations
 
+import math
 import shutil
 import tomllib
 from dataclasses import asdict, dataclass, field, replace
@@ -18,7 +19,7 @@ from crashhunt.base.temporary import remove_ended, temporary_beside
 from crashhunt.base.text import near_path
 from crashhunt.base.tolerance import known_part
 from crashhunt.base.validation import validate
-from crashhunt.crashes import Bundle, authenticate_bundle, list_bundles, signature_of
+from crashhunt.crashes import Bundle, authenticate_bundle, fault_of, list_bundles, signature_of
 from crashhunt.recording import write_log
 from crashhunt.snapshots import Snapshot, without_code
 from crashhunt.trial import Outcome
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Signature
+    from crashhunt.recording import Recording
 
 
 __all__ = ["Added", "Case", "Expectation", "add_case", "find_cases", "known_kinds", "read_case"]
@@ -88,6 +90,17 @@ class Case:
                 message, fix="restore it from the repository, or add the crash again", where=str(self.path)
             )
         return found[0]
+
+    def kind_of_log(self) -> Literal["whole", "compact", ""]:
+        """Return whether the log of the case has all actors; empty if there is no log, as in cases of early versions.
+
+        Raises:
+            BundleError: The crash or its log is damaged.
+        """
+        bundle = self.bundle()
+        if not (bundle.path / layout.LOG).is_file():
+            return ""
+        return "whole" if bundle.recording().compact is None else "compact"
 
     def expecting(self, expect: Expectation | None, note: str | None) -> Case:
         """Write another expectation or note into the case and return the changed case; None changes nothing.
@@ -171,7 +184,9 @@ def _is_hidden(path: Path) -> bool:
 
 # Adding a crash to a corpus: small, without code, and with the scenario that it needs.
 
-_MAX_BYTES_WITH_LOG = 100 * 1024  # a larger case omits the log, because a repository keeps every version forever
+_MAX_BYTES_WITH_LOG = 100 * 1024  # a larger case has a compact log, because a repository keeps every version forever
+_MIN_RADIUS_M, _MAX_RADIUS_M = 20.0, 2000.0  # around the agents, of the actors of a compact log
+_MAX_BYTES_OF_OBSERVATIONS = 50 * 1024  # raw; images have more, and only their comparison needs them
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,8 +248,14 @@ def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None,
 
 
 def _signature(bundle: Bundle) -> dict[str, str | bool]:
+    if _is_of_case(bundle):  # which may have no log
+        return read_case(bundle.hunt).signature
     parts: dict[str, object] = dict(signature_of(bundle).to_json())
     return {name: value for name, value in parts.items() if isinstance(value, str | bool)}
+
+
+def _is_of_case(bundle: Bundle) -> bool:
+    return (bundle.hunt / layout.CASE).is_file()
 
 
 def _id(bundle: Bundle) -> str:
@@ -242,6 +263,9 @@ def _id(bundle: Bundle) -> str:
 
 
 def _build(bundle: Bundle, case: Case, folder: Path) -> None:
+    if _is_of_case(bundle):  # a case has all that a case needs
+        _copy(bundle, case, folder)
+        return
     recording = bundle.recording()
     crash = folder / layout.CRASHES / _id(bundle)
     crash.mkdir(parents=True)
@@ -253,9 +277,45 @@ def _build(bundle: Bundle, case: Case, folder: Path) -> None:
     kept.write(into=crash)
     write_log(crash / layout.LOG, recording, views=False)
     if sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) > _MAX_BYTES_WITH_LOG:
-        (crash / layout.LOG).unlink()
+        write_log(crash / layout.LOG, _compact(bundle, recording), views=False)
     kept.write(into=crash)  # with the digest of the log
     sync_tree(folder)
+
+
+def _copy(bundle: Bundle, case: Case, folder: Path) -> None:
+    """Copy a case, with the given expectation and note."""
+    for place in (layout.CRASHES, layout.SNAPSHOTS):
+        shutil.copytree(bundle.hunt / place, folder / place)
+    shutil.copyfile(bundle.hunt / layout.HUNT, folder / layout.HUNT)
+    case.write(folder)
+    crash = folder / layout.CRASHES / bundle.path.name
+    kept = replace(bundle, path=crash)
+    replace(kept, authentication_code=authenticate_bundle(kept)).write(into=crash)
+    sync_tree(folder)
+
+
+def _compact(bundle: Bundle, recording: Recording) -> Recording:
+    """Return the recording with the vehicles of the crash, and in each step the actors near an agent.
+
+    The distance is so large that crash type and fault are those of all actors. Criticality and the closest approach
+    need actors that are farther away, so nothing reports them from a compact log.
+    """
+    if recording.compact is not None:
+        return recording
+    hit, truth = bundle.result.collision, _facts(bundle, recording)
+    always = () if hit is None else (hit.collider, hit.victim)
+    size = sum(recording.observations(agent).nbytes for agent in recording.agents)
+    radius_m = _MIN_RADIUS_M
+    while True:
+        small = recording.compacted(always, radius_m, observations=size <= _MAX_BYTES_OF_OBSERVATIONS)
+        if radius_m >= _MAX_RADIUS_M or _facts(bundle, small) == truth:
+            return small
+        radius_m = radius_m * 2 if radius_m * 2 < _MAX_RADIUS_M else math.inf
+
+
+def _facts(bundle: Bundle, recording: Recording) -> tuple[object, ...]:
+    """Return what commands derive from a recording, to compare two of them."""
+    return signature_of(bundle, recording), fault_of(bundle, recording).to_json()
 
 
 # The crash types that a corpus already has.

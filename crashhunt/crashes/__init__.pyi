@@ -16,6 +16,15 @@ from ._bundle import (
     write_bundle as write_bundle,
     write_trial as write_trial,
 )
+from ._causes import (
+    Cause as Cause,
+    CauseGroup as CauseGroup,
+    cause_of as cause_of,
+    features_of as features_of,
+    representatives as representatives,
+    spread as spread,
+)
+from ._contact import ContactRecord as ContactRecord, contact_record as contact_record
 from ._encounter import (
     DangerCourse as DangerCourse,
     Encounter as Encounter,
@@ -43,13 +52,14 @@ from ._judgement import (
     JudgementVerdict as JudgementVerdict,
     LeftOut as LeftOut,
     Why as Why,
-    Without as Without,
     judgement_of as judgement_of,
     wilson as wilson,
     with_judgement as with_judgement,
 )
 from ._lanes import LaneMap as LaneMap
+from ._omission import Omission as Omission, Reference as Reference, ReferenceRun as ReferenceRun, Without as Without
 from ._signature import (
+    SIGNATURE_VERSION as SIGNATURE_VERSION,
     Frame as Frame,
     Signature as Signature,
     own_frames as own_frames,

@@ -309,6 +309,12 @@ class Bundle:
         from crashhunt.recording import read_log  # MCAP and protobuf take longer than a hunt that is refused
 
         log = self.path / layout.LOG
+        if not log.exists() and (self.hunt / layout.CASE).is_file():
+            raise BundleError(
+                "the case has no log, because an earlier crashhunt left it out",
+                fix=f"crashhunt corpus run {self.hunt} --keep out runs it, and out/{self.hunt.name} has a log",
+                where=str(self.path),
+            )
         found = read_log(log)
         if found.digest != self.result.digest:
             raise BundleError("the log does not have the digest that crash.json says", fix=_UNDAMAGED, where=str(log))

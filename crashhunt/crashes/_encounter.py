@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -15,16 +16,21 @@ from crashhunt.world import (
     approaches,
     dangers,
     followers_danger,
+    lane_jump,
+    on_one_level,
+    outlines,
     outlines_overlap,
     rectangle_gap,
     time_to_contact,
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from crashhunt.recording import Recording
-    from crashhunt.world import DangerousMoment
+    from crashhunt.world import DangerousMoment, Rectangle
 
 
 __all__ = [
@@ -321,6 +327,8 @@ def _turned(vectors: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArr
 
 # How dangerous a recorded trial was from step to step: for the agent, and by those behind it.
 
+_DECAY_S, _MOST = 1.2, 0.999  # as in `crashhunt.world._danger`
+_SAME_LANE = math.radians(30)
 _UNKNOWN_S = 4.0  # before the end, a criticality of 0 is unknown: later actors are not in the recording
 
 
@@ -338,6 +346,7 @@ class DangerCourse:
         behind: The rear criticality in each of them: by actors that approach the agent from behind.
         greatest: the moment of the greatest own danger.
         greatest_behind: likewise of those behind; ``other`` is who.
+        nearest: the actor that came nearest to the agent, the gap in m, and the step; None where none came within 50 m.
         own_total: the integral over the trial, from 0 to below 1: for a trial without a crash and with one agent that
             is what trials are ranked by.
         behind_total: likewise.
@@ -351,6 +360,7 @@ class DangerCourse:
     greatest_behind: DangerousMoment
     own_total: float
     behind_total: float
+    nearest: tuple[str, float, int] | None = None
 
     def of_step(self, step: int) -> tuple[float, float] | None:
         """The own danger of a step and that by those behind; None where it has no scene."""
@@ -368,6 +378,7 @@ def danger_course(recording: Recording, agent: str) -> DangerCourse | None:
         return None
     dt = recording.prologue.step_length_s
     own, greatest = dangers(frames, [agent], dt)
+    own, greatest = _with_lane_changes(recording.scenes(), agent, own, greatest)
     meter = DangerMeter([agent], dt)
     meter.add(frames)
     behind, greatest_behind, behind_total = followers_danger(frames, agent, dt)
@@ -384,7 +395,67 @@ def danger_course(recording: Recording, agent: str) -> DangerCourse | None:
         greatest_behind=greatest_behind._replace(step=steps[greatest_behind.step]),
         own_total=meter.danger or 0.0,
         behind_total=behind_total,
+        nearest=_nearest(recording.scenes(), steps, agent),
     )
+
+
+def _with_lane_changes(
+    scenes: Sequence[Scene], agent: str, own: NDArray[np.float64], greatest: DangerousMoment
+) -> tuple[NDArray[np.float64], DangerousMoment]:
+    """Return the criticality with that of instantaneous lane changes towards the vehicles in the target lane.
+
+    The way of an agent after a lane change does not lead through the vehicles behind it, so `dangers` does not count
+    them. Here the post-encroachment time is that from the lane change until the vehicle behind is where the agent is.
+    """
+    own = own.copy()
+    for number, (before, after) in enumerate(pairwise(scenes), 1):
+        if not lane_jump(before, after, agent):
+            continue
+        row = after.roster.index[agent]
+        own_size = after.roster.half_sizes[row]
+        c, s = math.cos(after.headings[row]), math.sin(after.headings[row])
+        for other, (dx, dy) in enumerate(after.centers - after.centers[row]):
+            turn = abs(math.remainder(after.headings[other] - after.headings[row], math.tau))
+            ahead, aside = dx * c + dy * s, abs(dy * c - dx * s)
+            size = after.roster.half_sizes[other]
+            if other == row or turn > _SAME_LANE or ahead > 0 or aside > own_size[1] + size[1]:
+                continue
+            if not on_one_level(after, row, other):
+                continue
+            gap_m = max(0.0, -ahead - own_size[0] - size[0])
+            danger = min(math.exp(-gap_m / max(after.speeds[other], 1e-3) / _DECAY_S), _MOST)
+            own[number] = max(own[number], danger)
+            if danger > greatest.danger:
+                greatest = greatest._replace(
+                    danger=danger, step=number, agent=agent, other=after.roster.actors[other].id
+                )
+    return own, greatest
+
+
+def _nearest(scenes: Sequence[Scene], steps: Sequence[int], agent: str) -> tuple[str, float, int] | None:
+    """Return the actor that came nearest to an agent, the gap in m, and the step."""
+    _, gaps, _ = approaches([scene.frame for scene in scenes], agent)
+    if not len(gaps) or not math.isfinite(gaps.min()):
+        return None
+    number = int(gaps.argmin())
+    scene = scenes[number]
+    row = scene.roster.index[agent]
+    found = []
+    for _, other in scene.neighbors(row):
+        pairs = [(one, two) for one in outlines(scene, row) for two in outlines(scene, other)]
+        if on_one_level(scene, row, other):
+            found.append((min(_outline_gap(one, two) for one, two in pairs), scene.roster.actors[other].id))
+    return (min(found)[1], float(gaps[number]), steps[number]) if found else None
+
+
+def _outline_gap(one: Rectangle, two: Rectangle) -> float:
+    """Return the gap between two outlines, in m."""
+    (x, y, heading, length, width), (its_x, its_y, its_heading, its_length, its_width) = one, two
+    dx = its_x - its_length / 2 * math.cos(its_heading) - x + length / 2 * math.cos(heading)
+    dy = its_y - its_length / 2 * math.sin(its_heading) - y + length / 2 * math.sin(heading)
+    offset = _turned(np.array([[dx, dy]]), np.array([heading]))
+    halves = np.array([[length / 2, width / 2]]), np.array([[its_length / 2, its_width / 2]])
+    return float(rectangle_gap(offset, np.array([its_heading - heading]), *halves)[0])
 
 
 def most_dangerous(recording: Recording) -> DangerousMoment | None:

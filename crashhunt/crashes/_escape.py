@@ -8,6 +8,7 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
+from crashhunt.crashes._contact import record_in
 from crashhunt.crashes._encounter import Encounter, last_escape
 from crashhunt.recording import has_same_scenes
 from crashhunt.trial import Escape, Outcome, Overruled
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     from crashhunt.recording import Recording
     from crashhunt.simulators import FullBraking
-    from crashhunt.trial import TrialResult, TrialSpec
+    from crashhunt.trial import Collision, TrialResult, TrialSpec
 
 __all__ = ["Ending", "ending_of", "find_escape", "overruled_trial", "partner", "slowing"]
 
@@ -28,6 +29,11 @@ _GUESS = 4.5  # m/s², if the deceleration is unknown; a wrong guess only costs 
 _STANDS = 0.1  # m/s
 _AFTERWARDS_S = 5.0  # past the old end, so that a collision that only comes later is seen
 _AS_IT_CAN = "as hard as it can"
+_UNCLEAR = {
+    "other": "another crash follows",
+    "unclear": "the run ends before the outcome is clear",
+    "diverged": "the run deviates before the braking",
+}
 
 Ending = Literal["avoided", "hit", "other", "unclear", "diverged"]
 """The result of a run with overridden actions.
@@ -44,33 +50,43 @@ def partner(result: TrialResult) -> str:
 def find_escape(
     result: TrialResult,
     recording: Recording,
-    braking: FullBraking,
+    braking: FullBraking | None,
     run: Callable[[TrialSpec], tuple[TrialResult, Recording]],
 ) -> Escape | None:
-    """Return until when braking would have avoided a collision into which the agent drove.
+    """Return until when braking would have avoided a collision of two actors, or why that is unknown.
 
-    Nothing is computed that is not run: the same trial once more, in which the agent brakes as hard as it can after
-    some step, and the others react as they then do. Two runs, a step apart, are the answer: the first ends without a
-    crash, the second in the same one.
+    Only runs count, no calculation: the same trial once more, in which the agent brakes as hard as it can after some
+    step, and the others react as they then do. Two runs, a step apart, are the answer: the first ends without a crash,
+    the second in the same one. Where another vehicle drove into the agent from behind, nothing is run.
 
     Args:
         result: of the trial.
         recording: of it.
-        braking: how the vehicle brakes.
+        braking: how the vehicle brakes; None if it is unknown.
         run: runs a trial in the same way.
 
     Returns:
-        None where it was no such collision, or where the runs do not say it clearly.
+        None where it was no collision of two actors.
     """
     hit = result.collision
-    if result.outcome is not Outcome.COLLISION or hit is None or hit.role != "collider":
+    if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
         return None
+    if braking is None:
+        return Escape(why_not=f"the simulator does not say how {hit.agent} brakes")
+    if _is_from_behind(recording, hit):
+        return Escape(why_not=f"{hit.other} drove into {hit.agent} from behind")
     search = _Search(result=result, recording=recording, braking=braking, run=run)
     found = search.last()
     if found is None:
-        return None
+        return Escape(why_not=search.why_not)
     deceleration = max(search.decelerations, default=0.0)
     return Escape(*found, deceleration if deceleration > _STANDS else None, search.how(deceleration))
+
+
+def _is_from_behind(recording: Recording, hit: Collision) -> bool:
+    """Whether the front of another actor drove into the rear of the agent, in the same direction."""
+    record = record_in(recording.scenes(), hit)
+    return hit.role == "victim" and record is not None and record.follower == hit.other
 
 
 @dataclass(slots=True)
@@ -82,6 +98,7 @@ class _Search:
     endings: dict[int, Ending] = field(default_factory=dict)
     decelerations: list[float] = field(default_factory=list)
     began: float = field(default_factory=time.monotonic)
+    why_not: str = ""
 
     def last(self) -> tuple[int | None, int | None] | None:
         """Return the last step after which braking helps, and the next, after which it does not."""
@@ -90,6 +107,7 @@ class _Search:
         dt = self.recording.prologue.step_length_s
         both = [moment.step for moment in self._encounter(self.recording).moments if moment.step < end]
         if not both:
+            self.why_not = "the recording has the two vehicles together only when they touch"
             return None
         first = max(both[0], end - math.ceil(_BEFORE_S / dt), 0)
         agent, guess = self.result.collision.agent, self.braking.deceleration or _GUESS
@@ -99,7 +117,8 @@ class _Search:
         step, stride = start, 1
         while first <= step < end:
             ending = self._ending(step)
-            if ending == "unclear":
+            if ending not in ("avoided", "hit"):
+                self.why_not = self.why_not or f"when it brakes after step {step}, {_UNCLEAR[ending]}"
                 return None
             if ending == "avoided":
                 helps = step
@@ -115,6 +134,7 @@ class _Search:
                 step, stride = min(end - 1, step + stride), 2 * stride
             else:
                 step = (helps + late) // 2
+        self.why_not = "no step was examined"
         return None
 
     def how(self, deceleration: float) -> str:
@@ -134,11 +154,16 @@ class _Search:
 
     def _ending(self, after: int) -> Ending:
         """Run the trial with the agent overruled after a step, and say what became of the crash."""
-        if len(self.endings) >= _RUNS or time.monotonic() - self.began > _WALL_S:
-            return "unclear"
-        if after not in self.endings:
+        if after in self.endings:
+            return self.endings[after]
+        if len(self.endings) >= _RUNS:
+            self.why_not = f"{_RUNS} runs did not find it"
+        elif time.monotonic() - self.began > _WALL_S:
+            self.why_not = f"the runs took longer than {_WALL_S:g} s"
+        else:
             self.endings[after] = self._run(after)
-        return self.endings[after]
+            return self.endings[after]
+        return "unclear"
 
     def _run(self, after: int) -> Ending:
         result, recording = self.run(overruled_trial(self.result, self.recording, after, self.braking.deceleration))
@@ -146,7 +171,7 @@ class _Search:
         if found != "diverged":
             assert self.result.collision is not None
             self.decelerations.append(slowing(self.result.collision.agent, after, result, recording))
-        return found if found in ("avoided", "hit") else "unclear"
+        return found
 
 
 def overruled_trial(

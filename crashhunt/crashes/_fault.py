@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
-from crashhunt.crashes._lanes import SAME_WAY, Case, LaneMap
+from crashhunt.crashes._contact import SAME_WAY, contact_record
 from crashhunt.snapshots import Snapshot
 from crashhunt.trial import Outcome
-from crashhunt.world import is_person
+from crashhunt.world import STANDS_MPS, is_person
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle
+    from crashhunt.crashes._contact import ContactRecord
     from crashhunt.recording import Recording
     from crashhunt.world import RightOfWay
 
@@ -29,8 +30,8 @@ __all__ = ["RULES", "Blame", "Fault", "Finding", "Verdict", "fault_in", "fault_o
 
 # The rules that assign the fault of a collision. A rule returns a finding only if it is certain.
 #
-# A rule looks at a `Case` and returns a finding, or None where it has nothing to say. Names of sources: *Vienna* is the
-# Convention on Road Traffic of 1968; *StVO* the German traffic code; *RSS* is S. Shalev-Shwartz, S. Shammah and
+# A rule reads a `ContactRecord` and returns a finding, or None where it does not apply. Names of sources: *Vienna* is
+# the Convention on Road Traffic of 1968; *StVO* the German traffic code; *RSS* is S. Shalev-Shwartz, S. Shammah and
 # A. Shashua, On a formal model of safe and scalable self-driving cars, 2017, with parameters like ad-rss-lib's.
 
 Blame = Literal["ego", "other", "both"]
@@ -45,7 +46,6 @@ _FOLLOWS_S = 3.5  # who has been ahead for so long has not just come there
 _CHANGE_S = 3.0  # a lane change that began longer ago is over
 _AT_ONCE_S = 1.5  # an event that begins less than this before the contact is too late for a driver behind
 _TOGETHER_S = 0.5  # of each other: neither was there first
-_STANDS = 0.1  # m/s
 _STANDS_S = 1.0
 _STEP_M = 1.0  # lateral distance from a car's side; a nearer person walks in its way
 _OFF_M = 2.5  # lateral distance from a car's axis; a nearer person may be on the road
@@ -79,11 +79,11 @@ def safe_gap_m(speed: float, ahead: float) -> float:
     return float(max(0.0, driven + then * then / (2 * _BRAKES) - ahead * ahead / (2 * _BRAKES_HARD)))
 
 
-def _who(case: Case, actor: str) -> Blame:
+def _who(case: ContactRecord, actor: str) -> Blame:
     return "ego" if actor == case.agent else "other"
 
 
-def _red_light(case: Case) -> Finding | None:
+def _red_light(case: ContactRecord) -> Finding | None:
     """Blame the party that ran a red light at a junction with traffic from another side; blame both if both did."""
     if case.same_way:
         return None
@@ -101,7 +101,7 @@ def _red_light(case: Case) -> Finding | None:
     )
 
 
-def _wrong_way(case: Case) -> Finding | None:
+def _wrong_way(case: ContactRecord) -> Finding | None:
     """Who drove against the direction of its lane."""
     for time_s, event in reversed(case.events):
         if event.kind == "wrong_way" and event.agent in (case.agent, case.other) and case.time_s - time_s <= _RED_S:
@@ -114,13 +114,15 @@ def _wrong_way(case: Case) -> Finding | None:
     return None
 
 
-def _lane_change(case: Case) -> Finding | None:
+def _lane_change(case: ContactRecord) -> Finding | None:
     """Who changed lanes into a gap that was taken, or too short for who came behind."""
     if not case.lanes or not case.same_way:
         return None
     changed = {actor: case.changed_s(actor) for actor in (case.agent, case.other)}
     changers = [actor for actor, before in changed.items() if before is not None and before <= _CHANGE_S]
     source = "Vienna, articles 11 and 14; StVO § 7 (5)"
+    if len(changers) == 2 and len(case.jumpers) == 1:
+        return _into_who_had_changed(case, case.jumpers[0], source)
     if len(changers) == 2:
         times = [before for before in changed.values() if before is not None]
         at_once = abs(times[0] - times[1]) <= _TOGETHER_S
@@ -140,16 +142,28 @@ def _lane_change(case: Case) -> Finding | None:
         words = f"{changer} moved sideways into {other}, which was beside it and stayed in its lane"
         return Finding(rule="lane change", blames=_who(case, changer), words=words, source=source)
     if case.follower == changer:
-        if case.hardest_braking(other) > _IMPOSSIBLE or case.way(other).speeds[-1] < -_STANDS:
+        if case.hardest_braking(other) > _IMPOSSIBLE or case.way(other).speeds[-1] < -STANDS_MPS:
             return None
-        if case.turn >= _MERGES or not case.was_off_path(changer, int(np.argmin(np.abs(case.times - before)))):
+        if case.turned(before) >= _MERGES or not case.was_off_path(
+            changer, int(np.argmin(np.abs(case.times - before)))
+        ):
             return None  # it turned off, or was behind all the time: that leaves a lane sideways, too
         words = f"{changer} changed lanes {before:.1f} s before, to behind {other}, and drove into it"
         return Finding(rule="lane change", blames=_who(case, changer), words=words, source=source)
     return _cut_in(case, changer, before, source)
 
 
-def _cut_in(case: Case, changer: str, before: float, source: str) -> Finding | None:
+def _into_who_had_changed(case: ContactRecord, changer: str, source: str) -> Finding | None:
+    """Blame the actor that moves sideways into one that completed its own lane change a response time ago."""
+    other = case.partner(changer)
+    since = case.changed_s(other)
+    if since is None or since < _RESPONSE_S - 1e-6 or case.turned(since) > SAME_WAY:
+        return None  # the other may have been about to change as well, or came there in a bend
+    words = f"{changer} moved sideways into {other}, which had changed to the lane next to it {since:.1f} s before"
+    return Finding(rule="lane change", blames=_who(case, changer), words=words, source=source)
+
+
+def _cut_in(case: ContactRecord, changer: str, before: float, source: str) -> Finding | None:
     """Blame a cut-in, by its gap and by what the driver behind could do."""
     other = case.partner(changer)
     back = int(np.argmin(np.abs(case.times - before)))
@@ -170,7 +184,7 @@ def _cut_in(case: Case, changer: str, before: float, source: str) -> Finding | N
     )
 
 
-def _rear_end(case: Case) -> Finding | None:
+def _rear_end(case: ContactRecord) -> Finding | None:
     """Blame the follower that drove into the back of a vehicle that had been ahead for long."""
     follower = case.follower
     if not follower or is_person(case.partner(follower)):
@@ -180,7 +194,7 @@ def _rear_end(case: Case) -> Finding | None:
     if ahead_s < _FOLLOWS_S or case.hardest_braking(leader) > _IMPOSSIBLE:
         return None
     lead, follow = case.way(leader), case.way(follower)
-    if lead.speeds[-1] < -_STANDS:
+    if lead.speeds[-1] < -STANDS_MPS:
         return None  # it reversed
     back = int(np.argmin(np.abs(case.times - min(ahead_s, _FOLLOWS_S))))
     gap, safe = max(0.0, case.gap_m(leader, back)), safe_gap_m(float(follow.speeds[back]), float(lead.speeds[back]))
@@ -194,7 +208,7 @@ def _rear_end(case: Case) -> Finding | None:
     )
 
 
-def _turns_off(case: Case) -> Finding | None:
+def _turns_off(case: ContactRecord) -> Finding | None:
     """Blame the follower that drove straight on into a vehicle that had been ahead for long and was turning off."""
     if _rear_end(case) is not None:
         return None  # it says the same
@@ -206,7 +220,7 @@ def _turns_off(case: Case) -> Finding | None:
         if left_s is None or left_s > _AT_ONCE_S:
             continue
         lead = case.way(leader)
-        if case.hardest_braking(leader) > _IMPOSSIBLE or float(lead.speeds.min()) < -_STANDS:
+        if case.hardest_braking(leader) > _IMPOSSIBLE or float(lead.speeds.min()) < -STANDS_MPS:
             continue
         words = f"{follower} drove straight on into {leader}, which had been ahead of it until {left_s:.1f} s before"
         words += " and was turning off"
@@ -216,7 +230,7 @@ def _turns_off(case: Case) -> Finding | None:
     return None
 
 
-def _steps_out(case: Case) -> Finding | None:
+def _steps_out(case: ContactRecord) -> Finding | None:
     """Blame a person that stepped onto the road too late for any driver to stop, except at junctions and crossings."""
     person, driver = (case.agent, case.other) if is_person(case.agent) else (case.other, case.agent)
     if not is_person(person) or is_person(driver) or not case.is_between_junctions(person, driver):
@@ -237,23 +251,22 @@ def _steps_out(case: Case) -> Finding | None:
     )
 
 
-def _standing(case: Case) -> Finding | None:
+def _standing(case: ContactRecord) -> Finding | None:
     """Blame the party that drove into an actor that had stood still for longer than stopping takes."""
-    for actor in (case.agent, case.other):
-        mover = case.partner(actor)
-        own, its = case.way(actor), case.way(mover)
-        speed = float(its.speeds[0])
-        needs = max(_STANDS_S, _RESPONSE_S + speed / _BRAKES)
-        stood = case.times[0] if bool((own.speeds < _STANDS).all()) else 0.0
-        if stood >= needs and bool((its.speeds > _STANDS).all()) and not is_person(mover):
-            words = f"{mover} drove into {actor}, which had stood for at least {stood:.1f} s"
-            return Finding(
-                rule="standing", blames=_who(case, mover), words=words, source="Vienna, article 13 (1); StVO § 3 (1)"
-            )
-    return None
+    mover = case.collider
+    actor = case.partner(mover)
+    its = case.way(mover)
+    needs = max(_STANDS_S, _RESPONSE_S + float(its.speeds.max()) / _BRAKES)
+    stood = case.stood_s(actor)
+    if stood < needs or is_person(mover):
+        return None
+    words = f"{mover} drove into {actor}, which had stood for at least {stood:.1f} s"
+    return Finding(
+        rule="standing", blames=_who(case, mover), words=words, source="Vienna, article 13 (1); StVO § 3 (1)"
+    )
 
 
-def _right_of_way(case: Case) -> Finding | None:
+def _right_of_way(case: ContactRecord) -> Finding | None:
     """Who had to give way, as the map says it, where no traffic light decides."""
     rights = case.right_of_way
     if rights is None or case.turn < _MERGES or not case.before:
@@ -269,9 +282,9 @@ def _right_of_way(case: Case) -> Finding | None:
     if gives not in ({(True, False)}, {(False, True)}):
         return None  # both, neither, or it depends on where they were going
     yields, goes = (case.agent, case.other) if gives == {(True, False)} else (case.other, case.agent)
-    if float(case.way(goes).speeds.min()) < _STANDS or case.drifted(yields) or case.drifted(goes):
+    if float(case.way(goes).speeds.min()) < STANDS_MPS or case.drifted(yields) or case.drifted(goes):
         return None  # who had stood in the junction may have been let through
-    if float(case.way(yields).speeds[case.times <= _CLEARS_S].max(initial=0.0)) < _STANDS:
+    if float(case.way(yields).speeds[case.times <= _CLEARS_S].max(initial=0.0)) < STANDS_MPS:
         return None  # who has stood there for so long could be seen
     if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKS:
         return None  # a vehicle that starts off must let the vehicle inside the junction clear it first
@@ -284,7 +297,7 @@ def _right_of_way(case: Case) -> Finding | None:
     )
 
 
-RULES: tuple[Callable[[Case], Finding | None], ...] = (
+RULES: tuple[Callable[[ContactRecord], Finding | None], ...] = (
     _red_light, _wrong_way, _lane_change, _rear_end, _turns_off, _steps_out, _standing, _right_of_way,
 )  # fmt: skip
 """All rules. If two rules blame different parties, the fault is undecided. As an exception, a red light and the wrong
@@ -294,7 +307,6 @@ way take precedence over the right of way."""
 Verdict = Literal["ego", "the other", "both", "nobody can tell"]
 _VERDICTS: dict[str, Verdict] = {"ego": "ego", "other": "the other", "both": "both"}
 _FIRST = ("red light", "wrong way")
-_EVENTS_S = 10.0  # before the crash
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,12 +337,13 @@ class Fault:
         }
 
 
-def fault_of(bundle: Bundle, recording: Recording | None = None) -> Fault:
+def fault_of(bundle: Bundle, recording: Recording | None = None, record: ContactRecord | None = None) -> Fault:
     """Return whose fault a crash was; no code of the bundle is run.
 
     Args:
         bundle: the crash.
         recording: of it, where it has been read already.
+        record: of its contact, where that has been made already.
 
     Raises:
         BundleError: its log is missing or damaged.
@@ -350,37 +363,13 @@ def fault_of(bundle: Bundle, recording: Recording | None = None) -> Fault:
         )
     if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
         return Fault("nobody can tell")
-    from crashhunt.recording import read_lanes  # MCAP takes longer than a list of software faults
-
-    found = recording or bundle.recording()
-    scenes = found.scenes()
-    if not scenes or not all(name in scenes[-1].roster.index for name in (hit.agent, hit.other)):
+    contact = record or contact_record(bundle, recording)
+    if contact is None:
         return Fault("nobody can tell")
-    end_s = scenes[-1].time_s
-    events = tuple(
-        (step.scene.time_s, event)
-        for step in found.all_steps
-        if step.scene is not None and step.scene.time_s >= end_s - _EVENTS_S
-        for event in step.scene.events
-    )
-    lanes = LaneMap(read_lanes(bundle.path / layout.LOG), (hit.x, hit.y))
-    time_s = hit.time_s if end_s - found.prologue.step_length_s <= hit.time_s <= end_s else end_s
-    return fault_in(
-        Case(
-            agent=hit.agent,
-            other=hit.other,
-            scenes=scenes,
-            time_s=time_s,
-            began_s=scenes[0].time_s,
-            lanes=lanes,
-            events=events,
-            right_of_way=_right_of_way_of(bundle),
-            lane=hit.lane,
-        )
-    )
+    return fault_in(replace(contact, right_of_way=_right_of_way_of(bundle)))
 
 
-def fault_in(case: Case) -> Fault:
+def fault_in(case: ContactRecord) -> Fault:
     """Return what the rules say of a collision."""
     if case.time_s - case.began_s < 1.0 or len(case.before) < 2:
         return Fault("nobody can tell")  # it was put there

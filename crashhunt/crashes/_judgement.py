@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base.codec import JsonObject, Serializable
 from crashhunt.base.integrity import typed
+from crashhunt.crashes._omission import Reference, Without
 from crashhunt.trial import Value
 
 if TYPE_CHECKING:
@@ -35,9 +36,6 @@ __all__ = [
 
 # The causes of a collision, found by runs that each omit one candidate cause.
 
-Without = Literal["same", "other", "none", "unclear"]
-"""What became of the collision: the same two again, another crash, none, or something that does not say it."""
-
 _Z = 1.959963984540054  # of 95 % confidence
 
 
@@ -49,11 +47,13 @@ class LeftOut(Serializable):
         given: The other value of an argument or seed; for every other cause, the step after which it was suppressed.
         ending: The result of the run.
         into: The actor into which a vehicle with held speed drove itself; empty if there was none.
+        changed: What else the agent does otherwise in the run, such as ``ego does not change lanes``.
     """
 
     given: Value
     ending: Without
     into: str = ""
+    changed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,15 @@ def why_from(data: Any) -> Why | None:
     factors = [
         Factor(
             kind=str(each["kind"]), name=str(each["name"]), what=str(each["what"]), step=each["step"], was=each["was"],
-            runs=tuple(LeftOut(run["given"], run["ending"], str(run["into"])) for run in each["runs"]),
+            runs=tuple(
+                LeftOut(
+                    given=run["given"],
+                    ending=run["ending"],
+                    into=str(run["into"]),
+                    changed=tuple(map(str, run.get("changed", ()))),
+                )
+                for run in each["runs"]
+            ),
         )
         for each in data["factors"]
     ]  # fmt: skip
@@ -188,12 +196,14 @@ class Attempt:
         end: the step of the crash.
         endings: step to what became of it where the agent was overruled after that step.
         deceleration: the greatest in those runs, in m/s²; None where it never slowed down.
+        changed: What else the agent does otherwise in the run from the last step that avoids the crash.
     """
 
     manoeuvre: str
     end: int
     endings: Mapping[int, Ending]
     deceleration: float | None = None
+    changed: tuple[str, ...] = ()
 
     @property
     def last_step(self) -> int | None:
@@ -227,6 +237,7 @@ class Attempt:
             "too_late_step": self.too_late_step,
             "all_later_run": self.all_later_run,
             "deceleration": self.deceleration,
+            "changed": list(self.changed),
         }
 
 
@@ -239,12 +250,14 @@ class Judgement:
         why_not: why there is no answer, or not a whole one; empty where there is.
         why: The causes of the collision; None if they were not examined.
         visible_step: The step after which an observation first had the collision partner; None if it is unknown.
+        reference: What runs with a reference driver have shown; None if there were none.
     """
 
     attempts: tuple[Attempt, ...] = ()
     why_not: str = ""
     why: Why | None = None
     visible_step: int | None = None
+    reference: Reference | None = None
 
     @property
     def verdict(self) -> JudgementVerdict:
@@ -261,7 +274,8 @@ class Judgement:
     @property
     def is_interrupted(self) -> bool:
         """Whether the user interrupted the analysis, so that another run may add results."""
-        return INTERRUPTED in (self.why_not, self.why.why_not if self.why is not None else "")
+        parts = (self.why, self.reference)
+        return INTERRUPTED in (self.why_not, *(part.why_not for part in parts if part is not None))
 
     @property
     def runs(self) -> int:
@@ -298,6 +312,8 @@ class Judgement:
         }
         if self.why is not None:
             found["why"] = self.why.to_json()
+        if self.reference is not None:
+            found["reference"] = self.reference.to_json()
         return found
 
 
@@ -315,15 +331,18 @@ def judgement_of(bundle: Bundle) -> Judgement | None:
                     end=bundle.result.steps,
                     endings=endings,
                     deceleration=each["deceleration"],
+                    changed=tuple(map(str, each.get("changed", ()))),
                 )
             )
         visible = data.get("visible_step")
         seen = int(visible) if visible is not None else None
+        reference = data.get("reference")
         return Judgement(
             attempts=tuple(attempts),
             why_not=str(data.get("why_not", "")),
             why=why_from(data.get("why")),
             visible_step=seen,
+            reference=Reference.from_json(reference) if reference is not None else None,
         )
     except (ValueError, KeyError, TypeError, AttributeError):
         return None

@@ -9,29 +9,29 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
-from crashhunt.crashes import Encounter
+from crashhunt.crashes._contact import contact_record
 from crashhunt.crashes._lanes import LaneMap
-from crashhunt.world import is_person
+from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    import numpy as np
-    from numpy.typing import NDArray
-
     from crashhunt.crashes import Bundle
+    from crashhunt.crashes._contact import ContactRecord
     from crashhunt.recording import Recording
     from crashhunt.trial import Collision, Failure, TrialResult
 
 
-__all__ = ["Frame", "Signature", "own_frames", "signature_of", "signature_of_fault"]
+__all__ = ["SIGNATURE_VERSION", "Frame", "Signature", "own_frames", "signature_of", "signature_of_fault"]
 
+SIGNATURE_VERSION = 1
+"""Version of these rules. Raise it with each change by which a crash gets another type: types that an earlier version
+has noted in a ledger are then determined again."""
 
 # The place of a software fault in the user's code: the calls of a traceback or of a recorded stack.
 
 _CALLERS = (
     ("crashhunt", "episode", "_fast_path.py"),
     ("crashhunt", "episode", "_episode.py"),
+    ("crashhunt", "episode", "_blame.py"),
     ("crashhunt", "episode", "_ahead.py"),  # crashes that were saved by earlier versions name their files
     ("crashhunt", "episode.py"),
 )
@@ -95,8 +95,9 @@ class Signature(Serializable):
         outcome: how the trial ended.
         role: the agent's: ``collider``, ``victim``, ``alone``; empty where it is no collision.
         manner: The manner of a collision: ``rear end``, ``side swipe``, ``crossing from the left`` (the side of the
-            collision partner), ``crossing from the right``, ``head-on``, ``pedestrian`` or ``off road``. For a traffic
-            event, its type. For a software fault, the exception, signal or exit code.
+            collision partner), ``crossing from the right``, ``head-on``, ``pedestrian`` or ``off road``. Of a Gymnasium
+            environment, the kind that it names, or its crash rule. For a traffic event, its type. For a software fault,
+            the exception, signal or exit code.
         lane_change: who was changing lanes: ``agent``, ``other``, ``both`` or empty.
         place: ``crossing`` where lanes of different directions lie over each other, ``road`` elsewhere; empty where
             the map is not known, or it is no matter of place.
@@ -121,12 +122,13 @@ class Signature(Serializable):
         return f"{words}, disturbed" if self.disturbed else words
 
 
-def signature_of(bundle: Bundle, recording: Recording | None = None) -> Signature:
+def signature_of(bundle: Bundle, recording: Recording | None = None, record: ContactRecord | None = None) -> Signature:
     """Return the signature of a crash; no code of the bundle is run.
 
     Args:
         bundle: the crash.
         recording: of it, where it has been read already.
+        record: of its contact, where that has been made already.
 
     Raises:
         BundleError: its log is missing or damaged.
@@ -135,52 +137,36 @@ def signature_of(bundle: Bundle, recording: Recording | None = None) -> Signatur
     hit = result.collision
     if hit is None:
         found = signature_of_fault(result)
-    else:
+    elif not hit.other:
         from crashhunt.recording import read_lanes  # MCAP takes longer than a list of software faults
 
-        found = _of_a_collision(result, hit, recording or bundle.recording(), read_lanes(bundle.path / layout.LOG))
+        lanes = LaneMap(read_lanes(bundle.path / layout.LOG), (hit.x, hit.y))
+        # A collision with nothing is that of an environment without scenes, which says itself what happened.
+        is_named = result.outcome is Outcome.COLLISION and hit.kind
+        manner = _NUMBERS.sub("#", hit.kind) if is_named else "off road"
+        found = Signature(str(result.outcome), hit.role, manner, place=_place(lanes, hit))
+    else:
+        contact = record or contact_record(bundle, recording)
+        found = Signature(str(result.outcome), hit.role) if contact is None else _of_a_contact(result, hit, contact)
     return replace(found, disturbed=result.disturbed)
 
 
-def _of_a_collision(
-    result: TrialResult,
-    hit: Collision,
-    recording: Recording,
-    borders: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]],
-) -> Signature:
-    scenes = recording.scenes()
-    first = scenes[-1].time_s - _BEFORE_S
-    scenes = [scene for scene in scenes if scene.time_s >= first]
-    lanes = LaneMap(borders, (hit.x, hit.y))
-    place = ("crossing" if lanes.cross((hit.x, hit.y)) else "road") if lanes else ""
-    outcome = str(result.outcome)
-    if not hit.other:
-        return Signature(outcome, hit.role, "off road", place=place)
-    changes = [lanes.leaves_sideways(scenes, actor) for actor in (hit.agent, hit.other)]
-    manner = _manner(recording, hit)
-    if manner in ("side swipe", "rear end") and not any(changes):  # they touched before half a lane had been crossed
-        late = [scene for scene in scenes if scene.time_s >= scenes[-1].time_s - _BEFORE_S / 2]
-        changes = [
-            lanes.reaches_over(scenes, actor) or lanes.reaches_over(late, actor) for actor in (hit.agent, hit.other)
-        ]
-    lane_change = "both" if all(changes) else "agent" if changes[0] else "other" if changes[1] else ""
-    return Signature(outcome=outcome, role=hit.role, manner=manner, lane_change=lane_change, place=place)
+def _of_a_contact(result: TrialResult, hit: Collision, contact: ContactRecord) -> Signature:
+    changers = contact.lane_changers(_BEFORE_S)
+    lane_change = (
+        "both" if len(changers) == 2 else "".join("agent" if one == hit.agent else "other" for one in changers)
+    )
+    return Signature(
+        outcome=str(result.outcome),
+        role=hit.role,
+        manner=contact.manner,
+        lane_change=lane_change,
+        place=_place(contact.lanes, hit),
+    )
 
 
-def _manner(recording: Recording, hit: Collision) -> str:
-    if is_person(hit.other):
-        return "pedestrian"
-    encounter = Encounter(recording, hit.agent, hit.other)
-    last = encounter.moments[-1].step if encounter.moments else -1
-    position = encounter.position(last)
-    manner = encounter.manner(last)
-    if position is None or manner is None:
-        return ""
-    if position.faces == "other":
-        return "head-on"
-    if position.faces == "same":
-        return "rear end" if position.place in ("ahead", "behind") else "side swipe"
-    return manner
+def _place(lanes: LaneMap, hit: Collision) -> str:
+    return ("crossing" if lanes.cross((hit.x, hit.y)) else "road") if lanes else ""
 
 
 def signature_of_fault(result: TrialResult) -> Signature:

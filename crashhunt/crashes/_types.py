@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import BundleError
 from crashhunt.crashes import judgement_of
+from crashhunt.crashes._contact import contact_record
 from crashhunt.crashes._fault import fault_of
 from crashhunt.crashes._signature import Signature, signature_of
 
@@ -29,8 +30,8 @@ class Group:
     Args:
         signature: of all of them.
         bundles: in the order in which they were given; at least one.
-        faults: whose fault each was; empty where that was not asked.
-        dropped: how many more there were, whose bundles were given up.
+        faults: whose fault each of these was; empty where that was not asked.
+        dropped: how many more there were, whose bundles were deleted (``--keep``).
     """
 
     signature: Signature
@@ -45,13 +46,15 @@ class Group:
 
     @property
     def fault(self) -> str:
-        """Whose fault they were: one of `Verdict`, or ``mixed``; empty where that was not asked."""
+        """Whose fault those with a bundle were: one of `Verdict`, or ``mixed``; empty where that was not asked."""
         said = set(self.faults)
         return "mixed" if len(said) > 1 else next(iter(said), "")
 
     @property
     def avoidable(self) -> bool | None:
         """Whether runs have avoided all of them, or none; None where that differs, or is not known of all."""
+        if self.dropped:
+            return None
         said = {_avoidable(bundle) for bundle in self.bundles}
         return said.pop() if len(said) == 1 else None
 
@@ -71,6 +74,7 @@ class Group:
             "words": str(self.signature),
             "signature": self.signature.to_json(),
             "count": self.count,
+            "saved": len(self.bundles),
             "outcome": self.signature.outcome,
             "manner": self.signature.manner,
             "fault": self.fault,
@@ -94,27 +98,39 @@ class Groups:
     left_out: tuple[str, ...] = ()
 
 
-def group_crashes(bundles: Iterable[Bundle], dropped: Mapping[str, int] | None = None) -> Groups:
+def group_crashes(
+    bundles: Iterable[Bundle], dropped: Mapping[str, int] | None = None, *, faults: bool = True
+) -> Groups:
     """Group crashes by their signatures.
 
     Args:
         bundles: of one hunt or several; the log of each is read.
         dropped: of each kind, in words, how many more there were.
+        faults: whether to find whose fault each crash was.
     """
     signed, unsigned = [], []
-    faults: dict[Path, Verdict] = {}
+    verdicts: dict[Path, Verdict] = {}
     for bundle in bundles:
         try:
             recording = bundle.recording() if bundle.result.collision is not None else None
-            signed.append((signature_of(bundle, recording), bundle))
-            faults[bundle.path] = fault_of(bundle, recording).verdict
+            record = contact_record(bundle, recording)
+            signed.append((signature_of(bundle, recording, record), bundle))
+            if faults:
+                verdicts[bundle.path] = fault_of(bundle, recording, record).verdict
         except BundleError as error:
             unsigned.append(str(error))
-    groups = (
-        replace(group, faults=tuple(faults[bundle.path] for bundle in group.bundles))
-        for group in groups_of(signed, dropped)
-    )
-    return Groups(tuple(groups), tuple(unsigned))
+    groups = groups_of(signed, dropped)
+    if faults:
+        groups = tuple(
+            replace(group, faults=tuple(verdicts[bundle.path] for bundle in group.bundles)) for group in groups
+        )
+    typed = {str(group.signature) for group in groups}
+    unsigned += [
+        f"{count} {'crash' if count == 1 else 'crashes'} of the type {words!r}: no bundle of this type is left"
+        for words, count in (dropped or {}).items()
+        if words not in typed
+    ]
+    return Groups(groups, tuple(unsigned))
 
 
 def _avoidable(bundle: Bundle) -> bool | None:

@@ -4,9 +4,14 @@ from ._action_override import (
     TakingOver as TakingOver,
     overruled_agent as overruled_agent,
 )
+from ._blame import has_users_code as has_users_code, internal_error as internal_error
 from ._branches import Brancher as Brancher
 from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
-from ._failures import failure_of as failure_of, message_of_error as message_of_error
+from ._failures import (
+    failure_of as failure_of,
+    is_tampered as is_tampered,
+    message_of_error as message_of_error,
+)
 from ._forced_onsets import OnsetForcer as OnsetForcer
 from ._observers import (
     Nearness as Nearness,
@@ -23,6 +28,7 @@ from ._probes import (
     Prober as Prober,
 )
 from ._questions import FirstCopy as FirstCopy
+from ._reference_driver import ReferenceDriver as ReferenceDriver
 from ._run import (
     Parts as Parts,
     generators as generators,

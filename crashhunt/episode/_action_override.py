@@ -1,6 +1,6 @@
 """An agent that is overruled from a step on, or that takes over from a recording at a step.
 
-An overruled agent brakes, changes lanes and brakes, or keeps its lane or its speed.
+An overruled agent brakes, changes lanes and brakes, keeps its lane or its speed, or has a reference driver.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from crashhunt.agents import Closes, Recorded
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.episode._reference_driver import ReferenceDriver
 from crashhunt.simulators import BrakesFully, HasMeanings
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -
     Raises:
         InvalidEpisodeError: the simulator does not know how.
     """
+    if overruled.reference:
+        return ReferenceDriver(driver, simulator, overruled)
     if overruled.keeps:
         return Keeping(driver, simulator, overruled.agent, overruled.after, overruled.keeps)
     return Braking(driver, simulator, overruled.agent, overruled.after, overruled.manoeuvre)

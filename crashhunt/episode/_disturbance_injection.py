@@ -67,14 +67,20 @@ class DisturbanceInjector:
         spec: The specification of the trial.
         simulator: The simulator, after its reset.
         callbacks: Called with each disturbance that takes place; the caller may extend this list later.
+        advance: Runs a step of the simulator; by default its method ``step``.
 
     Raises:
         InvalidEpisodeError: The simulator does not support a type of disturbance.
     """
 
     def __init__(
-        self, spec: TrialSpec, simulator: Simulator, callbacks: Sequence[Callable[[Disturbance], None]]
+        self,
+        spec: TrialSpec,
+        simulator: Simulator,
+        callbacks: Sequence[Callable[[Disturbance], None]],
+        advance: Callable[[Mapping[str, Array]], StepResult] | None = None,
     ) -> None:
+        self._advance = advance or simulator.step
         self._seed = spec.seed
         self._simulator = simulator
         self._callbacks = callbacks
@@ -128,7 +134,7 @@ class DisturbanceInjector:
         self._step = step = self._step + 1
         if not self._going and not self._is_due(step):
             self._before = actions
-            return self._simulator.step(actions)
+            return self._advance(actions)
         self._end_before(step)
         for going in self._going:
             if going.active is not None:
@@ -136,7 +142,7 @@ class DisturbanceInjector:
         while self._traffic_waits and self._traffic_waits[-1].step <= step:
             self._begin(self._traffic_waits.pop())
         given, self._before = self._late(actions), actions
-        observations, *rest = self._simulator.step(given)
+        observations, *rest = self._advance(given)
         return self._shown(observations), *rest  # type: ignore[return-value]
 
     def end(self, result: TrialResult) -> TrialResult:

@@ -7,16 +7,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
+from crashhunt.base.boundaries import Boundary, ForeignError, Party, is_ours
 from crashhunt.base.capabilities import supports
-from crashhunt.base.errors import InvalidEpisodeError, RecorderError
+from crashhunt.base.errors import InternalError, InvalidEpisodeError
 from crashhunt.base.forks import Copy, Held, SuspendedFork, held, shared_memory
+from crashhunt.episode._blame import guarded_check, guarded_reset, guarded_scene, guarded_step
 from crashhunt.episode._disturbance_injection import DisturbanceInjector
-from crashhunt.episode._failures import Attribution, Ending, close_agent
+from crashhunt.episode._failures import Ending, close_agent
 from crashhunt.episode._fast_path import make_fast_path
-from crashhunt.episode._observers import agent_seed, callbacks_for, observation_restorer, options_of
+from crashhunt.episode._observers import agent_seed, callbacks_for, observation_restorers, options_of
 from crashhunt.native import ANSWERED, ASK, DONE, SIMULATED
 from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
-from crashhunt.simulators import CountsSetUp, FlattensObservations, HasMap, Reseeds
+from crashhunt.simulators import CountsSetUp, HasMap, Reseeds
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec, in_turn
 
 if TYPE_CHECKING:
@@ -153,6 +155,8 @@ MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 Reset = Callable[..., "tuple[Observations, Info]"]
 """What `Simulator.reset` is: called with ``seed`` and ``options``."""
 
+_FORM = Boundary(Party.SIMULATOR, "action conversion")
+_MAP = Boundary(Party.ORACLE, "see_map")
 _ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # never written to
 
 
@@ -218,7 +222,7 @@ class Episode(Forkable, Ending, Whereabouts):
         self._advance: Callable[[Mapping[str, NDArray[np.generic]]], StepResult] = simulator.step
         self._nothing: tuple[float, ...] = ()
         self._encoders: list[Callable[[object], NDArray[np.generic]]] = []
-        self._unflatten: dict[str, Callable[[NDArray[np.generic]], object]] = {}
+        self._restore: dict[str, Callable[[NDArray[np.generic]], object]] = {}
         # Call only observers that override a hook, because hooks run several times per step.
         self._on_begin: list[Callable[[Episode], None]] = callbacks_for(observers, "begin")
         self._on_making: list[Callable[[int], None]] = callbacks_for(observers, "making")
@@ -231,6 +235,10 @@ class Episode(Forkable, Ending, Whereabouts):
         self._disturbed: DisturbanceInjector | None = None
         self._forks = forks
         self._reset = reset or simulator.reset
+        self._look: Callable[[], Scene] | None = None  # None where the simulator is asked directly
+        if not is_ours(simulator):
+            self._advance, self._reset = guarded_step(simulator.step), guarded_reset(self._reset)
+            self._look = guarded_scene(simulator.scene)
         self._observers = tuple(observers)
 
     def start(self) -> TrialResult | None:
@@ -296,7 +304,7 @@ class Episode(Forkable, Ending, Whereabouts):
             raise RuntimeError("the episode is over" if self.result is not None else "the episode has not been started")
         # This runs a million times a hunt: it is one function, looks up little, and does nothing twice.
         try:
-            names, agents, observations, unflatten = self.names, self.agents, self._observations, self._unflatten
+            names, agents, observations, restore = self.names, self.agents, self._observations, self._restore
             asked, actions = (self.acting, {}) if actions is None else ((), actions)
             for tell in self._on_action if untold else ():
                 tell(0, actions[names[0]])
@@ -308,12 +316,16 @@ class Episode(Forkable, Ending, Whereabouts):
                 if name in given:
                     action = given[name]
                 else:
+                    if name in restore:
+                        observation = restore[name](observation)
                     try:
-                        if name in unflatten:
-                            observation = unflatten[name](observation)
-                        action = self._encoders[number](agents[name].act(observation))
+                        answer = agents[name].act(observation)
                     except BaseException as error:
-                        return self._fail(Outcome.AGENT_ERROR, error, name)
+                        return self._fail(Outcome.AGENT_ERROR, error, name, place="act")
+                    try:
+                        action = self._encoders[number](answer)
+                    except BaseException as error:
+                        return self._fail_in_conversion(error, name)
                 for tell in self._on_action:
                     tell(number, action)
                 actions[name] = action
@@ -321,11 +333,11 @@ class Episode(Forkable, Ending, Whereabouts):
             try:
                 taken = self._advance(actions) if advance is None else advance(actions)
                 self._observations, rewards, self._terminations, truncations, _ = taken
-                scene = simulator.scene()
-                scene.follow(self._scene)
-                self._scene = scene
+                scene = simulator.scene() if self._look is None else self._look()
             except BaseException as error:  # an environment of a user's may exit as well as an agent
                 return self._fail_in_simulator(error)
+            scene.follow(self._scene)
+            self._scene = scene
             self._rewards = rewards
             step, each = self.steps + 1, tuple(map(rewards.get, names, self._nothing))
             for show_scene in self._on_scene:
@@ -439,7 +451,6 @@ class Episode(Forkable, Ending, Whereabouts):
 
     def _set_up(self) -> TrialResult | None:
         spec, simulator = self.spec, self.simulator
-        agent = ""
         try:
             if spec.reseeding is not None:
                 _require_reseeding(simulator)
@@ -454,28 +465,25 @@ class Episode(Forkable, Ending, Whereabouts):
             if self._forks:
                 self._held = held(shared_memory())
             if spec.disturbances or self._forks:  # a copy may be disturbed, and then is as it would have been from here
-                self._disturb(DisturbanceInjector(spec, simulator, self._on_disturbance))
+                self._disturb(DisturbanceInjector(spec, simulator, self._on_disturbance, self._advance))
             for number, agent in enumerate(self.names):
                 for tell_making in self._on_making:
                     tell_making(number)
-                self.agents[agent] = self._make_agent(agent, simulator, spec.arguments.get(agent, {}))
-                self.agents[agent].reset(agent_seed(spec.seed, number))
-            agent = ""
+                if self._make(number, agent) is not None:
+                    return self.result
             for tell_making in self._on_making:
                 tell_making(-1)
-            self._scene = scene = simulator.scene()
+            self._scene = scene = simulator.scene() if self._look is None else self._look()
             for show in self._on_scene:
                 show(0, scene, self._nothing)
         except BaseException as error:
-            found = None if agent else self._attribute(error)
-            if found is None and isinstance(error, RecorderError) and not agent:
-                raise
-            found = found or Attribution(agent)
-            return self._fail(Outcome.INVALID, error, found.agent, found.cause)
+            return self._fail_in_set_up(error)
         for oracle in self._oracles:
             if isinstance(oracle, SeesMap):
-                oracle.see_map(simulator.lanes() if supports(simulator, HasMap) else ())
-        self._checks = [oracle.check for oracle in self._oracles]
+                lanes = simulator.lanes() if supports(simulator, HasMap) else ()
+                (oracle.see_map if is_ours(oracle) else _MAP.around(oracle.see_map))(lanes)
+        # Oracles of a user's are asked inside a boundary; crashhunt's own fail only by a fault of crashhunt.
+        self._checks = [oracle.check if is_ours(oracle) else guarded_check(oracle.check) for oracle in self._oracles]
         finding = self._find(scene)
         if finding is not None:
             hit = finding.collision
@@ -483,13 +491,27 @@ class Episode(Forkable, Ending, Whereabouts):
             failure = Failure("invalid", f"{what} before the first step")
             return self._end(Outcome.INVALID, collision=hit, failure=failure)
         self.acting = tuple(range(len(self.names)))
-        self._encoders = [simulator.actions[name].encode for name in self.names]
-        if supports(simulator, FlattensObservations):
-            self._unflatten = {name: observation_restorer(space) for name, space in simulator.shown_spaces.items()}
+        forms = [simulator.actions[name] for name in self.names]
+        self._encoders = [form.encode if is_ours(form) else _FORM.around(form.encode) for form in forms]
+        self._restore = observation_restorers(simulator)
         if self._disturbed is None:
             self._ahead = make_fast_path(simulator, self._observers, self._oracles, self._max_steps, self._encoders)
             self._take = None if self._ahead is None else self._ahead.at_once.core.take
         return self._end(Outcome.SURVIVED) if spec.max_steps < 1 else None
+
+    def _make(self, number: int, agent: str) -> TrialResult | None:
+        """Make and reset an agent; return the result if that fails."""
+        place = "constructor"
+        try:
+            made = self.agents[agent] = self._make_agent(agent, self.simulator, self.spec.arguments.get(agent, {}))
+            place = "reset"
+            made.reset(agent_seed(self.spec.seed, number))
+        except BaseException as error:
+            if type(error) is InternalError and place == "constructor":  # an agent's constructor has a boundary
+                raise
+            error = error.error if type(error) is ForeignError else error
+            return self._fail(Outcome.INVALID, error, agent, place=place)
+        return None
 
     def _disturb(self, disturbed: DisturbanceInjector) -> None:
         self._disturbed = disturbed

@@ -11,11 +11,13 @@ from types import FunctionType, ModuleType
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.agents import Closes
+from crashhunt.base.boundaries import ForeignError, Party
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ActionError, EpisodeError, InvalidEpisodeError, RecorderError, SimulatorError
 from crashhunt.base.exceptions import class_name, format_error, is_users, message_of
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import blocked_signals
+from crashhunt.episode._blame import Blame, blame, internal_error, party_of_simulator
 from crashhunt.scenario import Scenario
 from crashhunt.trial import Failure, Outcome, TrialResult
 
@@ -40,6 +42,7 @@ __all__ = [
     "close_agent",
     "failure_of",
     "is_emptied",
+    "is_tampered",
     "message_of_error",
     "record_originals",
 ]
@@ -55,13 +58,15 @@ _KINDS: tuple[tuple[type[BaseException], str], ...] = (
 )
 
 
-def failure_of(error: BaseException, agent: str, *, cause: str = "") -> Failure:
+def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str = "", place: str = "") -> Failure:
     """Return what a result says about an exception.
 
     Args:
         error: The exception. A long message or traceback is cut, with a note.
         agent: The agent whose code failed; empty if it was no agent's code.
         cause: Why the exception was raised, as a clause; empty if its message says so.
+        party: Whose code failed; empty if it is not known.
+        place: What that code was called for; empty if it is not known.
     """
     with blocked_signals(), _deep_enough():
         # crashhunt's own messages are complete, so they need no traceback.
@@ -79,6 +84,8 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "") -> Failure:
         message=f"{cause}, upon which this fails: {message}" if cause else message,
         traceback=text,
         agent=agent,
+        party=party,
+        place=place,
     )
 
 
@@ -129,6 +136,11 @@ _MAX_MODULES: Final = 2_000  # of a user's, that refer to each other
 _MAX_HELD: Final = 200  # objects that a simulator or an agent consists of
 _DEPTH_OF_HELD: Final = 3
 _WATCHED: Final = frozenset({"builtins", "math", "random", "time"})  # of Python's own modules
+_USED: Final = frozenset(
+    {"collections", "contextlib", "dataclasses", "functools", "hashlib", "io", "json", "json.decoder", "json.encoder",
+     "logging", "mmap", "os", "pathlib", "re", "resource", "signal", "struct", "sys", "threading", "traceback"}
+)  # fmt: skip
+"""Modules of Python that crashhunt itself needs to record and to report; see `is_tampered`."""
 _LIMITS: Final = {
     "RLIMIT_AS": resource.RLIMIT_AS,
     "RLIMIT_DATA": resource.RLIMIT_DATA,
@@ -157,6 +169,7 @@ class _Originals:
     packages: frozenset[str]
     functions: dict[str, dict[str, object]]
     classes: dict[type, dict[str, object]]
+    used: dict[str, dict[str, object]]
     recursion_limit: int
     limits: dict[str, int]
 
@@ -176,21 +189,56 @@ def record_originals() -> None:
     for name, module in list(sys.modules.items()):
         if not isinstance(module, ModuleType) or (name not in _WATCHED and name.partition(".")[0] not in packages):
             continue
-        held = {key: value for key, value in vars(module).items() if callable(value)}
-        functions[name] = held
+        functions[name] = held = _callables(module)
         for value in held.values():
             if isinstance(value, type) and value.__module__ == name and value not in classes:
-                classes[value] = {key: one for key, one in vars(value).items() if callable(one)}
+                classes[value] = _callables(value)
     limits = {name: resource.getrlimit(number)[0] for name, number in _LIMITS.items()}
     _originals[:] = [
         _Originals(
             packages=packages,
             functions=functions,
             classes=classes,
+            used={name: _callables(sys.modules[name]) for name in _USED if name in sys.modules},
             recursion_limit=sys.getrecursionlimit(),
             limits=limits,
         )
     ]
+
+
+def _callables(thing: ModuleType | type) -> dict[str, object]:
+    return {key: value for key, value in vars(thing).items() if callable(value)}
+
+
+def is_tampered() -> bool:
+    """Whether functions of crashhunt, or functions that it needs, have been replaced since `record_originals`.
+
+    Then a failure of crashhunt itself is not its own fault. A library or a simulator may replace functions of its own
+    by some of its own, so only functions that come from elsewhere count.
+    """
+    if is_emptied():
+        return True
+    if not _originals:
+        return False
+    before = _originals[0]
+    for name, held in before.used.items():
+        now = vars(sys.modules[name]) if name in sys.modules else {}
+        if any(now.get(key) is not value and _is_users_or_nothing(now.get(key)) for key, value in held.items()):
+            return True
+    for name, held in before.functions.items():
+        now = vars(sys.modules[name]) if name in sys.modules else {}
+        if any(now.get(key) is not value and _is_users_or_nothing(now.get(key)) for key, value in held.items()):
+            return True
+    return any(
+        vars(kind).get(key) is not value and _is_users_or_nothing(vars(kind).get(key))
+        for kind, held in before.classes.items()
+        for key, value in held.items()
+    )
+
+
+def _is_users_or_nothing(value: object) -> bool:
+    """Whether what stands in the place of a function is none, or a user's."""
+    return not callable(value) or _is_users_module(_module_of_value(value))
 
 
 def _packages_of_simulators() -> frozenset[str]:
@@ -431,23 +479,77 @@ class Ending:
     _oracles: tuple[Oracle, ...]
     _observers: tuple[Observer, ...]
 
-    def _fail(self, outcome: Outcome, error: BaseException, agent: str = "", cause: str = "") -> TrialResult:
-        """End with an exception of an agent's, or of the simulator's."""
+    def _fail(
+        self,
+        outcome: Outcome,
+        error: BaseException,
+        agent: str = "",
+        cause: str = "",
+        *,
+        party: Party = Party.AGENT,
+        place: str = "",
+    ) -> TrialResult:
+        """End with an exception of foreign code, by default an agent's."""
         self.error = error
-        return self._end(outcome, failure=failure_of(error, agent, cause=cause))
+        return self._end(outcome, failure=failure_of(error, agent, cause=cause, party=party, place=place))
 
-    def _fail_in_simulator(self, error: BaseException) -> TrialResult:
+    def _fail_in_simulator(self, error: BaseException, place: str = "step") -> TrialResult:
         """End with an exception that was raised while the simulator was running, by itself or by code of an agent.
 
         Raises:
             RecorderError: the disk is full.
+            InternalError: it is crashhunt's own.
         """
-        found = self._attribute(error)
+        blamed, found = self._blame(error, place)
         if found is not None:
-            return self._fail(Outcome.AGENT_ERROR, error, found.agent, found.cause)
-        if isinstance(error, RecorderError):
-            raise error
-        return self._fail(Outcome.SIMULATOR_ERROR, error)
+            return self._fail(Outcome.AGENT_ERROR, blamed.error, found.agent, found.cause)
+        if blamed.party is Party.CRASHHUNT and not blamed.is_resource:
+            raise internal_error(error, self.spec.number, self.steps) from error
+        party = party_of_simulator(self.simulator) if blamed.is_resource else blamed.party
+        return self._fail(Outcome.SIMULATOR_ERROR, blamed.error, party=party, place=blamed.place)
+
+    def _fail_in_set_up(self, error: BaseException) -> TrialResult:
+        """End with an exception that was raised before the first step, outside of the agents' own methods.
+
+        Raises:
+            RecorderError: the disk is full.
+            InternalError: it is crashhunt's own.
+        """
+        blamed, found = self._blame(error, "reset")
+        if found is not None:
+            return self._fail(Outcome.INVALID, blamed.error, found.agent, found.cause)
+        if blamed.party is Party.CRASHHUNT and not blamed.is_resource:
+            raise internal_error(error, self.spec.number, -1) from error
+        party = party_of_simulator(self.simulator) if blamed.is_resource else blamed.party
+        return self._fail(Outcome.INVALID, blamed.error, party=party, place=blamed.place)
+
+    def _fail_in_conversion(self, error: BaseException, agent: str) -> TrialResult:
+        """End with an exception that was raised while an agent's action was encoded.
+
+        Raises:
+            RecorderError: the disk is full.
+            InternalError: it is crashhunt's own.
+        """
+        # crashhunt raises no other than ordinary exceptions: the rest comes from methods of the agent's object.
+        if type(error) is ActionError or not issubclass(type(error), Exception):
+            return self._fail(Outcome.AGENT_ERROR, error, agent, place="action conversion")
+        return self._break(error)
+
+    def _blame(self, error: BaseException, place: str = "") -> tuple[Blame, Attribution | None]:
+        """Return whose code an exception comes from, and the agent if it is an agent's.
+
+        Raises:
+            RecorderError: the disk is full.
+        """
+        blamed = blame(error, self.simulator, place)
+        found = self._attribute(blamed.error)
+        if found is None and blamed.party is Party.AGENT:
+            found = Attribution("")
+        # A user's environment or oracle that raises it has not recorded anything.
+        is_ours = type(error) is not ForeignError or blamed.party is Party.SIMULATOR
+        if found is None and isinstance(blamed.error, RecorderError) and is_ours:
+            raise blamed.error
+        return blamed, found
 
     def end_by_agent(self, error: BaseException) -> TrialResult | None:
         """End with an exception that an agent's code has raised between two steps, as a signal handler may.
@@ -477,21 +579,23 @@ class Ending:
         return result
 
     def _break(self, error: BaseException) -> TrialResult:
-        """End an episode that cannot continue for a reason that is neither the agent's nor the simulator's.
-
-        An oracle has failed, an observer, or something that the agent has damaged, such as our own files.
+        """End an episode that cannot continue because an oracle, a conversion or crashhunt itself has failed.
 
         Raises:
             RecorderError: the disk is full.
+            InternalError: it is crashhunt's own, and no agent has caused it as far as is known.
         """
-        found = self._attribute(error)
-        if found is None and isinstance(error, RecorderError):
-            raise error
-        self.error = error
-        is_agents = found is not None or issubclass(type(error), OSError | MemoryError)
+        blamed, found = self._blame(error)
+        if found is None and blamed.party is Party.CRASHHUNT and not blamed.is_resource:
+            raise internal_error(error, self.spec.number, self.steps) from error
+        self.error = blamed.error
+        # Memory and files that run out in crashhunt's own code were used up by others, or closed.
+        is_agents = found is not None or blamed.is_resource
         found = found or Attribution("")
         outcome = Outcome.AGENT_ERROR if is_agents else Outcome.SIMULATOR_ERROR
-        failure = failure_of(error, found.agent, cause=found.cause)
+        party = "" if blamed.is_resource else Party.AGENT if is_agents else blamed.party
+        place = "" if is_agents else blamed.place
+        failure = failure_of(blamed.error, found.agent, cause=found.cause, party=party, place=place)
         self.result = TrialResult(self.spec, outcome, steps=self.steps, failure=failure)
         with suppress(BaseException):
             self._add(self.result)
@@ -506,6 +610,10 @@ class Ending:
         assert self._ahead is not None
         if self._ahead.cannot_record:
             return self._break(error)
+        if self._ahead.is_resuming:
+            return self._fail_in_simulator(error)
+        if self._ahead.is_encoding:
+            return self._fail_in_conversion(error, self.names[0])
         if not self._ahead.at_once.core.simulating:
-            return self._fail(Outcome.AGENT_ERROR, error, self.names[0])
+            return self._fail(Outcome.AGENT_ERROR, error, self.names[0], place="act")
         return self._fail_in_simulator(error)

@@ -50,6 +50,8 @@ class FastPath:
 
     Attributes:
         cannot_record: whether recording is what has failed, where something has.
+        is_resuming: whether the core was reading the simulator's state when something failed.
+        is_encoding: whether the agent's action was being encoded when something failed.
     """
 
     def __init__(
@@ -57,7 +59,7 @@ class FastPath:
     ) -> None:
         self.at_once = at_once
         self._recorder, self._agent, self._encode = recorder, agent, encode
-        self.cannot_record = False
+        self.cannot_record = self.is_resuming = self.is_encoding = False
         at_once.core.listen(at_once.enter, self._record_roster)
 
     def resume_after(self, come: int, agents: dict[str, Agent]) -> tuple[int, dict[str, NDArray[np.generic]] | None]:
@@ -70,11 +72,17 @@ class FastPath:
             agents: The agents by name.
         """
         core = self.at_once.core
-        if come == REFUSED and self._resume():
-            come = core.take(agents)
+        if come == REFUSED:
+            self.is_resuming = True
+            resumed = self._resume()
+            self.is_resuming = False
+            if resumed:
+                come = core.take(agents)
         if come in (DONE, ASK, REFUSED):
             return come, None
+        self.is_encoding = True
         action = self._encode(core.answer)
+        self.is_encoding = False
         if come == ANSWERED and core.note(action):
             come = core.go_on(self.at_once.apply(self._agent, action))
         return come, {self._agent: action}

@@ -30,14 +30,22 @@ from crashhunt.recording import (
     encode_notes,
     encode_spines,
 )
-from crashhunt.simulators import LeavesOut, NamesDanger, NamesObservations, PlaysPaths, TellsEvents
+from crashhunt.simulators import (
+    FlattensObservations,
+    LeavesOut,
+    NamesDanger,
+    NamesObservations,
+    OfAnyLength,
+    PlaysPaths,
+    RestoresObservations,
+    TellsEvents,
+)
 from crashhunt.trial import Outcome
 from crashhunt.world import ApproachMeter, DangerMeter, DrivenMeter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from gymnasium import Space
     from numpy.typing import NDArray
 
     from crashhunt.episode._episode import Episode
@@ -53,7 +61,7 @@ __all__ = [
     "Recorder",
     "agent_seed",
     "callbacks_for",
-    "observation_restorer",
+    "observation_restorers",
     "options_of",
     "overrides_hook",
     "ready_recorder",
@@ -149,11 +157,15 @@ def agent_seed(seed: int, number: int) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
 
 
-def observation_restorer(space: Space[object]) -> Callable[[NDArray[np.generic]], object]:
-    """Return what makes a Dict or Tuple observation again of the flattened array, which is recorded."""
+def observation_restorers(simulator: Simulator) -> dict[str, Callable[[NDArray[np.generic]], object]]:
+    """Return, by agent, what makes a structured observation again of its recorded array."""
+    if not supports(simulator, FlattensObservations):
+        return {}
+    if supports(simulator, RestoresObservations):
+        return {name: partial(simulator.restore_observation, name) for name in simulator.shown_spaces}
     from gymnasium.spaces import unflatten
 
-    return partial(unflatten, space)
+    return {name: partial(unflatten, space) for name, space in simulator.shown_spaces.items()}
 
 
 def callbacks_for(observers: Sequence[Observer], name: str) -> Any:
@@ -279,9 +291,8 @@ class Recorder(Observer):
         channels = []
         for agent in episode.names:
             space, form = simulator.observation_spaces[agent], simulator.actions[agent]
-            sample = _sample_of(form)
             shown = np.dtype(space.dtype).str, tuple(space.shape or ())
-            channels.append(AgentChannel(agent, *shown, sample.dtype.str, sample.shape, tuple(form.names), columns))
+            channels.append(AgentChannel(agent, *shown, *_type_of(form), tuple(form.names), columns))
         self._box.set_up(episode.setup_steps or 0)
         self._box.prologue(Prologue(tuple(channels), simulator.step_length_s).encode(), len(channels))
 
@@ -358,7 +369,17 @@ def ready_recorder(simulator: Simulator) -> None:
     an agent that samples from its action space gets the same. Only for simulators whose `reset` leaves them alone.
     """
     for form in simulator.actions.values():
+        if supports(form, OfAnyLength):
+            continue
         _ready[id(form)] = form, _encode_any(form)
+
+
+def _type_of(form: ActionForm) -> tuple[str, tuple[int, ...]]:
+    """Return type and shape of encoded actions, as in `AgentChannel`."""
+    if supports(form, OfAnyLength):
+        return "|u1", tuple(form.encoded_shape)
+    sample = _sample_of(form)
+    return sample.dtype.str, sample.shape
 
 
 def _sample_of(form: ActionForm) -> NDArray[np.generic]:

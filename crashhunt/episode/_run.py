@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crashhunt.agents import NeedsLibraries
+from crashhunt.base.boundaries import Boundary, Party
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.plugins import import_module, locate
 from crashhunt.base.sandbox import confine
 from crashhunt.base.temporary import record_shared_memory
+from crashhunt.episode._blame import internal_error
 from crashhunt.episode._episode import Episode
 from crashhunt.episode._failures import record_originals
 from crashhunt.episode._observers import Nearness, Recorder
@@ -160,6 +162,9 @@ def set_generators(state: tuple[Any, ...]) -> None:
         sys.modules["torch"].set_rng_state(state[2])
 
 
+_CONSTRUCTOR: Final = Boundary(Party.AGENT, "constructor")
+
+
 # A bound on how deep Python may recurse in a process that runs agents.
 
 MAX_RECURSION_LIMIT: Final = 200_000
@@ -252,7 +257,23 @@ class Parts:
 
         Raises:
             CrashhuntError: its module comes from elsewhere than the snapshot that has it.
+            ForeignError: its constructor failed.
+            InternalError: crashhunt itself failed.
         """
+        try:
+            factory, given = self._prepared(agent, simulator, arguments)
+        except CrashhuntError:
+            raise
+        except Exception as error:
+            raise internal_error(error) from error
+        with _CONSTRUCTOR:
+            made: Agent = factory(**given)
+        return made
+
+    def _prepared(
+        self, agent: str, simulator: Simulator, arguments: Mapping[str, Value]
+    ) -> tuple[Callable[..., Any], dict[str, object]]:
+        """Return the constructor of an agent, and its keyword arguments."""
         factory, wanted = self._factory(agent)
         given: dict[str, object] = {}
         if "observation_space" in wanted:
@@ -266,8 +287,7 @@ class Parts:
         values = {
             name: files.get(value, value) if isinstance(value, str) else value for name, value in arguments.items()
         }
-        made: Agent = factory(**{**given, **values})
-        return made
+        return factory, {**given, **values}
 
     def _factory(self, agent: str) -> tuple[Any, tuple[str, ...]]:
         found = self._factories.get(agent)

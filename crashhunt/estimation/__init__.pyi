@@ -1,2 +1,13 @@
 from ._comparison import Comparison as Comparison, HuntFigures as HuntFigures, compare as compare
-from ._rates import counting_rule as counting_rule, measure_rates as measure_rates, why_no_interval as why_no_interval
+from ._gate import (
+    GateCase as GateCase,
+    GateReport as GateReport,
+    PairedHunts as PairedHunts,
+    ScenarioCounts as ScenarioCounts,
+)
+from ._rates import (
+    counts_suffice as counts_suffice,
+    measure_rates as measure_rates,
+    rate_of_counts as rate_of_counts,
+    rate_of_trials as rate_of_trials,
+)

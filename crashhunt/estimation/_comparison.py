@@ -1,8 +1,15 @@
-"""Which of several hunts crashes more often, and whether that is more than chance."""
+"""Which of several hunts crashes more often, and whether that is more than chance, at any time.
+
+Hunts with the same seed and traffic are compared pair by pair (`crashhunt.rates.PairSequence`). The answer is valid
+whenever you look: also while the hunts run, or where they were killed or stopped at their first crash. Hunts without
+common traffic are compared by their certain intervals, each with half of the error probability.
+"""
 
 from __future__ import annotations
 
 import csv
+import json
+import math
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, TextIO
@@ -13,20 +20,25 @@ from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.json_types import finite_values
-from crashhunt.hunts import HuntResults
+from crashhunt.estimation._rates import measure_rates
+from crashhunt.hunts import HuntResults, counting_rule
 from crashhunt.ledger import Ledger
+from crashhunt.rates import CountingRule, Interval, PairSequence, PairTest, facts_of_plain
 from crashhunt.trial import Constant, Outcome
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from crashhunt.plans import HuntSettings
+    from crashhunt.rates import CrashRate, TrialFacts
 
-__all__ = ["Comparison", "HuntFigures", "Pair", "compare"]
+__all__ = ["Comparison", "HuntFigures", "Pair", "compare", "why_unpaired"]
 
 _CONFIDENCE = 0.95
+_ALPHA = 1 - _CONFIDENCE
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +49,11 @@ class HuntFigures:
         dir: its directory.
         state: where it stands.
         agents: vehicle to who drives it.
-        trials: that were valid.
+        trials: that count and are valid: up to the first number that has not ended.
         crashes: of them.
-        crash_rate: of them, from 0 to 1; NaN where there is no trial.
-        interval: Clopper and Pearson's, of 95 % confidence; None where the trials do not allow one.
-        why_not: why there is no interval.
+        crash_rate: of them, from 0 to 1; NaN where it would be biased, or there is no trial.
+        interval: of the rate, of 95 % confidence, valid whenever you look; None where the trials do not allow one.
+        why_not: why there is no interval, or no rate.
         median_steps_to_crash: NaN where there was no crash.
         median_time_to_collision_s: of the trials without a crash, the least of each; infinite where most never were
             on a collision course.
@@ -49,6 +61,7 @@ class HuntFigures:
         counted: the origin of the trials that all other figures are of, if the hunt guided the rest of its trials. Only
             unguided trials show a crash rate. Empty if all trials count.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
+        excluded: how many trials have ended, but not all of lower numbers; they do not count.
     """
 
     dir: str
@@ -64,6 +77,7 @@ class HuntFigures:
     outcomes: dict[str, int]
     counted: str = ""
     disturbed: int | None = None
+    excluded: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,16 +87,22 @@ class Pair:
     Args:
         first: directory.
         second: directory.
-        trials: how many pairs.
-        only_first: pairs in which only the first crashed.
-        only_second: pairs in which only the second did.
-        both: in which both did.
-        p_value: that neither crashes more often; 1 where they do not differ.
+        trials: how many pairs of valid trials.
+        only_first: pairs in which only the first crashed; with ``--seeds``, traffics in which it crashed more often.
+        only_second: likewise for the second.
+        both: in which both did, equally often.
+        p_value: of McNemar's or Fisher's exact test; None where the number of trials was not fixed ahead.
         caution: why the answer may mean something else; empty for nothing.
-        test: which test it is of: ``mcnemar``, the exact one over pairs; ``fisher``, the exact one over all trials of
-            each; empty where there is none.
+        test: what the verdict rests on: ``pairs``, the evidence of discordant pairs; ``intervals``, the certain
+            intervals of both; empty where there is none.
         why_unpaired: why there are no pairs; empty where there are.
         counts: crashes and valid trials of the first and of the second.
+        evidence: e-value that they do not crash equally often; 20 and more is 95 % confidence. None without pairs.
+        difference: interval of the difference in crashes per trial, second minus first; None where there is none.
+        units: independent pairs: of trials, or of traffics.
+        excluded: how many trials of both do not count: they have ended, but one of a lower number has not; or they are
+            invalid in one of the hunts.
+        answer: ``first`` or ``second``, which certainly crashes less; ``undecided``; empty where nothing can be said.
     """
 
     first: str
@@ -91,40 +111,57 @@ class Pair:
     only_first: int
     only_second: int
     both: int
-    p_value: float
+    p_value: float | None
     caution: str = ""
-    test: str = "mcnemar"
+    test: str = "pairs"
     why_unpaired: str = ""
     counts: tuple[int, int, int, int] = (0, 0, 0, 0)
+    evidence: float | None = None
+    difference: Interval | None = None
+    units: int = 0
+    excluded: int = 0
+    answer: str = ""
 
     @property
     def verdict(self) -> str:
         """The answer in words."""
-        if not self.trials:
+        if self.test != "pairs":
             return self._unpaired()
-        counts = (
-            f"of {self.trials} trials with the same seeds, {self.only_first} crash only in {self.first}, "
-            f"{self.only_second} only in {self.second}, {self.both} in both "
-            f"(McNemar's exact test: p = {self.p_value:.2g})"
-        )
-        if self.p_value >= 1 - _CONFIDENCE:
-            return f"no difference that chance does not explain: {counts}"
-        better = self.second if self.only_first > self.only_second else self.first
-        return f"{better} crashes less: {counts}"
+        assert self.evidence is not None
+        if self.units != self.trials:
+            what = (
+                f"of {self.units} traffics with {self.trials} trials each way, {self.first} crashes more often in "
+                f"{self.only_first}, {self.second} in {self.only_second}"
+            )
+        else:
+            what = (
+                f"of {self.trials} trials with the same seeds, {self.only_first} crash only in {self.first}, "
+                f"{self.only_second} only in {self.second}, {self.both} in both"
+            )
+        exact = "" if self.p_value is None else f"; McNemar's exact test: p = {self.p_value:.2g}"
+        return f"{self._answer}: {what} (evidence {self.evidence:.3g}{exact}){self._difference}"
+
+    @property
+    def _answer(self) -> str:
+        if self.answer in ("first", "second"):
+            return f"{self.first if self.answer == 'first' else self.second} crashes less"
+        return "undecided, no difference that chance does not explain"
+
+    @property
+    def _difference(self) -> str:
+        if self.difference is None:
+            return ""
+        low, high = self.difference
+        return f"; difference: {low:+.2%} to {high:+.2%} crashes per trial ({self.second} minus {self.first}, 95 %)"
 
     def _unpaired(self) -> str:
         reason = f"{self.first} and {self.second}{self.why_unpaired.removeprefix('they')}"
         if not self.test:
             return reason
         a, trials_a, b, trials_b = self.counts
-        counts = (
-            f"{a} of {trials_a} trials crash in {self.first}, {b} of {trials_b} in {self.second} "
-            f"(Fisher's exact test, unpaired: p = {self.p_value:.2g})"
-        )
-        if self.p_value >= 1 - _CONFIDENCE:
-            return f"{reason}; no difference that chance does not explain: {counts}"
-        better = self.second if a * trials_b > b * trials_a else self.first
-        return f"{reason}; {better} crashes less: {counts}"
+        exact = "" if self.p_value is None else f" (Fisher's exact test, unpaired: p = {self.p_value:.2g})"
+        counts = f"{a} of {trials_a} trials crash in {self.first}, {b} of {trials_b} in {self.second}{exact}"
+        return f"{reason}; {self._answer}: {counts}{self._difference}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +180,7 @@ class Comparison:
         """Return the shape that ``compare --json`` prints; what is no finite number is null."""
         return {
             "hunts": [finite_values(asdict(hunt)) for hunt in self.hunts],
-            "pairs": [{**finite_values(asdict(pair)), "verdict": pair.verdict} for pair in self.pairs],
+            "pairs": [_plain(pair) for pair in self.pairs],
         }
 
     def write_csv(self, out: TextIO) -> None:
@@ -163,6 +200,11 @@ class Comparison:
         return f"<comparison {rates}>"
 
 
+def _plain(pair: Pair) -> dict[str, object]:
+    difference = None if pair.difference is None else pair.difference._asdict()
+    return {**finite_values(asdict(pair)), "difference": difference, "verdict": pair.verdict}
+
+
 @clear_calls()
 def compare(*directories: Path | str) -> Comparison:
     """Compare hunts: how often each crashed, and over trials with the same seeds, whether one crashes less.
@@ -177,23 +219,65 @@ def compare(*directories: Path | str) -> Comparison:
     for hunt in hunts:
         if hunt.state.damaged:
             raise HuntDirectoryError(hunt.state.detail)
-    tables = [_table(hunt) for hunt in hunts]
-    figures = tuple(_figures(hunt, table) for hunt, table in zip(hunts, tables, strict=True))
-    pairs = tuple(_pair(hunts[0], tables[0], hunt, table) for hunt, table in zip(hunts[1:], tables[1:], strict=True))
-    return Comparison(figures, pairs)
+    figures = [_figures(hunt) for hunt in hunts]
+    pairs = tuple(
+        _pair(hunts[0], figures[0], hunt, figure) for hunt, figure in zip(hunts[1:], figures[1:], strict=True)
+    )
+    return Comparison(tuple(figures), pairs)
+
+
+# One hunt in numbers.
+
+
+def _figures(hunt: HuntResults) -> HuntFigures:
+    rate = _rate(hunt)
+    table = _table(hunt)
+    valid = table[table["valid"]]
+    crashed, fine = valid[valid["crash"]], valid[~valid["crash"]]
+    return HuntFigures(
+        dir=str(hunt.directory),
+        state=hunt.state.state,
+        agents={agent: chosen.agent for agent, chosen in hunt.settings.agents.items()},
+        trials=rate.trials,
+        crashes=rate.crashes,
+        crash_rate=_share(hunt, rate),
+        interval=None if rate.certain is None else (rate.certain.low, rate.certain.high),
+        why_not=rate.why_not if rate.trials else "there is no valid trial",
+        median_steps_to_crash=float(np.median(crashed["steps"])) if len(crashed) else float("nan"),
+        median_time_to_collision_s=float(np.median(fine["ttc"])) if len(fine) else float("nan"),
+        outcomes=hunt.state.outcomes,
+        counted=hunt.plain_origin,
+        disturbed=_disturbed(hunt, set(crashed["number"].tolist())) if hunt.settings.disturb else None,
+        excluded=rate.excluded.get("after_unfinished", 0),
+    )
+
+
+def _rate(hunt: HuntResults, confidence: float = 100 * _CONFIDENCE) -> CrashRate:
+    return measure_rates(hunt.directory, per="trial", confidence=confidence)[0]
+
+
+def _share(hunt: HuntResults, rate: CrashRate) -> float:
+    """Return the share of trials that crashed; NaN where the number of trials depends on the crashes."""
+    if rate.estimate is not None:
+        return rate.estimate
+    run = hunt.settings.run
+    is_whole = hunt.state.state in ("finished", "crashed") and run.keep_going and not run.distinct
+    if rate.certain is None and is_whole and rate.trials:  # a grid has a share as well, but no interval
+        return rate.crashes / rate.trials
+    return math.nan
 
 
 def _table(hunt: HuntResults) -> NDArray[np.void]:
-    """Number, seed, steps, least time to collision, whether it counts and whether it crashed, in order of numbers.
+    """Number, steps, least time to collision, whether it counts and whether it crashed, in order of numbers.
 
     Of a hunt that guided its trials, those that it did not.
     """
     crash_on = hunt.settings.crash_on
-    fields = [("number", "i8"), ("seed", "i8"), ("steps", "i8"), ("ttc", "f8"), ("valid", "?"), ("crash", "?")]
+    fields = [("number", "i8"), ("steps", "i8"), ("ttc", "f8"), ("valid", "?"), ("crash", "?")]
     with closing(Ledger(hunt.directory / layout.LEDGER)) as ledger:
         rows = (
-            (number, seed, steps, np.inf if ttc is None else ttc, name != Outcome.INVALID, name in crash_on)
-            for number, seed, name, steps, ttc in ledger.table()
+            (number, steps, np.inf if ttc is None else ttc, name != Outcome.INVALID, name in crash_on)
+            for number, _, name, steps, ttc in ledger.table()
         )
         table = np.fromiter(rows, fields)
     if hunt.plain_origin:
@@ -207,97 +291,144 @@ def _disturbed(hunt: HuntResults, crashed: set[int]) -> int:
     return sum(result.disturbed for result in found if result.spec.number in crashed)
 
 
-def _figures(hunt: HuntResults, table: NDArray[np.void]) -> HuntFigures:
-    valid = table[table["valid"]]
-    crashes = int(valid["crash"].sum())
-    crashed, fine = valid[valid["crash"]], valid[~valid["crash"]]
-    why_not = _why_no_interval(hunt)
-    interval = None
-    if not why_not and len(valid):
-        from scipy.stats import binomtest
-
-        found = binomtest(crashes, len(valid)).proportion_ci(_CONFIDENCE, "exact")
-        interval = (float(found.low), float(found.high))
-    return HuntFigures(
-        dir=str(hunt.directory),
-        state=hunt.state.state,
-        agents={agent: chosen.agent for agent, chosen in hunt.settings.agents.items()},
-        trials=len(valid),
-        crashes=crashes,
-        crash_rate=crashes / len(valid) if len(valid) else float("nan"),
-        interval=interval,
-        why_not=why_not if len(valid) else "there is no valid trial",
-        median_steps_to_crash=float(np.median(crashed["steps"])) if crashes else float("nan"),
-        median_time_to_collision_s=float(np.median(fine["ttc"])) if len(fine) else float("nan"),
-        outcomes=hunt.state.outcomes,
-        counted=hunt.plain_origin,
-        disturbed=_disturbed(hunt, set(crashed["number"].tolist())) if hunt.settings.disturb else None,
-    )
+# Two hunts.
 
 
-def _why_no_interval(hunt: HuntResults) -> str:
-    settings = hunt.settings
-    if settings.rare:
-        return "in rare mode, trials run without the hunt's disturbances"
-    if settings.seeds:
-        return f"its trials take place in {settings.seeds} traffics (--seeds), and are not independent of each other"
-    if not (hunt.independent or hunt.plain_origin):
-        return f"the sampler {settings.sampler} does not draw trials independently"
-    if not settings.run.keep_going and any(hunt.state.outcomes.get(kind) for kind in settings.crash_on):
-        return "it stopped at its first crash, and the rate of such a hunt is too high; use --keep-going"
-    if settings.run.distinct and (not settings.trials or hunt.state.trials_run < settings.trials):
-        return f"it stopped at {settings.run.distinct} kinds of crashes, and the rate of such a hunt is too high"
-    if hunt.state.state not in ("finished", "crashed"):
-        return f"it is {hunt.state.state}, and quick trials are over-represented"
-    return ""
-
-
-def _pair(first: HuntResults, left: NDArray[np.void], second: HuntResults, right: NDArray[np.void]) -> Pair:
-    (crashed, valid), (crashed_too, valid_too) = _counts(left), _counts(right)
-    totals = (crashed, valid, crashed_too, valid_too)
-    _, in_left, in_right = np.intersect1d(left["number"], right["number"], assume_unique=True, return_indices=True)
-    left, right = left[in_left], right[in_right]
-    same = (left["seed"] == right["seed"]) & left["valid"] & right["valid"]
-    why_not = "" if same.any() else "they have no seed in common: run both with the same --seed"
+def _pair(first: HuntResults, figures: HuntFigures, second: HuntResults, other: HuntFigures) -> Pair:
+    counts = (figures.crashes, figures.trials, other.crashes, other.trials)
+    why_not = why_unpaired(first.settings, second.settings)
     if not why_not:
-        why_not = _other_traffic(first.settings, second.settings)
-        if not why_not and not _same_draws(first, second):
-            same &= _same_arguments(first, second, left["number"])
-            why_not = "" if same.any() else "they have other values of the scenario's arguments with the same seeds"
-        if why_not:
-            same = np.zeros_like(same)
-    a, b = left["crash"][same], right["crash"][same]
-    only_first, only_second = int((a & ~b).sum()), int((~a & b).sum())
-    p_value, test = 1.0, "mcnemar"
-    if why_not:
-        p_value, test = _unpaired_test(first, second, totals)
-    elif only_first + only_second:
+        sequence, test = _paired(first, second)
+        if test.pairs and not sequence.why_not:
+            return _by_pairs(first, second, sequence, test, counts)
+        if sequence.why_not:
+            why_not = f"they have too few valid trials in common: {sequence.why_not}"
+        elif sequence.not_same:
+            settings = first.settings.seed, second.settings.seed
+            why_not = (
+                "they have other values of the scenario's arguments with the same seeds"
+                if settings[0] == settings[1]
+                else "they have no seed in common: run both with the same --seed"
+            )
+        else:
+            why_not = "they have no pair of trials yet"
+    return _by_intervals(first, second, why_not, counts)
+
+
+def _by_pairs(
+    first: HuntResults, second: HuntResults, sequence: PairSequence, test: PairTest, counts: tuple[int, int, int, int]
+) -> Pair:
+    log_evidence = test.log_evidence
+    answer = "undecided"
+    if log_evidence >= -math.log(_ALPHA):
+        answer = "first" if test.only_second > test.only_first else "second"
+    p_value = None
+    if _is_fixed_ahead(first) and _is_fixed_ahead(second):
         from scipy.stats import binomtest
 
-        p_value = float(binomtest(only_first, only_first + only_second).pvalue)
+        discordant = test.only_first + test.only_second
+        p_value = float(binomtest(test.only_first, discordant).pvalue) if discordant else 1.0
     return Pair(
         first=str(first.directory),
         second=str(second.directory),
-        trials=int(same.sum()),
-        only_first=only_first,
-        only_second=only_second,
-        both=int((a & b).sum()),
+        trials=test.trials,
+        only_first=test.only_first,
+        only_second=test.only_second,
+        both=test.both,
         p_value=p_value,
         caution=_caution(first, second),
-        test=test,
-        why_unpaired=why_not,
-        counts=totals,
+        counts=counts,
+        evidence=math.exp(min(log_evidence, 700.0)),  # a float ends soon after
+        difference=test.difference(_ALPHA),
+        units=test.pairs,
+        excluded=sequence.excluded + 2 * sequence.invalid,
+        answer=answer,
     )
 
 
-def _counts(table: NDArray[np.void]) -> tuple[int, int]:
-    """Crashes and valid trials."""
-    return int((table["crash"] & table["valid"]).sum()), int(table["valid"].sum())
+def _by_intervals(first: HuntResults, second: HuntResults, why_not: str, counts: tuple[int, int, int, int]) -> Pair:
+    """Compare hunts without common traffic; each interval has half of the error probability."""
+    a, b = (_rate(hunt, 100 * (1 - _ALPHA / 2)).certain for hunt in (first, second))
+    p_value, difference, answer = None, None, ""
+    if a is not None and b is not None:
+        difference = Interval(b.low - a.high, b.high - a.low)
+        answer = "first" if difference.low > 0 else "second" if difference.high < 0 else "undecided"
+        if _is_fixed_ahead(first) and _is_fixed_ahead(second):
+            from scipy.stats import fisher_exact
+
+            crashes, trials, other, other_trials = counts
+            p_value = float(fisher_exact([[crashes, trials - crashes], [other, other_trials - other]]).pvalue)
+    return Pair(
+        first=str(first.directory),
+        second=str(second.directory),
+        trials=0,
+        only_first=0,
+        only_second=0,
+        both=0,
+        p_value=p_value,
+        caution=_caution(first, second),
+        test="intervals" if answer else "",
+        why_unpaired=why_not,
+        counts=counts,
+        difference=difference,
+        answer=answer,
+    )
 
 
-def _other_traffic(one: HuntSettings, other: HuntSettings) -> str:
-    if shared := one.seeds or other.seeds:
-        return f"trials take place in {shared} traffics (--seeds), and are not independent of each other"
+def _is_fixed_ahead(hunt: HuntResults) -> bool:
+    """Return whether the number of trials did not depend on the crashes, so that a test with one look is valid."""
+    settings = hunt.settings
+    return not (settings.seeds or settings.run.until_rate) and _rate(hunt).estimate is not None
+
+
+def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, PairTest]:
+    hunts = first, second
+    rules = _rule(first), _rule(second)
+    with_arguments = not _same_draws(first, second)
+    sequence = PairSequence(rules, lambda one, other: one.tags == other.tags)
+    test = PairTest(rules[0].trials_per_unit if rules[0].traffics else 1)
+    for side in (0, 1):
+        for trial in _trials(hunts[side], with_arguments=with_arguments):
+            for pair in sequence.add(side, trial):
+                test.add(pair)
+    return sequence, test
+
+
+def _rule(hunt: HuntResults) -> CountingRule:
+    with closing(Ledger(hunt.directory / layout.LEDGER)) as ledger:
+        return counting_rule(hunt.settings, ledger.facts())
+
+
+def _trials(hunt: HuntResults, *, with_arguments: bool) -> Iterator[TrialFacts]:
+    """Yield the trials of a hunt, tagged with what a pair has in common."""
+    crash_on = hunt.settings.crash_on
+    with closing(Ledger(hunt.directory / layout.LEDGER)) as ledger:
+        for data in ledger.plain_results():
+            spec = data["spec"]
+            tags: tuple[str, ...] = (str(spec["seed"]),)
+            if with_arguments:
+                tags += (_text_of(spec["scenario_arguments"]),)
+            yield facts_of_plain(data, crash_on, tags)
+
+
+def _text_of(arguments: dict[str, object]) -> str:
+    """Return arguments as text that is equal where they are; 20 is 20.0."""
+    is_whole = {name: isinstance(value, int) and not isinstance(value, bool) for name, value in arguments.items()}
+    plain = {name: float(str(value)) if is_whole[name] else value for name, value in arguments.items()}
+    return json.dumps(plain, sort_keys=True)
+
+
+def why_unpaired(one: HuntSettings, other: HuntSettings) -> str:
+    """Return why trials of two hunts with the same number are no pairs, as a clause; empty where they are."""
+    if one.rare and other.rare:
+        return "they are in rare mode, in which one of five trials is undisturbed; each hunt itself reports its rate"
+    if one.rare != other.rare:
+        return "one is in rare mode, in which one of five trials is undisturbed: the same seed is another traffic"
+    if one.seeds != other.seeds:
+        counts = " and ".join(f"{hunt.seeds} traffics" if hunt.seeds else "one per trial" for hunt in (one, other))
+        return f"they have {counts} (--seeds), so that the same number is another traffic"
+    if one.seeds and min(one.trials, other.trials) < one.seeds:
+        return f"they have fewer trials than the {one.seeds} traffics of --seeds"
     if one.scenario_digest != other.scenario_digest:
         return "they are of two scenarios, in which the same seed is another traffic"
     differing = [
@@ -305,8 +436,6 @@ def _other_traffic(one: HuntSettings, other: HuntSettings) -> str:
         for name in sorted(one.scenario_arguments.keys() | other.scenario_arguments.keys())
         if one.scenario_arguments.get(name) != other.scenario_arguments.get(name)
     ]
-    if one.rare != other.rare:
-        return "one is in rare mode, in which trials run without disturbances, so that the same seed is another traffic"
     if one.disturb != other.disturb:
         return f"they have {_disturbances(one)} and {_disturbances(other)}, so that the same seed is another traffic"
     if differing:
@@ -326,21 +455,6 @@ def _same_draws(first: HuntResults, second: HuntResults) -> bool:
     return first.settings.sampler == second.settings.sampler and first.independent and second.independent
 
 
-def _same_arguments(first: HuntResults, second: HuntResults, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Of each trial, whether the scenario's arguments had the same values."""
-    found = [{row.number: row.scenario_arguments for row in hunt.trial_rows()} for hunt in (first, second)]
-    return np.array([found[0][number] == found[1][number] for number in numbers.tolist()], bool)
-
-
-def _unpaired_test(first: HuntResults, second: HuntResults, totals: tuple[int, int, int, int]) -> tuple[float, str]:
-    a, trials_a, b, trials_b = totals
-    if _why_no_interval(first) or _why_no_interval(second) or not (trials_a and trials_b):
-        return 1.0, ""  # their trials say nothing about how often they crash
-    from scipy.stats import fisher_exact
-
-    return float(fisher_exact([[a, trials_a - a], [b, trials_b - b]]).pvalue), "fisher"
-
-
 def _caution(first: HuntResults, second: HuntResults) -> str:
     one, other = first.settings, second.settings
     if one.max_steps != other.max_steps:
@@ -349,6 +463,4 @@ def _caution(first: HuntResults, second: HuntResults) -> str:
         return "they do not count the same outcomes as crashes"
     if one.disturb != other.disturb:
         return f"the one has {_disturbances(one)}, the other {_disturbances(other)}"
-    if not (one.run.keep_going and other.run.keep_going):
-        return "one that stops at its first crash runs fewer trials; use --keep-going"
     return ""

@@ -10,7 +10,7 @@ Cost: a ledger is read once for all measures, at 30,000 trials per second or so.
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -19,22 +19,22 @@ from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import BundleError, HuntDirectoryError, UsageError
 from crashhunt.base.text import one_of
 from crashhunt.crashes import fault_of, signature_of
-from crashhunt.hunts import HuntResults
+from crashhunt.hunts import HuntResults, counting_rule, why_no_interval
 from crashhunt.ledger import Ledger
-from crashhunt.rates import PERS, CountingRule, RateCounter, RatePart, UnitSequence, facts_of_plain, make_rate
+from crashhunt.rates import PERS, RateCounter, RatePart, UnitSequence, facts_of_plain, make_rate
 from crashhunt.trial import Choice, Range
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.ledger import Facts
     from crashhunt.plans import HuntSettings
-    from crashhunt.rates import CrashRate, Interval, Per, TrialFacts, Unit
+    from crashhunt.rates import CountingRule, CrashRate, Interval, Per, TrialFacts, Unit
     from crashhunt.trial import Distribution
 
-__all__ = ["counting_rule", "measure_rates", "why_no_interval"]
+__all__ = ["counts_suffice", "measure_rates", "rate_of_counts", "rate_of_trials"]
 
 _BINS = 4
 _MAX_BINS = 50
@@ -99,32 +99,73 @@ def measure_rates(
     return tuple(found)
 
 
-def counting_rule(settings: HuntSettings, facts: Facts) -> CountingRule:
-    """Return how the trials of a hunt count."""
-    independent = bool(facts.get("independent", settings.sampler == "random"))
-    origin = "" if independent or settings.seeds else facts.get("plain_origin") or ""
-    return CountingRule(
-        max_steps=settings.max_steps,
-        agents=max(1, len(settings.agents)),
-        plain_origin=origin,
-        traffics=settings.seeds,
-        planned=settings.trials,
-    )
+def counts_suffice(settings: HuntSettings, facts: Facts) -> bool:
+    """Whether the rate per trial follows from counts of the first trials alone, without reading each of them."""
+    rule = counting_rule(settings, facts)
+    return not rule.traffics and not rule.plain_origin and not facts.get("until_rate")
 
 
-def why_no_interval(settings: HuntSettings, facts: Facts) -> str:
-    """Return why the trials of a hunt say nothing about a rate; empty where they do."""
-    if settings.rare:
-        return "in rare mode, trials run without the hunt's disturbances; the hunt itself reports the rate"
-    if settings.seeds:
-        if settings.sampler != "random":
-            return f"the sampler {settings.sampler} does not draw trials independently"
-        if settings.trials < settings.seeds:
-            return "no number of trials was fixed ahead for each traffic (--seeds): TRIALS must be at least --seeds"
-        return ""
-    if facts.get("independent", settings.sampler == "random") or facts.get("plain_origin"):
-        return ""
-    return f"the sampler {settings.sampler} does not draw trials independently"
+def rate_of_counts(
+    directory: Path | str,
+    settings: HuntSettings,
+    facts: Facts,
+    *,
+    valid: int,
+    invalid: int,
+    crashes: int,
+    steps: int,
+    excluded: int,
+    confidence: float = 95.0,
+) -> CrashRate:
+    """Return the rate per trial that `measure_rates` returns, from counts; only where `counts_suffice`.
+
+    Args:
+        directory: of the hunt.
+        settings: of the hunt.
+        facts: of its ledger.
+        valid: how many of the first trials, up to the first that has not ended, were valid.
+        invalid: how many of them were not.
+        crashes: of the valid ones.
+        steps: that the valid ones took.
+        excluded: how many trials have ended after the first that has not.
+        confidence: of the certain interval, in percent.
+    """
+    rule = counting_rule(settings, facts)
+    sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")
+    sequence.add_counted(valid=valid, invalid=invalid)
+    if valid:
+        counter.add_counted(trials=valid, crashes=crashes, steps=steps)
+    found = make_rate(
+        str(directory), "trial", counter, sequence, confidence=confidence,
+        why_no_interval=why_no_interval(settings, facts), why_no_estimate=_why_no_estimate(settings, sequence, None),
+    )  # fmt: skip
+    return replace(found, excluded=found.excluded | ({"after_unfinished": excluded} if excluded else {}))
+
+
+def rate_of_trials(
+    directory: Path | str, settings: HuntSettings, facts: Facts, trials: Iterable[JsonObject], confidence: float = 95.0
+) -> CrashRate:
+    """Return the rate per trial that `measure_rates` returns, without parts, from trials that the caller reads.
+
+    Args:
+        directory: of the hunt.
+        settings: of the hunt.
+        facts: of its ledger.
+        trials: plain data of all trials, in the order of their numbers.
+        confidence: of the certain interval, in percent.
+    """
+    rule = counting_rule(settings, facts)
+    sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")
+    bar_of_hunt = facts.get("until_rate")
+    decided = bar_of_hunt["decided_at"] if bar_of_hunt else None
+    for data in trials:
+        if decided is None or data["spec"]["number"] <= decided:
+            for unit in sequence.add(facts_of_plain(data, settings.crash_on)):
+                counter.add(unit)
+    return make_rate(
+        str(directory), "trial", counter, sequence, confidence=confidence,
+        why_no_interval=why_no_interval(settings, facts), why_no_estimate=_why_no_estimate(settings, sequence, decided),
+    )  # fmt: skip
 
 
 def _why_no_estimate(settings: HuntSettings, sequence: UnitSequence, decided: int | None) -> str:

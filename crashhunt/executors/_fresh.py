@@ -187,7 +187,7 @@ class FreshProcessExecutor:
         for file in (running.answer, self._job(spec.number), self._log(spec.number)):
             file.unlink(missing_ok=True)  # a hunt has a million trials
         if "error" in answer:
-            raise WorkerError.from_json(answer)
+            raise WorkerError.from_json(answer)  # or an InternalError
         if "lost" in answer:
             return self._again(running, answer["lost"], answer.get("importing", ""))
         result = TrialResult.from_json(answer["result"])

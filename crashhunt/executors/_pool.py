@@ -115,7 +115,7 @@ class ForkServerLink:
                 return None
             message: FromForkServer = json.loads(data)
             if "error" in message:
-                raise CrashhuntError(**message["error"])
+                raise CrashhuntError.from_json({"error": message["error"]})
             if "slot" in message:
                 ended.append(message)
             self.ready = self.ready or "ready" in message

@@ -12,9 +12,10 @@ import struct
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, cast
 
 from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError, InternalError
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import scratch_of
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, Tag, digest_of, read_black_box, read_header
@@ -26,12 +27,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
+    from crashhunt.base.json_types import ErrorData
     from crashhunt.trial import TrialSpec
 
 
 __all__ = [
     "KEY_BYTES",
     "Attempt",
+    "FaultReport",
     "Report",
     "agent_in_stack",
     "check_report",
@@ -330,10 +333,19 @@ class Report(TypedDict):
     notices: list[str]
     map: NotRequired[str]
     entered: NotRequired[list[str]]
+    responses: NotRequired[list[JsonObject]]
     braking: NotRequired[Mapping[str, object] | None]
 
 
-def encode_report(report: Report, key: bytes, digest: str, *, dumps: Callable[[object], str] = json.dumps) -> bytes:
+class FaultReport(TypedDict):
+    """What the process of a trial reports if crashhunt itself failed in it."""
+
+    fault: ErrorData
+
+
+def encode_report(
+    report: Report | FaultReport, key: bytes, digest: str, *, dumps: Callable[[object], str] = json.dumps
+) -> bytes:
     """Return the bytes of a report.
 
     Args:
@@ -361,6 +373,9 @@ def check_report(
 
     Returns:
         The result and the whole report; in words what does not agree, where something does not.
+
+    Raises:
+        InternalError: crashhunt itself failed in that process.
     """
     found = _walk(records)
     if isinstance(found, str):
@@ -373,13 +388,23 @@ def check_report(
     if report[:_HASH_BYTES] not in (_keyed_hash(text, key, digest), _keyed_hash(text, key, "")):
         return "its report was not written by crashhunt"
     try:
-        said: Report = json.loads(text)
+        loaded: Any = json.loads(text)
+        if "fault" in loaded:
+            raise _fault_of(loaded["fault"])
+        said: Report = loaded
         data = cast("JsonObject", {**said["result"], "spec": spec.to_json()})
         result = TrialResult.from_json(data)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         return f"its report cannot be read ({type(error).__name__})"
     problem = _contradiction(result, spec, steps, time_s, digest)
     return problem or (replace(result, spec=spec), said)
+
+
+def _fault_of(data: ErrorData) -> CrashhuntError:
+    try:
+        return CrashhuntError.from_json(data)
+    except (KeyError, TypeError, AttributeError):
+        return InternalError("crashhunt itself failed in a trial, and its report cannot be read")
 
 
 def _contradiction(result: TrialResult, spec: TrialSpec, steps: int, time_s: float, digest: str) -> str:

@@ -29,7 +29,7 @@ from crashhunt.executors._postmortem import KEY_BYTES, Report, check_report, dam
 from crashhunt.executors._time_limits import START_UP_S, has_hung
 from crashhunt.recording import BlackBoxFile, Recording, read_black_box
 from crashhunt.simulators import FullBraking
-from crashhunt.trial import TrialSpec
+from crashhunt.trial import Escape, TrialSpec
 
 if TYPE_CHECKING:
     import socket
@@ -192,6 +192,8 @@ class Supervisor:
                     (folder / layout.ERROR_LOG).write_text(failure.traceback, encoding="utf-8", errors="replace")
             if (entered := report.get("entered")) is not None:
                 (folder / layout.ENTERED).write_text(json.dumps(entered), encoding="utf-8")
+            if (responses := report.get("responses")) is not None:
+                (folder / layout.RESPONSES).write_text(json.dumps(responses), encoding="utf-8")
         result = replace(result, kept=kept, failure=failure)
         return Ended(result, tuple(map(str, report["notices"])), report.get("braking"))
 
@@ -230,7 +232,7 @@ class Supervisor:
         while not self._zygote_pid:
             message = self._next(_LOOK_EVERY_S)
             if message is not None and "error" in message:
-                raise CrashhuntError(**message["error"])
+                raise CrashhuntError.from_json({"error": message["error"]})
             if message is not None and message.get("unfit"):
                 raise UnfitZygoteError
             self._zygote_pid = message.get("ready", 0) if message is not None else 0
@@ -402,12 +404,14 @@ def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) 
         ended: the trial.
     """
     result = ended.result
-    if not settings.find_escapes or result.collision is None or ended.braking is None or supervisor.retires:
+    if not settings.find_escapes or result.collision is None or supervisor.retires:
         return result
     from crashhunt.crashes import find_escape
 
-    how, deceleration = ended.braking["how"], ended.braking["deceleration"]
-    braking = FullBraking(None, str(how), float(deceleration) if isinstance(deceleration, int | float) else None)
+    braking = None
+    if ended.braking is not None:
+        how, deceleration = ended.braking["how"], ended.braking["deceleration"]
+        braking = FullBraking(None, str(how), float(deceleration) if isinstance(deceleration, int | float) else None)
     numbers = itertools.count(_FIRST_NUMBER + (os.getpid() << 16))
 
     def recording(number: int) -> Recording:
@@ -428,8 +432,8 @@ def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) 
 
     try:
         return replace(result, escape=find_escape(result, recording(result.spec.number), braking, run))
-    except BundleError:
-        return result
+    except BundleError as error:
+        return replace(result, escape=Escape(why_not=error.message))
     except LostTrialError as error:
         why = f"the process that searched {describe_death(error.exit_code)}, {_ATTEMPTS} times"
         return replace(result, why_no_escape=why)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NoReturn, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.capabilities import supports
-from crashhunt.base.errors import RecorderError
+from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.shared_state import SharedState
 from crashhunt.base.signals import block_signals
@@ -29,7 +29,11 @@ from crashhunt.episode import (
     OnsetForcer,
     Parts,
     Prober,
+    ReferenceDriver,
     TakingOver,
+    has_users_code,
+    internal_error,
+    is_tampered,
     overruled_agent,
     ready_recorder,
     run_episode,
@@ -45,7 +49,7 @@ if TYPE_CHECKING:
     from crashhunt.agents import Agent
     from crashhunt.base.codec import JsonObject
     from crashhunt.episode import Reset, WorkerSettings
-    from crashhunt.executors._postmortem import Report
+    from crashhunt.executors._postmortem import FaultReport, Report
     from crashhunt.simulators import Simulator
     from crashhunt.trial import TrialResult, Value
 
@@ -90,9 +94,11 @@ class TrialProcess:
         self._simulator: Simulator | None = None
         self._box: BlackBox | None = None
         self._pid = 0
+        self._has_begun = False
         self._shared: SharedState | None = None
         self._home = Path.cwd()
         self._notices: list[str] = []
+        self._reference: ReferenceDriver | None = None
         self._asking: tuple[
             tuple[Prober | Brancher | OnsetForcer, str], ...
         ] = ()  # copies of the trial, and what people call them
@@ -141,12 +147,15 @@ class TrialProcess:
         code = 1
         try:
             code = self._run(job, reset)
-        except BaseException:  # something that this process needs is damaged
-            for _ in (1, 2, 3):  # a signal handler of the agent may raise here as well, whenever a function is called
+        except BaseException as error:  # a fault of crashhunt, or something that this process needs is damaged
+            for attempt in (1, 2, 3):  # an agent's signal handler may raise here too, whenever a function is called
                 try:
                     block_signals()
                     if self._box is not None:
-                        self._box.announce_damage()
+                        if attempt == 1 and (self._is_mistake(error) or not (has_users_code(error) or is_tampered())):
+                            self._report_fault(error, job)
+                        else:
+                            self._box.announce_damage()
                     code = 0
                     break
                 except BaseException:
@@ -168,6 +177,7 @@ class TrialProcess:
         try:
             simulator = self.make_simulator()
             assert self._parts is not None
+            self._has_begun = True
             # From here on the trial's time runs; imports that each trial makes itself do not count.
             box.begin(pid=self._pid, trial=spec.number, started=time.monotonic())
             # Writes down where every thread is, without needing the interpreter; then the supervisor ends the process.
@@ -202,6 +212,22 @@ class TrialProcess:
         box.report(encode_report(report, bytes.fromhex(job["key"]), result.digest, dumps=_dumps))
         return 0
 
+    def _is_mistake(self, error: BaseException) -> bool:
+        """Whether an error is a mistake in the scenario: its parts are made before the trial begins."""
+        return not self._has_begun and issubclass(type(error), CrashhuntError)
+
+    def _report_fault(self, error: BaseException, job: Job) -> None:
+        """Report that crashhunt itself failed, which ends the hunt."""
+        assert self._box is not None
+        number = job["spec"]["number"]
+        said: CrashhuntError = internal_error(error, number)
+        if self._is_mistake(error) and isinstance(error, CrashhuntError):
+            said = error
+        fault: FaultReport = {"fault": said.to_json()}
+        if not self._has_begun:
+            self._box.begin(pid=self._pid, trial=number, started=time.monotonic())
+        self._box.report(encode_report(fault, bytes.fromhex(job["key"]), "", dumps=_dumps))
+
     def _redirect(self, folder: Path) -> None:
         """Have what is printed, and where this process is when it dies, written into the folder of the trial."""
         output = _open(folder / layout.RUN_LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
@@ -227,6 +253,8 @@ class TrialProcess:
             report["map"] = _dumps([[lane.id, lane.width, lane.shape] for lane in simulator.lanes()])
         if kept and result.spec.only is not None and supports(simulator, LeavesOut):
             report["entered"] = list(simulator.entered)
+        if kept and self._reference is not None:
+            report["responses"] = self._reference.responses
         if settings.find_escapes and result.collision is not None and supports(simulator, BrakesFully):
             braking = simulator.full_braking(result.collision.agent)
             said: dict[str, object] | None = None
@@ -274,6 +302,7 @@ class TrialProcess:
             made = TakingOver(made, spec.handover)
         if spec.overruled is not None and spec.overruled.agent == agent:
             made = overruled_agent(made, simulator, spec.overruled)
+            self._reference = made if isinstance(made, ReferenceDriver) else None
         return made
 
 

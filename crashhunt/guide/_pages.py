@@ -26,11 +26,11 @@ SECTIONS = {
 """The folders of the guide with their titles, in reading order."""
 
 _ORDER = [
-    "first-hunt", "your-town", "highway-env", "gymnasium", "ci",
-    "agent", "scenario", "searching", "disturbances", "probes", "branches", "look-into-a-crash", "kinds-of-crashes",
-    "fault", "judge", "causes", "what-if", "shrink", "film", "near-misses", "hand-over", "corpus", "suites", "warm-up",
-    "cluster", "rate", "rare", "compare", "train",
-    "commands", "api", "toml", "outcomes", "files", "json", "determinism", "security",
+    "first-hunt", "your-town", "from-a-map", "highway-env", "gymnasium", "ci",
+    "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
+    "kinds-of-crashes", "fault", "omissions", "judge", "causes", "what-if", "shrink", "film", "near-misses",
+    "hand-over", "corpus", "suites", "warm-up", "cluster", "dashboard", "rate", "rare", "compare", "gate", "train",
+    "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "determinism", "security",
     "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
 """Topics in reading order; all other topics follow them."""

@@ -343,7 +343,7 @@ def _command(command: argparse.ArgumentParser) -> Iterator[str]:
     yield f"`{command.prog}{' ' if places else ''}{places}`\n"
     yield f"{_plain(command.description)}\n"
     for group in command._action_groups:
-        actions = [action for action in group._group_actions if action.dest != "help"]
+        actions = [action for action in group._group_actions if action.dest not in ("help", "help_all")]
         if not actions:
             continue
         if group.title not in ("positional arguments", "options"):
@@ -386,7 +386,9 @@ _SAID = {
     ".py": re.compile(r'\A"""(.+?)(?:\n\n|""")', re.DOTALL),
     ".cpp": re.compile(r"\A// (.+?)\n"),
     ".hpp": re.compile(r"\A// (.+?)\n"),
-    ".html": re.compile(r"\A<!DOCTYPE html>\n<!-- (.+?) -->"),
+    ".html": re.compile(r"\A(?:<!DOCTYPE html>\n)?<!-- (.+?) -->"),
+    ".css": re.compile(r"\A/\* (.+?) \*/"),
+    ".js": re.compile(r"\A/\* (.+?) \*/"),
 }
 """What a file says first of itself; read as text, since importing everything would take seconds."""
 
@@ -410,6 +412,8 @@ def _members(folder: Path) -> Iterator[str]:
     for file in sorted(folder.iterdir()):
         if file.suffix in _SAID and file.name != "__init__.py":
             yield f"- `{file.name}`: {_said(file)}"
+        elif file.is_dir() and not (file / "__init__.py").exists():  # pages and scripts, which are no package
+            yield from (line.replace("- `", f"- `{file.name}/", 1) for line in _members(file))
 
 
 def _said(file: Path) -> str:

@@ -1,6 +1,7 @@
 from ._check import Checked as Checked, check as check, salvage as salvage
 from ._hunt import Hunt as Hunt
 from ._next_trials import Trials as Trials, spec_of as spec_of
+from ._phases import PhaseStatus as PhaseStatus
 from ._preflight import Preflight as Preflight, TrafficSurveyor as TrafficSurveyor
 from ._progress import (
     HuntStatus as HuntStatus,
@@ -21,6 +22,7 @@ from ._results import (
     write_text as write_text,
 )
 from ._retention import dropped_crashes as dropped_crashes
+from ._running_rates import counting_rule as counting_rule, why_no_interval as why_no_interval
 from ._state import (
     BranchSums as BranchSums,
     HuntDirectory as HuntDirectory,
@@ -31,4 +33,8 @@ from ._state import (
     find_hunts as find_hunts,
     hunt_state as hunt_state,
     is_hunt as is_hunt,
+    state_of_facts as state_of_facts,
+    sums_of_branches as sums_of_branches,
+    sums_of_probes as sums_of_probes,
 )
+from ._tally import CrashTally as CrashTally, FoundCrashes as FoundCrashes, find_crashes as find_crashes

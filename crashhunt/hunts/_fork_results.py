@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.hunts._rare import PrecisionRule, crashed_copies, greatest_weight
+from crashhunt.hunts._rare import RareWatch, crashed_copies
 from crashhunt.hunts._reports import BranchReport, ProbeReport, RareReport
 from crashhunt.hunts._state import BRANCHES, PROBES
 from crashhunt.hunts._verification import Found
@@ -77,7 +77,7 @@ def verify_branches(copies: VerificationRuns) -> BranchReport | None:
         for number, branch in sorted(found, key=lambda pair: (pair[0] not in kept, -_likely(pair[1])))[:_LIKELIEST]
         if (result := ledger.result(number)) is not None
     ]
-    crashes, not_finished = copies.crashes(specs, layout.BRANCHES)
+    crashes, not_finished = copies.crashes(specs, layout.BRANCHES, "branches")
     return BranchReport(
         trials=sums["trials"],
         moments=sums["moments"],
@@ -150,7 +150,7 @@ def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
         if (result := ledger.result(number)) is not None
     ]
     specs = [one for result in results if (one := mildest(result)) is not None]
-    crashes, not_finished = copies.crashes(specs, layout.PROBES)
+    crashes, not_finished = copies.crashes(specs, layout.PROBES, "probes")
     asked = {result.spec.number: result.stress for result in results}
     return ProbeReport(
         margins=tuple(margins),
@@ -286,8 +286,6 @@ def verify_fork_results(copies: VerificationRuns) -> tuple[ProbeReport | None, B
 
 # Rare mode: the weightiest crashes of forks are run from the start.
 
-_WEIGHTIEST = 5  # roots; a crash of a copy is a crash only where it comes again from the start
-
 
 def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport | None:
     """Estimate the rate, and run the weightiest crashes of copies from the start, in fresh processes.
@@ -302,13 +300,12 @@ def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport
     again = copies.again
     if not again.settings.rare or copies.disturber is None:
         return None
-    rule = PrecisionRule(again.settings, again.ledger, copies.disturber)
+    rule = RareWatch(again.settings, again.ledger, copies.disturber)
     rule.read()
     found = [
-        _crash_of_copy(result, max(crashed_copies(result), key=lambda copy: copy.weight))
-        for result in sorted(rule.results, key=greatest_weight, reverse=True)[:_WEIGHTIEST]
+        _crash_of_copy(result, max(crashed_copies(result), key=lambda copy: copy.weight)) for result in rule.weightiest
     ]
-    crashes, not_finished = copies.crashes(found, layout.BRANCHES)
+    crashes, not_finished = copies.crashes(found, layout.BRANCHES, "rare crashes")
     verified = 0 if copies.is_stopped else len(found)
     estimate = rule.estimate()
     why = f"{differences} trials of the audit were not the same again" if differences else ""

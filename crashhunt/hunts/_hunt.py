@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from contextlib import suppress
 from dataclasses import replace
@@ -17,16 +18,27 @@ from crashhunt.episode import scratch_of
 from crashhunt.executors import SharedExecutors, make_executor, read_map
 from crashhunt.hunts._fork_results import CopiedCrashes, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import LAG, Trials, Unanswered, settings_of_workers
+from crashhunt.hunts._phases import PhaseClock, PhaseStatus, RemainingTime
 from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
 from crashhunt.hunts._progress import HuntStatus, Progress
-from crashhunt.hunts._rare import Forcings, PrecisionRule
+from crashhunt.hunts._rare import Forcings, RareWatch
 from crashhunt.hunts._reports import HuntReport, StoppedBecause
 from crashhunt.hunts._retention import keep_near_misses, prune_bundles
-from crashhunt.hunts._state import HEARTBEAT_S, HuntDirectory, copies_to_come, draws_independently, ledger_owner
-from crashhunt.hunts._verification import Audit, AuditsLeft, Confirmation, TrialReruns, VerificationRuns
+from crashhunt.hunts._running_rates import bar_watch, rate_watch
+from crashhunt.hunts._state import (
+    HEARTBEAT_S,
+    HuntDirectory,
+    copies_to_come,
+    draws_independently,
+    ledger_owner,
+    sums_of_branches,
+    sums_of_probes,
+)
+from crashhunt.hunts._tally import tally_crashes
+from crashhunt.hunts._verification import Audit, AuditsLeft, Confirmation, TrialReruns, VerificationRuns, is_settled
 from crashhunt.ledger import Ledger
-from crashhunt.plans import core_of, disturber, parallel_here, rate_of, sampler_of
-from crashhunt.rates import BarWatch, CountingRule, make_rate
+from crashhunt.plans import core_of, disturber, parallel_here, sampler_of
+from crashhunt.rates import make_rate
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
 
@@ -36,9 +48,9 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.executors import Executor
-    from crashhunt.ledger import Facts
+    from crashhunt.ledger import Facts, Noted
     from crashhunt.plans import HuntSettings
-    from crashhunt.rates import CrashRate
+    from crashhunt.rates import BarWatch, CrashRate
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.scenario import Scenario
 
@@ -145,7 +157,9 @@ class Hunt:
         progress.nearest = ledger.nearest_miss()
         before = ledger.facts()
         progress.resume(list_bundles(self.directory), settings.run, before)
-        progress.rate = _bar_watch(settings, ledger)
+        progress.tally = tally_crashes(ledger, settings.crash_on, disturbed=self._disturber is not None)
+        self._resume_counts(ledger, progress, before, settings)
+        progress.rate = bar_watch(settings, ledger)
         lag, alike = self._lag(before), not finished or draws_independently(before, settings)
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
         self._audits_left = AuditsLeft(ledger, before, worker_settings)
@@ -160,7 +174,7 @@ class Hunt:
             unanswered=again,
             forcings=self._rare(ledger, Forcings),
         )
-        self._precision = self._rare(ledger, PrecisionRule) if settings.run.until_error else None
+        progress.rare = self._rare(ledger, RareWatch)
         ledger.enter(
             "running",
             owner=ledger_owner(),
@@ -170,6 +184,7 @@ class Hunt:
             planned=settings.trials,
             until=time.time() + settings.run.duration_s if settings.run.duration else None,
             hunt_seed=settings.seed,
+            crash_on=list(settings.crash_on),
             independent=sampler.independent and not settings.seeds and alike,
             plain_origin=sampler.plain_origin or None,
             core=core_of(self.scenario, settings.run),
@@ -178,7 +193,10 @@ class Hunt:
             audits_left=self._audits_left.numbers or before.get("audits_left"),
             lag=lag if sampler.learns and settings.run.deterministic else None,
             until_rate=None if progress.rate is None else progress.rate.noted(),
+            phase=None,
+            ends_at=None,
         )
+        progress.counted = progress.rate or rate_watch(settings, ledger)
         runs_again = TrialReruns(
             place=self._place,
             ledger=ledger,
@@ -188,6 +206,7 @@ class Hunt:
             failed=progress.failed,
             stops=self._stops,
             executors=SharedExecutors(self._place.scratch / "confirmations", parallel=self._parallel_here),
+            phases=PhaseClock(self._show_phase(ledger, progress, watch), self._parallel_here),
             taken=snapshot.digest,
         )
         try:
@@ -213,19 +232,21 @@ class Hunt:
         if not progress.is_done:
             stopped = self._hunt(runs_again, ledger, trials, snapshot, progress, finished, watch)
         prune_bundles(ledger, progress, settings.run)
-        watch(self._status(progress, "confirming"))
         progress.replace(runs_again.confirm(progress.crashes))
         if self._audits_left.numbers:
-            watch(self._status(progress, "auditing"))
             self._audits_left.finish(runs_again, progress)
         near, (probes, branches) = keep_near_misses(runs_again), verify_fork_results(copies)
         rare = verify_rare(copies, differences=len(progress.audit.differences) if progress.audit else 0)
+        progress.phase = progress.ends_at = None
         watch(self._status(progress, "done"))
         self._restore_ledger(ledger, progress)
+        last: Noted = progress.noted(now=True)
+        if rare is not None:
+            last["running_rate"] = rare.estimate.running()
         invalid = progress.last_invalid if stopped == "no_valid_trial" else None
         reason = why_invalid(invalid, self.scenario) if invalid is not None else ""
         # A suite and a rerun resume what was interrupted; otherwise crashes would stay unconfirmed for good.
-        ledger.enter("interrupted" if self._stops else stopped, reason, **progress.noted())
+        ledger.enter("interrupted" if self._stops else stopped, reason, **last)
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         unanswered = 0 if stopped in ("crash", "distinct", "rate") else len(self._unanswered)
         return HuntReport(
@@ -248,9 +269,39 @@ class Hunt:
             branches=branches,
             copied=progress.ended_by_copy,
             unanswered=unanswered,
+            unconfirmed=sum(not is_settled(bundle) for bundle in crashes) if self._stops else 0,
             rare=rare,
+            tally=progress.tally,
             rate=_rate_of(self.directory, progress.rate, stopped),
         )
+
+    def _show_phase(
+        self, ledger: Ledger, progress: Progress, watch: Callable[[HuntStatus], None]
+    ) -> Callable[[PhaseStatus], None]:
+        """Return what shows the progress after the last trial, on the screen and, every second, in the ledger."""
+        noted = -math.inf
+
+        def show(phase: PhaseStatus) -> None:
+            nonlocal noted
+            began = progress.phase is None or progress.phase.name != phase.name
+            progress.phase, progress.ends_at = phase, None
+            watch(self._status(progress, phase.name))
+            if began or time.monotonic() - noted > HEARTBEAT_S:
+                noted = time.monotonic()
+                self._restore_ledger(ledger, progress)
+                ledger.note(**progress.noted())
+
+        return show
+
+    def _resume_counts(self, ledger: Ledger, progress: Progress, before: Facts, settings: HuntSettings) -> None:
+        """Take over what the screen counts from the trials of earlier runs."""
+        if before.get("origins"):
+            progress.searching.resume(sum(progress.outcomes.values()), ledger.tried_by_origin(settings.crash_on))
+        branches, probes = sums_of_branches(ledger, before), sums_of_probes(ledger, before)
+        progress.branched = branches["crashed"] if branches is not None else 0
+        progress.not_fully_asked = sum(sums["not_fully_asked"] for sums in (branches, probes) if sums is not None)
+        if probes is not None and probes["crashed_trials"] and probes["trial"] is not None:
+            progress.stressed = ledger.result(probes["trial"])
 
     def _rare(self, ledger: Ledger, make: Callable[[HuntSettings, Ledger, DisturbanceSampler], T]) -> T | None:
         """Return a part of rare mode; None in any other hunt."""
@@ -282,11 +333,12 @@ class Hunt:
         confirmation = Confirmation(runs_again, executor)
         heartbeat = 0.0
         progress.until = time.monotonic() + run.duration_s
+        progress.remaining = RemainingTime(time.monotonic())
         try:
             while True:
-                if self._precision is not None:
-                    self._precision.read(min(in_flight, default=trials.upcoming))
-                precise = self._precision is not None and self._precision.is_met
+                if progress.rare is not None:
+                    progress.rare.read(min(in_flight, default=trials.upcoming))
+                precise = progress.rare is not None and progress.rare.is_met
                 stopping = progress.last_wanted is not None or progress.time_left_s <= 0 or precise
                 for spec in [] if stopping else trials.take(_under_way(executor.capacity) - len(in_flight)):
                     executor.submit(spec)
@@ -310,6 +362,7 @@ class Hunt:
                     return "no_valid_trial"
                 self._listen(executor, audit, ledger, progress)
                 confirmation.look(progress)
+                self._expect_end(progress, executor.capacity)
                 if time.monotonic() - heartbeat > HEARTBEAT_S:
                     heartbeat = time.monotonic()
                     self._restore_ledger(ledger, progress)
@@ -341,11 +394,19 @@ class Hunt:
             confirmation.close(progress)
         if self._stops:
             return "interrupted"
-        if self._precision is not None and self._precision.is_met:
+        if progress.rare is not None and progress.rare.is_met:
             return "precise"
         if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
             return "no_valid_trial"
         return "all_trials" if trials.exhausted else "time"
+
+    def _expect_end(self, progress: Progress, parallel: int) -> None:
+        """Estimate when the last trial ends."""
+        left = self.settings.trials - sum(progress.outcomes.values())
+        found = progress.remaining.seconds_left(time.monotonic(), left, parallel) if left > 0 else 0.0
+        found = min(found, progress.time_left_s)
+        progress.parallel = parallel
+        progress.ends_at = time.time() + found if self.settings.trials and math.isfinite(found) else None
 
     def _cancelled(self, executor: Executor, in_flight: set[int], wanted: int) -> set[int]:
         """Cancel trials that are not waited for, as one is what the hunt is after; return those under way that are."""
@@ -394,8 +455,10 @@ class Hunt:
             return
         crashed = result.outcome in settings.crash_on
         progress.count(result, crashed=crashed)
-        if progress.rate is not None:
-            progress.rate.add(result)
+        left = max(0, settings.trials - sum(progress.outcomes.values()))
+        progress.remaining.ended(time.monotonic(), left, progress.parallel)
+        if progress.counted is not None:
+            progress.counted.add(result)
         if crashed:
             if progress.kinds is not None:
                 self._save(result, ledger, snapshot, progress)
@@ -434,7 +497,7 @@ class Hunt:
         self, progress: Progress, phase: str, workers: Mapping[int, BlackBoxHeader] | None = None
     ) -> HuntStatus:
         elapsed = time.monotonic() - progress.began
-        kinds, newest_s, newest_trials = progress.about_kinds()
+        kinds, newest_s, newest_trials = progress.about_kinds(running=phase != "done")
         return HuntStatus(
             phase=phase,
             planned=self.settings.trials,
@@ -444,7 +507,7 @@ class Hunt:
             elapsed_s=elapsed,
             nearest=progress.nearest,
             workers=dict(workers or {}),
-            crashes=len(progress.crashes) + (progress.unsaved is not None),
+            crashes=progress.crash_count,
             nodes=progress.nodes,
             kinds=kinds,
             newest_kind_s=newest_s,
@@ -455,20 +518,10 @@ class Hunt:
             branched=progress.branched,
             not_fully_asked=progress.not_fully_asked,
             search=progress.searching.status(),
-            rate=progress.rate,
+            rate=progress.running_rate(),
+            trials_left_s=None if progress.ends_at is None else max(0.0, progress.ends_at - time.time()),
+            progress=progress.phase,
         )
-
-
-def _bar_watch(settings: HuntSettings, ledger: Ledger) -> BarWatch | None:
-    """Return what watches the rate, with the trials that ended in earlier runs; None where there is no bar."""
-    if not settings.run.until_rate:
-        return None
-    bar, per = rate_of(settings.run.until_rate)
-    rule = CountingRule(max_steps=settings.max_steps, agents=max(1, len(settings.agents)), planned=settings.trials)
-    watch = BarWatch(rule, bar, per, settings.crash_on)
-    for data in ledger.plain_results():
-        watch.add(data)
-    return watch
 
 
 def _rate_of(directory: Path, watch: BarWatch | None, stopped: StoppedBecause) -> CrashRate | None:
@@ -480,7 +533,7 @@ def _rate_of(directory: Path, watch: BarWatch | None, stopped: StoppedBecause) -
         str(directory), watch.per, watch.counter, watch.sequence, confidence=100 * (1 - watch.alpha),
         why_no_estimate=why_not, bar=watch.bar,
     )  # fmt: skip
-    return replace(found, verdict=watch.verdict)
+    return replace(found, verdict=watch.verdict, why_undecided=watch.why_undecided)
 
 
 def _under_way(parallel: int) -> int:

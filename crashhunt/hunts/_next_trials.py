@@ -55,7 +55,7 @@ class Trials:
             proposes the same trials.
         lag: how many trials the hunt has under way at once; where it is deterministic, how many it may.
         disturber: what draws their disturbances; None where they have none.
-        forcings: the forcing of each trial, in rare mode; None in any other hunt.
+        forcings: the forcing of each root, in rare mode; None in any other hunt.
 
     Raises:
         CrashhuntError: the sampler fails, or the ledger is damaged.

@@ -10,19 +10,22 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import BundleError
-from crashhunt.crashes import Group, fault_of, groups_of, signature_of
+from crashhunt.crashes import SIGNATURE_VERSION, Group, fault_of, groups_of, signature_of
 from crashhunt.executors import HasNodes
+from crashhunt.hunts._phases import PhaseStatus, RemainingTime
 from crashhunt.hunts._reports import kind_data
+from crashhunt.hunts._tally import CrashTally
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from crashhunt.crashes import Bundle, Signature
     from crashhunt.executors import Executor, NodeFigures
+    from crashhunt.hunts._rare import RareWatch
     from crashhunt.hunts._reports import AuditReport, StoppedBecause
-    from crashhunt.ledger import Facts, Noted
+    from crashhunt.ledger import Facts, Noted, RunningRate
     from crashhunt.plans import RunSettings
-    from crashhunt.rates import BarWatch
+    from crashhunt.rates import BarWatch, RateWatch
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialResult
 
@@ -36,6 +39,7 @@ __all__ = [
     "StrategyStatus",
 ]
 
+_SHARE_OF_TIME = 0.05  # that grouping crashes for a screen may take
 
 # Which kinds of crashes a hunt has found, while it runs.
 
@@ -49,6 +53,7 @@ class Kinds:
         newest: when the last new kind came, in s since the epoch; None where that is unknown.
         only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
         dropped: of each kind, in words, the trials whose bundles were given up before.
+        dropped_at_fault: of these, the trials whose crashes are the agent's own fault.
     """
 
     def __init__(
@@ -59,6 +64,7 @@ class Kinds:
         *,
         only_at_fault: bool = False,
         dropped: Mapping[str, Sequence[int]] | None = None,
+        dropped_at_fault: Sequence[int] = (),
     ) -> None:
         self._only_at_fault = only_at_fault
         self._at_fault: set[int] = set()
@@ -67,12 +73,15 @@ class Kinds:
         self._seen: set[Signature] = set()
         self._first: dict[Signature, int] = {}  # of each kind that counts, its trial of the least number
         self._groups: tuple[Group, ...] | None = None
+        self._shown: tuple[Group, ...] = ()
+        self._due = 0.0
         self.newest = newest
         self.newest_trial: int | None = None
         there = {bundle.result.spec.number for bundle in crashes}  # it was killed before it had removed them
         self.dropped = {
             words: [number for number in numbers if number not in there] for words, numbers in (dropped or {}).items()
         }
+        self._dropped_at_fault = {number for number in dropped_at_fault if number not in there}
         for bundle in crashes:
             self._sign(bundle)
 
@@ -86,11 +95,21 @@ class Kinds:
         if self._sign(bundle):
             self.newest, self.newest_trial = time.time(), ended
 
-    def groups(self) -> tuple[Group, ...]:
-        """Return what there is, the most frequent kind first, each with its crashes in the order of their trials."""
-        if self._groups is None:  # a screen asks ten times a second
+    def groups(self, *, running: bool = False) -> tuple[Group, ...]:
+        """Return what there is, the most frequent kind first, each with its crashes in the order of their trials.
+
+        Args:
+            running: for a screen, which asks ten times a second: those of some moments ago, where new ones would take
+                too much of the time, as with 10,000 crashes.
+        """
+        began = time.monotonic()
+        if running and self._groups is None and began < self._due:
+            return self._shown
+        if self._groups is None:
             dropped = {words: len(numbers) for words, numbers in self.dropped.items()}
             self._groups = groups_of((self._signed[number] for number in sorted(self._signed)), dropped)
+            ended = time.monotonic()
+            self._shown, self._due = self._groups, ended + (ended - began) / _SHARE_OF_TIME
         return self._groups
 
     def surplus(self, keep: int) -> list[Bundle]:
@@ -103,7 +122,9 @@ class Kinds:
             for bundle in sorted(group.bundles, key=self._worth)[keep:]:
                 number = bundle.result.spec.number
                 del self._signed[number]
-                self._at_fault.discard(number)
+                if number in self._at_fault:
+                    self._at_fault.discard(number)
+                    self._dropped_at_fault.add(number)
                 self.dropped.setdefault(str(group.signature), []).append(number)
                 found.append(bundle)
         if found:
@@ -123,8 +144,13 @@ class Kinds:
 
     @property
     def at_fault(self) -> tuple[int, ...] | None:
-        """The trials whose crashes are the agent's own fault; None where that was not asked."""
-        return tuple(sorted(self._at_fault)) if self._only_at_fault else None
+        """The trials whose crashes are the agent's own fault, also without a bundle; None where that was not asked."""
+        return tuple(sorted(self._at_fault | self._dropped_at_fault)) if self._only_at_fault else None
+
+    @property
+    def dropped_at_fault(self) -> list[int]:
+        """Of the trials whose bundles were deleted, those whose crashes are the agent's own fault."""
+        return sorted(self._dropped_at_fault)
 
     def refresh(self, crashes: Sequence[Bundle]) -> None:
         """Take the crashes as they are now: they have been confirmed."""
@@ -201,11 +227,22 @@ class _Tally:
 
 @dataclass(slots=True)
 class Searching:
-    """Keeps account of the trials of this run."""
+    """Keeps account of the trials of a hunt, also those of its earlier runs."""
 
     ended: int = 0
     _tallies: dict[str, _Tally] = field(default_factory=dict)
     _grown: tuple[int, float] | None = None  # after how many trials, and when
+
+    def resume(self, ended: int, tried: Iterable[tuple[str, int, int, float, int]]) -> None:
+        """Count the trials of earlier runs.
+
+        Args:
+            ended: how many there were.
+            tried: of each origin its name, trials, trials with a danger, their sum of danger, and crashes.
+        """
+        self.ended = ended
+        for name, trials, measured, danger, crashes in tried:
+            self._tallies[name] = _Tally(trials=trials, measured=measured, danger=danger, crashes=crashes)
 
     def take(self, result: TrialResult, *, crashed: bool) -> None:
         """Count a trial that has ended."""
@@ -247,7 +284,7 @@ class HuntStatus:
     """How a hunt is going, for people who watch.
 
     Args:
-        phase: ``hunting``, ``saving``, ``auditing``, ``confirming`` or ``done``.
+        phase: ``hunting``, ``saving``, ``auditing``, ``done``, or a name of `PhaseStatus`.
         planned: trials in all; 0 where only the time is limited.
         done: trials that have ended, in earlier runs of the hunt too.
         outcomes: how they ended.
@@ -255,18 +292,20 @@ class HuntStatus:
         elapsed_s: wall time of this run.
         nearest: the trial that came nearest to a crash without one.
         workers: trial number to where it is.
-        crashes: found so far; all but the last are saved.
+        crashes: found so far, with or without a bundle.
         nodes: the machines that take part now; None where there is this one only.
         kinds: of crashes, the most frequent first; None where the first crash ends the hunt.
         newest_kind_s: how long ago the last new one came, in s; None where that is unknown.
         newest_kind_trials: how many trials have ended since; None where it came in an earlier run of the hunt.
         time_left_s: until no more trials begin, in s of wall time; infinite without a limit.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
-        stressed: the trial of this run with the least stress margin; None if no copy was asked, or if no copy crashed.
-        branched: how many branches of trials of this run have crashed.
-        not_fully_asked: of how many trials of this run a question to their copies has no answer.
-        search: which strategies have had trials in this run, and when the greatest danger grew.
-        rate: that is watched until it is certainly on one side of a bar; None where there is no bar.
+        stressed: the trial with the least stress margin; None if no copy was asked, or if no copy crashed.
+        branched: how many branches have crashed.
+        not_fully_asked: of how many trials a question to their copies has no answer.
+        search: which strategies have had trials, and when the greatest danger grew in this run.
+        rate: the crash rate so far; None where the trials bound none.
+        trials_left_s: until the last trial ends, in s of wall time; None for an estimate by the mean rate.
+        progress: of what is done after the last trial; None before.
     """
 
     phase: str
@@ -288,12 +327,18 @@ class HuntStatus:
     branched: int = 0
     not_fully_asked: int = 0
     search: SearchStatus = field(default_factory=SearchStatus)
-    rate: BarWatch | None = None
+    rate: RunningRate | None = None
+    trials_left_s: float | None = None
+    progress: PhaseStatus | None = None
 
     @property
     def seconds_left(self) -> float:
-        """When the hunt will be at its end, by trials or by the clock, whichever comes first; infinite if never."""
-        left = (self.planned - self.done) / self.rate_per_s if self.planned and self.rate_per_s else math.inf
+        """Time until the last trial, or until the limit, whichever comes first; infinite if neither is known."""
+        if not self.planned:
+            return self.time_left_s
+        if self.trials_left_s is not None:
+            return min(self.trials_left_s, self.time_left_s)
+        left = (self.planned - self.done) / self.rate_per_s if self.rate_per_s else math.inf
         return min(left, self.time_left_s)
 
     @property
@@ -306,13 +351,18 @@ class HuntStatus:
 
 @dataclass(slots=True)
 class Progress:
-    """What this run of the hunt has seen."""
+    """What the hunt has seen, in this run of it and before."""
 
     began: float = field(default_factory=time.monotonic)
     until: float = math.inf  # no trial begins
+    remaining: RemainingTime = field(default_factory=lambda: RemainingTime(time.monotonic()))
+    phase: PhaseStatus | None = None  # after the last trial
+    parallel: int = 1  # trials that run at a time
+    ends_at: float | None = None  # of the trials, in s since the epoch
     ended_here: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     crashes: list[Bundle] = field(default_factory=list)
+    tally: CrashTally = field(default_factory=CrashTally)
     found: dict[int, TrialResult] = field(default_factory=dict)  # crashes that are not saved yet
     copied: dict[int, Bundle] = field(default_factory=dict)  # what copies of trials have found, run from the start
     nearest: TrialResult | None = None
@@ -329,6 +379,8 @@ class Progress:
     kinds: Kinds | None = None
     searching: Searching = field(default_factory=Searching)
     rate: BarWatch | None = None
+    counted: RateWatch | None = None  # the same where there is a bar
+    rare: RareWatch | None = None
 
     def resume(self, crashes: list[Bundle], run: RunSettings, before: Facts) -> None:
         """Take in what was saved before."""
@@ -337,8 +389,14 @@ class Progress:
         if run.keep_going or run.only_at_fault:
             wanted = run.distinct if run.keep_going else 1
             newest = before.get("newest_kind")
-            dropped = before.get("dropped")
-            self.kinds = Kinds(wanted, crashes, newest, only_at_fault=run.only_at_fault, dropped=dropped)
+            self.kinds = Kinds(
+                wanted,
+                crashes,
+                newest,
+                only_at_fault=run.only_at_fault,
+                dropped=before.get("dropped"),
+                dropped_at_fault=before.get("dropped_at_fault") or (),
+            )
 
     def count(self, result: TrialResult, *, crashed: bool) -> None:
         """Count a trial that has ended."""
@@ -363,6 +421,7 @@ class Progress:
     def save(self, bundle: Bundle) -> None:
         """Take in a crash that has been saved."""
         self.crashes.append(bundle)
+        self.tally.add(bundle.result)
         if self.kinds is not None:
             self.kinds.add(bundle, self.ended_here)
 
@@ -410,7 +469,12 @@ class Progress:
     def disturbed(self) -> int:
         """How many of the crashes had disturbances."""
         unsaved = self.unsaved
-        return sum(one.result.disturbed for one in self.crashes) + (unsaved is not None and unsaved.disturbed)
+        return self.tally.disturbed + (unsaved is not None and unsaved.disturbed)
+
+    @property
+    def crash_count(self) -> int:
+        """How many crashes there are, with or without a bundle."""
+        return self.tally.found + (self.unsaved is not None)
 
     @property
     def time_left_s(self) -> float:
@@ -421,22 +485,38 @@ class Progress:
         """Take note of where trials run."""
         self.nodes = tuple(executor.nodes()) if supports(executor, HasNodes) else None
 
-    def noted(self) -> Noted:
-        """Return what the ledger is to say about now."""
+    def running_rate(self, *, now: bool = False) -> RunningRate | None:
+        """Return the crash rate so far; None where the trials bound none.
+
+        Args:
+            now: whether that of some moments ago will not do.
+        """
+        watch = self.rare or self.counted
+        return None if watch is None else watch.running(now=now)
+
+    def noted(self, *, now: bool = False) -> Noted:
+        """Return what the ledger is to say about now.
+
+        Args:
+            now: whether a rate of some moments ago will not do.
+        """
         nodes: Noted = {} if self.nodes is None else {"nodes": [asdict(node) for node in self.nodes]}
         kinds: Noted = {}
         if self.kinds is not None:
-            kinds = {"kinds": list(map(kind_data, self.kinds.groups())), "newest_kind": self.kinds.newest}
+            groups = list(map(kind_data, self.kinds.groups()))
+            kinds = {"kinds": groups, "kinds_version": SIGNATURE_VERSION, "newest_kind": self.kinds.newest}
         failed = self.failed_steps + sum(result.steps + result.other_steps for result in self.failed)
         in_vain: Noted = {"failed_steps": failed} if failed else {}
         audits: Noted = {} if self.audit is None else {"audits_left": self.audits_left or None}
         bar: Noted = {} if self.rate is None else {"until_rate": self.rate.noted()}
-        return {"heartbeat": time.time(), **audits, **nodes, **kinds, **in_vain, **bar}
+        rate: Noted = {"running_rate": self.running_rate(now=now)}
+        phase: Noted = {"phase": None if self.phase is None else self.phase.to_json(), "ends_at": self.ends_at}
+        return {"heartbeat": time.time(), **audits, **nodes, **kinds, **in_vain, **bar, **phase, **rate}
 
-    def about_kinds(self) -> tuple[tuple[Group, ...] | None, float | None, int | None]:
-        """Return the last three of `HuntStatus`."""
+    def about_kinds(self, *, running: bool = False) -> tuple[tuple[Group, ...] | None, float | None, int | None]:
+        """Return the last three of `HuntStatus`; `running` as of `Kinds.groups`."""
         if self.kinds is None:
             return None, None, None
         newest, trial = self.kinds.newest, self.kinds.newest_trial
         since = None if newest is None else max(0.0, time.time() - newest)
-        return self.kinds.groups(), since, None if trial is None else self.ended_here - trial
+        return self.kinds.groups(running=running), since, None if trial is None else self.ended_here - trial

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.codec import Serializable
+from crashhunt.hunts._tally import CrashTally
+from crashhunt.rates import TRIALS_PER_ROOT
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -217,23 +219,31 @@ class RareReport:
             )
         lines = [answer]
         if found.estimated is None:
-            more = f"; about {found.more_roots} more roots are needed" if found.more_roots is not None else ""
+            more = ""
+            if found.more_roots is not None:
+                more = f"; about {found.more_roots * TRIALS_PER_ROOT} more trials are needed"
             lines.append(f"  no interval from {found.roots} roots: {found.why_not}{more}")
         shares = [
             f"{cell} {part:.2g} ({part / found.disturbed:.0%})" for cell, part in found.parts.items() if found.disturbed
         ]
-        lines.append("  " + "; ".join([f"undisturbed {found.undisturbed_crashes} of {found.roots}", *shares[:5]]))
+        undisturbed = f"undisturbed {found.undisturbed_crashes} of {found.roots + found.plain} trials"
+        lines.append("  " + "; ".join([undisturbed, *shares[:_CELLS_SHOWN]]))
+        if len(shares) > _CELLS_SHOWN:
+            lines.append(f"  {_CELLS_SHOWN} of {len(shares)} parts shown; run --json has all of them")
         if found.plain_equivalent_steps is not None:
-            lines.append(
-                f"  {found.steps} steps; plain trials need about {found.plain_equivalent_steps:.2g} for the same error"
-            )
+            spent = f"{found.steps} steps, {found.plain_steps} of them in plain trials"
+            lines.append(f"  {spent}; plain trials alone need about {found.plain_equivalent_steps:.2g} steps")
         if self.verified:
             lines.append(f"  of the {self.verified} weightiest crashes, {len(self.crashes)} came again from the start")
         if found.certain is not None:
             low, high = found.certain
-            lines.append(f"  certain: at least {low:.2g}, at most {high:.2g} ({found.confidence:.0%})")
+            crashed = f"{found.plain_crashes} of {found.plain} plain trials crashed"
+            lines.append(f"  certain: at least {low:.2g}, at most {high:.2g} ({found.confidence:.0%}; {crashed})")
         lines.append("  the estimate omits failures that no copy has met; the certain bounds include them")
         return lines
+
+
+_CELLS_SHOWN = 5  # parts of the estimate of rare mode
 
 
 def kind_data(group: Group) -> KindData:
@@ -261,7 +271,7 @@ class HuntReport:
         trial_steps: number of steps of the trials.
         steps_total: number of simulated steps. It includes warm-up traffic, copies, and confirmations that failed.
         wall_s: wall time of this run, in s.
-        crashes: the crashes that were found, the one with the fewest steps first.
+        crashes: the crashes that have a bundle, the one with the fewest steps first.
         reason: in words, where no trial was valid.
         notes: facts about the run that users should know, such as trials that were run again.
         events: traffic events of all trials: kind to their number, and the number of trials that had one.
@@ -273,6 +283,8 @@ class HuntReport:
         branches: the result of the branches; None without ``--branch``.
         copied: the crash of a copy that ended the hunt. It was confirmed by a run from the start.
         rare: the result of rare mode; None without ``--rare``.
+        tally: counts of the crashes of all trials, with or without a bundle.
+        unconfirmed: number of crashes that the same command runs again, because Ctrl-C came before their confirmation.
         unanswered: number of trials that the same command runs again, because they or their copies were killed.
         rate: the rate, compared with the bar of ``until_rate``; None where there is no bar.
     """
@@ -296,8 +308,10 @@ class HuntReport:
     branches: BranchReport | None = None
     copied: Bundle | None = None
     unanswered: int = 0
+    unconfirmed: int = 0
     rate: CrashRate | None = None
     rare: RareReport | None = None
+    tally: CrashTally = field(default_factory=CrashTally)
 
     def to_json(self) -> JsonObject:
         """Return the shape that ``run --json`` prints."""
@@ -311,10 +325,12 @@ class HuntReport:
             "wall_s": round(self.wall_s, 3),
             "steps_total": self.steps_total,
             "events": {kind: {"count": count, "trials": trials} for kind, (count, trials) in self.events.items()},
+            "crashes_found": self.tally.found,
             "crashes": [bundle.summary() for bundle in self.crashes],
             "notes": list(self.notes),
             "audit": self.audit.to_json() if self.audit is not None else None,
             "unanswered": self.unanswered,
+            "unconfirmed": self.unconfirmed,
         }
         if self.probes is not None:
             found["probes"] = self.probes.to_json()

@@ -37,7 +37,7 @@ def prune_bundles(ledger: Ledger, progress: Progress, run: RunSettings) -> None:
     surplus = progress.kinds.surplus(run.keep) if progress.kinds is not None and run.keep else []
     if not surplus or progress.kinds is None:
         return
-    ledger.note(dropped=progress.kinds.dropped)
+    ledger.note(dropped=progress.kinds.dropped, dropped_at_fault=progress.kinds.dropped_at_fault)
     for bundle in surplus:
         remove_at_once(bundle.path)  # half a bundle would be a damaged one
     gone = {bundle.id for bundle in surplus}
@@ -80,8 +80,11 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
             del wanted[bundle.result.spec.number]
         else:
             remove_at_once(bundle.path)
+    if wanted:
+        again.phases.begin("near misses", len(wanted))
     try:
         for one in again.run([result.spec for result in wanted.values()], layout.NEAR_MISSES):
+            again.phases.advance()
             now, was = one.result, wanted[one.result.spec.number]
             if now.was_killed_from_outside:
                 what = f"trial {now.spec.number}, a near miss, was {now.summary}"

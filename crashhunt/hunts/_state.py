@@ -9,7 +9,7 @@ import os
 import shutil
 import socket
 import time
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 from crashhunt.base import layout
 from crashhunt.base.codec import OMIT_DEFAULT, Serializable, written_if
 from crashhunt.base.errors import BusyError, HuntDirectoryError
-from crashhunt.base.integrity import changed_file, read_object
+from crashhunt.base.integrity import changed_file
 from crashhunt.base.temporary import remove_ended, remove_scratch, temporary_beside, this_process
 from crashhunt.base.text import near_path
 from crashhunt.crashes import crash_folders, files_of
-from crashhunt.ledger import KindData, Ledger, damaged, has_begun
+from crashhunt.hunts._tally import outcomes_of_crashes, tally_crashes
+from crashhunt.ledger import KindData, Ledger, RunningRate, damaged, has_begun
 from crashhunt.plans import HuntSettings, read_settings, write_settings
 from crashhunt.trial import Outcome
 
@@ -49,6 +50,7 @@ __all__ = [
     "hunt_state",
     "is_hunt",
     "ledger_owner",
+    "state_of_facts",
     "sums_of_branches",
     "sums_of_probes",
 ]
@@ -192,15 +194,20 @@ class HuntState(Serializable):
         trials_planned: how many were asked for; 0 where only the time is limited.
         trials_run: how many have ended.
         outcomes: how.
-        crashes: how many were saved.
+        crashes: how many were found, with or without a bundle.
+        crashes_saved: how many have a bundle, where these are fewer (``--keep``); else None.
         errors: how many trials could not be set up, or ended in a software fault.
         rate_per_s: trials a second, in its last run.
-        seconds_left: to the last trial, at that rate, or until its time is up; None where it does not run.
+        seconds_left: to the last trial, or until its time is up, or to the end of its phase; None where it does not
+            run, or where that is unknown.
         owner_alive: whether its process is there.
         damaged: whether its ledger cannot be read, so that the counts say nothing.
+        phase: what it does after its last trial: fields of `PhaseStatus` but the time; None before, and where it does
+            not run.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
         probes: what came of them so far; None where it has none.
         branches: likewise.
+        rate: the crash rate, as it was at its last heartbeat: fields of `RunningRate`; None where none is known.
         core: whether the simulator's compiled core is used; None where it has none.
         nodes: the machines on which it runs, or ran last: fields of `NodeFigures`; None where it was this one only.
         kinds: of crashes, the most frequent first: fields of `KindData`; None where the first crash ends the hunt.
@@ -219,6 +226,8 @@ class HuntState(Serializable):
     seconds_left: float | None = None
     owner_alive: bool = False
     damaged: bool = False
+    crashes_saved: int | None = field(default=None, metadata=OMIT_DEFAULT)
+    phase: dict[str, Any] | None = field(default=None, metadata=OMIT_DEFAULT)
     disturbed: int | None = field(default=None, metadata=OMIT_DEFAULT)
     core: str | None = field(default=None, metadata=OMIT_DEFAULT)
     nodes: list[dict[str, Any]] | None = field(default=None, metadata=OMIT_DEFAULT)
@@ -226,6 +235,7 @@ class HuntState(Serializable):
     newest_kind_s: float | None = field(default=None, metadata=written_if(lambda state: state.kinds is not None))
     probes: ProbeSums | None = field(default=None, metadata=OMIT_DEFAULT)
     branches: BranchSums | None = field(default=None, metadata=OMIT_DEFAULT)
+    rate: RunningRate | None = field(default=None, metadata=OMIT_DEFAULT)
 
     @property
     def failed(self) -> bool:
@@ -280,7 +290,7 @@ def hunt_state(directory: Path) -> HuntState:
     try:
         with closing(Ledger(directory / layout.LEDGER)) as ledger:
             facts, outcomes, last = ledger.facts(), ledger.outcomes(), ledger.last_ended_at()
-            found = _state(directory, facts, outcomes, last)
+            found = _with_crashes(state_of_facts(directory, facts, outcomes, last), ledger, facts)
             return replace(found, probes=sums_of_probes(ledger, facts), branches=sums_of_branches(ledger, facts))
     except HuntDirectoryError as error:
         if not (directory / layout.LEDGER).exists():
@@ -292,17 +302,22 @@ def hunt_state(directory: Path) -> HuntState:
         return HuntState(str(directory), "error", str(wrong), damaged=True)
 
 
-def _state(directory: Path, facts: Facts, outcomes: dict[str, int], last: float | None) -> HuntState:
+def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last: float | None) -> HuntState:
+    """Return the state of a hunt from what its ledger says, without its crashes and the sums over its copies.
+
+    Args:
+        directory: of the hunt.
+        facts: of its ledger.
+        outcomes: how many trials ended how.
+        last: when the last trial ended, in s since the epoch; None where none has.
+    """
     said = facts.get("state", "queued")
     owner = facts.get("owner")
     alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))
-    crashes = len(crash_folders(directory))
     state: State = ("running" if alive else "killed") if said == "running" else _ENDED.get(said, "error")
-    if state == "finished" and crashes:
-        state = "crashed"
     run = sum(outcomes.values())
     planned, began = int(facts.get("planned", 0)), float(facts.get("began", 0.0))
-    until = time.time() if state == "running" else (last or began)
+    until = time.time() if state == "running" and not facts.get("phase") else (last or began)
     here = run - int(facts.get("done_before", 0))
     rate = here / (until - began) if until > began and here > 0 else 0.0
     return HuntState(
@@ -312,21 +327,32 @@ def _state(directory: Path, facts: Facts, outcomes: dict[str, int], last: float 
         trials_planned=planned,
         trials_run=run,
         outcomes=outcomes,
-        crashes=crashes,
         errors=sum(n for name, n in outcomes.items() if name == Outcome.INVALID or Outcome(name).is_software_fault),
         rate_per_s=rate,
         seconds_left=_seconds_left(facts, planned - run, rate) if state == "running" else None,
+        phase=_phase(facts) if state == "running" else None,
         owner_alive=alive,
-        disturbed=_disturbed(directory) if facts.get("disturb") else None,
         core=facts.get("core"),
         nodes=facts.get("nodes"),
         kinds=facts.get("kinds"),
+        rate=facts.get("running_rate"),
         newest_kind_s=max(0.0, time.time() - newest) if (newest := facts.get("newest_kind")) is not None else None,
     )
 
 
+def _phase(facts: Facts) -> dict[str, Any] | None:
+    """Return what a running hunt does after its last trial."""
+    phase = facts.get("phase")
+    return {name: phase[name] for name in ("name", "done", "total")} if phase else None
+
+
 def _seconds_left(facts: Facts, trials: int, rate: float) -> float | None:
-    """Until the last trial, at that rate, or until the time is up, whichever is first."""
+    """Until the last trial, or until the time is up, whichever is first; after that, to the end of the phase."""
+    if phase := facts.get("phase"):
+        left: float | None = phase["seconds_left"]
+        return None if left is None else max(0.0, left - (time.time() - facts.get("heartbeat", time.time())))
+    if (ends_at := facts.get("ends_at")) is not None:
+        return max(0.0, ends_at - time.time())
     until = facts.get("until")
     by_clock = math.inf if until is None else max(0.0, until - time.time())
     by_count = trials / rate if rate > 0 and facts.get("planned") else math.inf
@@ -334,13 +360,22 @@ def _seconds_left(facts: Facts, trials: int, rate: float) -> float | None:
     return left if left < math.inf else None
 
 
-def _disturbed(directory: Path) -> int:
-    """How many crashes had disturbances; unreadable bundles are not counted."""
-    count = 0
-    for path in (directory / layout.CRASHES).glob(f"{layout.SHOWN}/{layout.CRASH}"):
-        with suppress(OSError, ValueError):
-            count += read_object(path, dict[str, object]).get("disturbed") is True
-    return count
+def _with_crashes(state: HuntState, ledger: Ledger, facts: Facts) -> HuntState:
+    """Return the state with the counts of crashes over all trials."""
+    directory = Path(state.dir)
+    saved, disturbs = len(crash_folders(directory)), bool(facts.get("disturb"))
+    outcomes = outcomes_of_crashes(directory, facts)
+    tally = None if outcomes is None else tally_crashes(ledger, outcomes, disturbed=disturbs)
+    dropped = sum(len(numbers) for numbers in (facts.get("dropped") or {}).values())
+    # A bundle is written before its row.
+    found = max(saved + dropped, 0 if tally is None else tally.found)
+    return replace(
+        state,
+        state="crashed" if state.state == "finished" and found else state.state,
+        crashes=found,
+        crashes_saved=saved if saved < found else None,
+        disturbed=tally.disturbed if tally is not None and disturbs else None,
+    )
 
 
 def draws_independently(facts: Facts, settings: HuntSettings) -> bool:

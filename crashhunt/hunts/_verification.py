@@ -5,10 +5,8 @@ from __future__ import annotations
 import queue
 import shutil
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
@@ -37,6 +35,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.executors import Executor
+    from crashhunt.hunts._phases import PhaseClock, PhaseName
     from crashhunt.hunts._progress import Progress
     from crashhunt.hunts._state import HuntDirectory
     from crashhunt.ledger import Facts, Ledger
@@ -52,6 +51,7 @@ __all__ = [
     "Found",
     "TrialReruns",
     "VerificationRuns",
+    "is_settled",
 ]
 
 
@@ -133,6 +133,7 @@ class TrialReruns:
         failed: gets what was to confirm something, and ended otherwise.
         stops: non-empty as soon as a stop is requested.
         executors: which run crashes again.
+        phases: receive the progress of these runs.
         taken: the digest of the snapshot that this process has taken; without it, each snapshot has to be trusted.
     """
 
@@ -144,6 +145,7 @@ class TrialReruns:
     failed: list[TrialResult]
     stops: Sized
     executors: SharedExecutors
+    phases: PhaseClock
     taken: str = ""
 
     def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
@@ -173,16 +175,24 @@ class TrialReruns:
             try:
                 again = settings_again(self.settings, snapshot, scratch)
                 with closing(snapshot_executor(again, parallel=self.parallel)) as executor:
-                    stopped = partial(bool, self.stops)
-                    for _, result in run_trials(executor, group, stopped=stopped, check_every_s=_STOP_CHECK_S):
+                    for _, result in run_trials(executor, group, stopped=self._look, check_every_s=_STOP_CHECK_S):
                         yield Again(result=result, runs=self, snapshot=digest, scratch=scratch, folder=folder)
             finally:
                 remove_scratch(scratch)
 
     def confirm(self, crashes: Sequence[Bundle]) -> list[Bundle]:
         """Run every crash that is not fully confirmed yet once more, and return them all, in their order."""
-        with ThreadPoolExecutor(self.parallel) as threads:  # which only wait for their process
-            return list(threads.map(self.confirm_one, crashes))
+        left = [bundle for bundle in crashes if not is_settled(bundle)]
+        if not left:
+            return list(crashes)
+        self.phases.begin("confirming", len(crashes), len(crashes) - len(left))
+        found = {bundle.id: bundle for bundle in self.phases.run(self.confirm_one, left, counts=is_settled)}
+        return [found.get(bundle.id, bundle) for bundle in crashes]
+
+    def _look(self) -> bool:
+        """Show the progress; return whether a stop is requested."""
+        self.phases.tick()
+        return bool(len(self.stops))
 
     def confirm_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Bundle:
         """Run a crash that is not fully confirmed yet once more; return it as it is then.
@@ -191,8 +201,7 @@ class TrialReruns:
             bundle: the crash.
             stopped: called regularly; true to cancel.
         """
-        is_settled = bundle.confirmed is not None and not bundle.result.why_no_escape
-        if is_settled or len(self.stops) or stopped():
+        if is_settled(bundle) or len(self.stops) or stopped():
             return bundle
         try:
             found = confirm(
@@ -215,6 +224,11 @@ class TrialReruns:
     def _is_made_now(self, bundle: Bundle) -> bool | None:
         """Whether a bundle ran what this process has just taken a snapshot of, whose files need no second look."""
         return True if bundle.snapshot == self.taken and is_bundle_made_here(bundle) else None
+
+
+def is_settled(bundle: Bundle) -> bool:
+    """Whether a crash is fully confirmed, so that it is not run again."""
+    return bundle.confirmed is not None and not bundle.result.why_no_escape
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,7 +295,7 @@ class VerificationRuns:
         """Whether a stop is requested: crashes of copies may then not have been run from the start."""
         return bool(len(self.again.stops))
 
-    def crashes(self, found: Sequence[Found], folder: str) -> tuple[tuple[Bundle, ...], int]:
+    def crashes(self, found: Sequence[Found], folder: str, name: PhaseName) -> tuple[tuple[Bundle, ...], int]:
         """Return those that reproduce at the same step, and once more bit-identically, in their order.
 
         The second value is how many could not be run to their end, so that nothing is known about them.
@@ -290,6 +304,7 @@ class VerificationRuns:
             found: of different trials.
             folder: of the hunt, for the bundles; what it had before is gone, but for what is kept. If a stop is
                 requested, it stays.
+            name: of the phase.
         """
         if self.is_stopped:
             return (), 0
@@ -297,7 +312,10 @@ class VerificationRuns:
         stay = {bundle.path.name for bundle in kept.values()}
         for path in [one for one in place.iterdir() if one.name not in stay] if kept else [place]:
             remove_at_once(path)
-        crashed, unanswered = self._run([one for one in found if one.spec.number not in kept], folder)
+        asked = [one for one in found if one.spec.number not in kept]
+        if asked:  # each is run from the start, and what crashes once more
+            self.again.phases.begin(name, 2 * len(asked))
+        crashed, unanswered = self._run(asked, folder)
         crashed = kept | crashed
         return tuple(crashed[one.spec.number] for one in found if one.spec.number in crashed), len(unanswered)
 
@@ -321,6 +339,7 @@ class VerificationRuns:
         bundles: dict[int, Bundle] = {}
         try:
             for one in self.again.run([one.spec for one in found], folder):
+                self.again.phases.advance()
                 result, copy = one.result, wanted[one.result.spec.number]
                 if result.was_killed_from_outside:
                     continue
@@ -333,8 +352,7 @@ class VerificationRuns:
                 bundles[result.spec.number] = one.write(result)
         except CrashhuntError as error:
             self.again.notes.append(f"what copies have found could not be run from the start: {error}")
-        with ThreadPoolExecutor(self.again.parallel) as threads:  # which only wait for their process
-            confirmed = list(threads.map(lambda bundle: self._confirmed(bundle, unanswered), bundles.values()))
+        confirmed = self.again.phases.run(lambda bundle: self._confirmed(bundle, unanswered), list(bundles.values()))
         return {bundle.result.spec.number: bundle for bundle in confirmed if bundle is not None}, unanswered
 
     def _confirmed(self, bundle: Bundle, unanswered: set[int]) -> Bundle | None:
@@ -529,6 +547,8 @@ def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, li
     ledger = again.ledger
     wanted = {number: result for number in numbers if (result := ledger.result(number)) is not None and result.digest}
     left, differences = set(wanted), []
+    if wanted:
+        again.phases.begin("auditing", len(wanted))
     try:
         for one in again.run([result.spec for result in wanted.values()], _FOLDER):
             now, was = one.result, wanted[one.result.spec.number]
@@ -536,6 +556,7 @@ def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, li
             if now.was_killed_from_outside:
                 continue
             left.discard(now.spec.number)
+            again.phases.advance()
             if not was.is_identical_run(now):
                 difference = Difference(
                     trial=now.spec.number,

@@ -1,9 +1,11 @@
-from ._file import Row as Row, damaged as damaged
+from ._file import Row as Row, damaged as damaged, leave_untouched as leave_untouched
 from ._reader import (
+    Bounds as Bounds,
     Facts as Facts,
     KindData as KindData,
     Noted as Noted,
     Owner as Owner,
+    RunningRate as RunningRate,
     Turn as Turn,
     UntilRate as UntilRate,
 )

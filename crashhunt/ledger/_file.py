@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
-from contextlib import closing
+from contextlib import closing, contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from crashhunt.base.errors import HuntDirectoryError
@@ -14,12 +15,25 @@ from crashhunt.base.integrity import digest_of_row
 from crashhunt.trial import check_plain
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
 
 
-__all__ = ["Row", "checked", "damaged", "explained", "opened", "plain_trial", "removed", "rewrite"]
+__all__ = [
+    "Row",
+    "checked",
+    "damaged",
+    "explained",
+    "has_content",
+    "is_untouched",
+    "leave_untouched",
+    "opened",
+    "plain_trial",
+    "removed",
+    "rewrite",
+]
 
 
 Row: TypeAlias = tuple[Any, ...]
@@ -91,9 +105,47 @@ def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
     return damaged(path, text)
 
 
-def opened(path: Path) -> sqlite3.Connection:
-    """Open a ledger."""
-    return sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
+_untouched: ContextVar[bool] = ContextVar("untouched", default=False)
+
+
+@contextmanager
+def leave_untouched() -> Iterator[None]:
+    """Open every ledger that is only read as `opened` does with `read_only`, in whatever is called meanwhile."""
+    before = _untouched.set(True)
+    try:
+        yield
+    finally:
+        _untouched.reset(before)
+
+
+def is_untouched() -> bool:
+    """Whether the caller is within `leave_untouched`."""
+    return _untouched.get()
+
+
+def opened(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
+    """Open a ledger.
+
+    Args:
+        path: of the file.
+        read_only: leave the folder as it is. SQLite makes two files next to a ledger that is read, and the last reader
+            of a killed hunt moves one of them into the ledger.
+    """
+    if not read_only:
+        return sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
+    log = path.with_name(f"{path.name}-wal")
+    # Without a write-ahead log, nothing writes to the file. With one, readers need the shared memory next to it.
+    mode = "mode=ro" if has_content(log) else "mode=ro&immutable=1"
+    uri = f"{path.absolute().as_uri()}?{mode}"
+    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False, timeout=10.0)
+
+
+def has_content(path: Path) -> bool:
+    """Whether a file is there, and not empty."""
+    try:
+        return path.stat().st_size > 0
+    except OSError:
+        return False
 
 
 def removed(path: Path, was: os.stat_result) -> bool:

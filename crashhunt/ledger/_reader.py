@@ -6,13 +6,14 @@ import hashlib
 import json
 import re
 import sqlite3
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypedDict, cast
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.ledger._file import Row, checked, damaged, explained, plain_trial
 from crashhunt.ledger._schema import OWN_FACTS, SEAL, WITH_EVENTS
-from crashhunt.trial import TrialResult, TrialSpec
+from crashhunt.trial import KILLED, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -54,6 +55,52 @@ class UntilRate(TypedDict):
     verdict: str
 
 
+class Bounds(TypedDict):
+    """An interval.
+
+    Args:
+        low: the least rate.
+        high: the greatest; None where nothing bounds it.
+    """
+
+    low: float
+    high: float | None
+
+
+class RunningRate(TypedDict):
+    """The rate of a hunt so far, as ``status --json`` reports it.
+
+    Args:
+        method: ``plain``, counted trials; or ``rare``, copies with forced onsets, and plain trials.
+        per: what the rate is per.
+        confidence: of all intervals, in percent.
+        units: independent units that count: trials, traffics or roots.
+        trials: plain trials that count.
+        crashes: of them.
+        origin: the origin of the trials that count; empty where all do.
+        certain: interval that is valid whenever you look; None where there is none.
+        estimate: crash probability per trial by the copies; None where there is none.
+        estimated: interval for it; None where the roots cannot carry one.
+        why_not: why there is no certain interval, or no estimated one; empty where there is.
+        bar: rate that the hunt is compared with; None for none.
+        verdict: ``below``, ``above`` or ``undecided``; empty without a bar.
+    """
+
+    method: Literal["plain", "rare"]
+    per: Literal["trial", "hour", "1000km"]
+    confidence: float
+    units: int
+    trials: int
+    crashes: int
+    origin: str
+    certain: Bounds | None
+    estimate: float | None
+    estimated: Bounds | None
+    why_not: str
+    bar: float | None
+    verdict: str
+
+
 class Noted(TypedDict, total=False):
     """What is noted of a hunt besides its state; None where something no longer holds.
 
@@ -75,12 +122,18 @@ class Noted(TypedDict, total=False):
         confirmed: of these, how many trials were run from the start of what they found, and how many crashed there.
         nodes: the machines on which it ran last, where there were several: fields of `NodeFigures`.
         kinds: of crashes, the most frequent first, where it collects them all.
+        kinds_version: of the rules that say which crashes are of one kind.
+        crash_on: the outcomes that count as a crash.
         dropped: of each kind, in words, the trials whose crashes are in the ledger only, as shorter ones were kept.
+        dropped_at_fault: of these, the trials whose crashes are the agent's own fault, where that is asked.
         newest_kind: when the last new one came, in s since the epoch; None if none or unknown.
         audits_left: the trials that were to be run again for the audit, and have not been; None where there is none.
+        phase: what the hunt does after its last trial: fields of `PhaseStatus`; None before and at its end.
+        ends_at: when its last trial is expected to end, in s since the epoch; None where that is unknown.
         failed_steps: how many steps were simulated to confirm something that was not confirmed.
         until_rate: ``bar``, as it was given, ``decided_at``, the number of the trial that decided, and ``verdict``;
             None where the hunt has no bar.
+        running_rate: the crash rate so far: None where no rate is known.
     """
 
     owner: Owner | None
@@ -100,11 +153,17 @@ class Noted(TypedDict, total=False):
     confirmed: Mapping[str, Sequence[int]] | None
     nodes: list[dict[str, Any]]
     kinds: list[KindData]
+    kinds_version: int
+    crash_on: list[str]
     newest_kind: float | None
     audits_left: list[int] | None
+    phase: dict[str, Any] | None
+    ends_at: float | None
     failed_steps: int
     dropped: dict[str, list[int]]
+    dropped_at_fault: list[int]
     until_rate: UntilRate | None
+    running_rate: RunningRate | None
 
 
 class Facts(Noted, total=False):
@@ -260,6 +319,41 @@ class LedgerReader:
         trials = "(SELECT number, iif(json_valid(result), result, '{}') AS data FROM trials)"
         return list(self._select(f"SELECT {what} FROM ({each} FROM {trials})"))
 
+    def disturbed_crashes(self, outcomes: tuple[str, ...]) -> tuple[int, tuple[int, str, float] | None]:
+        """Return how many crashes had disturbances, and of the likeliest its number, outcome and log-likelihood.
+
+        Args:
+            outcomes: that count as a crash.
+        """
+        marks = ",".join("?" * len(outcomes))
+        (row,) = self._select(
+            # Of a query with one max(), SQLite takes what stands bare from the row that has it.
+            "SELECT total(disturbed), max(iif(disturbed, likely, NULL)), number, outcome FROM (SELECT number, outcome, "
+            "json_extract(data, '$.log_likelihood') AS likely, "
+            "coalesce(json_array_length(data, '$.disturbances'), 0) > 0 AS disturbed FROM ("
+            "SELECT number, outcome, iif(json_valid(result), result, '{}') AS data FROM trials "
+            f"WHERE outcome IN ({marks})))",
+            outcomes,
+        )
+        count, likely, number, outcome = row
+        return int(count), None if likely is None else (number, outcome, float(likely))
+
+    def tried_by_origin(self, outcomes: tuple[str, ...]) -> list[tuple[str, int, int, float, int]]:
+        """Return of each origin of trials its name, trials, trials with a danger, their sum of danger, and crashes.
+
+        Args:
+            outcomes: that count as a crash, of which each has a danger of 1.
+        """
+        marks = ",".join("?" * len(outcomes))
+        rows = self._select(
+            "SELECT origin, count(*), count(danger), total(danger), total(crashed) FROM (SELECT "
+            "json_extract(data, '$.spec.origin') AS origin, crashed, iif(crashed, 1.0, json_extract(data, '$.danger')) "
+            f"AS danger FROM (SELECT outcome IN ({marks}) AS crashed, iif(json_valid(result), result, '{{}}') AS data "
+            "FROM trials)) WHERE origin > '' GROUP BY origin",
+            outcomes,
+        )
+        return [(name, count, measured, danger, int(crashes)) for name, count, measured, danger, crashes in rows]
+
     def trial_steps(self) -> int:
         """Return how many steps trials have taken."""
         seal = self._seal()
@@ -298,6 +392,19 @@ class LedgerReader:
             if count != sum(said.values()) and self._seal() == seal:
                 raise damaged(self._path, f"it has {count} such trials, and {sum(said.values())} were written")
 
+    def endings(self) -> Iterator[tuple[int, str, str, bool]]:
+        """Yield how trials ended, in the order of their numbers, without reading their rows as a whole.
+
+        Each is number, outcome, origin, and whether its process was killed from outside.
+        """
+        of = "iif(json_valid(result), result, '{}')"
+        rows = self._select(
+            f"SELECT number, outcome, json_extract({of}, '$.spec.origin'), json_extract({of}, '$.failure.kind') = ? "
+            "FROM trials ORDER BY number",
+            (KILLED,),
+        )
+        return ((number, outcome, origin or "", bool(was_killed)) for number, outcome, origin, was_killed in rows)
+
     def intact_rows(self, numbers: Iterable[int]) -> Iterator[tuple[int, Row | None]]:
         """Yield the rows of trials, whatever has become of the others: None for one that is not as it was written."""
         for number in numbers:
@@ -329,8 +436,12 @@ class LedgerReader:
 
     def results_where(self, condition: str, *values: float) -> Iterator[TrialResult]:
         """Yield the trials whose rows fulfil a condition in SQL, in the order of their numbers."""
+        return map(self._result, self.plain_results_where(condition, *values))
+
+    def plain_results_where(self, condition: str, *values: float) -> Iterator[JsonObject]:
+        """Yield the same as plain data."""
         rows = self._select(f"{self._shape.select('trials')} WHERE {condition} ORDER BY number", values)
-        return (self._result(self._plain(row)) for row in rows)
+        return map(self._plain, rows)
 
     def result_text(self, number: int) -> str | None:
         """Return one trial as it is written, or None where it has not ended."""
@@ -396,6 +507,71 @@ class LedgerReader:
             said.update(_as_text(rows))
             yield from rows
         self._compare_seal(seal, "table", said.hexdigest())
+
+    # What a reader that follows a hunt asks again and again: what has come, and not all of it.
+
+    @contextmanager
+    def one_moment(self) -> Iterator[None]:
+        """Read everything as of one moment, although the hunt writes on."""
+        next(self._select("BEGIN"), None)
+        try:
+            yield
+        finally:
+            if self._database.in_transaction:
+                self._database.execute("ROLLBACK")
+
+    def last_number(self) -> int:
+        """Return the greatest number of a trial that has ended; -1 where none has."""
+        return int(next(self._select("SELECT coalesce(max(number), -1) FROM trials"))[0])
+
+    def replaced_count(self) -> int:
+        """Return how many trials have been moved out of the way to run again."""
+        return self._count("replaced")
+
+    def steps_by_outcome(self) -> dict[str, tuple[int, int, int]]:
+        """Return for each outcome how many trials had it, and the least and the most steps of one; from an index."""
+        rows = self._select("SELECT outcome, count(*), min(steps), max(steps) FROM trials GROUP BY outcome")
+        return {outcome: (trials, least, most) for outcome, trials, least, most in rows}
+
+    def parts_of(self, width: int, outcome: str) -> Iterator[tuple[int, int, int]]:
+        """Yield part, trials and steps of all trials that ended in one way, from an index only.
+
+        Args:
+            width: numbers of trials in a part; part i begins with trial i * width.
+            outcome: how they ended.
+        """
+        yield from self._select(
+            "SELECT number / ?, count(*), sum(steps) FROM trials WHERE outcome = ? GROUP BY number / ?",
+            (width, outcome, width),
+        )
+
+    def ended_between(self, first: int, last: int) -> Iterator[tuple[int, str, int]]:
+        """Yield number, outcome and steps of the trials whose numbers are in a range, both ends included."""
+        yield from self._select(
+            "SELECT number, outcome, steps FROM trials WHERE number BETWEEN ? AND ? ORDER BY number", (first, last)
+        )
+
+    def numbers_of(self, outcomes: Iterable[str]) -> list[int]:
+        """Return the numbers of the trials that ended in one of some ways, in order; from an index only."""
+        found: list[int] = []
+        for outcome in outcomes:
+            found += (number for (number,) in self._select("SELECT number FROM trials WHERE outcome = ?", (outcome,)))
+        return sorted(found)
+
+    def killed_numbers(self, first: int = 0) -> list[int]:
+        """Return the numbers, from one on, of trials that were killed from outside, in order: they run again."""
+        sign = f'"kind": "{KILLED}"'
+        query = "SELECT number FROM trials WHERE outcome = 'invalid' AND number >= ? AND instr(result, ?) > 0"
+        return sorted(number for (number,) in self._select(query, (first, sign)))
+
+    def plain_trial(self, number: int) -> JsonObject | None:
+        """Return one trial as plain data; None where it has not ended.
+
+        Raises:
+            HuntDirectoryError: it is not as it was written.
+        """
+        row = self._row(number)
+        return None if row is None else self._plain(row)
 
     def last_ended_at(self) -> float | None:
         """Return when the last trial ended, in s since the epoch; None where none has."""

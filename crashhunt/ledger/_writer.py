@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Unpack
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.ledger._file import damaged, explained, opened, removed, rewrite
+from crashhunt.ledger._file import damaged, explained, is_untouched, opened, removed, rewrite
 from crashhunt.ledger._reader import LedgerReader, Turn
 from crashhunt.ledger._schema import SEAL, VERSION, columns_of_trials, create, migrate, shape_of
 
@@ -49,12 +49,13 @@ class Ledger(LedgerReader):
     Args:
         path: of ``ledger.sqlite``.
         writable: the one writer; creates the file, and brings one of an earlier version to this one.
+        read_only: leave even SQLite's own files next to it as they are; for a reader of foreign hunts.
 
     Raises:
         HuntDirectoryError: the file cannot be opened, is not a ledger, or is damaged.
     """
 
-    def __init__(self, path: Path, *, writable: bool = False) -> None:
+    def __init__(self, path: Path, *, writable: bool = False, read_only: bool = False) -> None:
         self._writable = False
         self._together_since = math.inf
         if not writable and not path.exists():
@@ -65,7 +66,7 @@ class Ledger(LedgerReader):
         try:
             if writable and not has_begun(path):
                 create(path)
-            database = opened(path)
+            database = opened(path, read_only=read_only or (not writable and is_untouched()))
             with ExitStack() as failed:
                 failed.callback(database.close)
                 super().__init__(database, path, shape_of(database, path))

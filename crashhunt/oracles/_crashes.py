@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.oracles._protocol import Finding
 from crashhunt.trial import Collision, Outcome
-from crashhunt.world import first_contact, outlines_overlap, reachable_m
+from crashhunt.world import contact_at, first_contact, lane_jump, outlines_overlap, reachable_m
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["HARDEST", "OffRoad", "Overlap", "ReportedCollision"]
 
+_NEAR_M = 1.0  # a reported collision of actors further apart is not one of their outlines
+
 HARDEST = 10.0
 """Upper bound of braking, in m/s²: it bounds the speed of an actor in the previous scene."""
 
@@ -24,8 +26,8 @@ HARDEST = 10.0
 class ReportedCollision:
     """Believes the simulator's own list of collisions, where a controlled vehicle takes part.
 
-    Outlines decide the collider and the time, where they overlap. After a long step the simulator may report the
-    two vehicles in the wrong order.
+    The ways of both actors decide the collider, the speeds and the time. After a long step or a lane change the
+    simulator may report the two vehicles in the wrong order, and a lane that is not the agent's.
     """
 
     name = "reported"
@@ -41,13 +43,14 @@ class ReportedCollision:
         return findings
 
     def _collision(self, scene: Scene, agent: str, contact: Contact) -> Collision:
-        x, y, lane = _where(scene, agent)
         index = scene.roster.index
         other = contact.victim if agent == contact.collider else contact.collider
         if scene.swept and agent in index and other in index:
-            touch = first_contact(scene.previous, scene, index[agent], index[other])
-            if touch is not None:
-                return _touching(self.name, agent, other, touch, contact.kind, contact.lane or lane)
+            touch = contact_at(scene.previous, scene, index[agent], index[other])
+            if touch.gap_m < _NEAR_M:
+                lane = _lane_at(scene, agent, touch) or contact.lane
+                return _touching(self.name, agent, other, touch, contact.kind, lane)
+        x, y, lane = _where(scene, agent)
         return Collision(
             agent=agent,
             role="alone" if not contact.victim else "collider" if agent == contact.collider else "victim",
@@ -57,7 +60,7 @@ class ReportedCollision:
             kind=contact.kind,
             x=x,
             y=y,
-            lane=contact.lane or lane,
+            lane=lane or contact.lane,
             collider_speed=contact.collider_speed,
             victim_speed=contact.victim_speed,
             time_s=scene.time_s,
@@ -67,8 +70,8 @@ class ReportedCollision:
 class Overlap:
     """Sees a collision where the outlines of a controlled vehicle and another actor overlap, or did within the step.
 
-    Simulators miss some: SUMO compares vehicles of one lane only. The collider is the vehicle that
-    has the other in front of it at the first touch.
+    Simulators miss some: SUMO compares vehicles of one lane only. The collider is the vehicle that moves into the
+    other's lane, or that has the other in front of it at the first touch. A vehicle that stands is no collider.
     """
 
     name = "overlap"
@@ -85,7 +88,7 @@ class Overlap:
                 touch = first_contact(previous, scene, row, other)
                 if touch is not None:
                     name = scene.roster.actors[other].id
-                    lane = _where(scene, agent)[2]
+                    lane = _lane_at(scene, agent, touch)
                     collision = _touching(self.name, agent, name, touch, "overlap", lane)
                     findings.append(Finding(Outcome.COLLISION, collision))
         return findings
@@ -220,6 +223,14 @@ def _touching(name: str, agent: str, other: str, touch: Touch, kind: str, lane: 
     speeds = (touch.speed, touch.other_speed) if touch.drives_into else (touch.other_speed, touch.speed)
     role = "collider" if touch.drives_into else "victim"
     return Collision(agent, role, collider, victim, (name,), kind, touch.x, touch.y, lane, *speeds, touch.time_s)
+
+
+def _lane_at(scene: Scene, agent: str, touch: Touch) -> str:
+    """Return the lane of an agent at a contact; empty if it is unknown."""
+    previous = scene.previous
+    if touch.share < 1.0 and previous is not None and lane_jump(previous, scene, agent):
+        return previous.agent_lanes.get(agent, "")  # it changed lanes after the contact
+    return _where(scene, agent)[2]
 
 
 def _where(scene: Scene, agent: str) -> tuple[float, float, str]:

@@ -1,6 +1,9 @@
 from ._declaration import (
+    RATE_PERS as RATE_PERS,
     Given as Given,
     HuntOption as HuntOption,
+    RatePer as RatePer,
+    check_duration as check_duration,
     check_rate as check_rate,
     rate_of as rate_of,
     seconds_of as seconds_of,

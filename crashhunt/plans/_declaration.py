@@ -15,10 +15,12 @@ from typing import Any, Literal, TypeAlias, TypeVar, Union, cast, get_args, get_
 from crashhunt.base.errors import UsageError
 
 __all__ = [
+    "RATE_PERS",
     "About",
     "Form",
     "Given",
     "HuntOption",
+    "RatePer",
     "above_zero",
     "at_least",
     "check_duration",
@@ -56,7 +58,9 @@ class About:
         unset: what holds where it is not given, in words; empty where that is the default itself.
         flag: on the command line; empty where it is not there.
         metavar: of its value, on the command line.
-        group: of the help of ``crashhunt run``.
+        group: of the help of ``crashhunt run``: what is tested, search, faults and probes, what is kept, how it runs,
+            output.
+        brief: the same in one line, for the short help of ``crashhunt run``; empty for options that it only names.
         check: says what to give instead of a value that is none.
         separator: of a list that is one word on the command line; empty where its flag may be repeated.
         named: of a table, whether every value has a name.
@@ -69,7 +73,8 @@ class About:
     unset: str = ""
     flag: str = ""
     metavar: str = ""
-    group: Literal["what", "how"] = "how"
+    group: Literal["what", "search", "faults", "kept", "run", "output"] = "run"
+    brief: str = ""
     check: Check | None = None
     separator: str = ""
     named: bool = True
@@ -275,6 +280,8 @@ def check_probe(text: str) -> str:
 # ``--until-rate RATE/UNIT`` and ``--bar RATE/UNIT``: how often an agent may crash.
 
 RatePer = Literal["trial", "hour", "1000km"]
+"""What a rate is per."""
+RATE_PERS: tuple[RatePer, ...] = get_args(RatePer)
 _RATE = re.compile(r"(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)\s*/\s*(trial|hour|1000\s?km)")
 
 

@@ -67,6 +67,7 @@ class Subject(_Options):
     scenario: Path | str = option(
         "loop", "a shipped name, or a path",
         help="a shipped scenario (see crashhunt scenarios), a folder, a scenario.toml or a .sumocfg",
+        brief="a shipped scenario, a folder, a scenario.toml or a .sumocfg",
         flag="--scenario", metavar="NAME|PATH", group="what",
     )  # fmt: skip
     ego: str = option(
@@ -85,16 +86,19 @@ class Subject(_Options):
         {}, "vehicle to who drives it, where there are several",
         help="who drives: a class or function, or a name that crashhunt agents lists; ID= where the scenario has "
         "several controlled vehicles",
+        brief="the class, function or listed name that drives",
         flag="--agent", metavar="[ID=]MODULE:ATTR", group="what", named=False,
     )  # fmt: skip
     arguments: Mapping[str, Spec] | None = option(
         {}, '``NAME`` or ``AGENT.NAME`` to a value or a specification such as ``"5:40"``',
         help=f"what to try for an argument of the agent: {_SPEC}; ID.NAME=SPEC for one of several agents",
+        brief="values of an argument of the agent: 20, 5:40, log:1e-3:1, a|b|c",
         flag="--arg", metavar="NAME=SPEC", group="what",
     )  # fmt: skip
     scenario_arguments: Mapping[str, Spec] | None = option(
         {}, "the same for arguments of the scenario: name to value or specification",
         help="the same for an argument of the scenario, such as its traffic demand",
+        brief="the same for an argument of the scenario, such as its traffic",
         flag="--set", metavar="NAME=SPEC", group="what",
     )  # fmt: skip
     oracles: Sequence[str] = option(
@@ -113,21 +117,23 @@ class TrialOptions(_Options):
         "random", "its name",
         help="random, halton, sobol, grid or sweep; or one that learns: guided, cross-entropy, mutation, cma-es, "
         "optuna:NAME, as in optuna:tpe",
-        flag="--sampler", metavar="NAME",
+        brief="random, grid, guided and others: how arguments are chosen",
+        flag="--sampler", group="search", metavar="NAME",
     )  # fmt: skip
     points: int = option(
-        10, "values that grid and sweep try of a range without a step", flag="--points", metavar="N",
+        10, "values that grid and sweep try of a range without a step", flag="--points", group="search", metavar="N",
         check=at_least(1),
     )  # fmt: skip
     seed: int | None = option(
-        None, "of the hunt", unset="a new one, which is printed", flag="--seed", metavar="N", check=at_least(0),
+        None, "of the hunt", unset="a new one, which is printed", brief="the same seed runs the same trials",
+        flag="--seed", group="search", metavar="N", check=at_least(0),
     )  # fmt: skip
     crash_on: Sequence[str] = option(
         CRASHES, "the outcomes that count as a crash",
         help="the outcomes that count as a crash: collision, off_road, agent_error, simulator_error, process_died, "
         "hang, which are the default; and traffic events: red_light, wrong_way, off_route, not_moving (for 60 s, or "
         "not_moving:S), others_collided, hard_braking (or hard_braking:M/S²), teleport",
-        flag="--crash-on", metavar="KIND,…", separator=",",
+        flag="--crash-on", group="what", metavar="KIND,…", separator=",",
     )  # fmt: skip
     disturb: Sequence[str] = option(
         (), "how often others around the agent err, or it sees or acts late: ``NAME=RATE`` with a rate per second; or "
@@ -137,30 +143,32 @@ class TrialOptions(_Options):
         "late_observation, noisy_observation, late_action or module:attribute; or in every trial from one step on, as "
         "in brake@124=ahead:4:2 for 4 m/s² and 2 s; none for nothing at all",
         unset="as the scenario says, and nothing where it is silent",
-        flag="--disturb", metavar="NAME=RATE,…", separator=",",
+        brief="faults of other actors or of sensors, such as brake=0.02",
+        flag="--disturb", group="faults", metavar="NAME=RATE,…", separator=",",
     )  # fmt: skip
     probe: str = option(
         "", "how often copies of a trial are asked for the mildest disturbance with which it crashes, such as ``4s``",
         help="every so many seconds of simulation, ask copies of the trial for the mildest disturbance with which it "
-        "crashes, such as 4s", unset="never", flag="--probe", metavar="TIME", check=check_probe,
+        "crashes, such as 4s", unset="never", flag="--probe", group="faults", metavar="TIME", check=check_probe,
     )  # fmt: skip
     branch: bool = option(
         False, "whether copies of a trial continue with other disturbances where another actor is near",
         help="where another actor is near, continue copies of a trial with several disturbances, from then and "
         "from some seconds before; needs --disturb",
-        flag="--branch",
+        flag="--branch", group="faults",
     )  # fmt: skip
     rare: bool = option(
         False, "whether to estimate how often rare crashes happen, by copies of trials with forced disturbances",
-        help="estimate how often rare crashes happen: trials run undisturbed, and copies of each begin with a first "
-        "disturbance, weighted by its probability; needs --disturb with rates and implies --keep-going",
-        flag="--rare",
+        help="estimate how often rare crashes happen: one of five trials runs undisturbed, and copies of it begin with "
+        "a first disturbance, weighted by its probability; needs --disturb with rates and implies --keep-going",
+        flag="--rare", group="faults",
     )  # fmt: skip
     seeds: int = option(
         0, "how many traffics there are, each used for many arguments; 0: every trial has its own",
         help="draw so many traffics (a seed, and the scenario's arguments), and use each for many arguments of the "
         "agents, from one warm-up",
-        unset="every trial has its own", flag="--seeds", metavar="N", check=at_least(0, zero="every trial has its own"),
+        unset="every trial has its own",
+        flag="--seeds", group="search", metavar="N", check=at_least(0, zero="every trial has its own"),
     )  # fmt: skip
 
 
@@ -171,94 +179,98 @@ class RunOptions(_Options):
     duration: str = option(
         "", "time limit of the hunt: ``90s``, ``30m``, ``1h30m``; TRIALS may be 0 then",
         help="begin no trial after this time, such as 90s, 30m or 1h30m; TRIALS may be 0 then, for no limit",
-        unset="as long as it takes", flag="--for", metavar="TIME", check=check_duration,
+        unset="as long as it takes", brief="begin no trial after this time, such as 30m",
+        flag="--for", group="search", metavar="TIME", check=check_duration,
     )  # fmt: skip
     keep_going: bool = option(
-        False, "collect all crashes instead of stopping at the first", flag="--keep-going",
+        False, "collect all crashes instead of stopping at the first",
+        brief="collect all crashes instead of stopping at the first",
+        flag="--keep-going", group="search",
     )  # fmt: skip
     distinct: int = option(
         0, "end after so many crash types, and collect all crashes until then; 0: never",
         help="collect all crashes until N crash types have been found, as crashhunt crashes groups "
         "them; 0: never stop for that",
-        flag="--distinct", metavar="N", check=at_least(0, zero="never"),
+        flag="--distinct", group="search", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
     until_rate: str = option(
         "", "a rate, such as ``1e-3/trial``, ``2/hour`` or ``5/1000km``: end once the agent certainly crashes less, or "
         "more, often",
         help="end once the agent certainly crashes less, or more, often than this, such as 1e-3/trial, 2/hour or "
         "5/1000km; collects all crashes, and TRIALS may be 0; exit code 0: below, 1: above, 3: undecided",
-        unset="run all trials", flag="--until-rate", metavar="RATE", check=check_rate,
+        unset="run all trials", flag="--until-rate", group="search", metavar="RATE", check=check_rate,
     )  # fmt: skip
     most: int = option(
         0, "with ``until_rate``, how many trials it has at most; 0: as many as TRIALS says",
         help="with --until-rate: run N trials at most; 0: as many as TRIALS says",
-        flag="--most", metavar="N", check=at_least(0, zero="as many as TRIALS says"),
+        flag="--most", group="search", metavar="N", check=at_least(0, zero="as many as TRIALS says"),
     )  # fmt: skip
     keep: int = option(
         0, "number of bundles to keep of each crash type, those of the shortest crashes; 0: all",
         help="keep only the N shortest bundles of each crash type; the ledger keeps all crashes. Requires "
         "--keep-going or --distinct; 0: keep all",
-        flag="--keep", metavar="N", check=at_least(0, zero="keep all"),
+        brief="keep only the N shortest crashes of each type",
+        flag="--keep", group="kept", metavar="N", check=at_least(0, zero="keep all"),
     )  # fmt: skip
     only_at_fault: bool = option(
         False, "stop only at crashes that are the agent's own fault; the others are kept, and the hunt continues",
         help="hunt for crashes that are the agent's own fault, according to the rules; other and undecided crashes "
         "are kept and do not end the hunt",
-        flag="--only-at-fault",
+        flag="--only-at-fault", group="search",
     )  # fmt: skip
     until_error: str = option(
         "", "with ``rare``, end once half of the width of the interval is at most this share of the estimate: ``0.3``",
         help="with --rare: end once half of the width of the interval is at most this share of the estimate, such as "
-        "0.3", unset="all trials", flag="--until-error", metavar="SHARE", check=check_share,
+        "0.3", unset="all trials", flag="--until-error", group="faults", metavar="SHARE", check=check_share,
     )  # fmt: skip
     deterministic: bool = option(
         False, "at a crash, let running trials of lower numbers finish: the same seed gives the same crash",
-        flag="--deterministic",
+        flag="--deterministic", group="run",
     )  # fmt: skip
     timeout_s: float = option(
-        60.0, "wall-clock limit of a trial, in s", flag="--timeout", metavar="S",
+        60.0, "wall-clock limit of a trial, in s", flag="--timeout", group="run", metavar="S",
         check=above_zero("give seconds above 0"),
     )  # fmt: skip
     keep_trials: bool = option(
-        False, "keep the logs of every trial, not of crashes only", flag="--keep-trials",
+        False, "keep the logs of every trial, not of crashes only", flag="--keep-trials", group="kept",
     )  # fmt: skip
     accelerate: bool = option(
         True, "speed simulators up where that changes no bit",
         help="run highway-env as it is; the accelerator changes no bit, and only the time it takes",
-        flag="--no-accelerate",
+        flag="--no-accelerate", group="run",
     )  # fmt: skip
     native: bool = option(
         True, "use the compiled core of simulators where it is there, which changes no bit",
         help="do without the compiled core, which changes no bit of SUMO's trials, and only the time they take",
-        flag="--no-native",
+        flag="--no-native", group="run",
     )  # fmt: skip
     recycle_after: int = option(
         1000, "not used any more: every trial has a process of its own",
         help="not used any more: every trial has a process of its own",
-        flag="--recycle-after", metavar="N", check=at_least(0, zero="never"),
+        flag="--recycle-after", group="run", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
     warm_copies: int = option(
         8, "with ``seeds``, the number of warmed-up traffics of which each worker keeps a suspended fork; 0: none",
         help="with --seeds: the number of warmed-up traffics of which each worker keeps a suspended fork; 0: none",
-        flag="--warm-copies", metavar="N", check=at_least(0, zero="none"),
+        flag="--warm-copies", group="run", metavar="N", check=at_least(0, zero="none"),
     )  # fmt: skip
     audit: float = option(
         0.0, "the share of trials without a crash that are run again in a fresh process, to see that they are the same",
         help="run this share of the trials without a crash again, each in a fresh process, and say where one is not "
         "the same: 0.02 is one in fifty",
-        flag="--audit", metavar="SHARE", check=within(0, 1, "give a share of the trials, from 0 to 1"),
+        flag="--audit", group="run", metavar="SHARE", check=within(0, 1, "give a share of the trials, from 0 to 1"),
     )  # fmt: skip
     near_misses: int = option(
         0, "how many of the most dangerous trials without a crash are kept as bundles of their own",
         help="keep the N most dangerous trials without a crash as bundles of their own, to be replayed and shown; each "
         "is run once more for that, at the end",
-        flag="--near-misses", metavar="N", check=at_least(0, zero="none"),
+        flag="--near-misses", group="kept", metavar="N", check=at_least(0, zero="none"),
     )  # fmt: skip
     executor: str = option(
         "pool", "where trials run: its name, and perhaps ``:ARG``",
         help="where trials run: pool (warm processes on this machine), fresh (a new process for each), "
         "ray[:HOST:PORT] (all machines of a Ray cluster) or module:attribute; ARG is for one that takes an argument",
-        flag="--executor", metavar="NAME[:ARG]", anywhere=True,
+        flag="--executor", group="run", metavar="NAME[:ARG]", anywhere=True,
     )  # fmt: skip
 
     def checked(self) -> Self:
@@ -286,16 +298,16 @@ class SnapshotChoices(_Options):
     snapshot_roots: Sequence[str | Path] = option(
         (), "files and folders that the snapshot takes in besides the agents' own projects",
         help="a file or folder that the snapshot takes in besides the agent's own project; may be repeated",
-        flag="--snapshot-root", metavar="PATH",
+        flag="--snapshot-root", group="kept", metavar="PATH",
     )  # fmt: skip
     snapshot_limit_mb: float = option(
         500.0, "the most that a snapshot may have, in MB", help="the most that a snapshot may have",
-        flag="--snapshot-limit", metavar="MB",
+        flag="--snapshot-limit", group="kept", metavar="MB",
         check=above_zero("give MB above 0, or --no-snapshot", finite=False),
     )  # fmt: skip
     snapshot_code: bool = option(
         True, "whether the snapshot has code at all; without, a replay runs what is current",
-        help="keep no code; a replay then runs what is current", flag="--no-snapshot",
+        help="keep no code; a replay then runs what is current", flag="--no-snapshot", group="kept",
     )  # fmt: skip
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.plans._request import Request
-    from crashhunt.trial import Signature
+    from crashhunt.trial import Signature, Value
 
     Surveyor = Callable[[Scenario, Request, HuntSettings], Scenario]
 
@@ -111,13 +111,14 @@ for part in attribute.split("."):
 try:
     parameters = inspect.signature(found).parameters.values()
 except (TypeError, ValueError):
-    names, is_open = [], True
+    names, is_open, defaults = [], True, {}
 else:
     given = ("observation_space", "action_space", "step_length_s")
     kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     names = [known.name for known in parameters if known.kind in kinds and known.name not in given]
     is_open = any(known.kind is known.VAR_KEYWORD for known in parameters)
-json.dump([names, is_open], answer)
+    defaults = {known.name: known.default for known in parameters if type(known.default) in (bool, int, float, str)}
+json.dump([names, is_open, defaults], answer)
 """
 
 
@@ -128,10 +129,12 @@ class Takes:
     Args:
         names: of those that it declares.
         open: whether it takes any other as well (``**kwargs``).
+        defaults: of those that have a number, a string or a truth value as default.
     """
 
     names: Collection[str] = ()
     open: bool = False
+    defaults: Mapping[str, Value] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,10 +248,10 @@ def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None)
             [sys.executable, "-P", "-c", _ASK, target], env=environment, cwd=home, stdin=subprocess.DEVNULL,
             capture_output=True, timeout=_ASK_S, check=True,
         )  # fmt: skip
-        names, is_open = json.loads(done.stdout)
+        names, is_open, defaults = json.loads(done.stdout)
     except (OSError, ValueError, subprocess.SubprocessError):
         return Takes(open=True)
-    return Takes(tuple(names), bool(is_open))
+    return Takes(tuple(names), bool(is_open), {name: defaults[name] for name in names if name in defaults})
 
 
 def plan(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario, HuntSettings]:

@@ -4,19 +4,35 @@ from ._betting import (
     RateTest as RateTest,
     discordance_evidence as discordance_evidence,
 )
+from ._pairs import (
+    Pair as Pair,
+    PairSequence as PairSequence,
+    PairTest as PairTest,
+    PairVerdict as PairVerdict,
+    PairWatch as PairWatch,
+)
 from ._rare import (
     BLOCK as BLOCK,
+    TRIALS_PER_ROOT as TRIALS_PER_ROOT,
     Estimated as Estimated,
+    RareCounter as RareCounter,
     RareEstimate as RareEstimate,
     Root as Root,
+    is_root as is_root,
     learn_forcing as learn_forcing,
     rare_estimate as rare_estimate,
     root_of as root_of,
+    with_plain as with_plain,
 )
 from ._rate import CrashRate as CrashRate, RatePart as RatePart, make_rate as make_rate
-from ._units import (
-    PERS as PERS,
+from ._running import (
     BarWatch as BarWatch,
+    Paced as Paced,
+    RateWatch as RateWatch,
+)
+from ._units import (
+    MAX_INVALID_SHARE as MAX_INVALID_SHARE,
+    PERS as PERS,
     CountingRule as CountingRule,
     Per as Per,
     RateCounter as RateCounter,

@@ -4,29 +4,39 @@ Each root has a value: the weighted crashes of its copies, plus the probability 
 crashes. The values are independent, given the allocation, and unbiased (see `crashhunt.disturbances.FirstOnsets`). The
 estimate is their mean. Crashes that a disturbance had an effect on, and crashes without, are summed apart.
 
+Plain trials: after each root come four trials as ``run`` without ``--rare`` has them. They take about as many steps as
+the root and its copies. Which trial is a root follows from its number. Plain trials have two purposes. Of undisturbed
+crashes the copies know no more than the root, so the undisturbed part of a root is the mean over it and its plain
+trials. And they bound what no copy has met.
+
 Learning: the forcing of a block of 32 roots depends on the blocks before the previous one only. So it is the same
 whatever the number of workers, and no worker waits for the end of a block. The proposal is 10 % the law itself and
 90 % the law times the square root of the smoothed crash share of each cell. That minimizes the variance for
 independent copies of equal cost; the 10 % bound all weights.
 
-The interval is that of Student's t, reported only where the data can carry it. The effective sample size and the number
-of roots with a crash are at least 20, and no root has more than 20 % of the sum. The same interval on the logarithm was
-tried and covered less: where an interval is seldom reported, it is reported of estimates that are too high. No interval
-from weighted copies can exclude a failure mode that no copy has met. The certain interval is for that: it is the one of
-`crashhunt.rates._betting`, so it is valid at any number of roots. The part of the roots themselves and that of their
-copies are bounded apart and added, by Bonferroni's inequality. A copies' sum Y is at most b, which the forcing of its
-root fixes before the root begins. So Y / b counts as events and 1 / b as exposure: their ratio of means is the rate.
+The estimated interval is that of Student's t, reported only where the data can carry it. The effective sample size and
+the number of roots with a crash are at least 20, and no root has more than 20 % of the sum. The same interval on the
+logarithm was tried and covered less: where an interval is seldom reported, it is reported of estimates that are too
+high. No interval from weighted copies can exclude a failure mode that no copy has met.
+
+The certain interval is for that: it is the one of `crashhunt.rates._betting`, so it is valid at any number of roots. A
+plain trial is a unit with 0 or 1 crashes and exposure 1. A root is a unit with the value V, which is at most B. Its
+forcing fixes B before the root begins. So V / B counts as events and 1 / B as exposure. Their ratio of means is the
+rate. A root without a crash counts as 1 / B of a trial. The lower end has a second source: the copies alone. Their
+bound is that of their weights, so it is far below 1 for rare onsets. The crash probability by copies is a part of the
+whole, so a lower bound of it is one of the whole. Both intervals together have the confidence, by Bonferroni's
+inequality. The first has three quarters of the risk, the second a quarter.
 
 Source: Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 to 9; Kish, Survey sampling, 1965, for the
 effective sample size.
-Cost: one pass over the roots.
+Cost: constant for a root; the certain interval takes milliseconds for each hundred roots with different values.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from crashhunt.disturbances import COPIES_PER_ROOT
@@ -37,20 +47,27 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from crashhunt.base.codec import JsonObject
+    from crashhunt.ledger import RunningRate
+    from crashhunt.rates._betting import Interval
     from crashhunt.trial import Forced, TrialResult
 
 __all__ = [
-    "BLOCK", "Estimated", "RareEstimate", "Root", "learn_forcing", "rare_estimate", "root_of",
+    "BLOCK", "TRIALS_PER_ROOT", "Estimated", "RareCounter", "RareEstimate", "Root", "is_root", "learn_forcing",
+    "rare_estimate", "root_of", "with_plain",
 ]  # fmt: skip
 
 BLOCK: Final = 32
 """Roots with the same forcing."""
+PLAIN_PER_ROOT: Final = 4
+TRIALS_PER_ROOT: Final = 1 + PLAIN_PER_ROOT
+"""A root, and the plain trials after it."""
 PLAIN_SHARE: Final = 0.1
 """Share of the proposal that is the law itself: no weight is above 10 times that of the law."""
 _PRIOR_COPIES: Final = 4.0  # weight of the common crash share in that of a cell
 MIN_EFFECTIVE: Final = 20.0
 MIN_ROOTS_WITH_CRASH: Final = 20
 MAX_SHARE: Final = 0.2
+_RISK_OF_COPIES: Final = 0.25  # share of the risk that the certain lower end by copies alone takes
 MAX_EXCLUDED: Final = 0.05
 """Share of roots without a complete result above which nothing is estimated."""
 
@@ -68,6 +85,11 @@ class Root:
         own_steps: its own steps.
         bound: the largest possible part of copies, known before the root begins.
         crashed: whether the root itself crashed undisturbed.
+        copies: the part of copies, from 0 to `bound`.
+        plain: valid plain trials after it.
+        plain_crashes: how many of them crashed.
+        plain_undisturbed: how many of these crashed undisturbed.
+        plain_steps: simulated for them.
     """
 
     undisturbed: float
@@ -78,6 +100,11 @@ class Root:
     own_steps: int = 0
     bound: float = math.inf
     crashed: bool = False
+    copies: float = 0.0
+    plain: int = 0
+    plain_crashes: int = 0
+    plain_undisturbed: int = 0
+    plain_steps: int = 0
 
     @property
     def value(self) -> float:
@@ -121,8 +148,11 @@ class RareEstimate:
         certain: bounds that hold whatever the roots have not met; None where they were not asked for.
         excluded: how many roots have no complete result.
         parts: by cell, the part of ``disturbed`` whose first onset is of that cell.
-        undisturbed_crashes: how many roots crashed undisturbed.
+        undisturbed_crashes: how many roots and plain trials crashed undisturbed.
+        plain: how many plain trials count.
+        plain_crashes: how many of them crashed.
         steps: how many were simulated.
+        plain_steps: how many of them for plain trials.
         plain_equivalent_steps: how many steps plain trials would take to the same standard error; None without one.
         relative_error: half the width of ``estimated`` over the estimate; infinite where there is none.
     """
@@ -140,7 +170,10 @@ class RareEstimate:
     excluded: int
     parts: Mapping[str, float]
     undisturbed_crashes: int
+    plain: int
+    plain_crashes: int
     steps: int
+    plain_steps: int
     plain_equivalent_steps: float | None
     confidence: float
 
@@ -157,8 +190,10 @@ class RareEstimate:
         return {
             "method": "rare",
             "per": "trial",
-            "confidence": self.confidence,
+            "confidence": 100 * self.confidence,
             "units": self.roots,
+            "trials": self.plain,
+            "crashes": self.plain_crashes,
             "estimate": self.estimate,
             "certain": {"low": low, "high": high} if self.certain is not None else None,
             "estimated": _plain(self.estimated),
@@ -175,7 +210,28 @@ class RareEstimate:
                 },
             },
             "steps": self.steps,
+            "plain_steps": self.plain_steps,
             "plain_equivalent_steps": self.plain_equivalent_steps,
+        }
+
+    def running(self) -> RunningRate:
+        """Return what ``status`` reports of it."""
+        low, high = self.certain or (0.0, None)
+        one = self.estimated
+        return {
+            "method": "rare",
+            "per": "trial",
+            "confidence": 100 * self.confidence,
+            "units": self.roots,
+            "trials": self.plain,
+            "crashes": self.plain_crashes,
+            "origin": "",
+            "certain": None if self.certain is None else {"low": low, "high": high},
+            "estimate": self.estimate,
+            "estimated": None if one is None else {"low": one.low, "high": one.high},
+            "why_not": self.why_not,
+            "bar": None,
+            "verdict": "",
         }
 
 
@@ -189,6 +245,32 @@ def _plain(one: Estimated | None) -> JsonObject | None:
         "largest_share": one.largest_share,
         "roots_with_crash": one.roots_with_crash,
     }
+
+
+def is_root(number: int) -> bool:
+    """Whether a trial in rare mode is a root; the others are plain trials."""
+    return number % TRIALS_PER_ROOT == 0
+
+
+def with_plain(root: Root, trials: Iterable[TrialResult], crash_on: Sequence[Outcome]) -> Root:
+    """Return a root with the plain trials after it.
+
+    Args:
+        root: as it is alone.
+        trials: the plain trials; invalid ones do not count.
+        crash_on: the outcomes that count as a crash.
+    """
+    valid = [trial for trial in trials if trial.outcome is not Outcome.INVALID]
+    crashed = [trial for trial in valid if trial.outcome in crash_on]
+    undisturbed = sum(not trial.disturbed for trial in crashed)
+    return replace(
+        root,
+        undisturbed=(root.undisturbed + undisturbed) / (1 + len(valid)),
+        plain=len(valid),
+        plain_crashes=len(crashed),
+        plain_undisturbed=undisturbed,
+        plain_steps=sum(trial.steps + (trial.setup_steps or 0) for trial in valid),
+    )
 
 
 def root_of(result: TrialResult, crash_on: Sequence[Outcome], hazard: float) -> Root | None:
@@ -206,12 +288,14 @@ def root_of(result: TrialResult, crash_on: Sequence[Outcome], hazard: float) -> 
     own = forced.survival if crashed else 0.0
     undisturbed, disturbed = (0.0, own) if result.disturbed else (own, 0.0)
     by: defaultdict[str, float] = defaultdict(float)
+    copies = 0.0
     for copy in forced.copies:
         if copy.crash and copy.disturbed:
             disturbed += copy.weight
             by[copy.cell] += copy.weight
         elif copy.crash:
             undisturbed += copy.weight
+        copies += copy.weight if copy.crash else 0.0
     return Root(
         undisturbed=undisturbed,
         disturbed=disturbed,
@@ -221,6 +305,7 @@ def root_of(result: TrialResult, crash_on: Sequence[Outcome], hazard: float) -> 
         own_steps=result.steps + (result.setup_steps or 0),
         bound=_bound(result.spec.forcing, hazard * result.spec.max_steps),
         crashed=crashed and not result.disturbed,
+        copies=copies,
     )
 
 
@@ -266,8 +351,119 @@ def learn_forcing(earlier: Iterable[Forced], start: Forcing) -> Forcing:
     return Forcing(total / roots / COPIES_PER_ROOT, ratios)
 
 
+class RareCounter:
+    """Counts roots with their plain trials, and returns the estimate at any time.
+
+    Args:
+        least_bound: lower limit of all `Root.bound`, fixed before the first root; None for no certain interval.
+        confidence: of all intervals, in (0, 1).
+    """
+
+    def __init__(self, least_bound: float | None = None, confidence: float = 0.95) -> None:
+        self.confidence = confidence
+        self.excluded = 0
+        self.roots = 0
+        self._whole, self._disturbed = _Sums(), _Sums()
+        self._undisturbed = 0.0
+        self._parts: defaultdict[str, float] = defaultdict(float)
+        self._counts: Counter[str] = Counter()
+        self._tests = None
+        if least_bound is not None:
+            self._tests = RateTest(), RateTest(Bets(1.0, 1.0 / least_bound, fixed_exposure=False))
+
+    def add(self, root: Root | None, plain: Iterable[bool] = ()) -> None:
+        """Add a root.
+
+        Args:
+            root: with its plain trials; None where it has no complete result.
+            plain: of a root without a complete result, which of its valid plain trials crashed: they count for the
+                certain interval.
+        """
+        if root is None:
+            self.excluded += 1
+            self._add_plain(list(plain))
+            return
+        self.roots += 1
+        self._whole.add(root.value)
+        self._disturbed.add(root.disturbed)
+        self._undisturbed += root.undisturbed
+        for cell, weight in root.by.items():
+            self._parts[cell] += weight
+        self._counts.update(
+            undisturbed=root.crashed + root.plain_undisturbed,
+            steps=root.steps + root.plain_steps,
+            plain_steps=root.plain_steps,
+            own_steps=root.own_steps,
+        )
+        if self._tests is not None:
+            whole, copies = self._tests
+            bound = 1.0 + root.bound
+            whole.add((root.own + root.copies) / bound, 1.0 / bound)
+            copies.add(root.copies / root.bound, 1.0 / root.bound)
+        self._add_plain([True] * root.plain_crashes + [False] * (root.plain - root.plain_crashes))
+
+    def _add_plain(self, crashed: Sequence[bool]) -> None:
+        self._counts.update(plain=len(crashed), plain_crashes=sum(crashed))
+        if self._tests is not None:
+            for one in crashed:
+                self._tests[0].add(float(one))
+
+    def certain(self) -> tuple[float, float] | None:
+        """Return bounds that are valid whenever you look; None where they were not asked for, or nothing counts."""
+        if self._tests is None or not self._tests[0].count:
+            return None
+        alpha = 1.0 - self.confidence
+        whole, copies = self._tests
+        found: Interval = whole.interval(alpha * (1.0 - _RISK_OF_COPIES))
+        low = max(found.low, copies.interval(alpha * _RISK_OF_COPIES).low) if copies.events else found.low
+        return min(low, found.high), found.high
+
+    def estimate(self) -> RareEstimate:
+        """Return the crash probability per trial with its intervals."""
+        count, counts = self.roots, self._counts
+        estimate = self._whole.total / count if count else None
+        certain = self.certain()
+        why = ""
+        if self.excluded > MAX_EXCLUDED * (count + self.excluded):
+            why = f"{self.excluded} of {count + self.excluded} roots have no complete result"
+            why += f" (allowed: {MAX_EXCLUDED:.0%})"
+            certain = None
+        whole, why_not, more = self._whole.interval(count, self.confidence)
+        part, why_not_part, _ = self._disturbed.interval(count, self.confidence)
+        if not why and whole is not None and certain is not None and certain[0] > whole.high:
+            # Certain bounds rest on less. Where the two exclude each other, the copies have missed something.
+            why_not = f"plain trials crash more often than the copies explain ({whole.low:.2g} to {whole.high:.2g})"
+            whole = part = None
+            why_not_part = why_not
+        plain_steps = None
+        if estimate and count > 1 and (spread := self._whole.standard_error(count)) > 0:
+            plain_steps = estimate * (1.0 - min(estimate, 1.0)) / spread**2 * counts["own_steps"] / count
+        parts = {cell: part / count for cell, part in self._parts.items()}
+        return RareEstimate(
+            roots=count,
+            estimate=None if why else estimate,
+            undisturbed=self._undisturbed / count if count else 0.0,
+            disturbed=self._disturbed.total / count if count else 0.0,
+            estimated=None if why else whole,
+            estimated_disturbed=None if why else part,
+            why_not=why or why_not,
+            why_not_disturbed=why or why_not_part,
+            more_roots=None if why or whole is not None else more,
+            certain=certain,
+            excluded=self.excluded,
+            parts=dict(sorted(parts.items(), key=lambda item: (-item[1], item[0]))),
+            undisturbed_crashes=counts["undisturbed"],
+            plain=counts["plain"],
+            plain_crashes=counts["plain_crashes"],
+            steps=counts["steps"],
+            plain_steps=counts["plain_steps"],
+            plain_equivalent_steps=plain_steps,
+            confidence=self.confidence,
+        )
+
+
 def rare_estimate(
-    roots: Sequence[Root], *, least_bound: float | None = None, excluded: int = 0, confidence: float = 0.95
+    roots: Iterable[Root], *, least_bound: float | None = None, excluded: int = 0, confidence: float = 0.95
 ) -> RareEstimate:
     """Return the crash probability per trial with its intervals.
 
@@ -277,86 +473,58 @@ def rare_estimate(
         excluded: how many roots have none.
         confidence: of all intervals, in (0, 1).
     """
-    values = [root.value for root in roots]
-    count = len(roots)
-    parts: defaultdict[str, float] = defaultdict(float)
+    counter = RareCounter(least_bound, confidence)
     for root in roots:
-        for cell, weight in root.by.items():
-            parts[cell] += weight / count
-    estimate = math.fsum(values) / count if count else None
-    why = ""
-    if excluded > MAX_EXCLUDED * (count + excluded):
-        why = f"{excluded} of {count + excluded} roots have no complete result (allowed: {MAX_EXCLUDED:.0%})"
-    whole, why_not, more = _interval(values, confidence)
-    part, why_not_part, _ = _interval([root.disturbed for root in roots], confidence)
-    plain_steps = None
-    if estimate and count > 1 and (spread := _standard_error(values)) > 0:
-        per_trial = sum(root.own_steps for root in roots) / count
-        plain_steps = estimate * (1.0 - min(estimate, 1.0)) / spread**2 * per_trial
-    return RareEstimate(
-        roots=count,
-        estimate=None if why else estimate,
-        undisturbed=math.fsum(root.undisturbed for root in roots) / count if count else 0.0,
-        disturbed=math.fsum(root.disturbed for root in roots) / count if count else 0.0,
-        estimated=None if why else whole,
-        estimated_disturbed=None if why else part,
-        why_not=why or why_not,
-        why_not_disturbed=why or why_not_part,
-        more_roots=None if why or whole is not None else more,
-        certain=None if why or least_bound is None or not count else _certain(roots, least_bound, confidence),
-        excluded=excluded,
-        parts=dict(sorted(parts.items(), key=lambda item: (-item[1], item[0]))),
-        undisturbed_crashes=sum(root.crashed for root in roots),
-        steps=sum(root.steps for root in roots),
-        plain_equivalent_steps=plain_steps,
-        confidence=confidence,
-    )
+        counter.add(root)
+    for _ in range(excluded):
+        counter.add(None)
+    return counter.estimate()
 
 
-def _certain(roots: Sequence[Root], least_bound: float, confidence: float) -> tuple[float, float]:
-    """Return bounds on the sum of the part of the roots themselves and the part of their copies."""
-    own, copies = RateTest(), RateTest(Bets(1.0, 1.0 / least_bound, fixed_exposure=False))
-    for root in roots:
-        own.add(root.own, 1.0)
-        copies.add((root.value - root.own) / root.bound, 1.0 / root.bound)
-    alpha = (1.0 - confidence) / 2
-    found = [test.interval(alpha) for test in (own, copies)]
-    return math.fsum(one.low for one in found), min(1.0, math.fsum(one.high for one in found))
+class _Sums:
+    """Sums over the values of roots."""
 
+    def __init__(self) -> None:
+        self.total = self.squares = self.greatest = 0.0
+        self.positive = 0
 
-def _standard_error(values: Sequence[float]) -> float:
-    count, mean = len(values), math.fsum(values) / len(values)
-    return math.sqrt(math.fsum((value - mean) ** 2 for value in values) / (count - 1) / count)
+    def add(self, value: float) -> None:
+        """Add the value of a root."""
+        self.total += value
+        self.squares += value * value
+        self.greatest = max(self.greatest, value)
+        self.positive += value > 0
 
+    def standard_error(self, count: int) -> float:
+        """Return the standard error of the mean of so many roots."""
+        return math.sqrt(max(0.0, self.squares - self.total**2 / count) / (count - 1) / count)
 
-def _interval(values: Sequence[float], confidence: float) -> tuple[Estimated | None, str, int | None]:
-    """Return the estimated interval, or None with the reason and how many more roots are probably needed."""
-    from scipy.special import stdtrit
+    def interval(self, count: int, confidence: float) -> tuple[Estimated | None, str, int | None]:
+        """Return the estimated interval, or None with the reason and how many more roots are probably needed."""
+        if not count:
+            return None, "no root has ended", None
+        if self.total <= 0.0:
+            return None, f"none of {count} roots has a crash, or a copy with one", None
+        effective = self.total**2 / self.squares
+        share = self.greatest / self.total
+        needed = count * max(MIN_EFFECTIVE / effective, MIN_ROOTS_WITH_CRASH / self.positive, share / MAX_SHARE)
+        few = self.positive < MIN_ROOTS_WITH_CRASH
+        reasons = [
+            f"the effective sample size is {effective:.1f} (at least {MIN_EFFECTIVE:g})" * (effective < MIN_EFFECTIVE),
+            f"{self.positive} roots have a crash (at least {MIN_ROOTS_WITH_CRASH})" * few,
+            f"one root is {share:.0%} of the sum (at most {MAX_SHARE:.0%})" * (share > MAX_SHARE),
+        ]
+        if why := ", ".join(filter(None, reasons)):
+            return None, why, max(1, math.ceil(needed - count))
+        from scipy.special import stdtrit
 
-    count, total = len(values), math.fsum(values)
-    with_crash = sum(value > 0 for value in values)
-    if total <= 0.0:
-        return None, f"none of {count} roots has a crash, or a copy with one", None
-    effective = total**2 / math.fsum(value**2 for value in values)
-    share = max(values) / total
-    needed = count * max(MIN_EFFECTIVE / effective, MIN_ROOTS_WITH_CRASH / with_crash, share / MAX_SHARE)
-    reasons = [
-        f"the effective sample size is {effective:.1f} (at least {MIN_EFFECTIVE:g})" * (effective < MIN_EFFECTIVE),
-        f"{with_crash} roots have a crash (at least {MIN_ROOTS_WITH_CRASH})" * (with_crash < MIN_ROOTS_WITH_CRASH),
-        f"one root is {share:.0%} of the sum (at most {MAX_SHARE:.0%})" * (share > MAX_SHARE),
-    ]
-    if why := ", ".join(filter(None, reasons)):
-        return None, why, max(1, math.ceil(needed - count))
-    mean = total / count
-    width = float(stdtrit(count - 1, (1.0 + confidence) / 2)) * _standard_error(values)
-    return (
-        Estimated(
+        mean = self.total / count
+        width = float(stdtrit(count - 1, (1.0 + confidence) / 2)) * self.standard_error(count)
+        found = Estimated(
             low=max(0.0, mean - width),
             high=mean + width,
             effective=effective,
             largest_share=share,
-            roots_with_crash=with_crash,
-        ),
-        "",
-        None,
-    )
+            roots_with_crash=self.positive,
+        )
+        return found, "", None

@@ -68,6 +68,7 @@ class CrashRate:
         steps: that the trials took.
         bar: rate that it was compared with; None for none.
         verdict: ``below``, ``above`` or ``undecided``; empty without a bar.
+        why_undecided: why more trials do not help to compare it; empty where they do, or it is decided.
     """
 
     dir: str
@@ -87,6 +88,7 @@ class CrashRate:
     steps: int = 0
     bar: float | None = None
     verdict: str = ""
+    why_undecided: str = ""
 
     def to_json(self) -> JsonObject:
         """Return an entry of what ``rate --json`` prints; what is no finite number is null."""

@@ -15,10 +15,10 @@ Cost: constant for each trial; trials wait in memory only until those of lower n
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, get_args
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
+from crashhunt.plans import RATE_PERS, RatePer
 from crashhunt.rates._betting import Bets, Interval, RateTest
 from crashhunt.trial import KILLED, Outcome
 
@@ -26,13 +26,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from typing import Any
 
-    from crashhunt.ledger import UntilRate
     from crashhunt.trial import TrialResult
 
 __all__ = [
     "MAX_INVALID_SHARE",
     "PERS",
-    "BarWatch",
     "CountingRule",
     "Per",
     "RateCounter",
@@ -41,17 +39,17 @@ __all__ = [
     "UnitSequence",
     "facts_of",
     "facts_of_plain",
+    "has_too_many_invalid",
 ]
 
-Per = Literal["trial", "hour", "1000km"]
+Per: TypeAlias = RatePer
 """What a rate is per."""
 
-PERS: tuple[Per, ...] = get_args(Per)
+PERS: tuple[Per, ...] = RATE_PERS
 MAX_INVALID_SHARE = 0.05  # of the trials that have ended
 MAX_SPEED_MPS = 100.0  # 360 km/h: no trial's vehicle is faster, so the exposure in km has a bound before it begins
 _S_PER_HOUR, _M_PER_1000KM = 3600.0, 1e6
 _SPARE_STEPS = 1  # of the bound: exposures are rounded
-_SHARE_OF_TIME = 0.05  # that running intervals may take
 
 
 class TrialFacts(NamedTuple):
@@ -164,6 +162,7 @@ class UnitSequence:
         self._traffics: dict[int, list[TrialFacts]] = {}
         self._next = 0  # trial, or traffic
         self.valid = self.invalid = self.not_random = 0  # of the trials in the sequence
+        self.hopeless_at: int | None = None  # the first trial with which too many are certainly invalid
 
     def add(self, trial: TrialFacts) -> Iterator[Unit]:
         """Add a trial, and yield the units that are complete now."""
@@ -177,6 +176,17 @@ class UnitSequence:
             self._next += 1
             if unit := self._counted([found]):
                 yield unit
+
+    def add_counted(self, *, valid: int, invalid: int) -> None:
+        """Add the first trials of a hunt as counts, where each trial is a unit and has its own traffic.
+
+        Args:
+            valid: how many ended and count.
+            invalid: how many ended and do not.
+        """
+        self._next += valid + invalid
+        self.valid += valid
+        self.invalid += invalid
 
     def _add_to_traffic(self, trial: TrialFacts) -> Iterator[Unit]:
         turns, rounds = self._rule.traffics, self._rule.trials_per_unit
@@ -196,6 +206,8 @@ class UnitSequence:
         self.not_random += len(trials) - len(plain)
         self.invalid += len(plain) - len(counted)
         self.valid += len(counted)
+        if self.hopeless_at is None and has_too_many_invalid(self.invalid, self.valid):
+            self.hopeless_at = trials[-1].number
         return counted
 
     @property
@@ -212,6 +224,19 @@ class UnitSequence:
     def invalid_share(self) -> float:
         """The share of invalid trials among those in the sequence."""
         return self.invalid / (self.invalid + self.valid) if self.invalid else 0.0
+
+
+def has_too_many_invalid(invalid: int, valid: int) -> bool:
+    """Return whether the share of invalid trials is certainly above `MAX_INVALID_SHARE`, so that more change nothing.
+
+    The probability that it ever is, at a smaller share, is 5 % at most.
+    """
+    if invalid <= MAX_INVALID_SHARE * (invalid + valid):
+        return False
+    test = RateTest()
+    test.add(1, times=invalid)
+    test.add(0, times=valid)
+    return test.verdict(MAX_INVALID_SHARE) == "above"
 
 
 class RateCounter:
@@ -264,6 +289,23 @@ class RateCounter:
             self.why_not = self.why_not or f"trial {trials[0].number} is beyond the bounds of the hunt: {error}"
         return len(crashed), exposure
 
+    def add_counted(self, *, trials: int, crashes: int, steps: int) -> None:
+        """Add trials as counts, for the rate per trial where each trial is a unit.
+
+        Args:
+            trials: valid ones.
+            crashes: of them.
+            steps: that they took.
+        """
+        self.units += trials
+        self.trials += trials
+        self.crashes += crashes
+        self.steps += steps
+        if self.test is None:
+            self.test = RateTest(self._rule.bets("trial", None))
+        self.test.add(1, 1.0, crashes)
+        self.test.add(0, 1.0, trials - crashes)
+
     def _exposure(self, trial: TrialFacts) -> float:
         if self._per == "trial":
             return 1.0
@@ -282,71 +324,3 @@ class RateCounter:
     def observed(self) -> float | None:
         """Crashes by exposure; None where that is not known."""
         return None if self.test is None or self.why_not else self.test.observed
-
-
-class BarWatch:
-    """Watches a hunt until its rate is certainly below or above a bar.
-
-    The evidence against the bar is updated with each unit, at constant cost. Once it decides, later units do not count.
-    So any number of workers gives the same decision, the same interval and the same estimate.
-
-    Args:
-        rule: how trials count.
-        bar: the rate.
-        per: what it is per.
-        crash_on: the outcomes that count as a crash.
-        alpha: the probability of a wrong decision, at most.
-    """
-
-    def __init__(self, rule: CountingRule, bar: float, per: Per, crash_on: Sequence[str], alpha: float = 0.05) -> None:
-        self.rule, self.bar, self.per, self.alpha = rule, bar, per, alpha
-        self._crash_on = crash_on
-        self.sequence, self.counter = UnitSequence(rule), RateCounter(rule, per)
-        self._log_capitals: Any = 0.0
-        self.verdict: Literal["below", "above", "undecided"] = "undecided"
-        self.decided_at: int | None = None
-        self._interval: tuple[int, Interval] | None = None
-        self._due = 0.0
-
-    def add(self, result: TrialResult | Mapping[str, Any]) -> None:
-        """Add a trial that has ended, in any order, as a result or as a ledger has it."""
-        if self.decided_at is not None:
-            return
-        make = facts_of_plain if isinstance(result, dict) else facts_of
-        for unit in self.sequence.add(make(result, self._crash_on)):  # type: ignore[arg-type]
-            self._count(unit)
-            if self.decided_at is not None:
-                return
-
-    def _count(self, unit: Unit) -> None:
-        import numpy as np
-
-        found = self.counter.add(unit)
-        test = self.counter.test
-        if found is None or test is None or self.counter.why_not:
-            return
-        events, exposure = found
-        self._log_capitals = self._log_capitals + np.log1p(test.bets.stakes(self.bar) * (events - self.bar * exposure))
-        decided = test.bets.log_evidence(self._log_capitals) >= -math.log(self.alpha)
-        if decided and self.sequence.invalid_share <= MAX_INVALID_SHARE:
-            self.verdict = "below" if test.events < self.bar * test.exposure else "above"
-            self.decided_at = unit[-1].number
-
-    def noted(self) -> UntilRate:
-        """Return what the ledger says of it."""
-        return {"bar": f"{self.bar!r}/{self.per}", "decided_at": self.decided_at, "verdict": self.verdict}
-
-    def interval(self, *, running: bool = False) -> Interval | None:
-        """Return the certain interval.
-
-        Args:
-            running: for people who watch: that of some moments ago where a new one would take too much of the time.
-        """
-        began, before = time.monotonic(), self._interval
-        if running and before is not None and (before[0] == self.counter.units or began < self._due):
-            return before[1]
-        found = self.counter.interval(self.alpha)
-        if found is not None:
-            ended = time.monotonic()
-            self._interval, self._due = (self.counter.units, found), ended + (ended - began) / _SHARE_OF_TIME
-        return found

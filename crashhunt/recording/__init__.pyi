@@ -8,6 +8,7 @@ from ._blackbox import (
     read_black_box as read_black_box,
     read_header as read_header,
 )
+from ._compact import Compact as Compact
 from ._compare import (
     first_divergence as first_divergence,
     has_same_scenes as has_same_scenes,
@@ -18,6 +19,14 @@ from ._foxglove import foxglove_layout as foxglove_layout, lane_borders as lane_
 from ._log import read_log as read_log, write_log as write_log
 from ._reading import AgentChannel as AgentChannel, Prologue as Prologue, StepRecord as StepRecord
 from ._recording import Recording as Recording
+from ._values import (
+    OPAQUE_SHAPE as OPAQUE_SHAPE,
+    OpaqueValue as OpaqueValue,
+    decode_value as decode_value,
+    describe_value as describe_value,
+    encode_value as encode_value,
+    is_opaque as is_opaque,
+)
 from .records import RECORD_TYPES as RECORD_TYPES, Tag as Tag
 from .records._events import (
     encode_disturbance as encode_disturbance,

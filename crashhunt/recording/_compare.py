@@ -18,8 +18,10 @@ __all__ = ["first_divergence", "has_same_scenes", "values_around"]
 def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | None:
     """Return the first difference of bits, or None where the two are bit-identical.
 
-    Within a step, observations come before actions and actions before the scene, as in the episode.
+    Within a step, observations come before actions and actions before the scene, as in the episode. If the first is
+    compact, the values of its actors are compared, and the digest of the whole recording.
     """
+    whole, replayed = replayed, replayed.like(recorded)
     if recorded.prologue != replayed.prologue:
         return Divergence(
             step=0,
@@ -43,10 +45,12 @@ def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | N
             recorded=len(recorded.all_steps) - 1,
             replayed=len(replayed.all_steps) - 1,
         )
-    if recorded.digest != replayed.digest:
-        # Every value of every step agrees, so only the way it was written can differ.
+    if recorded.compact is not None and not recorded.compact.digest:  # the beginning of one
+        whole = replayed.beginning(len(replayed.records))
+    if recorded.digest != whole.digest:
+        # Every value of every step agrees, so only the way it was written can differ, or an actor that is not kept.
         return Divergence(
-            step=recorded.steps, agent="", field="digest", recorded=recorded.digest, replayed=replayed.digest
+            step=recorded.steps, agent="", field="digest", recorded=recorded.digest, replayed=whole.digest
         )
     return None
 
@@ -93,6 +97,7 @@ def has_same_scenes(recorded: Recording, rerun: Recording, step: int) -> bool:
         rerun: the recording of the run.
         step: the last step to compare.
     """
+    rerun = rerun.like(recorded)
     return rerun.steps >= step and all(
         recorded.scene(number).frame[1].tobytes() == rerun.scene(number).frame[1].tobytes()
         for number in range(step + 1)

@@ -6,8 +6,9 @@ Reading them gives back the very same records, hence the same digest. View chann
 
 from __future__ import annotations
 
+import json
 import struct
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
@@ -19,6 +20,7 @@ from mcap.writer import Writer
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
 from crashhunt.recording._blackbox import Record
+from crashhunt.recording._compact import Compact
 from crashhunt.recording._foxglove import write_views
 from crashhunt.recording._mcap import MESSAGES, NAMESPACE, LogWriter, to_ns
 from crashhunt.recording._reading import Prologue
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 __all__ = ["read_log", "write_log"]
 
 SCHEMA = "1"
+_COMPACT = "crashhunt_compact"  # key of the metadata that says what a compact recording lacks
 _KNOWN_BY_TOPIC = 11
 """The last tag of the types that have been there from the beginning: a channel of any other says its tag."""
 
@@ -67,7 +70,8 @@ def write_log(
     with whole_file(path, lasting=False, noted=False) as temporary, temporary.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="crashhunt")
-        writer.add_metadata("crashhunt", {**(metadata or {}), "crashhunt_log_schema": SCHEMA})
+        compact = {} if recording.compact is None else {_COMPACT: _compact_to_text(recording.compact)}
+        writer.add_metadata("crashhunt", {**(metadata or {}), **compact, "crashhunt_log_schema": SCHEMA})
         log = LogWriter(writer)
         _write_evidence(log, recording)
         if views:
@@ -88,8 +92,9 @@ def read_log(path: Path) -> Recording:
     try:
         with path.open("rb") as file:
             reader = SeekingReader(file, validate_crcs=True)
-            versions = [entry.metadata.get("crashhunt_log_schema") for entry in reader.iter_metadata()]
-            version = next((found for found in versions if found is not None), None)
+            entries = [entry.metadata for entry in reader.iter_metadata()]
+            version = next((found for one in entries if (found := one.get("crashhunt_log_schema")) is not None), None)
+            compact = next((_compact_from_text(one[_COMPACT]) for one in entries if _COMPACT in one), None)
             if version is None:
                 raise refuse("this MCAP file was not written by crashhunt", "give a log.mcap of a crash bundle")
             if version != SCHEMA:
@@ -107,7 +112,7 @@ def read_log(path: Path) -> Recording:
                 if schema is not None and schema.name.startswith(NAMESPACE) and message.sequence
             ]
             evidence.sort(key=itemgetter(0))
-            return Recording(_read_evidence(evidence))
+            return Recording(_read_evidence(evidence), compact)
     except OSError as error:
         raise refuse(f"cannot be read: {error.strerror}", "give the path of a log.mcap") from None
     except BundleError as error:
@@ -116,6 +121,20 @@ def read_log(path: Path) -> Recording:
         raise refuse(f"not a whole MCAP file: {type(error).__name__}: {error}") from None
     except Exception as error:
         raise refuse(f"damaged: {type(error).__name__}: {error}") from None
+
+
+def _compact_to_text(compact: Compact) -> str:
+    return json.dumps(asdict(compact))
+
+
+def _compact_from_text(text: str) -> Compact:
+    said = json.loads(text)
+    return Compact(
+        digest=said["digest"],
+        actors=said["actors"],
+        radius_m=said["radius_m"],
+        observations=said["observations"],
+    )
 
 
 class _Message(NamedTuple):

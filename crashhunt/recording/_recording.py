@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,12 +11,14 @@ import numpy as np
 from crashhunt.base.errors import BundleError
 from crashhunt.base.text import one_of
 from crashhunt.recording._blackbox import digest_of, is_evidence
+from crashhunt.recording._compact import Compact, Near, Present, compact_records
 from crashhunt.recording._reading import Prologue, Reading
+from crashhunt.recording._values import is_opaque
 from crashhunt.recording.records import RECORD_TYPES
 from crashhunt.recording.records._agents import PROLOGUE
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
 
     from numpy.typing import NDArray
 
@@ -32,13 +35,15 @@ class Recording:
 
     Args:
         records: as they were written, from a black box or a log.
+        compact: what is missing; None for a whole recording.
 
     Raises:
         BundleError: the records make no sense.
     """
 
-    def __init__(self, records: Iterable[Record]) -> None:
+    def __init__(self, records: Iterable[Record], compact: Compact | None = None) -> None:
         self.records = tuple(records)
+        self.compact = compact
         if not self.records or self.records[0].tag != PROLOGUE.tag:
             raise BundleError("the recording has no beginning", fix="it was cut short or is not a recording")
         try:
@@ -56,7 +61,9 @@ class Recording:
 
     @property
     def digest(self) -> str:
-        """The trace digest, in hexadecimal."""
+        """The trace digest, in hexadecimal; of a compact recording that of the whole one."""
+        if self.compact is not None and self.compact.digest:
+            return self.compact.digest
         return digest_of(b"".join(record.encode() for record in self.records if is_evidence(record.tag)))
 
     @property
@@ -64,18 +71,50 @@ class Recording:
         """How many steps were completed."""
         return max((step.step for step in self.all_steps if step.whole), default=0)
 
+    def compacted(self, always: Collection[str], radius_m: float, *, observations: bool = True) -> Recording:
+        """Return the recording with the agents, some other actors, and in each step those near an agent.
+
+        Args:
+            always: identifiers of the actors that are kept in each step.
+            radius_m: greatest distance between an agent and another actor, in m.
+            observations: whether it has what the agents observed.
+        """
+        compact = Compact(
+            digest=self.digest,
+            actors=len({actor.id for actor in self.actors}),
+            radius_m=radius_m,
+            observations=observations,
+        )
+        near = Near(self.agents, frozenset(always), radius_m)
+        return Recording(compact_records(self.records, near, observations=observations), compact)
+
+    def like(self, other: Recording) -> Recording:
+        """Return the recording with the actors and observations that another one has; itself if that one is whole."""
+        if other.compact is None or self.compact is not None:
+            return self
+        there = Present([step.scene.roster.index.keys() if step.scene is not None else () for step in other.all_steps])
+        records = compact_records(self.records, there, observations=other.compact.observations)
+        return Recording(records, replace(other.compact, digest=self.digest))
+
+    def beginning(self, records: int) -> Recording:
+        """Return the recording of its first records."""
+        compact = self.compact and replace(self.compact, digest="")
+        return Recording(self.records[:records], compact)
+
     def observations(self, agent: str) -> NDArray[np.generic]:
-        """What an agent was shown, shape (steps it saw, *observation shape)."""
+        """What an agent was shown, shape (steps it saw, *observation shape).
+
+        Values of any length (`is_opaque`) are an array of arrays, shape (steps it saw,); `decode_value` reads each.
+        """
         channel = self._channel(agent)
         found = [step.observations[agent] for step in self.all_steps if agent in step.observations]
-        shape = (len(found), *channel.observation_shape)
-        return np.array(found, dtype=channel.observation_dtype).reshape(shape)
+        return _stacked(found, channel.observation_dtype, channel.observation_shape)
 
     def actions(self, agent: str) -> NDArray[np.generic]:
-        """What an agent answered, shape (steps it acted, *action shape)."""
+        """What an agent answered, shape (steps it acted, *action shape); of any length as for `observations`."""
         channel = self._channel(agent)
         found = [step.actions[agent] for step in self.all_steps if agent in step.actions]
-        return np.array(found, dtype=channel.action_dtype).reshape((len(found), *channel.action_shape))
+        return _stacked(found, channel.action_dtype, channel.action_shape)
 
     def scene(self, step: int) -> Scene:
         """The scene after a step (0: before the first).
@@ -117,3 +156,12 @@ def _read(records: tuple[Record, ...]) -> Reading:
     if current.observations or current.actions or current.more:
         reading.steps.append(current)  # the process ended in it
     return reading
+
+
+def _stacked(found: list[NDArray[np.generic]], dtype: str, shape: tuple[int, ...]) -> NDArray[np.generic]:
+    if not is_opaque(shape):
+        return np.array(found, dtype=dtype).reshape((len(found), *shape))
+    stacked = np.empty(len(found), object)
+    for place, array in enumerate(found):
+        stacked[place] = array
+    return stacked

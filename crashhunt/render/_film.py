@@ -17,6 +17,7 @@ from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.watching import watched
 from crashhunt.crashes import Encounter
 from crashhunt.panels import Action, Curve, Text
+from crashhunt.recording import is_opaque
 from crashhunt.render._scene import SceneView
 from crashhunt.world import approaches
 
@@ -53,8 +54,8 @@ _PANEL = (240, 160)
 _PAPER = 255
 _AROUND_S = 10.0  # of a near miss, half of it before and half after
 _SHOWN_S = 10.0  # of the built-in curves
-_BUILTIN = ("time to collision s", "gap to the other m", "speed m/s", "action")
-_NEAREST = "nearest gap m"  # of a crash that has no other one
+_BUILTIN = ("time to collision with the other s", "gap to the other m", "speed m/s", "action")
+_NEAREST = ("least time to collision s", "nearest gap m")  # of a crash that has no other one
 _WITHOUT_SCENE = ("reward", "action")
 
 
@@ -306,7 +307,7 @@ def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions, *, w
 
 
 def _builtin_labels(shot: Shot) -> tuple[str, ...]:
-    return _BUILTIN if shot.other else (_BUILTIN[0], _NEAREST, *_BUILTIN[2:])
+    return _BUILTIN if shot.other else (*_NEAREST, *_BUILTIN[2:])
 
 
 class _Builtin:
@@ -319,7 +320,10 @@ class _Builtin:
         self._times, self._gaps, _ = approaches([scene.frame for scene in scenes], agent)
         if shot.other:
             moments = {moment.step: moment for moment in Encounter(recording, agent, shot.other).moments}
-            self._gaps = np.array([moments[n].gap_m if n in moments else np.nan for n in range(len(scenes))])
+            self._gaps, self._times = (
+                np.array([getattr(moments[n], name) if n in moments else np.nan for n in range(len(scenes))])
+                for name in ("gap_m", "time_to_collision_s")
+            )
         rows = [scene.roster.index.get(agent) for scene in scenes]
         self._speeds = np.array(
             [np.nan if row is None else scene.speeds[row] for scene, row in zip(scenes, rows, strict=True)]
@@ -329,7 +333,9 @@ class _Builtin:
         self._shot = shot
         channel = next((found for found in recording.prologue.agents if found.id == agent), None)
         self._names = tuple(channel.action_names) if channel is not None else ()
-        taken = [step.actions[agent] for step in recording.all_steps if agent in step.actions]
+        self._plots_actions = channel is None or not is_opaque(channel.action_shape)
+        every = recording.all_steps if self._plots_actions else []
+        taken = [step.actions[agent] for step in every if agent in step.actions]
         spread = np.array(taken).reshape(len(taken), -1) if taken else np.zeros((1, 1))
         # The bounds are not recorded; what was decided in the whole episode says enough.
         self._low, self._high = np.minimum(spread.min(axis=0), 0.0), np.maximum(spread.max(axis=0), 1.0)
@@ -341,14 +347,14 @@ class _Builtin:
         x = self._seconds[part]
         times = np.where(np.isfinite(self._times[part]), np.minimum(self._times[part], 10.0), np.nan)
         found: list[tuple[str, Panel]] = [
-            (_BUILTIN[0], Curve(times, x, low=0.0, high=10.0)),
+            (_builtin_labels(self._shot)[0], Curve(times, x, low=0.0, high=10.0)),
             (_builtin_labels(self._shot)[1], Curve(np.minimum(self._gaps[part], 100.0), x, low=0.0)),
             (_BUILTIN[2], Curve(self._speeds[part], x, low=0.0)),
         ]
         if not self._shot.recording.actors:
             found = [(_WITHOUT_SCENE[0], Curve(self._rewards[part], x))]
         action = self._shot.recording.all_steps[step].actions.get(self._shot.agent)
-        if action is not None:
+        if action is not None and self._plots_actions:
             value = action.reshape(-1)
             if value.size == 1 and np.issubdtype(value.dtype, np.integer):
                 found.append((_BUILTIN[3], Action(int(value[0]), names=self._shot.meanings)))

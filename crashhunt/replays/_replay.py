@@ -227,7 +227,7 @@ def _end_divergence(was: TrialResult, now: TrialResult, code: Code) -> Divergenc
 def up_to(recording: Recording, step: int) -> Recording:
     """Return a recording to the end of a step. What recorded actions can bring back ends with its last whole one."""
     ends = [number for number, record in enumerate(recording.records) if record.tag == Tag.STEP]
-    return recording if step >= len(ends) else Recording(recording.records[: ends[step] + 1])
+    return recording if step >= len(ends) else recording.beginning(ends[step] + 1)
 
 
 def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport:

@@ -7,6 +7,12 @@ from ._findings import (
     findings_of as findings_of,
     write_sarif as write_sarif,
 )
+from ._gate import (
+    describe_gate as describe_gate,
+    gate_annotations as gate_annotations,
+    gate_summary as gate_summary,
+    write_gate_junit as write_gate_junit,
+)
 from ._listing import (
     ArgumentEntry as ArgumentEntry,
     ListingEntry as ListingEntry,
@@ -16,19 +22,42 @@ from ._listing import (
     list_oracles as list_oracles,
     list_scenarios as list_scenarios,
 )
-from ._page import report_data as report_data, write_report as write_report
+from ._page import (
+    UNCHOSEN as UNCHOSEN,
+    PlayerParts as PlayerParts,
+    importance_of as importance_of,
+    lineage_of as lineage_of,
+    player_data as player_data,
+    player_parts as player_parts,
+    report_data as report_data,
+    values_of as values_of,
+    write_report as write_report,
+)
 from ._rate import (
     describe_rates as describe_rates,
+    describe_running as describe_running,
     format_interval as format_interval,
     format_rate as format_rate,
     rates_page as rates_page,
     write_rates_csv as write_rates_csv,
 )
 from ._show import Story as Story
-from ._status_screen import Watcher as Watcher, format_arguments as format_arguments, format_seconds as format_seconds
+from ._status_screen import (
+    Watcher as Watcher,
+    describe_phase as describe_phase,
+    format_arguments as format_arguments,
+    format_pace as format_pace,
+    format_seconds as format_seconds,
+)
 from ._summary import (
+    describe_causes as describe_causes,
     describe_groups as describe_groups,
     describe_hunt as describe_hunt,
     describe_replay as describe_replay,
 )
-from ._table import check_fields as check_fields, format_table as format_table, steps_table as steps_table
+from ._table import (
+    argument_units as argument_units,
+    check_fields as check_fields,
+    format_table as format_table,
+    steps_table as steps_table,
+)

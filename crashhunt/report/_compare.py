@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +26,6 @@ __all__ = ["comparison_page", "describe_comparison"]
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5a5a5a")
 _BINS = 10  # more, and most hunts have too few crashes a bin
-_MOST = 200_000  # trials of a hunt that the plots are made from
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1b2430; --faint: #5d6b7d; --line: #d9dfe7; --paper: #fff; --back: #f6f7f9; }
 @media (prefers-color-scheme: dark) {
@@ -60,9 +58,9 @@ def describe_comparison(found: Comparison) -> str:
             hunt.dir,
             str(hunt.trials),
             f"{hunt.crashes} ({hunt.disturbed} disturbed)" if hunt.disturbed is not None else str(hunt.crashes),
-            f"{hunt.crash_rate:.2%}" if hunt.trials else "-",
+            f"{hunt.crash_rate:.2%}" if np.isfinite(hunt.crash_rate) else "-",
             f"{hunt.interval[0]:.2%} to {hunt.interval[1]:.2%}" if hunt.interval else "-",
-            f"{hunt.median_steps_to_crash:g}" if hunt.crashes else "-",
+            f"{hunt.median_steps_to_crash:g}" if np.isfinite(hunt.median_steps_to_crash) else "-",
             f"{hunt.median_time_to_collision_s:.2f} s" if np.isfinite(hunt.median_time_to_collision_s) else "-",
         )
         for hunt in found.hunts
@@ -73,7 +71,12 @@ def describe_comparison(found: Comparison) -> str:
         for hunt in found.hunts
         if hunt.counted
     ]
-    lines += [f"{hunt.dir}: no interval, for {hunt.why_not}" for hunt in found.hunts if hunt.why_not]
+    for hunt in found.hunts:
+        if hunt.why_not:
+            missing = "no interval" if hunt.interval is None else "no crash rate"
+            lines.append(f"{hunt.dir}: {missing}: {hunt.why_not}")
+        if hunt.excluded:
+            lines.append(f"{hunt.dir}: not counted: {hunt.excluded} trials after one that has not ended")
     for pair in found.pairs:
         lines += ["", pair.verdict]
         if pair.caution:
@@ -111,11 +114,12 @@ def comparison_page(found: Comparison, path: Path) -> None:
 
 def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
     """A bar per hunt, and its interval; in percent of the width, so that a telephone shows it as well."""
-    most = max([hunt.interval[1] if hunt.interval else hunt.crash_rate for hunt in hunts if hunt.trials] or [1.0])
+    most = max([hunt.interval[1] if hunt.interval else _drawn_rate(hunt) for hunt in hunts] or [1.0])
     scale, parts = 100 / max(most, 1e-9), []
     for hunt in hunts:
-        rate = hunt.crash_rate if hunt.trials else 0.0
-        said = f"{rate:.2%} ({hunt.crashes} of {hunt.trials})"
+        rate = _drawn_rate(hunt)
+        share = f"{rate:.2%} ({hunt.crashes} of {hunt.trials})"
+        said = share if np.isfinite(hunt.crash_rate) else f"{hunt.crashes} of {hunt.trials}"
         if hunt.disturbed is not None:
             said += f", {hunt.disturbed} of them disturbed"
         bar = f'<span style="left:0;width:{rate * scale:.2f}%;background:{colors[hunt.dir]}"></span>'
@@ -128,6 +132,11 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
         name = f'<span class="name">{html.escape(hunt.dir)}</span>'
         parts.append(f'<div>{name} <span class="faint">{said}</span><div class="rate">{bar}</div></div>')
     return "".join(parts)
+
+
+def _drawn_rate(hunt: HuntFigures) -> float:
+    """Return the length of a hunt's bar; 0 where there is no rate."""
+    return hunt.crash_rate if np.isfinite(hunt.crash_rate) else 0.0
 
 
 def _outcomes(hunts: Sequence[HuntFigures]) -> str:
@@ -158,7 +167,7 @@ def _arguments(hunt: HuntResults) -> dict[str, tuple[NDArray[np.generic], NDArra
     columns: dict[str, list[Cell]] = {name: [] for name in names}
     crashed: list[bool] = []
     crash_on = hunt.settings.crash_on
-    for row in islice(hunt.rows(), _MOST):
+    for row in hunt.rows():
         if row["outcome"] == Outcome.INVALID or (hunt.plain_origin and row["origin"] != hunt.plain_origin):
             continue
         crashed.append(row["outcome"] in crash_on)

@@ -145,7 +145,7 @@ def _in_project(file: PurePath) -> str:
 
 # Results of hunts and corpora for CI: a summary in Markdown, and annotations in the syntax of GitHub's runners.
 
-_MOST = 10  # annotations of one step that GitHub shows
+_MOST = 10  # annotations of each level that GitHub shows for one step
 _SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|~])")
 _ICONS = {"still": "💥", "changed": "🔀", "fixed": "✅", "cannot_run": "🚫"}
 
@@ -176,12 +176,16 @@ def crashes_summary(findings: Sequence[Finding], *, compared: bool = False) -> s
 
 
 def crash_annotations(findings: Sequence[Finding]) -> list[str]:
-    """Return a GitHub annotation command for each new crash type, at its line of code; at most ten."""
-    return [
+    """Return a GitHub annotation command for each new crash type, at its line of code.
+
+    Of more than ten, GitHub shows ten; a notice then has both numbers.
+    """
+    found = [
         _command("error", finding.title, finding.message, finding.file, finding.line)
         for finding in findings
         if not finding.known
-    ][:_MOST]
+    ]
+    return _limited(found, "new crash types")
 
 
 def corpus_summary(reports: Sequence[CaseReport]) -> str:
@@ -203,8 +207,11 @@ def corpus_summary(reports: Sequence[CaseReport]) -> str:
 
 
 def corpus_annotations(reports: Sequence[CaseReport]) -> list[str]:
-    """Return a GitHub annotation command for each case that is not as expected, or that is newly fixed."""
-    found = []
+    """Return a GitHub annotation command for each case that is not as expected, or that is newly fixed.
+
+    Of more than ten, GitHub shows ten of each level; a notice then has both numbers.
+    """
+    found, tighter = [], []
     for report in sorted(reports, key=lambda report: report.ok):
         file = (report.path / layout.CASE).as_posix()
         if not report.ok:
@@ -212,8 +219,17 @@ def corpus_annotations(reports: Sequence[CaseReport]) -> list[str]:
             found.append(_command("error", title, "\n".join(words) or title, file, 1))
         elif report.may_be_tightened:
             words = ["the crash is fixed. Set expect to fixed"]
-            found.append(_command("notice", f"{report.path.name}: may be tightened", words[0], file, 1))
-    return found[:_MOST]
+            tighter.append(_command("notice", f"{report.path.name}: may be tightened", words[0], file, 1))
+    return [*_limited(found, "cases that are not as expected"), *_limited(tighter, "fixed cases")]
+
+
+def _limited(annotations: Sequence[str], what: str) -> list[str]:
+    """Return at most ten annotations, with a notice if there are more."""
+    shown, count = list(annotations[:_MOST]), len(annotations)
+    if count <= _MOST:
+        return shown
+    said = f"{_MOST} of {count} {what} are annotated. The summary of the job has all of them."
+    return [_command("notice", f"{_MOST} of {count} {what} shown", said, "", 1), *shown]
 
 
 def _count(number: int, one: str, many: str) -> str:

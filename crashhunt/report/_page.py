@@ -1,4 +1,7 @@
-"""The report's data: one HTML file that shows a hunt and animates its crashes; its looks are in `page.html`."""
+"""The report's data: one HTML file that shows a hunt and animates its crashes; its looks are in `page.html`.
+
+The dashboard has the same player: `player_parts` returns its style, controls and script, `player_data` a crash for it.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import json
 import math
 import zlib
 from importlib import resources
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -15,11 +18,12 @@ from crashhunt.base import layout
 from crashhunt.base.files import whole_file
 from crashhunt.base.version import __version__
 from crashhunt.base.watching import watched
-from crashhunt.crashes import groups_of, signature_of
-from crashhunt.hunts import TrialRow
+from crashhunt.crashes import signature_of
+from crashhunt.hunts import TrialRow, find_crashes
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
-from crashhunt.recording import read_lanes
+from crashhunt.recording import is_opaque, read_lanes
+from crashhunt.report._rate import describe_running
 from crashhunt.report._show import Story
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import argument_units
@@ -35,13 +39,26 @@ if TYPE_CHECKING:
 
     from crashhunt.base.watching import Watch
     from crashhunt.crashes import Bundle, Encounter
+    from crashhunt.hunts import FoundCrashes
+    from crashhunt.ledger import RunningRate
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import Recording
     from crashhunt.trial import TrialResult, Value
     from crashhunt.world import Actor
 
 
-__all__ = ["UNCHOSEN", "Importance", "importance_of", "lineage_of", "report_data", "values_of", "write_report"]
+__all__ = [
+    "UNCHOSEN",
+    "Importance",
+    "PlayerParts",
+    "importance_of",
+    "lineage_of",
+    "player_data",
+    "player_parts",
+    "report_data",
+    "values_of",
+    "write_report",
+]
 
 
 # The search on the page: the arguments that criticality depends on, and the trials that a crash was derived from.
@@ -88,7 +105,8 @@ def importance_of(trials: Sequence[tuple[Mapping[str, Value], float]]) -> list[I
     Returns:
         Nothing where there are fewer than 40.
     """
-    trials = trials[:: max(1, -(-len(trials) // _MOST))]
+    if len(trials) > _MOST:
+        trials = [trials[place * len(trials) // _MOST] for place in range(_MOST)]
     if len(trials) < _LEAST:
         return []
     dangers = np.array([danger for _, danger in trials])
@@ -154,7 +172,14 @@ _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 def write_report(
-    directory: Path, bundles: Sequence[Bundle], target: Path, *, name: str = "", watch: Watch | None = None
+    directory: Path,
+    bundles: Sequence[Bundle],
+    target: Path,
+    *,
+    found: FoundCrashes | None = None,
+    near_misses: int = 0,
+    name: str = "",
+    watch: Watch | None = None,
 ) -> int:
     """Write the report of a hunt, all of it or nothing.
 
@@ -162,6 +187,8 @@ def write_report(
         directory: of the hunt; its ledger may be missing, as in an exported crash.
         bundles: the crashes and near misses to animate.
         target: the file; one that is there is replaced.
+        found: all crashes of the hunt; by default those of the directory.
+        near_misses: number of near misses of the hunt, of which `bundles` has some.
         name: of the hunt, for the title; its directory's by default.
         watch: called after each crash with how many are done, and how many there are.
 
@@ -172,8 +199,17 @@ def write_report(
         BundleError: a crash is damaged.
         HuntDirectoryError: the file cannot be written.
     """
-    data = report_data(directory, bundles, name=name or directory.resolve().name, watch=watch)
-    page = resources.files("crashhunt.report").joinpath("page.html").read_text(encoding="utf-8")
+    data = report_data(
+        directory,
+        bundles,
+        found=found or find_crashes(directory, 0),
+        near_misses=near_misses,
+        name=name or directory.resolve().name,
+        watch=watch,
+    )
+    player = player_parts()
+    page = _read("page.html").replace("/*STYLE*/", player.style).replace("<!--PLAYER-->\n", player.controls)
+    page = page.replace("/*PLAYER*/\n", player.script)
     # Inside a script element, only "</" and "<!--" mean something to HTML.
     text = page.replace("/*DATA*/", json.dumps(data, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c"))
     with whole_file(target) as temporary:
@@ -181,8 +217,50 @@ def write_report(
     return target.stat().st_size
 
 
+class PlayerParts(NamedTuple):
+    """The player of a crash, in the parts that a page needs.
+
+    Args:
+        style: CSS: the colours of both schemes, and the looks of the controls.
+        controls: HTML of the scene, the controls and the curves.
+        script: JavaScript, for the end of the page; ``load`` and ``show`` take what `player_data` returns.
+    """
+
+    style: str
+    controls: str
+    script: str
+
+
+def player_parts() -> PlayerParts:
+    """Return the player that the report and the dashboard have."""
+    return PlayerParts(_read("page.css"), _read("player.html"), _read("player.js"))
+
+
+def _read(name: str) -> str:
+    return resources.files("crashhunt.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def player_data(bundle: Bundle, story: Story | None = None) -> dict[str, object]:
+    """Return a crash or near miss for the player, with what is said of it.
+
+    Args:
+        bundle: the crash; its log is read.
+        story: of it, where there is one already.
+
+    Raises:
+        BundleError: it is damaged.
+    """
+    return _crash(bundle, story or Story(bundle))
+
+
 def report_data(
-    directory: Path, bundles: Sequence[Bundle], *, name: str, watch: Watch | None = None
+    directory: Path,
+    bundles: Sequence[Bundle],
+    *,
+    found: FoundCrashes,
+    near_misses: int,
+    name: str,
+    watch: Watch | None = None,
 ) -> dict[str, object]:
     """Return everything that the page shows."""
     settings = read_settings(directory / layout.HUNT)
@@ -200,8 +278,9 @@ def report_data(
             _shown_name(agent, name, settings): unit
             for (agent, name), unit in argument_units(directory, settings).items()
         },
-        **_trials(directory),
-        **_crashes(bundles, watch),
+        **_trials(directory, settings),
+        **_crashes(bundles, found, watch),
+        "nearMisses": near_misses,
         "lineages": _lineages(directory, bundles),
     }
 
@@ -221,30 +300,40 @@ def _lineages(directory: Path, bundles: Sequence[Bundle]) -> dict[str, list[list
     }
 
 
-def _crashes(bundles: Sequence[Bundle], watch: Watch | None) -> dict[str, object]:
-    """The crashes in the order of the page, and their kinds, each with where its crashes are in it."""
-    crashes, signed, place = [], [], {}
+def _crashes(bundles: Sequence[Bundle], found: FoundCrashes, watch: Watch | None) -> dict[str, object]:
+    """Return the crashes in the order of the page, and the types of all crashes with the places of those shown."""
+    crashes: list[dict[str, object]] = []
+    members: dict[str, list[int]] = {}
     crashed = [bundle for bundle in bundles if not bundle.is_near_miss]
     shown = [*by_likelihood(crashed), *(bundle for bundle in bundles if bundle.is_near_miss)]
     for number, bundle in enumerate(watched(shown, len(shown), watch)):
         story = Story(bundle)
         near = f"near miss at step {story.nearest.step}, danger {story.nearest.danger:.2f}" if story.nearest else ""
-        traffic = near if bundle.is_near_miss else traffic_of(bundle, crashed)
+        traffic = near if bundle.is_near_miss else traffic_of(bundle, found.tally.likeliest)
         crashes.append({**_crash(bundle, story), "traffic": traffic})
-        if bundle.is_near_miss:
-            continue
-        signed.append((signature_of(bundle, story.recording), bundle))
-        place[bundle.path] = number
+        if not bundle.is_near_miss:
+            members.setdefault(str(signature_of(bundle, story.recording)), []).append(number)
     kinds = [
         {
-            "words": str(group.signature),
-            "category": group.first.result.outcome.category,
-            "shortest": place[group.shortest.path],
-            "members": [place[bundle.path] for bundle in group.bundles],
+            "words": words,
+            "category": _category(found.shortest.get(words, "")),
+            "count": count,
+            "members": members.pop(words, []),
         }
-        for group in groups_of(signed)
+        for words, count in found.types.items()
     ]
-    return {"kinds": kinds, "crashes": crashes}
+    kinds += [{"words": "type not determined", "category": "traffic crash", "count": found.untyped, "members": []}] * (
+        found.untyped > 0
+    )
+    return {"kinds": kinds, "crashes": crashes, "found": found.tally.found, "saved": found.saved}
+
+
+def _category(crash: str) -> str:
+    """Return the category of the outcome that the identifier of a crash contains."""
+    try:
+        return Outcome(crash.partition("-")[2]).category
+    except ValueError:
+        return "traffic crash"
 
 
 def _shown_name(agent: str, name: str, settings: HuntSettings) -> str:
@@ -252,18 +341,22 @@ def _shown_name(agent: str, name: str, settings: HuntSettings) -> str:
     return f"{agent}.{name}" if agent and len(settings.agents) > 1 else name
 
 
-def _trials(directory: Path) -> dict[str, object]:
-    """Outcomes, and what was tried against how it went."""
+def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
+    """Return the outcomes of all trials, and for the plots their arguments and criticality.
+
+    A plot has at most 4,000 crashes and 4,000 other trials, which are drawn evenly over the hunt.
+    """
     path = directory / layout.LEDGER
     if not has_begun(path):
-        nothing = {"outcomes": {}, "categories": {}, "steps": 0, "trials": [], "stress": None, "thinned": False}
-        return {**nothing, "importance": [], "not_fully_asked": 0}
+        nothing = {"outcomes": {}, "categories": {}, "steps": 0, "trials": [], "stress": None, "drawn": None}
+        return {**nothing, "importance": [], "weighed": None, "not_fully_asked": 0, "rate": None}
     ledger = Ledger(path)
     try:
         outcomes = ledger.outcomes()
         total = sum(outcomes.values())
-        share = _DOTS / max(total, 1)
-        trials, stress, not_fully_asked = [], None, 0
+        crashes = sum(outcomes.get(str(name), 0) for name in settings.crash_on)
+        share, share_of_crashes = _DOTS / max(total - crashes, 1), _DOTS / max(crashes, 1)
+        trials, stress, not_fully_asked, unchosen_in_all = [], None, 0, 0
         unchosen: list[tuple[Mapping[str, Value], float]] = []
         for number, row in enumerate(map(TrialRow, ledger.plain_results())):
             outcome, margin = row.outcome, row.stress_margin
@@ -272,10 +365,12 @@ def _trials(directory: Path) -> dict[str, object]:
             not_fully_asked += not row.is_fully_asked
             crashed = outcome.category != "no crash"
             danger = 1.0 if crashed else row.danger
-            drawn = _is_drawn(number, share)
-            if row.origin in UNCHOSEN and row.parent is None and danger is not None and drawn:
-                unchosen.append((values_of(row), danger))
-            if drawn or crashed:
+            counts = outcome in settings.crash_on
+            if row.origin in UNCHOSEN and row.parent is None and danger is not None:
+                unchosen_in_all += 1
+                if _is_drawn(number, 2 * _MOST / max(total, 1)):
+                    unchosen.append((values_of(row), danger))
+            if _is_drawn(number, share_of_crashes if counts else share):
                 time_s = row.time_to_collision_s
                 trials.append(
                     {
@@ -296,11 +391,34 @@ def _trials(directory: Path) -> dict[str, object]:
             "trials": trials,
             "stress": stress,
             "not_fully_asked": not_fully_asked,
-            "thinned": share < 1.0,
+            "drawn": _drawn(trials, total, crashes, settings) if len(trials) < total else None,
             "importance": importance_of(unchosen),
+            "rate": _rate(ledger.facts().get("running_rate")),
+            "weighed": [min(len(unchosen), _MOST), unchosen_in_all] if unchosen_in_all > _MOST else None,
         }
     finally:
         ledger.close()
+
+
+def _rate(rate: RunningRate | None) -> dict[str, object] | None:
+    """Return the crash rate as the hunt has left it; None where it has none, as those of earlier versions."""
+    if rate is None:
+        return None
+    words = f"At least and at most are certain: {rate['confidence']:g} % confidence, valid whenever you look."
+    if rate["method"] == "rare":
+        words += " The estimate omits failures that no copy has met; the certain bounds include them."
+    return {
+        "answer": describe_running(rate).removeprefix("rate: "),
+        "words": words,
+        "certain": rate["certain"],
+        "estimated": rate["estimated"],
+    }
+
+
+def _drawn(trials: Sequence[Mapping[str, object]], total: int, crashes: int, settings: HuntSettings) -> dict[str, int]:
+    """Return how many crashes and other trials the plots show, and how many there are."""
+    shown = sum(trial["outcome"] in settings.crash_on for trial in trials)
+    return {"crashes": shown, "allCrashes": crashes, "others": len(trials) - shown, "allOthers": total - crashes}
 
 
 def _is_drawn(number: int, share: float) -> bool:
@@ -344,7 +462,7 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
         "agents": list(recording.agents),
         "dt": recording.prologue.step_length_s,
         **_scenes(recording, story.agent),
-        **({} if story.encounter is None else {"gap": _gap_to_other(story.encounter, recording)}),
+        **({} if story.encounter is None else _to_other(story.encounter, recording)),
         "lanes": _lanes(bundle, recording),
         "disturbances": [
             [one.step, one.step + steps_of(one.how_long, recording.prologue.step_length_s) - 1, one.words, one.vehicle]
@@ -387,10 +505,12 @@ def _scenes(recording: Recording, agent: str) -> dict[str, object]:
     origin = _origin(recording)
     table[:, :, :2] -= origin
     times, gaps, _ = approaches([scene.frame for scene in scenes], agent)
+    if recording.compact is not None:  # without the actors that are farther away, these would be too large
+        times, gaps = np.full_like(times, np.nan), np.full_like(gaps, np.nan)
     actions = np.full((len(scenes), 0), np.nan)
     channel = next((found for found in recording.prologue.agents if found.id == agent), None)
     action_names: list[str] = []
-    if channel is not None:
+    if channel is not None and not is_opaque(channel.action_shape):
         size = math.prod(channel.action_shape)
         action_names = list(channel.action_names) or [f"action[{n}]" for n in range(size)]
         actions = np.full((len(scenes), size), np.nan)
@@ -415,11 +535,15 @@ def _scenes(recording: Recording, agent: str) -> dict[str, object]:
     }
 
 
-def _gap_to_other(encounter: Encounter, recording: Recording) -> str:
-    """The gap to the one that it crashed with, instead of that to the nearest."""
-    moments = {moment.step: moment.gap_m for moment in encounter.moments}
+def _to_other(encounter: Encounter, recording: Recording) -> dict[str, str]:
+    """Return gap and time to collision to the actor that the text is about, instead of those to the nearest."""
+    moments = {moment.step: moment for moment in encounter.moments}
     steps = [step.step for step in recording.all_steps if step.scene is not None]
-    return _packed(np.array([moments.get(step, np.nan) for step in steps]))
+    found = {"gap": "gap_m", "ttc": "time_to_collision_s"}
+    return {
+        key: _packed(np.array([getattr(moments[step], name) if step in moments else np.nan for step in steps]))
+        for key, name in found.items()
+    }
 
 
 def _lanes(bundle: Bundle, recording: Recording) -> list[list[str]]:

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, TextIO
 
 from crashhunt.base.files import whole_file
 from crashhunt.base.text import in_lines
+from crashhunt.rates import Interval
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from crashhunt.rates import BarWatch, CrashRate, Interval, RatePart
+    from crashhunt.ledger import Bounds, RunningRate
+    from crashhunt.rates import CrashRate, RatePart
 
-__all__ = ["describe_rates", "describe_watch", "format_interval", "format_rate", "rates_page", "write_rates_csv"]
+__all__ = ["describe_rates", "describe_running", "format_interval", "format_rate", "rates_page", "write_rates_csv"]
 
 _PER = {"trial": "per trial", "hour": "per hour", "1000km": "per 1,000 km"}
 _REASONS = {
@@ -59,14 +61,33 @@ def format_interval(interval: Interval) -> str:
     return f"{least}at most {format_rate(interval.high)}"
 
 
-def describe_watch(watch: BarWatch) -> str:
-    """Return the running interval of a hunt with a bar, in a line."""
-    bar = f"bar {format_rate(watch.bar)} {_PER[watch.per]}: {watch.verdict}"
-    found = watch.interval(running=True)
-    if found is None:
-        return f"rate: not known yet; {bar}"
-    trials = f"{_count(watch.counter.crashes, 'crash', 'crashes')} in {_count(watch.counter.trials, 'trial', 'trials')}"
-    return f"rate: {format_interval(found)} {_PER[watch.per]} ({trials}); {bar}"
+def describe_running(rate: RunningRate) -> str:
+    """Return the rate of a running hunt in a line: the answer, then what it rests on."""
+    if rate["method"] == "rare":
+        return _describe_rare(rate)
+    bar = f"; bar {format_rate(rate['bar'])} {_PER[rate['per']]}: {rate['verdict']}" if rate["bar"] is not None else ""
+    if rate["certain"] is None:
+        return f"rate: not known yet ({rate['why_not']}){bar}"
+    trials = f"{_count(rate['crashes'], 'crash', 'crashes')} in {_count(rate['trials'], 'trial', 'trials')}"
+    trials += " drawn at random" if rate["origin"] else ""
+    return f"rate: {_certain(rate['certain'])} {_PER[rate['per']]} ({trials}, {rate['confidence']:g} %){bar}"
+
+
+def _describe_rare(rate: RunningRate) -> str:
+    roots = _count(rate["units"], "root", "roots")
+    certain = f"; certain: {_certain(rate['certain'])} ({rate['confidence']:g} %)" if rate["certain"] else ""
+    if rate["estimate"] is None:
+        return f"rate: not known yet ({rate['why_not']}){certain}"
+    found = f"rate: {format_rate(rate['estimate'])} per trial"
+    if (one := rate["estimated"]) is not None and one["high"] is not None:
+        found += f" ({format_rate(one['low'])} to {format_rate(one['high'])}, estimated from {roots})"
+    else:
+        found += f" (no interval from {roots} yet)"
+    return found + certain
+
+
+def _certain(bounds: Bounds) -> str:
+    return format_interval(Interval(bounds["low"], math.inf if bounds["high"] is None else bounds["high"]))
 
 
 def describe_rates(rates: Sequence[CrashRate]) -> str:
@@ -101,14 +122,17 @@ def _of_hunt(rates: list[CrashRate]) -> list[str]:
         each = [f"{count} {_REASONS[reason]}" for reason, count in first.excluded.items()]
         lines.append(f"  not counted: {', '.join(each)}")
     lines += [line for rate in rates for line in _part_lines(rate)]
-    lines += [f"  {_verdict(rate.verdict, rate.bar)} {_PER[rate.per]}" for rate in rates if rate.bar is not None]
+    lines += [f"  {_verdict(rate, rate.bar)}" for rate in rates if rate.bar is not None]
     return lines
 
 
-def _verdict(verdict: str, bar: float) -> str:
-    if verdict == "undecided":
-        return f"undecided: more trials are needed to compare with the bar of {format_rate(bar)}"
-    return f"certainly {verdict} the bar of {format_rate(bar)}"
+def _verdict(rate: CrashRate, bar: float) -> str:
+    shown = f"the bar of {format_rate(bar)} {_PER[rate.per]}"
+    if rate.verdict != "undecided":
+        return f"certainly {rate.verdict} {shown}"
+    if rate.why_undecided:
+        return f"undecided about {shown}: {rate.why_undecided}"
+    return f"undecided: more trials are needed to compare with {shown}"
 
 
 def _answer(rate: CrashRate | RatePart) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
 from crashhunt.crashes import Encounter, danger_course, fault_of, judgement_of, last_escape, most_dangerous
+from crashhunt.recording import describe_value, is_opaque
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
 from crashhunt.report._words import (
@@ -20,6 +21,7 @@ from crashhunt.report._words import (
     about_judgement,
     about_nearest,
     about_place,
+    about_reference,
     about_why,
     danger_cells,
     danger_to_json,
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Story"]
 
+_MAX_ACTION_CHARACTERS = 60  # of an action that is no array of numbers
 _ROWS = 20  # of the table; of more steps, the table shows a selection
 
 
@@ -57,7 +60,9 @@ class Story:
         self.nearest = most_dangerous(self.recording) if bundle.is_near_miss else None
         near = self.nearest
         self.agent, self.other = (near.agent, near.other) if near else (bundle.driver, hit.other if hit else "")
-        self.danger = danger_course(self.recording, self.agent)
+        compact = self.recording.compact
+        self._is_whole = compact is None  # otherwise actors are missing that criticality and closest approach need
+        self.danger = danger_course(self.recording, self.agent) if compact is None else None
         self._first, self._last = window_of(self.recording, last_s, near)
         self.encounter = Encounter(self.recording, self.agent, self.other) if self.other else None
         self.judgement = judgement_of(bundle)
@@ -70,8 +75,12 @@ class Story:
 
     def to_json(self) -> dict[str, object]:
         """Return the shape that ``show --json`` prints."""
-        nearest = steps_table(self.recording, NEAREST, self.agent) if self.encounter else []
+        nearest: list[Mapping[str, TableCell]] = [dict.fromkeys(NEAREST)] * (self.recording.steps + 1)
+        if self.encounter and self._is_whole:
+            nearest = list(steps_table(self.recording, NEAREST, self.agent))
         moments, tried = self.encounter.moments if self.encounter else [], self.bundle.result.escape
+        why_not = tried.why_not if tried is not None else ""
+        tried = None if why_not else tried
         return {
             "crash": self.bundle.id,
             "summary": self.bundle.result.summary,
@@ -84,6 +93,7 @@ class Story:
                 "by": "calculation" if self._braking else "running it" if tried else None,
                 "how": tried.how if tried and not self._braking else None,
                 "too_late_step": tried.too_late if tried and not self._braking else None,
+                "why_not": (why_not or self.bundle.result.why_no_escape) if not self._braking else "",
             },
             "judged": self.judgement.to_json() if self.judgement is not None else None,
             "fault": self.fault.to_json(),
@@ -94,7 +104,7 @@ class Story:
                     name: None if isinstance(value, float) and not math.isfinite(value) else value
                     for name, value in _named(moment, nearest[moment.step]).items()
                 }
-                | {"action": self._action(moment.step)}
+                | {"action": self._opaque_action(moment.step) or self._action(moment.step)}
                 for moment in moments
                 if self._first <= moment.step <= self._last
             ],
@@ -118,9 +128,15 @@ class Story:
         if result.event is not None or (hit is not None and hit.role == "alone"):
             before = self._action(end)
             whose = "Its" if result.event is None else f"{self.agent}'s"
-            sentences.append(f"{whose} last decision was {_words(before, self._names())}.")
+            decision = self._opaque_action(end) or _words(before, self._names())
+            sentences.append(f"{whose} last decision was {decision}.")
         if self.danger is not None:
             sentences.append(about_danger(self.danger))
+        if (compact := recording.compact) is not None:
+            sentences.append(
+                "The log is compact: it has the vehicles of the crash, and others up to "
+                f"{compact.radius_m:g} m from an agent. Criticality is not reported."
+            )
         if result.failure is not None:
             sentences += self._about_failure()
         if self.encounter is None:
@@ -133,13 +149,15 @@ class Story:
         lines.append(f"  seed {self.bundle.result.spec.seed}, {format_arguments(self.bundle.result)}")
         lines += _shrunk(self.bundle)
         lines += ["", *self.words(), "", *self.table()]
+        shown, steps = len(self._steps_shown()), len(self._steps())
+        lines += [f"{shown} of {steps} steps shown"] if shown < steps else []
         return in_lines(lines)
 
     def table(self) -> list[str]:
         """Return the last steps as a table."""
         names = self._names()
         hit = self.bundle.result.collision
-        drives_into = hit is not None and hit.role == "collider"  # only a collider can avoid it by braking
+        drives_into = hit is not None and hit.role == "collider"  # the agent had the other in front of it
         header = ["step", "time s", f"{self.agent} m/s", *names]
         if self.encounter is not None:
             header += [f"{self.other} m/s", "gap to it m", "closing m/s", "TTC to it s"]
@@ -147,9 +165,7 @@ class Story:
         header += COLUMNS if self.danger is not None else ()
         moments = {moment.step: moment for moment in self.encounter.moments} if self.encounter else {}
         rows = []
-        steps = [step for step in self.recording.all_steps if self._first <= step.step <= self._last]
-        near = self.nearest
-        for step in _thinned(steps, _ROWS, always=self.escape) if near is None else _around(steps, _ROWS, near.step):
+        for step in self._steps_shown():
             scene = step.scene
             row = scene.roster.index.get(self.agent) if scene is not None else None
             speed = f"{scene.speeds[row]:.1f}" if scene is not None and row is not None else "-"
@@ -162,6 +178,15 @@ class Story:
             cells += danger_cells(self.danger, step.step) if self.danger is not None else []
             rows.append([*cells, self._mark(step.step, moments.get(step.step))])
         return aligned([header, *rows])
+
+    def _steps(self) -> list[StepRecord]:
+        """Return the steps that are described."""
+        return [step for step in self.recording.all_steps if self._first <= step.step <= self._last]
+
+    def _steps_shown(self) -> list[StepRecord]:
+        """Return the steps of the table, a selection of those that are described."""
+        steps, near = self._steps(), self.nearest
+        return _thinned(steps, _ROWS, always=self.escape) if near is None else _around(steps, _ROWS, near.step)
 
     def _mark(self, step: int, moment: Moment | None) -> str:
         """Return the remark at the end of a row of the table."""
@@ -225,6 +250,8 @@ class Story:
         if tried is None:
             why = self.bundle.result.why_no_escape
             return [f"The last step at which braking would have helped is unknown: {why}."] if why else []
+        if tried.why_not:
+            return [f"The last step at which braking would have helped is unknown: {tried.why_not}."]
         braking = f"Braking {tried.how}"
         if tried.step is None:
             assert tried.too_late is not None
@@ -239,7 +266,9 @@ class Story:
         if self.judgement is None:
             return []
         why = about_why(self.judgement.why, self._at) if self.judgement.why is not None else []
-        return [*about_judgement(self.judgement, self._ago, self.agent, self.other), *why]
+        reference = self.judgement.reference
+        cause = about_reference(reference, self._ago, self.agent) if reference is not None else []
+        return [*cause, *about_judgement(self.judgement, self._ago, self.agent, self.other), *why]
 
     def _calculated(self, braking: float) -> str:
         if self.escape is None:
@@ -288,8 +317,10 @@ class Story:
             channel = next(agent for agent in self.recording.prologue.agents if agent.id == self.agent)
             seen = last.observations[self.agent]
             names = channel.observation_names or tuple(map(str, range(seen.shape[-1] if seen.ndim else 1)))
-            own = seen.reshape(-1, seen.shape[-1])[0].tolist() if seen.ndim else [seen.item()]
+            own = seen.reshape(-1, seen.shape[-1])[:1].reshape(-1).tolist() if seen.ndim else [seen.item()]
             facts = ", ".join(f"{name} {value:.3g}" for name, value in zip(names, own, strict=False))
+            if is_opaque(channel.observation_shape):
+                facts = describe_value(seen)
             sentences.append(f"Its last observation, in step {last.step}: {facts}.")
         frames = [line.strip() for line in failure.traceback.splitlines() if line.strip()]
         if frames:
@@ -300,16 +331,30 @@ class Story:
         channel = next((agent for agent in self.recording.prologue.agents if agent.id == self.agent), None)
         if channel is None:
             return ()
+        if is_opaque(channel.action_shape):
+            return ("action",)
         return channel.action_names or tuple(f"action[{n}]" for n in range(math.prod(channel.action_shape)))
+
+    def _opaque_action(self, step: int) -> str:
+        """The text of an action that is no array of numbers; empty for other actions."""
+        channel = next((agent for agent in self.recording.prologue.agents if agent.id == self.agent), None)
+        if channel is None or not is_opaque(channel.action_shape) or not 0 <= step < len(self.recording.all_steps):
+            return ""
+        array = self.recording.all_steps[step].actions.get(self.agent)
+        return "" if array is None else describe_value(array, _MAX_ACTION_CHARACTERS)
 
     def _action(self, step: int) -> list[float] | None:
         """What the agent decided in a step."""
         if not 0 <= step < len(self.recording.all_steps):
             return None
         array = self.recording.all_steps[step].actions.get(self.agent)
-        return None if array is None else [float(value) for value in array.reshape(-1)]
+        if array is None or self._opaque_action(step):
+            return None
+        return [float(value) for value in array.reshape(-1)]
 
     def _decision(self, step: int) -> list[str]:
+        if opaque := self._opaque_action(step):
+            return [opaque]
         action = self._action(step)
         return ["-"] * len(self._names()) if action is None else [f"{value:.4g}" for value in action]
 

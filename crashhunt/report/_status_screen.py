@@ -14,7 +14,7 @@ from rich.text import Text
 
 from crashhunt.base.text import one_line
 from crashhunt.recording import Phase
-from crashhunt.report._rate import describe_watch
+from crashhunt.report._rate import describe_running
 from crashhunt.trial import Outcome, without_folder
 
 if TYPE_CHECKING:
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
     from rich.console import Console, RenderableType
 
-    from crashhunt.hunts import HuntStatus, SearchStatus
+    from crashhunt.hunts import HuntStatus, PhaseStatus, SearchStatus
     from crashhunt.trial import TrialResult, Value
 
-__all__ = ["Watcher", "format_arguments", "format_seconds"]
+__all__ = ["Watcher", "describe_phase", "format_arguments", "format_pace", "format_seconds"]
 
 _LINE_EVERY_S = 5.0  # where lines cannot be overwritten, such as in a CI log
 _LEAST_BAR = 8  # columns; a shorter bar is unreadable, and the words need the space
@@ -51,7 +51,7 @@ class Watcher:
         self._console = console
         self._notes = notes
         self._title = one_line(title)
-        self._last_line = -math.inf
+        self._last_line, self._last_phase = -math.inf, ""
         self._live = Live(console=console, refresh_per_second=8, transient=True) if console.is_terminal else None
 
     def __enter__(self) -> Self:
@@ -70,9 +70,13 @@ class Watcher:
         self.tell_notes()
         if self._live is not None:
             self._live.update(self._screen(status))
-        elif time.monotonic() - self._last_line >= _LINE_EVERY_S:
-            self._last_line = time.monotonic()
+        elif time.monotonic() - self._last_line >= _LINE_EVERY_S or self._is_new_phase(status):
+            self._last_line, self._last_phase = time.monotonic(), status.phase
             self._console.print(_line(status), soft_wrap=True, highlight=False)
+
+    def _is_new_phase(self, status: HuntStatus) -> bool:
+        """Whether a phase with a progress of its own begins."""
+        return status.progress is not None and status.phase != self._last_phase
 
     def tell_notes(self) -> None:
         """Print the notes, once."""
@@ -92,7 +96,7 @@ class Watcher:
             outcomes += Text(f"   {_disturbed(status)}")
         rows.append(outcomes or Text("no trial has finished", style="dim"))
         if status.rate is not None:
-            rows.append(Text(describe_watch(status.rate), no_wrap=True, overflow="ellipsis"))
+            rows.append(Text(describe_running(status.rate), no_wrap=True, overflow="ellipsis"))
         if status.kinds:
             kinds = Text(f"{describe_kinds(status)}: ", no_wrap=True, overflow="ellipsis")
             each = "; ".join(f"{kind.count} {kind.signature}" for kind in status.kinds)
@@ -123,19 +127,25 @@ class Watcher:
         return Group(*rows, *nodes, _workers(status, width, max(1, left - len(nodes))))
 
     def _head(self, status: HuntStatus, width: int) -> Text:
-        now = f"   {status.phase}   {format_seconds(status.elapsed_s)}"
+        phase = "confirming" if status.progress is not None else status.phase
+        now = f"   {phase}   {format_seconds(status.elapsed_s)}"
         title = Text(self._title, "bold")
         title.truncate(max(1, width - len(now)), overflow="ellipsis")
         return Text.assemble(title, now, no_wrap=True)
 
 
 def _bar(status: HuntStatus, width: int) -> RenderableType:
-    said = (f"{_count(status)} trials", f"{status.rate_per_s:.1f}/s", f"{format_seconds(status.seconds_left)} left")
-    if width - sum(len(part) + 2 for part in said) < _LEAST_BAR:
+    said: tuple[str, ...] = (
+        f"{_count(status)} trials", format_pace(status.rate_per_s), f"{format_seconds(status.seconds_left)} left",
+    )  # fmt: skip
+    share, phase = status.share_done, status.progress
+    if phase is not None:
+        said, share = (describe_phase(phase.name, phase.done, phase.total, phase.seconds_left),), _share(phase)
+    elif width - sum(len(part) + 2 for part in said) < _LEAST_BAR:
         said = (said[0].removesuffix(" trials"), *said[1:])
     table = Table.grid(padding=(0, 2))
     room = width - sum(len(part) + 2 for part in said)
-    bar = ProgressBar(total=1.0, completed=status.share_done, width=max(1, min(30, room)))
+    bar = ProgressBar(total=1.0, completed=share, width=max(1, min(30, room)))
     table.add_row(bar, *said)
     return table
 
@@ -147,7 +157,14 @@ def _nodes(status: HuntStatus, lines: int) -> list[RenderableType]:
     if not status.nodes:
         return [Text("no node is connected; the hunt waits", style="yellow")]
     found = [
-        f"node {one_line(node.name)}   {node.parallel} at a time   {node.trials} trials   {node.rate_per_s:.1f}/s"
+        "   ".join(
+            (
+                f"node {one_line(node.name)}",
+                f"{node.parallel} at a time",
+                f"{node.trials} trials",
+                format_pace(node.rate_per_s),
+            )
+        )
         for node in status.nodes
     ]
     if len(found) > lines:
@@ -195,6 +212,36 @@ def _short(value: Value) -> str:
     return without_folder(value)
 
 
+def format_pace(rate_per_s: float) -> str:
+    """Return a rate of trials as ``4.6/s``, or as ``12 s/trial`` below one per second."""
+    if rate_per_s >= 0.95:
+        return f"{rate_per_s:.1f}/s"
+    if not rate_per_s:
+        return "-/s"
+    seconds = 1.0 / rate_per_s
+    return f"{seconds:.1f} s/trial" if seconds < 9.95 else f"{seconds:.0f} s/trial"
+
+
+_PHASES = {
+    "confirming": "confirming",
+    "auditing": "auditing",
+    "near misses": "confirming near misses",
+    "probes": "confirming crashes of probes",
+    "branches": "confirming crashes of branches",
+    "rare crashes": "confirming rare crashes",
+}
+
+
+def describe_phase(name: str, done: int, total: int, seconds_left: float | None) -> str:
+    """Return the progress after the last trial, such as ``confirming 24 of 60, 0:40 left``."""
+    said = f"{_PHASES.get(name, name)} {done} of {total}"
+    return said if seconds_left is None else f"{said}, {format_seconds(seconds_left)} left"
+
+
+def _share(phase: PhaseStatus) -> float:
+    return phase.done / phase.total if phase.total else 1.0
+
+
 def format_seconds(seconds: float) -> str:
     """Return a duration as ``M:SS`` or ``H:MM:SS``."""
     if not math.isfinite(seconds):
@@ -222,11 +269,13 @@ def _disturbed(status: HuntStatus) -> str:
 
 def _line(status: HuntStatus) -> str:
     outcomes = ", ".join(f"{name} {count}" for name, count in sorted(status.outcomes.items()))
+    if (after := status.progress) is not None:
+        return describe_phase(after.name, after.done, after.total, after.seconds_left)
     phase = "running" if status.phase == "hunting" else status.phase
     count = f"{status.done} of {status.planned}" if status.planned else str(status.done)
     line = f"{phase}: {count} trials finished" + (f" ({outcomes})" if outcomes else "")
     if status.phase == "hunting" and status.done:
-        line += f", {status.rate_per_s:.1f}/s, {format_seconds(status.seconds_left)} left"
+        line += f", {format_pace(status.rate_per_s)}, {format_seconds(status.seconds_left)} left"
     if status.disturbed is not None and status.crashes:
         line += f"; {_disturbed(status)}"
     if status.phase == "hunting" and status.kinds:
@@ -234,7 +283,7 @@ def _line(status: HuntStatus) -> str:
     if status.phase == "hunting" and status.nodes is not None:
         line += f"; connected nodes: {len(status.nodes)}" if status.nodes else "; no node is connected"
     if status.rate is not None:
-        line += f"; {describe_watch(status.rate)}"
+        line += f"; {describe_running(status.rate)}"
     return line
 
 

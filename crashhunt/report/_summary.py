@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from crashhunt.base.json_types import Plain
-    from crashhunt.crashes import Bundle, Group, Signature
+    from crashhunt.crashes import Bundle, CauseGroup, Group, Signature
     from crashhunt.hunts import HuntReport
     from crashhunt.replays import ReplayReport
     from crashhunt.trial import TrialResult
@@ -63,7 +63,28 @@ def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | No
         )
     count = sum(group.count for group in groups)
     words = f"{count} {'crash' if count == 1 else 'crashes'} of {len(groups)} {'type' if len(groups) == 1 else 'types'}"
+    saved = sum(len(group.bundles) for group in groups)
+    if saved < count:
+        words += f" ({saved} of {count} have a bundle{', and faults are of these' if faults else ''})"
     return "\n".join([f"{words}:", "", *_lines(rows)])
+
+
+def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGroup]]) -> str:
+    """Return the causes of each crash type, one line each.
+
+    Args:
+        groups: one for each crash type.
+        causes: the crashes of each type, divided by cause.
+    """
+    rows = [["crashes", "type and cause", "judged", "shortest", "steps"]]
+    for group, parts in zip(groups, causes, strict=True):
+        rows.append([str(group.count), str(group.signature), "", "", ""])
+        for part in parts:
+            shortest = part.shortest
+            cells = [f"  {part.cause}", str(len(part.judged)), shortest.id, str(shortest.result.steps)]
+            rows.append([str(len(part.members)), *cells])
+    count = len({part.cause for parts in causes for part in parts})
+    return "\n".join(["", f"{count} {'cause' if count == 1 else 'causes'}:", "", *_lines(rows)])
 
 
 def _lines(rows: list[list[str]]) -> list[str]:
@@ -112,7 +133,10 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
         why = "processes were killed from outside"
         fix = f"Run the same command to run {them} again."
         lines.append(f"{report.unanswered} {trials} incomplete answers: {why}. {fix}")
-    if report.stopped_because == "interrupted":
+    if report.unconfirmed:
+        count = f"{report.unconfirmed} of {len(report.crashes)} crashes"
+        lines.append(f"Interrupted: {count} are not confirmed. Run the same command to confirm them.")
+    elif report.stopped_because == "interrupted":
         lines.append("Interrupted. Run the same command to resume.")
     if not report.crashes and report.stopped_because in ("all_trials", "time"):
         lines.append(
@@ -124,9 +148,9 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     lines += describe_probes(report)
     lines += describe_branches(report)
     lines += report.rare.lines if report.rare is not None else []
-    lines += describe_disturbances(report.crashes)
+    lines += describe_disturbances(report)
     if report.at_fault is not None and report.crashes:
-        all_of_them = len(report.crashes)
+        all_of_them = report.tally.found
         what = "crash is" if all_of_them == 1 else "crashes are"
         lines.append(f"{len(report.at_fault)} of {all_of_them} {what} the agent's own fault.")
     if report.kinds and sum(group.count for group in report.kinds) > 1:  # `--keep` leaves fewer bundles than crashes
@@ -135,7 +159,9 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     for bundle in crashes[:_SHOWN]:
         lines += ["", *_describe_crash(bundle)]
     if len(report.crashes) > _SHOWN:
-        lines += ["", f"… and {len(report.crashes) - _SHOWN} more in {report.directory / 'crashes'}"]
+        shown = f"{_SHOWN} of {report.tally.found} crashes shown"
+        more = f"{len(report.crashes) - _SHOWN} more in {report.directory / 'crashes'}"
+        lines += ["", f"{shown}; {more}"]
     lines += _near_misses(report, program)
     if report.copied is not None:
         lines += ["", *_describe_crash(report.copied)]
@@ -158,7 +184,7 @@ def _near_misses(report: HuntReport, program: str) -> list[str]:
         result = bundle.result
         lines.append(f"  {bundle.id}  danger {result.danger or 0.0:.2f}  {format_arguments(result)}")
     if len(report.near_misses) > _SHOWN:
-        lines.append(f"  … and {len(report.near_misses) - _SHOWN} more")
+        lines.append(f"  {_SHOWN} of {len(report.near_misses)} near misses shown")
     first = report.near_misses[0].id
     return [*lines, f"Replay one:  {shlex.join([program, 'replay', str(report.directory), '--crash', first])}"]
 

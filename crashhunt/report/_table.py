@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.plugins import locate
 from crashhunt.base.text import did_you_mean, one_line
 from crashhunt.crashes import Encounter
+from crashhunt.recording import describe_value, is_opaque
 from crashhunt.snapshots import latest_snapshot
 from crashhunt.trial import signature_of
 from crashhunt.world import approaches
@@ -99,10 +100,10 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
                 row[name] = float(measured[name][number]) if step.scene is not None else None
             elif name in actions:
                 array = step.actions.get(agent)
-                row[name] = None if array is None else array.reshape(-1)[actions.index(name)].item()
+                row[name] = None if array is None else _item(array, (actions.index(name),), channel.action_shape)
             elif name in observed:
                 array = step.observations.get(agent)
-                row[name] = None if array is None else array[observed[name]].item()
+                row[name] = None if array is None else _item(array, observed[name], channel.observation_shape)
             else:
                 row[name] = _of_scene(step, agent, name)
         rows.append({name: None if _is_nothing(value) else value for name, value in row.items()})
@@ -135,12 +136,23 @@ def aligned(rows: Sequence[Sequence[str]], *, left: int = 0) -> list[str]:
     return lines
 
 
+def _item(array: NDArray[np.generic], place: tuple[int, ...], shape: tuple[int, ...]) -> Any:
+    """Return a number of an action, flattened, or of an observation; the text of a value of any length."""
+    if is_opaque(shape):
+        return describe_value(array)
+    return (array.reshape(-1) if len(place) == 1 else array)[place].item()
+
+
 def _actions(channel: AgentChannel) -> tuple[str, ...]:
+    if is_opaque(channel.action_shape):
+        return ("action",)
     return tuple(channel.action_names) or tuple(f"action[{n}]" for n in range(math.prod(channel.action_shape)))
 
 
 def _observed(channel: AgentChannel) -> dict[str, tuple[int, ...]]:
     shape = tuple(channel.observation_shape)
+    if is_opaque(shape):
+        return {"observation": ()}
     if len(shape) == 2:
         names = channel.observation_names or tuple(map(str, range(shape[1])))
         return {

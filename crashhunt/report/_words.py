@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from crashhunt.crashes import Attempt, Bundle, DangerCourse, Encounter, Factor, Judgement, Moment, Why
+    from crashhunt.crashes import (
+        Attempt,
+        Bundle,
+        DangerCourse,
+        Encounter,
+        Factor,
+        Judgement,
+        Moment,
+        Omission,
+        Reference,
+        Why,
+    )
     from crashhunt.hunts import HuntReport
     from crashhunt.recording import Recording
     from crashhunt.trial import Disturbance, TrialResult, Value
@@ -26,6 +37,7 @@ __all__ = [
     "about_judgement",
     "about_nearest",
     "about_place",
+    "about_reference",
     "about_why",
     "by_likelihood",
     "danger_cells",
@@ -33,7 +45,6 @@ __all__ = [
     "describe_branches",
     "describe_disturbances",
     "describe_probes",
-    "likeliest",
     "list_disturbances",
     "may_be_disturbed",
     "nearest_to_json",
@@ -110,7 +121,7 @@ def about_danger(course: DangerCourse) -> str:
     """Return the greatest criticality of both kinds, and their sums over the trial."""
     parts = []
     for whose, moment, total, relation, absent in (
-        (f"{course.agent}'s own", course.greatest, course.own_total, "towards", "no actor was near"),
+        (f"{course.agent}'s own", course.greatest, course.own_total, "towards", _no_danger(course)),
         (
             "that by those behind it",
             course.greatest_behind,
@@ -125,6 +136,13 @@ def about_danger(course: DangerCourse) -> str:
         most = f"at most {moment.danger:.2f}, after step {moment.step}, {relation} {moment.other}"
         parts.append(f"{whose} was {most} ({total:.2f} over the trial)")
     return f"Danger: {parts[0]}; {parts[1]}."
+
+
+def _no_danger(course: DangerCourse) -> str:
+    if course.nearest is None:
+        return "no actor came within 50 m"
+    actor, gap_m, step = course.nearest
+    return f"no actor was on its way; {actor} came nearest, {gap_m:.1f} m away after step {step}"
 
 
 def danger_cells(course: DangerCourse, step: int) -> list[str]:
@@ -212,37 +230,33 @@ def list_disturbances(result: TrialResult) -> list[str]:
     return lines
 
 
-def describe_disturbances(crashes: Sequence[Bundle]) -> list[str]:
+def describe_disturbances(report: HuntReport) -> list[str]:
     """Return how many crashes of a hunt with disturbances had any, and which of those is the likeliest."""
-    if not any(may_be_disturbed(bundle.result) for bundle in crashes):
+    found = report.tally
+    if not (report.settings.disturb and found.found):
         return []
-    disturbed = [bundle for bundle in crashes if bundle.result.disturbed]
-    lines = [f"Crashes: {len(crashes) - len(disturbed)} in undisturbed traffic, {len(disturbed)} with disturbances."]
-    first = likeliest(crashes)
-    if first is not None:
-        lines.append(f"Likeliest crash with disturbances: {first.id} (log-likelihood {_likely(first):.2f})")
+    undisturbed = found.found - found.disturbed
+    lines = [f"Crashes: {undisturbed} in undisturbed traffic, {found.disturbed} with disturbances."]
+    if found.likeliest:
+        lines.append(
+            f"Likeliest crash with disturbances: {found.likeliest} (log-likelihood {found.log_likelihood:.2f})"
+        )
     return lines
 
 
-def likeliest(crashes: Sequence[Bundle]) -> Bundle | None:
-    """Return the likeliest of the crashes with disturbances; None where none of them was drawn."""
-    drawn = [bundle for bundle in crashes if bundle.result.disturbed and math.isfinite(_likely(bundle))]
-    return by_likelihood(drawn)[0] if drawn else None
-
-
-def traffic_of(bundle: Bundle, crashes: Sequence[Bundle]) -> str:
+def traffic_of(bundle: Bundle, likeliest: str) -> str:
     """Return which traffic a crash took place in, in words; empty where its hunt has no disturbances.
 
     Args:
         bundle: the crash.
-        crashes: all of the hunt.
+        likeliest: identifier of the likeliest crash with disturbances of the hunt.
     """
     if not may_be_disturbed(bundle.result):
         return ""
     if not bundle.result.disturbed:
         return "in undisturbed traffic"
     likely = f", log-likelihood {_likely(bundle):.1f}" * math.isfinite(_likely(bundle))
-    return f"with disturbances{likely}{': the likeliest' * (bundle is likeliest(crashes))}"
+    return f"with disturbances{likely}{': the likeliest' * (bundle.id == likeliest)}"
 
 
 def by_likelihood(crashes: Sequence[Bundle]) -> list[Bundle]:
@@ -338,17 +352,78 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
     return sentences
 
 
+_FACULTIES = {
+    "longitudinal": "controls its speed",
+    "lateral": "decides about its lane changes",
+    "both": "controls its speed and decides about its lane changes",
+}
+
+
+def about_reference(reference: Reference, ago: Callable[[int], str], agent: str) -> list[str]:
+    """Return what the agent omitted, in sentences; empty where no run says so.
+
+    Args:
+        reference: the runs with a reference driver.
+        ago: as in `about_judgement`.
+        agent: the controlled vehicle.
+    """
+    if reference.omission is None:
+        return []
+    omission, runs = reference.omission, [run for run in reference.deciding if run.ending != "unclear"]
+    sentences = [f"Cause: {_omitted(omission, agent, ago)}."]
+    count = "the run ends" if len(runs) == 1 else f"all {len(runs)} runs end"
+    changed = sorted({each for run in runs for each in run.changed} if omission.faculty == "longitudinal" else ())
+    more = f" In these runs {' and '.join(changed)}, too." if changed else ""
+    sentences.append(
+        f"With a reference driver that {_FACULTIES[omission.faculty]} from {ago(omission.step)}, on, {count} without a "
+        f"crash.{more}"
+    )
+    return sentences
+
+
+def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
+    """What an agent omitted, as a sentence without its period."""
+    actor, kind = omission.actor, omission.kind
+    seen = ""
+    if omission.visible_step is not None and omission.visible_step <= omission.step:
+        seen = ", which it observed from the start" if omission.visible_step == 0 else ""
+        seen = seen or f", which it observed since {ago(omission.visible_step)}"
+    elif actor and omission.visible_step is not None:
+        seen = ", which it did not observe yet"
+    if omission.instead == "changed lanes":
+        relation, _, side = kind.rpartition(" ")
+        if relation == "no lane":
+            return f"{agent} changed to the {side}, where it has no lane"
+        away = "" if omission.gap_m is None or relation == "alongside" else f"{omission.gap_m:.1f} m "
+        speeds = f"{omission.actor_speed_mps or 0:.1f} m/s against {omission.speed_mps:.1f} m/s of {agent}"
+        needs, where = "", "alongside it"
+        if relation != "alongside":
+            where = f"{away}{relation}{' it' if relation == 'behind' else ''}"
+            needs = f"; the safe gap is {omission.safe or 0:.1f} m"
+        return f"{agent} changed to the {side} lane although {actor} was {where} ({speeds}{needs}){seen}"
+    what = "stop for a red light" if kind == "red light" else f"brake for {actor}"
+    what = f"yield to {actor}" if kind == "crossing" else what
+    gap = f"{omission.gap_m:.1f} m ahead, " if omission.gap_m is not None else ""
+    safe = f"{omission.speed_mps:.1f} m/s where {omission.safe or 0:.1f} m/s are safe"
+    if omission.speed_mps <= (omission.safe or 0.0):  # not too fast yet, but its action would make it so
+        safe = f"{omission.safe:.1f} m/s are safe, and it was about to drive faster"
+    if omission.instead == "braked too little":
+        return f"{agent} braked too little to {what} ({gap}{safe}){seen}"
+    return f"{agent} did not {what} ({gap}{safe}){seen}, and {omission.instead}"
+
+
 def _until(attempt: Attempt, ago: Callable[[int], str]) -> str:
     assert attempt.last_step is not None
     braking = f" (at up to {attempt.deceleration:.1f} m/s²)" if attempt.deceleration is not None else ""
     words = (
         f"It could be avoided until {ago(attempt.last_step)}, {_BY.get(attempt.manoeuvre, attempt.manoeuvre)}{braking}"
     )
+    more = f" In that run {' and '.join(attempt.changed)}, too." if attempt.changed else ""
     if attempt.all_later_run and attempt.last_step < attempt.end - 1:
-        return f"{words}; that was run, and after each later step it was too late."
+        return f"{words}; that was run, and after each later step it was too late.{more}"
     if attempt.too_late_step is not None:
-        return f"{words}; that was run, and one step later it was too late."
-    return f"{words}; that was run."
+        return f"{words}; that was run, and one step later it was too late.{more}"
+    return f"{words}; that was run.{more}"
 
 
 # The causes of a crash, in words. Every sentence reports runs, not calculations.
@@ -426,6 +501,10 @@ def _outcome(factor: Factor) -> str:
     parts = [f"{words} in {number} of {of} runs" if of > 1 else words for words, number in several if number]
     into = sorted({run.into for run in factor.runs if run.into})
     more = f", though {factor.name} then drives into {' or '.join(into)} itself" if into else ""
+    changed = sorted({each for run in factor.runs for each in run.changed})
+    of_changed = sum(bool(run.changed) for run in factor.runs)
+    if changed:
+        more += f" (in {of_changed} of {of} runs {' or '.join(changed)}, too)"
     return f"{' and '.join(parts)}{more}"
 
 

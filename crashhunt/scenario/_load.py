@@ -189,7 +189,8 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
     path = _path_of(name)
     if path.suffix == ".toml":
         if ego:
-            message = f"--ego {ego!r} is for a bare {_configuration_endings()}"
+            bare = [known.endings[0] for known in configurations() if known.takes_ego]
+            message = f"--ego {ego!r} is for a bare {' or a '.join(bare)}"
             raise ScenarioError(message, fix="set the vehicle under [agents] instead", where=str(path))
         scenario = _load_toml(path, kept=kept)
     else:

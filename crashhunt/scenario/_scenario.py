@@ -382,11 +382,15 @@ class Configuration:
         endings: of its name, such as ``.sumocfg``; messages name the first one.
         load: returns it as a scenario, from its path and from what ``--ego`` says, which may be empty.
         arguments: the scenario arguments that every such scenario has, for completion in the shell.
+        takes_ego: whether ``--ego`` chooses its controlled vehicle.
+        waiting: what takes its time when one is loaded, in words; empty where nothing does.
     """
 
     endings: tuple[str, ...]
     load: Callable[[Path, str], Scenario]
     arguments: tuple[str, ...] = ()
+    takes_ego: bool = True
+    waiting: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -65,6 +65,7 @@ class Runs:
         count: how many have been run, or are known from the last time.
         steps: of these, altogether.
         most_steps: what takes longer to crash does not count as the same.
+        found_steps: how many steps the last candidate that crashed in the same manner has begun.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class Runs:
         watch: Watch | None,
     ) -> None:
         self.count = self.steps = 0
-        self.most_steps = max(1, rerun.bundle.result.steps_begun)
+        self.most_steps = self.found_steps = max(1, rerun.bundle.result.steps_begun)
         self._rerun, self._signature, self._memory_file = rerun, signature, memory
         self._budget, self._watch, self._scratch = budget, watch, scratch
         self._memory = _remembered(memory)
@@ -135,6 +136,8 @@ class Runs:
         if self._watch is not None:
             self._watch(min(self.count, self._budget), self._budget)
         if best() < len(candidates):
+            was = self._rerun.bundle.result
+            self.found_steps = max(1, found[best()].steps + was.steps_begun - was.steps)
             return best()
         if len(found) < len(candidates):
             raise StoppedError

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import Value
 
-__all__ = ["Tried", "fewest", "plainest"]
+__all__ = ["Tried", "as_type_of", "fewest", "plainest"]
 
 T = TypeVar("T")
 Tried = Callable[[Sequence[T]], int | None]
@@ -71,9 +71,16 @@ def plainest(value: Value, default: Value | None) -> list[Value]:
     return list(dict.fromkeys(found[: found.index(value)] if value in found else found))
 
 
+def as_type_of(value: Value, default: Value) -> Value | None:
+    """Return a default as the type of a value; None where that would be another value. ``speed=5`` may mean 5.0."""
+    if isinstance(value, float) and isinstance(default, int) and not isinstance(default, bool):
+        return float(default)
+    return default if type(default) is type(value) else None
+
+
 def _plainer(value: Value, default: Value | None) -> Iterator[Value]:
-    if default is not None and type(default) is type(value):
-        yield default
+    if default is not None and (same := as_type_of(value, default)) is not None:
+        yield same
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return
     for digits in _DIGITS:

@@ -12,6 +12,7 @@ from crashhunt.base.temporary import remove_at_once, temporary_folder
 from crashhunt.crashes import is_bundle_made_here, signature_of, write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import read_map, run_alone
+from crashhunt.plans import takes_of
 from crashhunt.replays import ReplayOptions, confirm, prepare
 from crashhunt.shrinking._runs import Runs, is_same
 from crashhunt.shrinking._stages import Ended, Form, Search
@@ -154,7 +155,7 @@ def shrink(
             stopped=stopped, watch=watch,
         )  # fmt: skip
         try:
-            search = Search(rerun, runs, form)
+            search = Search(rerun, runs, form, _constructor_defaults(rerun))
             ended, why = search.run(stopped)
         finally:
             runs.close()
@@ -208,6 +209,15 @@ def shrink(
         steps_cut=search.steps_cut,
         notes=(*rerun.warnings, *search.notes),
     )
+
+
+def _constructor_defaults(rerun: Rerun) -> dict[tuple[str, str], Value]:
+    """Return the defaults in the constructors of the agents, by agent and name; those that are no plain values miss."""
+    found: dict[tuple[str, str], Value] = {}
+    for agent, setup in rerun.worker.scenario.agents.items():
+        defaults = takes_of(setup.agent, rerun.worker.code).defaults
+        found |= {(agent, name): default for name, default in defaults.items()}
+    return found
 
 
 def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.shrinking._runs import OutOfTimeError
 from crashhunt.shrinking._scripting import Part, Scripting, can_be_scripted
-from crashhunt.shrinking._search import fewest, plainest
+from crashhunt.shrinking._search import as_type_of, fewest, plainest
 from crashhunt.trial import EVERYBODY, OF_AGENT
 from crashhunt.whatif import StoppedError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
@@ -41,6 +43,8 @@ class Search:
         rerun: the crash.
         runs: what runs candidates.
         form: Whether the other actors drive; with ``either``, they drive if few of them remain.
+        constructor_defaults: The defaults in the agents' own code, by agent and name. They win over those of the
+            scenario, because the user finds them where the agent is fixed.
 
     Attributes:
         best: the smallest that did it.
@@ -49,7 +53,13 @@ class Search:
         notes: what could not be tried, in words.
     """
 
-    def __init__(self, rerun: Rerun, runs: Runs, form: Form) -> None:
+    def __init__(
+        self,
+        rerun: Rerun,
+        runs: Runs,
+        form: Form,
+        constructor_defaults: Mapping[tuple[str, str], Value] = MappingProxyType({}),
+    ) -> None:
         self.best = rerun.spec
         self.smaller: list[TrialSpec] = []
         self.reproduced = False
@@ -57,7 +67,8 @@ class Search:
         self._rerun, self._runs, self._form = rerun, runs, form
         self._everybody: tuple[str, ...] = ()
         self._left_out = True
-        self._shortest = runs.most_steps
+        self._shortest = self._steps = runs.most_steps
+        self._defaults = {**rerun.defaults, **constructor_defaults}
         self._scripting = Scripting(rerun) if form != "traffic" and can_be_scripted(rerun) else None
 
     def run(self, stopped: Callable[[], bool]) -> tuple[Ended, str]:
@@ -103,6 +114,8 @@ class Search:
                 self._until_nothing_helps(self._fewer_others)
         if self._wants_script():
             self._script(scripting)
+        elif self._form == "either" and self._steps > self._shortest:
+            self._begin_later(scripting)
         if self.best.only is None and self.best.script is None and self._form == "either":
             self._scripting = None
             self._until_nothing_helps(self._fewer_others)
@@ -120,7 +133,17 @@ class Search:
         if good is not None:
             self.best = specs[good]
             self.smaller.append(self.best)
+            self._steps = self._runs.found_steps
         return good
+
+    @contextmanager
+    def _no_longer(self) -> Iterator[None]:
+        """Refuse candidates that take longer than the best: steps count more than arguments and disturbances."""
+        before, self._runs.most_steps = self._runs.most_steps, min(self._runs.most_steps, self._steps)
+        try:
+            yield
+        finally:
+            self._runs.most_steps = before
 
     # With the traffic driving
 
@@ -192,6 +215,19 @@ class Search:
                 del self.smaller[before:]
         if self.best.script is not None:  # where it begins later, or with plainer arguments, fewer may do
             self._until_nothing_helps(self._fewer_moved)
+
+    def _begin_later(self, scripting: Scripting) -> None:
+        """Script the few actors that are left, from as late as possible: without the rest, the crash took longer."""
+        others = tuple(name for name in scripting.whole.others if name in (self.best.only or ()))
+        agents = scripting.whole.agents
+        whole = Part(agents, others)
+        parts = [*(replace(whole, begin=begin) for begin in scripting.begins(agents)), whole]
+        before, self._runs.most_steps = self._runs.most_steps, self._shortest
+        try:
+            if self._try([scripting.spec(part) for part in parts]) is not None:
+                self._until_nothing_helps(self._fewer_moved)
+        finally:
+            self._runs.most_steps = before
 
     def _is_smaller(self, than: TrialSpec) -> bool:
         """Whether the best has fewer actors, agents or steps than one in which the others drive."""
@@ -285,14 +321,20 @@ class Search:
         def tried(some: Sequence[tuple[Disturbance, ...]]) -> int | None:
             return self._try([replace(best, disturbances=one) for one in some])
 
-        fewest(best.disturbances, tried)
+        with self._no_longer():
+            fewest(best.disturbances, tried)
 
     def _plainer_arguments(self) -> None:
-        defaults = self._rerun.defaults
+        with self._no_longer():
+            self._plain_arguments()
+
+    def _plain_arguments(self) -> None:
+        defaults = self._defaults
         at_default = self.best
         for key in _keys(self.best):
-            if defaults.get(key) is not None:
-                at_default = _with(at_default, key, defaults[key])
+            default = defaults.get(key)
+            if default is not None:
+                at_default = _with(at_default, key, as_type_of(_value(self.best, key), default))
         if at_default != self.best:
             self._try([at_default])
         for key in _keys(self.best):

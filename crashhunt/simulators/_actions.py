@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt.base.boundaries import Boundary, Party
 from crashhunt.base.errors import ActionError
 
 if TYPE_CHECKING:
@@ -17,6 +19,7 @@ __all__ = ["META_ACTIONS", "MetaAction", "SpaceAction", "SpeedAndLaneChange", "c
 
 MAX_TARGET_SPEED = 100.0  # m/s; a Box space needs a finite bound, and no road vehicle is faster
 _MAX_ACTION_CHARACTERS = 200  # of an action in an error message
+_SPACE = Boundary(Party.ENVIRONMENT, "action conversion")
 META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 """The meta-actions in the order of highway-env's DiscreteMetaAction."""
 
@@ -68,19 +71,27 @@ class SpaceAction:
     names: tuple[str, ...] = ()
 
     def __init__(self, space: Space[object]) -> None:
+        from gymnasium.spaces import Box
+
         self.space = space
         self._dtype = np.dtype(space.dtype)
+        self._is_box = isinstance(space, Box)
 
     def encode(self, action: object) -> NDArray[np.generic]:
         """Return an array of the space's type and shape."""
-        try:
+        array: NDArray[np.generic] | None = None
+        with suppress(Exception):  # converting the agent's object runs the agent's code, which may raise anything
             array = cast(action, self._dtype)
-            inside = self.space.contains(array if self.space.shape else array[()])
-        except Exception:  # converting the agent's object runs the agent's code, which may raise anything
-            inside = False
-        if not inside:
+        if array is None or not self._contains(array):
             raise ActionError(f"the action {describe_action(action)} is not in {self.space}", fix="return one that is")
         return array
+
+    def _contains(self, array: NDArray[np.generic]) -> bool:
+        # The array has no code of the agent's. So if the space fails, which may be a user's, it is the space's fault.
+        try:
+            return bool(self.space.contains(array if self.space.shape or self._is_box else array[()]))
+        except BaseException as error:
+            _SPACE.wrap(error)
 
 
 class MetaAction(SpaceAction):

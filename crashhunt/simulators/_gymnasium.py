@@ -1,19 +1,23 @@
-"""Observations and actions of any Gymnasium space as arrays of a fixed shape, which recordings can hold."""
+"""Observations and actions of any Gymnasium space as arrays, which recordings can hold."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from gymnasium import spaces
+from gymnasium import Space, spaces
 
-from crashhunt.base.errors import ActionError, ScenarioError
+from crashhunt.base.boundaries import Boundary, Party
+from crashhunt.base.errors import ActionError
+from crashhunt.recording import OPAQUE_SHAPE, decode_value, encode_value
 from crashhunt.simulators._actions import SpaceAction, cast, describe_action, is_masked
 
 if TYPE_CHECKING:
-    from gymnasium import Space
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from crashhunt.base.json_types import Plain
@@ -22,37 +26,207 @@ if TYPE_CHECKING:
     from crashhunt.trial import Value
 
 
-__all__ = ["FlatAction", "ObservationForm", "action_form", "as_tables", "merge", "native", "reseed_in_place"]
+__all__ = [
+    "FlatAction",
+    "ObservationForm",
+    "OpaqueAction",
+    "OpaqueSpace",
+    "action_form",
+    "as_tables",
+    "merge",
+    "native",
+    "reseed_in_place",
+]
 
 
 _ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+_MAX_ORIGINALS: Final = 256  # objects of a user's classes that may be needed again, because an agent sees them late
+_NOT_WHOLE: Final = b'{"opaque":'  # in the text of a value with a part that cannot be restored; texts escape quotes
+_SPACE = Boundary(Party.ENVIRONMENT, "space conversion")
+_ACTION_SPACE = Boundary(Party.ENVIRONMENT, "action conversion")
 
 
 class ObservationForm:
-    """Converts the observations of an environment into arrays of a fixed shape.
+    """Converts the observations of an environment into arrays.
+
+    An observation is recorded as it is if its space is an array. Observations of a Dict or Tuple space of arrays are
+    flattened, if that loses nothing. Any other observation is recorded as the text of its value (`encode_value`).
 
     Args:
-        space: The environment's observation space. Observations of a Dict or Tuple space are flattened.
+        space: The environment's observation space.
 
-    Raises:
-        ScenarioError: The space has no fixed size.
+    Attributes:
+        original: The environment's observation space.
+        space: The space of the arrays.
+        structured: Whether agents receive something else than the array: call `restore`.
     """
 
-    def __init__(self, space: Space[object]) -> None:
+    def __init__(self, space: Space[Any]) -> None:
         self.original = space
-        self.flattened = not isinstance(space, _ARRAYS)
-        if self.flattened and not space.is_np_flattenable:
-            raise ScenarioError(
-                f"observations of the space {space} have no fixed size", fix="wrap the environment so that they have"
-            )
-        self.space: Space[object] = spaces.flatten_space(space) if self.flattened else space
+        self._values: _Values | None = None
+        self.flattened = False
+        self.space: Space[Any] = space
+        if not _is_array(space):
+            self.flattened = _flattens_exactly(space)
+            self.space = spaces.flatten_space(space) if self.flattened else OpaqueSpace(space)
+            self._values = None if self.flattened else _Values()
+        self.structured = self.space is not space
         self._dtype = np.dtype(self.space.dtype)
 
     def encode(self, observation: object) -> NDArray[np.generic]:
-        """Return a new array with the type and shape of `space`."""
-        if self.flattened:
-            observation = spaces.flatten(self.original, observation)
-        return np.array(observation, self._dtype).reshape(self.space.shape or ())
+        """Return a new array with the type and shape of `space`.
+
+        Raises:
+            ForeignError: The environment's observation does not have the form that its space says.
+        """
+        if self._values is not None:
+            return self._values.encode(observation)
+        with _SPACE:  # the observation is the environment's, of any class
+            if self.flattened:
+                with _quiet():
+                    observation = self._flat(observation)
+            return np.array(observation, self._dtype).reshape(self.space.shape or ())
+
+    def restore(self, array: NDArray[np.generic]) -> object:
+        """Return the observation that the agent receives, from its array."""
+        if self._values is not None:
+            return self._values.restore(array)
+        return spaces.unflatten(self.original, array) if self.flattened else array
+
+    def contains(self, observation: object, array: NDArray[np.generic]) -> bool:
+        """Return whether an observation lies inside the environment's space.
+
+        Args:
+            observation: The observation.
+            array: Its array.
+        """
+        if self.structured:
+            with _SPACE, _quiet():
+                return bool(self.original.contains(observation))
+        return bool(self.space.contains(array))
+
+    def _flat(self, observation: object) -> object:
+        flat = spaces.flatten(self.original, observation)
+        # Outside the space, a number may become another one without an error: a Discrete -1 becomes the largest.
+        if not self.original.contains(observation) and not _equal(spaces.unflatten(self.original, flat), observation):
+            raise ValueError(f"the observation {describe_action(observation)} does not have the form of its space")
+        return flat
+
+
+class OpaqueSpace(Space[Any]):
+    """The space of recorded values: arrays of bytes of any length, each the text of a value of another space.
+
+    Args:
+        original: The space of the values.
+    """
+
+    def __init__(self, original: Space[Any]) -> None:
+        super().__init__(OPAQUE_SHAPE, np.uint8)
+        self.original = original
+
+    @property
+    def is_np_flattenable(self) -> bool:
+        """False: the arrays have no fixed size."""
+        return False
+
+    def sample(self, *args: Any, **kwargs: Any) -> NDArray[np.uint8]:
+        """Return the text of a sample of the original space."""
+        return encode_value(self.original.sample(*args, **kwargs))
+
+    def contains(self, x: Any) -> bool:
+        """Return whether an array holds the text of a value."""
+        if not (isinstance(x, np.ndarray) and x.dtype == np.uint8 and x.ndim == 1):
+            return False
+        try:
+            decode_value(x)
+        except ValueError:
+            return False
+        return True
+
+    def __repr__(self) -> str:
+        return f"OpaqueSpace({self.original!r})"
+
+
+class _Values:
+    """Converts values of any class into arrays and back.
+
+    A value that a recording cannot hold is restored as the object itself, in the process that has encoded it.
+    """
+
+    def __init__(self) -> None:
+        self._originals: dict[bytes, object] = {}
+
+    def encode(self, value: object) -> NDArray[np.generic]:
+        """Return the text of a value."""
+        array = encode_value(value)
+        text = array.tobytes()
+        if _NOT_WHOLE in text:
+            self._originals.pop(text, None)
+            self._originals[text] = value
+            if len(self._originals) > _MAX_ORIGINALS:
+                del self._originals[next(iter(self._originals))]
+        return array
+
+    def restore(self, array: NDArray[np.generic]) -> object:
+        """Return the value that an array holds: a copy, or the object itself if it cannot be restored."""
+        text = array.tobytes()
+        return self._originals[text] if text in self._originals else decode_value(array)[0]
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Ignore warnings: Gymnasium warns whenever it turns lists and numbers into arrays."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _is_array(space: Space[Any]) -> bool:
+    return isinstance(space, _ARRAYS) and _can_be_recorded(np.dtype(space.dtype))
+
+
+def _can_be_recorded(dtype: np.dtype[Any]) -> bool:
+    """Whether logs hold arrays of a type without losing a bit."""
+    return (dtype.kind == "f" and dtype.itemsize in (4, 8)) or dtype.kind in "ib" or dtype.str[1:] in ("u1", "u2", "u4")
+
+
+def _leaves(space: Space[Any]) -> Iterator[Space[Any]]:
+    """Yield the spaces inside Dict and Tuple spaces; an empty one, which Gymnasium cannot flatten, as it is."""
+    if isinstance(space, spaces.Dict | spaces.Tuple) and len(space.spaces):
+        for part in space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces:
+            yield from _leaves(part)
+    else:
+        yield space
+
+
+def _flattens_exactly(space: Space[Any]) -> bool:
+    """Whether flattening a value of a space and unflattening it loses nothing."""
+    leaves = list(_leaves(space))
+    if isinstance(space, _ARRAYS) or not leaves or not all(isinstance(leaf, _ARRAYS) for leaf in leaves):
+        return False
+    dtype = np.dtype(spaces.flatten_space(space).dtype)
+    return _can_be_recorded(dtype) and all(_fits(leaf, dtype) for leaf in leaves)
+
+
+def _fits(leaf: Space[Any], dtype: np.dtype[Any]) -> bool:
+    if not isinstance(leaf, spaces.Box):  # flattening makes zeros and ones of it
+        return True
+    if not np.can_cast(leaf.dtype, dtype, "safe"):
+        return False
+    if np.dtype(leaf.dtype).kind in "iu" and dtype.kind == "f":
+        exact = 2 ** (np.finfo(dtype).nmant + 1)
+        return bool(leaf.low.size == 0 or (leaf.low.min() >= -exact and leaf.high.max() <= exact))
+    return True
+
+
+def _equal(one: Any, other: Any) -> bool:
+    """Whether two structures have equal numbers."""
+    if isinstance(one, Mapping):
+        return isinstance(other, Mapping) and all(key in other and _equal(one[key], other[key]) for key in one)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(_equal, one, other))
+    left, right = np.asarray(one), np.asarray(other)
+    return np.array_equal(left, right.astype(left.dtype), equal_nan=left.dtype.kind == "f")
 
 
 class FlatAction:
@@ -65,8 +239,6 @@ class FlatAction:
     names: tuple[str, ...] = ()
 
     def __init__(self, space: Space[object]) -> None:
-        if not space.is_np_flattenable:
-            raise ScenarioError(f"actions of the space {space} have no fixed size", fix="wrap the environment")
         self.space = space
         self._flat = spaces.flatten_space(space)
 
@@ -81,8 +253,7 @@ class FlatAction:
                 again = np.asarray(spaces.flatten(self.space, structured))
                 inside = self.space.contains(structured) and np.allclose(again, array, rtol=1e-3, atol=1e-3)
             else:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # Gymnasium warns that it turns lists into arrays
+                with _quiet():
                     inside = not _any_masked(action) and self.space.contains(action)
                     array = np.asarray(spaces.flatten(self.space, action)) if inside else array
         except Exception:  # reading the agent's object runs the agent's code, which may raise anything
@@ -92,18 +263,57 @@ class FlatAction:
         return array
 
 
+class OpaqueAction:
+    """An action of a space without a fixed size, such as Text, Sequence or Graph, recorded as the text of its value.
+
+    Args:
+        space: The environment's action space.
+    """
+
+    names: tuple[str, ...] = ()
+    encoded_shape = OPAQUE_SHAPE
+
+    def __init__(self, space: Space[object]) -> None:
+        self.space = space
+        self._values = _Values()
+
+    def encode(self, action: object) -> NDArray[np.generic]:
+        """Return the text of the action; an action that is already encoded does not change."""
+        array = self._values.encode(action)
+        # The copy contains no code of the agent's. So if the space fails, it is the space's own fault.
+        if self._contains(self._values.restore(array)):
+            return array
+        if OpaqueSpace(self.space).contains(action):
+            given = np.array(action)
+            if self._contains(self._values.restore(given)):
+                return given
+        raise ActionError(f"the action {describe_action(action)} is not in {self.space}", fix="return one that is")
+
+    def restore(self, array: NDArray[np.generic]) -> object:
+        """Return the action that an array holds."""
+        return self._values.restore(array)
+
+    def _contains(self, action: object) -> bool:
+        with _ACTION_SPACE, _quiet():
+            return bool(self.space.contains(action))
+
+
 def _any_masked(action: object) -> bool:
     parts = action.values() if isinstance(action, Mapping) else action if isinstance(action, list | tuple) else ()
     return is_masked(action) or any(map(_any_masked, parts))
 
 
-def action_form(space: Space[object]) -> ActionForm:
+def action_form(space: Space[Any]) -> ActionForm:
     """Return the action form of a Gymnasium space."""
-    return SpaceAction(space) if isinstance(space, _ARRAYS) else FlatAction(space)
+    if _is_array(space):
+        return SpaceAction(space)
+    return FlatAction(space) if _flattens_exactly(space) else OpaqueAction(space)
 
 
 def native(form: ActionForm, action: NDArray[np.generic]) -> object:
     """Return an encoded action in the form that the environment expects: a number, an array or a structure."""
+    if isinstance(form, OpaqueAction):
+        return form.restore(action)
     if isinstance(form, FlatAction):
         return spaces.unflatten(form.space, action)
     return action.item() if isinstance(form.space, spaces.Discrete) else np.array(action)

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     import numpy as np
     from gymnasium import Space
 
+    from crashhunt.base.boundaries import Party
     from crashhunt.native import UsualSteps, Vehicles
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Lane, Paths, Roster, Scene
+    from crashhunt.world import Lane, Paths, Roster, Scene, Surroundings
 
 __all__ = [
     "FACULTIES",
@@ -36,9 +37,13 @@ __all__ = [
     "NamesDanger",
     "NamesObservations",
     "Observations",
+    "OfAnyLength",
     "Options",
     "PlaysPaths",
     "Reseeds",
+    "RestoresObservations",
+    "RunsForeignCode",
+    "SeesSurroundings",
     "Simulator",
     "StepResult",
     "StepsAtOnce",
@@ -103,6 +108,14 @@ class ActionForm(Protocol):
         """
 
 
+class OfAnyLength(Protocol):
+    """An action form whose encoded actions are arrays of bytes, each of its own length."""
+
+    @property
+    def encoded_shape(self) -> tuple[int, ...]:
+        """The shape in the prologue of a recording: (-1,)."""
+
+
 class Simulator(Protocol):
     """Runs one episode after another.
 
@@ -110,10 +123,11 @@ class Simulator(Protocol):
     actions. This holds in the same process and in another process, whatever ran before. The simulator never changes an
     array that it has returned.
 
-    Each optional capability is a protocol of its own: `TellsNotices`, `FlattensObservations`, `NamesObservations`,
-    `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `SupportsDisturbances`, `HoldsBack`, `LeavesOut`,
-    `PlaysPaths`, `Reseeds`, `CountsSetUp`, `Tidies` and `ReadiesProcess`. A simulator supports a protocol if it has the
-    methods and attributes of the protocol. It need not register them.
+    Each optional capability is a protocol of its own: `TellsNotices`, `FlattensObservations`, `RestoresObservations`,
+    `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `SeesSurroundings`,
+    `SupportsDisturbances`, `HoldsBack`, `LeavesOut`, `PlaysPaths`, `Reseeds`, `CountsSetUp`, `RunsForeignCode`,
+    `Tidies` and `ReadiesProcess`. A simulator supports a protocol if it has the methods and attributes of the protocol.
+    It need not register them.
     """
 
     @property
@@ -183,6 +197,22 @@ class FlattensObservations(Protocol):
         """
 
 
+class RestoresObservations(Protocol):
+    """A simulator that makes structured observations again of their arrays, in place of `gymnasium.spaces.unflatten`.
+
+    Needed for observations of the agents in `FlattensObservations.shown_spaces` whose arrays are not flattened values,
+    such as texts and graphs.
+    """
+
+    def restore_observation(self, agent: str, array: NDArray[Any], /) -> object:
+        """Return the observation that an agent receives.
+
+        Args:
+            agent: The agent, which is in `shown_spaces`.
+            array: An array that `Simulator.reset` or `Simulator.step` has returned in this episode.
+        """
+
+
 class NamesObservations(Protocol):
     """A simulator whose observations are tables with one row per actor and named columns."""
 
@@ -246,6 +276,20 @@ class BrakesFully(Protocol):
         """Return the action for full braking; None if no action keeps this vehicle in its lane while it brakes.
 
         crashhunt calls this method after `Simulator.reset`.
+        """
+
+
+class SeesSurroundings(Protocol):
+    """A simulator that knows what a careful driver of an agent's vehicle would consider.
+
+    Counterfactual runs with a reference driver need it. Contract: `surroundings` changes nothing in the simulation.
+    """
+
+    def surroundings(self, agent: str) -> Surroundings:
+        """Return the surroundings of a vehicle after the last `Simulator.reset` or `Simulator.step`.
+
+        Args:
+            agent: The identifier of an agent's vehicle that has not left the simulation.
         """
 
 
@@ -351,6 +395,18 @@ class CountsSetUp(Protocol):
     """
 
 
+class RunsForeignCode(Protocol):
+    """A simulator of crashhunt's own that runs code of others, which may fail without a fault of crashhunt."""
+
+    party: Party
+    """Whose code it runs: that of a simulator, or of a user's environment."""
+    foreign_packages: Sequence[str]
+    """Top-level packages of that code; an exception that has come through them is no fault of crashhunt.
+
+    Empty if the simulator calls that code inside boundaries only (`crashhunt.base.boundaries`).
+    """
+
+
 class Tidies(Protocol):
     """A simulator whose episodes change state outside the simulator object, such as class attributes of a library."""
 
@@ -419,12 +475,14 @@ class StepsAtOnce(Protocol):
 FACULTIES: tuple[type, ...] = (
     TellsNotices,
     FlattensObservations,
+    RestoresObservations,
     NamesDanger,
     NamesObservations,
     TellsEvents,
     HasMap,
     HasWindow,
     BrakesFully,
+    SeesSurroundings,
     SupportsDisturbances,
     HoldsBack,
     LeavesOut,
@@ -432,6 +490,7 @@ FACULTIES: tuple[type, ...] = (
     Reseeds,
     StepsAtOnce,
     CountsSetUp,
+    RunsForeignCode,
     Tidies,
     ReadiesProcess,
 )

@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from crashhunt.base.errors import CrashhuntError, InvalidEpisodeError, ScenarioError
+from crashhunt.base.boundaries import Boundary, ForeignError, Party
+from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
+from crashhunt.base.exceptions import in_words, place_of
 from crashhunt.base.plugins import load_object
-from crashhunt.base.text import encodable
+from crashhunt.base.text import encodable, one_of
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.gym import GymSetup
 from crashhunt.simulators._gymnasium import ObservationForm, action_form, as_tables, merge, native, reseed_in_place
+from crashhunt.simulators._parallel import OneLearner, is_parallel, takes_turns
 from crashhunt.world import Contact, Roster, Scene
 
 if TYPE_CHECKING:
@@ -32,6 +35,11 @@ if TYPE_CHECKING:
 __all__ = ["GymSimulator"]
 
 _NOBODY = Roster(())
+_KIND = "crash_kind"
+_MAX_KIND_CHARACTERS = 80
+_CONSTRUCTOR, _RESET, _STEP, _REWARD, _INFO, _CLOSE = (
+    Boundary(Party.ENVIRONMENT, place) for place in ("constructor", "reset", "step", "reward", "info", "close")
+)
 
 
 class GymSimulator:
@@ -55,29 +63,32 @@ class GymSimulator:
         (self._agent,) = scenario.agents
         self.step_length_s = scenario.step_length_s
         self._factory = self._find()
+        self._others = load_object(self._setup.others) if self._setup.others else None
         self._rule = _Rule(self._setup.crash)
         self._near, _, self._key = self._setup.danger.partition("info.")
         self.named_danger: float | None = None
         self.agents: list[str] = []
         self.notices: dict[str, None] = {}
+        self._steps = 0
         try:
             self._adopt(self._make(argument_values(scenario)))  # to read its spaces
-        except CrashhuntError:
-            raise
-        except Exception as error:
-            raise self._mistake(f"{type(error).__name__}: {error}") from error
+        except ForeignError as error:
+            place = place_of(error.error)
+            what = f"its {error.place} fails{f' at {place}' if place else ''}: {in_words(error.error)}"
+            raise self._mistake(what) from error.error
+
+    party = Party.ENVIRONMENT
+    foreign_packages = ()  # boundaries are around all calls
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
         """Make the environment and reset it."""
-        self._env.close()
+        self._close()
         try:
             self._adopt(self._make((options or {}).get("arguments", {})))
-            observation, info = self._env.reset(seed=seed)
-        except CrashhuntError:
-            raise
-        except Exception as error:
-            message = f"the environment could not be set up: {type(error).__name__}: {error}"
-            raise InvalidEpisodeError(message) from error
+            with _RESET:
+                observation, info = self._env.reset(seed=seed)
+        except ForeignError as error:
+            raise InvalidEpisodeError(f"the environment could not be set up: {in_words(error.error)}") from error.error
         self.agents = [self._agent]
         self._steps = 0
         self._crashed = False
@@ -94,16 +105,26 @@ class GymSimulator:
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Step the environment."""
         action = native(self.actions[self._agent], actions[self._agent])
-        observation, reward, terminated, truncated, info = self._env.step(action)
+        with _STEP:
+            observation, reward, ended, cut, info = self._env.step(action)
+        with _REWARD:  # these may be objects of any class
+            reward, terminated, truncated = float(reward), bool(ended), bool(cut)
         self._steps += 1
-        self._look(self._rule(observation, float(reward), bool(terminated), bool(truncated), info))
-        if self._key and self._key in info:
-            self._record_danger(info[self._key])
-        over = bool(terminated or truncated) or self._crashed
+        with _INFO:  # the crash rule may be a function of the user's
+            what = self._rule(observation, reward, terminated, truncated, info)
+            reported = info[self._key] if self._key and self._key in info else None
+        self._look(what)
+        if reported is not None:
+            self._record_danger(reported)
+        over = terminated or truncated or self._crashed
         if over:
             self.agents = []
         agent, shown = self._agent, self._shown(observation)
-        return {agent: shown}, {agent: float(reward)}, {agent: over}, {agent: False}, {agent: info}
+        return {agent: shown}, {agent: reward}, {agent: over}, {agent: False}, {agent: info}
+
+    def restore_observation(self, agent: str, array: NDArray[np.generic]) -> object:
+        """Return what the agent receives for a recorded observation."""
+        return self._form.restore(array)
 
     def scene(self) -> Scene:
         """Return the scene: the time and a crash, without actors."""
@@ -111,7 +132,15 @@ class GymSimulator:
 
     def close(self) -> None:
         """Close the environment."""
-        self._env.close()
+        self._close()
+
+    def _close(self) -> None:
+        """Close the environment; report a failure once per hunt, because it cannot affect the episode."""
+        try:
+            with _CLOSE:
+                self._env.close()
+        except ForeignError as error:
+            self._notice(f"the environment {self._setup.id!r} cannot be closed: {in_words(error.error)}")
 
     def _shown(self, observation: object) -> NDArray[np.generic]:
         """Return an observation as it is recorded; report an observation outside the space once per hunt.
@@ -119,15 +148,17 @@ class GymSimulator:
         The episode continues, because many environments leave their space by a rounding error.
         """
         array = self._form.encode(observation)
-        if not self._form.space.contains(array):
+        if not self._form.contains(observation, array):
             what = "outside its own observation space"
             if array.dtype.kind == "f" and np.isnan(array).any():
                 what = "that contains NaN"
-            notice = f"the environment {self._setup.id!r} shows its agent an observation {what}"
-            if notice not in self.notices:
-                self.notices[notice] = None
-                logging.getLogger("crashhunt").warning("%s, for the first time at step %d", notice, self._steps)
+            self._notice(f"the environment {self._setup.id!r} shows its agent an observation {what}")
         return array
+
+    def _notice(self, notice: str) -> None:
+        if notice not in self.notices:
+            self.notices[notice] = None
+            logging.getLogger("crashhunt").warning("%s, for the first time at step %d", notice, self._steps)
 
     def _find(self) -> Callable[..., object]:
         name = self._setup.id
@@ -142,24 +173,50 @@ class GymSimulator:
         for table in as_tables(self._scenario, arguments):
             merge(kwargs, table)
         try:
-            with warnings.catch_warnings():
+            with _CONSTRUCTOR, warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)  # for an outdated version, which the user chose
                 made = self._factory(**kwargs)
-        except (gymnasium.error.Error, ImportError, TypeError) as error:
-            raise self._mistake(str(error)) from None
+        except ForeignError as error:
+            if isinstance(error.error, gymnasium.error.Error | ImportError | TypeError):
+                raise self._mistake(str(error.error)) from None
+            raise
+        if is_parallel(made):
+            learner, names = self._setup.learner, list(map(str, made.possible_agents))
+            if learner and learner not in names:
+                raise ScenarioError(
+                    f"gym.learner = {learner!r} is no agent", fix=one_of(learner, names), where=self._scenario.origin
+                )
+            with _CONSTRUCTOR:
+                made = OneLearner(made, self._setup.learner, self._others)
+        elif self._setup.learner or self._setup.others:
+            fix = "remove gym.learner and gym.others"
+            raise self._mistake("this environment has one agent, and is not a parallel one of PettingZoo", fix=fix)
         if not isinstance(made, gymnasium.Env):
-            raise self._mistake(f"this factory returned a {type(made).__name__}; it must return a gymnasium.Env")
+            fix, what = (
+                "return a gymnasium.Env, or a parallel environment of PettingZoo",
+                "which is not a gymnasium.Env",
+            )
+            if takes_turns(made):
+                fix, what = "name its parallel_env", "whose agents take turns"
+            raise self._mistake(f"this factory returned a {type(made).__name__}, {what}", fix=fix)
         return made
 
-    def _mistake(self, message: str) -> ScenarioError:
-        return ScenarioError(f"gym.id = {self._setup.id!r}: {' '.join(message.split())}", where=self._scenario.origin)
+    def _mistake(self, message: str, *, fix: str = "") -> ScenarioError:
+        text = f"gym.id = {self._setup.id!r}: {' '.join(message.split())}"
+        return ScenarioError(text, fix=fix, where=self._scenario.origin)
 
     def _adopt(self, env: gymnasium.Env[Any, Any]) -> None:
         self._env = env
-        self._form = ObservationForm(env.observation_space)
+        with _CONSTRUCTOR:
+            spaces = env.observation_space, env.action_space
+        for name, space in zip(("observation_space", "action_space"), spaces, strict=True):
+            if not isinstance(space, gymnasium.Space):
+                fix = "set it in the environment's constructor"
+                raise self._mistake(f"its {name} is {space!r:.80}, not a gymnasium.Space", fix=fix)
+        self._form = ObservationForm(spaces[0])
         self.observation_spaces = {self._agent: self._form.space}
-        self.shown_spaces = {self._agent: self._form.original} if self._form.flattened else {}
-        self.actions: dict[str, ActionForm] = {self._agent: action_form(env.action_space)}
+        self.shown_spaces = {self._agent: self._form.original} if self._form.structured else {}
+        self.actions: dict[str, ActionForm] = {self._agent: action_form(spaces[1])}
 
     def _record_danger(self, reported: Any) -> None:
         try:
@@ -192,9 +249,19 @@ class _Rule:
     def __init__(self, rule: CrashRule) -> None:
         self._rule = rule
         self._function = load_object(rule.function) if rule.function else None
+        self._kind = load_object(rule.kind) if rule.kind else None
 
     def __call__(self, observation: object, reward: float, terminated: bool, truncated: bool, info: Info) -> str:
-        """Return a description of the crash; empty if the step has no crash."""
+        """Return a description of the crash, by default its type; empty if the step has no crash."""
+        found = self._find(observation, reward, terminated, truncated, info)
+        if not found:
+            return ""
+        given = observation, reward, terminated, truncated, info
+        kind = info.get(_KIND) if self._kind is None else self._kind(*given)
+        text = " ".join(encodable(kind).split()) if isinstance(kind, str) else ""
+        return text[:_MAX_KIND_CHARACTERS] or found
+
+    def _find(self, observation: object, reward: float, terminated: bool, truncated: bool, info: Info) -> str:
         rule = self._rule
         if rule.info and info.get(rule.info):
             return rule.info

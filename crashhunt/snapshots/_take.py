@@ -70,6 +70,7 @@ def find_sources(
 ) -> Sources:
     """Find crashhunt itself, the project of each agent, and all other imported modules that are not installed.
 
+    An installed module that is named is included, too, unless its wheel has libraries next to it (``NAME.libs``).
     A project is the git work tree that holds a module, with its tracked files in their current state and its untracked
     files that git does not ignore. A module outside of work trees comes with its package, or alone. Links that lead out
     of a work tree are not followed. The directories of hunts are excluded.
@@ -95,6 +96,9 @@ def find_sources(
     for name in sorted(names - {"crashhunt"}):
         place = _place_of(name)
         if place is None:
+            continue
+        if _is_installed(place) and (place / f"{name}.libs").is_dir():
+            # Its compiled code loads libraries from there, and a copy would not find them. Its version identifies it.
             continue
         listing = None if _is_installed(place) else _listing_that_has(place, name, found)
         if listing is None:

@@ -1,3 +1,4 @@
+from ._gate import Gate as Gate, GateProgress as GateProgress, GateVersion as GateVersion
 from ._processes import (
     RunRequest as RunRequest,
     refuse_untrusted_hunt as refuse_untrusted_hunt,

@@ -40,7 +40,7 @@ from crashhunt.plans import (
 from crashhunt.snapshots import Snapshot, SnapshotOptions, latest_snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from crashhunt.crashes import TrustedOrigin
     from crashhunt.plans import Given, HuntSettings
@@ -144,14 +144,18 @@ def run_all(
     *,
     watch: Callable[[], None] | None = None,
     machine: Given | None = None,
+    is_enough: Callable[[], bool] = lambda: False,
+    environments: Mapping[Path, Mapping[str, str]] | None = None,
 ) -> None:
-    """Run hunts, each in a process of its own, until the last has ended or an interrupt arrives.
+    """Run hunts, each in a process of its own, until the last has ended, is not needed any more, or is interrupted.
 
     Args:
         folders: of the runs, each with its ``request.json``.
         parallel: trials at a time, of all hunts together; 0 for one per core.
         watch: called about once a second, and at the end.
         machine: options that hold for all of them, whatever each says.
+        is_enough: asked after each `watch`; where it is true, the hunts stop as after an interrupt.
+        environments: folder to the environment variables of its process; that of this process where there is none.
 
     Raises:
         UsageError: ``parallel`` is negative.
@@ -161,30 +165,32 @@ def run_all(
     waiting = deque(folders)
     running: dict[subprocess.Popen[bytes], int] = {}
     watched = 0.0
-    passed_on = False
+    passed_on = enough = False
     with stop_requests() as asked:
         try:
             while waiting or running:
                 for process in [process for process in running if process.poll() is not None]:
                     del running[process]
                 free = slots - sum(running.values())
-                while waiting and free > 0 and not asked:
+                while waiting and free > 0 and not (asked or enough):
                     # Towards the end there are fewer hunts than slots: then each gets several.
                     width = max(1, free // len(waiting))
                     folder = waiting.popleft()
                     try:
-                        running[_start(folder, {**(machine or {}), "parallel": width})] = width
+                        run = {**(machine or {}), "parallel": width}
+                        running[_start(folder, run, (environments or {}).get(folder))] = width
                         free -= width
                     except (CrashhuntError, OSError) as error:
                         _fail(folder, str(error), "")
-                if asked and not passed_on:
+                if (asked or enough) and not passed_on:
                     passed_on = True
                     waiting.clear()
                     for process in running:
-                        process.send_signal(asked[0])
+                        process.send_signal(asked[0] if asked else signal.SIGINT)
                 if watch is not None and time.monotonic() - watched > _WATCH_EVERY_S:
                     watched = time.monotonic()
                     watch()
+                    enough = enough or is_enough()
                 time.sleep(_LOOK_EVERY_S)
         finally:
             for process in running:
@@ -234,7 +240,7 @@ def _is_same_plan(aside: Path, request: RunRequest) -> bool:
     return RunRequest.read(aside / REQUEST).to_plain() == request.to_plain()
 
 
-def _start(folder: Path, run: Given) -> subprocess.Popen[bytes]:
+def _start(folder: Path, run: Given, environment: Mapping[str, str] | None) -> subprocess.Popen[bytes]:
     request = RunRequest.read(folder / REQUEST)
     with (folder / layout.RUN_LOG).open("ab") as log:
         return subprocess.Popen(
@@ -248,6 +254,7 @@ def _start(folder: Path, run: Given) -> subprocess.Popen[bytes]:
                 str(os.getpid()),
             ],
             cwd=request.folder if Path(request.folder).is_dir() else None,
+            env=environment,
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
@@ -285,8 +292,10 @@ def _main(folder: Path, run: Given, parent: int) -> None:
         _fail(folder, f"{type(error).__name__}: {error}", traceback.format_exc())
 
 
-def _planned(folder: Path, request: Request, run: Given) -> tuple[Scenario, HuntSettings]:
-    """What to run: what is there already, or what was asked for."""
+def _planned(folder: Path, request: Request, machine: Given) -> tuple[Scenario, HuntSettings]:
+    """What to run: what is there already, or what was asked for; ``trials`` in the options replaces their number."""
+    run = dict(machine)
+    trials = run.pop("trials", None)
     begun, snapshot = (folder / layout.HUNT).exists(), latest_snapshot(folder)
     if not begun or snapshot is None:
         from crashhunt.hunts import TrafficSurveyor
@@ -298,6 +307,8 @@ def _planned(folder: Path, request: Request, run: Given) -> tuple[Scenario, Hunt
     else:
         scenario = snapshot.scenario()
     settings = read_settings(folder / layout.HUNT)
+    if trials is not None:
+        settings = replace(settings, trials=trials)
     return with_settings(scenario, settings), replace(settings, run=replace(settings.run, **run))
 
 

@@ -194,11 +194,23 @@ class Suite:
         )
         return [hunt_state(folder) for folder in folders]
 
-    def _planned(self, entry: SuiteEntry, number: int, folder: Path) -> RunRequest:
+    def request(self, entry: SuiteEntry, number: int) -> RunRequest:
+        """Return what a run of an entry will be, with a seed of its own.
+
+        Args:
+            entry: of this suite.
+            number: of the run, from 0.
+
+        Raises:
+            UsageError: who drives is in no module that a worker could import.
+        """
         roots = tuple(str((self.folder / root).resolve()) for root in entry.snapshot_roots)
         snapshot = SnapshotChoices(**{name: getattr(entry, name) for name in fields_of(SnapshotChoices)})
         snapshot = replace(snapshot, snapshot_roots=roots)
-        wanted = RunRequest(self._request(entry, number), str(self.folder), snapshot)
+        return RunRequest(self._request(entry, number), str(self.folder), snapshot)
+
+    def _planned(self, entry: SuiteEntry, number: int, folder: Path) -> RunRequest:
+        wanted = self.request(entry, number)
         if not (folder / REQUEST).exists():
             return wanted
         before = RunRequest.read(folder / REQUEST)

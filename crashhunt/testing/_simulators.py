@@ -20,6 +20,7 @@ from crashhunt.simulators import (
     HasMap,
     NamesObservations,
     Reseeds,
+    RestoresObservations,
     Simulator,
     SupportsDisturbances,
     TellsEvents,
@@ -233,6 +234,9 @@ class SimulatorContract:
         shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
         assert set(shown) <= set(observations)
         for agent, space in shown.items():
+            if supports(simulator, RestoresObservations):
+                assert simulator.restore_observation(agent, observations[agent]) is not None
+                continue
             seen: object = spaces.unflatten(space, observations[agent])
             again = np.asarray(spaces.flatten(space, seen))
             assert np.array_equal(again, observations[agent], equal_nan=True)

@@ -78,8 +78,12 @@ HELD: Mapping[str, Kind] = {
 }
 """The holds of other vehicles for counterfactual runs: hunts never draw them, and each names its vehicle."""
 
-Manoeuvre = Literal["brake", "left", "right", "keep_lane", "keep_speed"]
-"""What an agent can be overruled with: it brakes, changes lanes to a side and brakes, or keeps its lane or speed."""
+Manoeuvre = Literal[
+    "brake", "left", "right", "keep_lane", "keep_speed", "reference_speed", "reference_lanes", "reference"
+]
+"""What an agent can be overruled with: it brakes, changes lanes to a side and brakes, or keeps its lane or speed.
+
+With the last three, a reference driver corrects its speed, its lane changes, or both, where they are not safe."""
 
 OF_AGENT = frozenset(name for name, kind in KINDS.items() if kind.of_agent)
 """The types that affect the agent itself and need no support by the simulator."""

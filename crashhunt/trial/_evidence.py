@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Final
 
-from crashhunt.base.codec import Serializable, null_is
+from crashhunt.base.codec import OMIT_DEFAULT, Serializable, null_is
 from crashhunt.base.text import encodable
 
 __all__ = ["KILLED", "Collision", "Escape", "Failure"]
@@ -65,12 +65,14 @@ class Escape(Serializable):
         too_late: Full braking after this step does not avoid the collision; the next step, if ``step`` exists.
         braking: The greatest deceleration of these runs, in m/s²; None if the vehicle never slowed down.
         how: A description of the braking, as in `FullBraking`.
+        why_not: Why there is no such step, and no step after which braking does not help; empty if there is one.
     """
 
     step: int | None = None
     too_late: int | None = None
     braking: float | None = None
     how: str = ""
+    why_not: str = field(default="", metadata=OMIT_DEFAULT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,8 @@ class Failure(Serializable):
         message: The message in one line.
         traceback: The traceback of the exception, or the stack of the stuck thread.
         agent: The agent whose code failed; empty if it was no agent's code.
+        party: Whose code failed: ``agent``, ``environment``, ``simulator`` or ``oracle``; empty if it is not known.
+        place: What that code was called for, such as ``act``, ``step`` or ``space conversion``; empty if not known.
         exit_code: The exit code of a process that died; negative for a signal, as in `subprocess`.
         last_output: The last output of the process.
     """
@@ -92,6 +96,8 @@ class Failure(Serializable):
     agent: str = ""
     exit_code: int | None = None
     last_output: str = ""
+    party: str = field(default="", metadata=OMIT_DEFAULT)
+    place: str = field(default="", metadata=OMIT_DEFAULT)
 
     def __post_init__(self) -> None:
         # The texts are written to JSON, logs and terminals, but an exception's message may contain invalid characters.

@@ -191,6 +191,8 @@ def summarize(result: TrialResult) -> str:
         failure = result.failure
         if failure.traceback and failure.exit_code is None and failure.kind != "timeout":
             whose = f"{failure.agent}: " if failure.agent else ""
+            if failure.party not in ("", "agent", "simulator"):
+                whose = f"{failure.party} ({failure.place}): "
             return f"{whose}{failure.kind}: {failure.message}"
         return failure.message
     return f"{result.outcome} after {result.steps} steps"

@@ -33,12 +33,16 @@ class Overruled(Serializable):
         manoeuvre: ``brake``; ``left`` or ``right`` also changes to the lane on that side in the first step.
         keeps: ``lane`` or ``speed``: the agent still acts, but the vehicle keeps its lane or its current speed. Then
             the manoeuvre has no effect.
+        reference: ``longitudinal``, ``lateral`` or ``both``: the agent still acts, and a reference driver corrects its
+            speeds, its lane changes, or both, where they are not safe. ``none``: the reference driver only reports
+            where it would have. Then manoeuvre and ``keeps`` have no effect.
     """
 
     agent: str
     after: int
     manoeuvre: str = field(default="brake", metadata=_ESSENTIAL)
     keeps: str = field(default="", metadata=_ESSENTIAL)
+    reference: str = field(default="", metadata=_ESSENTIAL)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,3 +13,8 @@ from ._interventions import (
     step_before as step_before,
 )
 from ._reruns import Ended as Ended, Reruns as Reruns, StoppedError as StoppedError
+from ._types_by_cause import (
+    REPRESENTATIVES as REPRESENTATIVES,
+    divide_by_cause as divide_by_cause,
+    find_cause as find_cause,
+)

@@ -5,21 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes import (
     INTERRUPTED,
     Attempt,
     Judgement,
+    LaneMap,
     ending_of,
     last_escape,
     overruled_trial,
     slowing,
     visible_from,
 )
+from crashhunt.recording import read_lanes
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Outcome
 from crashhunt.whatif._causes import find_why
+from crashhunt.whatif._omissions import changes_of, find_omission
 from crashhunt.whatif._reruns import NotUnderstoodError, Reruns, StoppedError
 
 if TYPE_CHECKING:
@@ -55,11 +59,13 @@ class Tried:
         step: after which the agent was overruled.
         ending: what became of the collision.
         deceleration: the greatest, in m/s².
+        changed: What else the agent did otherwise, besides the manoeuvre.
     """
 
     step: int
     ending: Ending
     deceleration: float = 0.0
+    changed: tuple[str, ...] = ()
 
 
 class _Enough(Exception):  # noqa: N818 - no error
@@ -74,6 +80,7 @@ class _Tries:
     most: int
     endings: dict[int, Ending] = field(default_factory=dict)
     decelerations: list[float] = field(default_factory=list)
+    changed: dict[int, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def last(self) -> int | None:
@@ -126,6 +133,7 @@ class Search:
                 end=self._end,
                 endings=dict(tried.endings),
                 deceleration=max((value for value in tried.decelerations if value > _STANDS), default=None),
+                changed=tried.changed.get(tried.last, ()) if tried.last is not None else (),
             )
             for tried in self._tries
             if tried.endings
@@ -189,6 +197,7 @@ class Search:
             self._left -= 1
             tries.endings[tried.step] = tried.ending
             tries.decelerations.append(tried.deceleration)
+            tries.changed[tried.step] = tried.changed
             if tried.ending == "diverged":
                 self.why_not = f"the trial was not the same up to step {tried.step} when it was run again"
                 raise _Enough
@@ -203,6 +212,7 @@ def judge(
     *,
     runs: int = 60,
     why: int = 0,
+    reference: int = 0,
     parallel: int = 1,
     watch: Watch | None = None,
     stopped: Callable[[], bool] = lambda: False,
@@ -219,6 +229,7 @@ def judge(
         options: of the replays; only whose code drives, and whether it is trusted.
         runs: the most trials to run to avoid it.
         why: the most trials to run for what it hangs on; 0 leaves that out.
+        reference: the most trials to run with a reference driver, for what the agent omitted; 0 leaves that out.
         parallel: how many at a time.
         watch: called with how many have been run, and the most.
         stopped: Returns whether to stop; called repeatedly. The results until then are returned.
@@ -240,9 +251,10 @@ def judge(
 
         def tell(done: int) -> None:
             if watch is not None:
-                watch(done, runs + why)
+                watch(done, runs + why + reference)
 
-        trials = _Trials(result=result, recorded=rerun.recorded, reruns=reruns, tell=tell)
+        lanes = LaneMap(read_lanes(bundle.path / layout.LOG), (hit.x, hit.y) if hit is not None else (0.0, 0.0))
+        trials = _Trials(result=result, recorded=rerun.recorded, reruns=reruns, lanes=lanes, tell=tell)
         search = Search(result.steps, _start(rerun) if of_two else 0, trials.run, runs=runs, parallel=parallel)
         found = None
         try:
@@ -254,8 +266,20 @@ def judge(
             search.why_not = INTERRUPTED
         finally:
             reruns.close()
+    with temporary_folder("judge") as scratch:
+        before = trials.done + (found.runs if found is not None else 0)
+        omitted = None
+        if reference > 0 and result.outcome in (Outcome.COLLISION, Outcome.OFF_ROAD) and search.why_not != INTERRUPTED:
+            omitted = find_omission(
+                rerun,
+                scratch,
+                most=reference,
+                parallel=parallel,
+                stopped=stopped,
+                tell=lambda done: tell(before + done),
+            )
     visible = visible_from(rerun.recorded, hit.agent, hit.other) if of_two and hit is not None else None
-    return replace(search.judgement(), why=found, visible_step=visible)
+    return replace(search.judgement(), why=found, visible_step=visible, reference=omitted)
 
 
 def _see_that_it_can_be_judged(bundle: Bundle, *, of_two: bool, why: int) -> None:
@@ -294,6 +318,7 @@ class _Trials:
     result: TrialResult
     recorded: Recording
     reruns: Reruns
+    lanes: LaneMap
     tell: Callable[[int], None]
     done: int = 0
 
@@ -307,7 +332,7 @@ class _Trials:
         made = [overruled_trial(self.result, self.recorded, step, None, manoeuvre) for step in steps]
         try:
             for ended in self.reruns.run(made):
-                yield self._tried(steps[ended.place], ended)
+                yield self._tried(manoeuvre, steps[ended.place], ended)
         except NotUnderstoodError as error:
             raise CannotError(error.message) from error
         except (RecorderError, CannotError):
@@ -317,7 +342,7 @@ class _Trials:
                 raise
             raise CannotError(str(error)) from error  # the crashhunt of an older snapshot knows braking only
 
-    def _tried(self, step: int, ended: Ended) -> Tried:
+    def _tried(self, manoeuvre: str, step: int, ended: Ended) -> Tried:
         result, recording = ended.result, ended.recording
         if result.outcome is Outcome.INVALID:
             raise CannotError(result.failure.message if result.failure else "its trial could not be set up")
@@ -327,4 +352,7 @@ class _Trials:
         if recording is None:
             return Tried(step, "unclear")
         ending = ending_of(self.result, self.recorded, step, result, recording)
-        return Tried(step, ending, slowing(self.result.collision.agent, step, result, recording))
+        agent = self.result.collision.agent
+        changed = changes_of(self.recorded, recording, agent, self.lanes, step) if manoeuvre == "brake" else ()
+        deceleration = slowing(agent, step, result, recording)
+        return Tried(step=step, ending=ending, deceleration=deceleration, changed=changed)

@@ -19,6 +19,7 @@ from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why, partne
 from crashhunt.plans import read_settings
 from crashhunt.recording import has_same_scenes, read_lanes
 from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled
+from crashhunt.whatif._omissions import changes_of
 from crashhunt.whatif._reruns import StoppedError
 from crashhunt.world import first_contact
 
@@ -273,6 +274,7 @@ class _Search:
         if result.outcome in _SAYS_NOTHING and result.outcome is not self._result.outcome:
             return LeftOut(given, "unclear")
         into = ""
+        changed: tuple[str, ...] = ()
         if asked.inside:
             step = int(given)
             if recording is None or not has_same_scenes(self._recording, recording, step):
@@ -283,10 +285,12 @@ class _Search:
                 if (held.step, held.what, held.vehicle) not in recorded:
                     return LeftOut(given, "unclear")  # the simulator could not apply the hold
             into = self._into(recording, asked.held, step) if asked.held else ""
+            if asked.factor.what in ("braked", "sped up") and asked.factor.kind == "agent":
+                changed = changes_of(self._recording, recording, asked.factor.name, self._lanes, step)
         ending: Without = "none"
         if result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
             ending = "same" if self._is_same(result) else "other"
-        return LeftOut(given, ending, into)
+        return LeftOut(given=given, ending=ending, into=into, changed=changed)
 
     def _is_same(self, result: TrialResult) -> bool:
         """Whether a run ended in the same crash: with the same other one, or in the same failure at the same place."""

@@ -36,6 +36,9 @@ __all__ = [
 ]
 
 
+_FACULTIES = {"reference_speed": "longitudinal", "reference_lanes": "lateral", "reference": "both"}
+
+
 class Intervention(Protocol):
     """What is changed in a trial."""
 
@@ -107,7 +110,8 @@ class Overrule:
     Args:
         from_step: the last step that stays as it was recorded.
         manoeuvre: ``brake`` as hard as the vehicle can, change lanes to the ``left`` or ``right`` and brake, or
-            ``keep_lane`` or ``keep_speed``.
+            ``keep_lane`` or ``keep_speed``. With ``reference_speed``, ``reference_lanes`` or ``reference``, a reference
+            driver corrects unsafe speeds, unsafe lane changes, or both.
         agent: its id; empty for the only agent.
     """
 
@@ -120,6 +124,9 @@ class Overrule:
         if self.manoeuvre not in get_args(Manoeuvre):
             raise UsageError(f"manoeuvre is {self.manoeuvre!r}", fix=one_of(self.manoeuvre, get_args(Manoeuvre)))
         agent = _agent_of(self.agent, rerun)
+        if faculty := _FACULTIES.get(self.manoeuvre):
+            overruled = Overruled(agent, self.from_step, reference=faculty)
+            return replace(rerun, spec=replace(rerun.spec, overruled=overruled))
         verb, _, kept = self.manoeuvre.partition("_")
         overruled = Overruled(agent, self.from_step, keeps=kept) if kept else Overruled(agent, self.from_step, verb)
         return replace(rerun, spec=replace(rerun.spec, overruled=overruled))

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.executors import Executor
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialResult, TrialSpec
@@ -61,6 +62,7 @@ class Ended:
         recording: of the trial; None where it was not wanted, or where the process died before there was one.
         folder: with the files of the trial, until the next run is asked for.
         entered: the ids of all actors that entered, where the specification asked for them (`EVERYBODY`).
+        responses: of the reference driver, where the specification has one; None where the trial left none.
     """
 
     place: int
@@ -68,6 +70,7 @@ class Ended:
     recording: Recording | None
     folder: Path
     entered: tuple[str, ...] = ()
+    responses: tuple[JsonObject, ...] | None = None
 
 
 class Reruns:
@@ -80,6 +83,7 @@ class Reruns:
         stopped: called before each wait for results, about twice a second; returns whether to stop, or raises.
         keep_all: whether trials without a crash leave a recording too.
         warm_copies: suspended set-ups of the simulator per worker.
+        todays: whether they run with this crashhunt and not with that of the snapshot; None to find out.
     """
 
     def __init__(
@@ -91,10 +95,11 @@ class Reruns:
         stopped: Callable[[], bool],
         keep_all: bool = True,
         warm_copies: int = _WARM_COPIES,
+        todays: bool | None = None,
     ) -> None:
         self._scratch, self._stopped = scratch, stopped
         worker = replace(rerun.worker, scratch=scratch, keep_trials=keep_all, warm_copies=warm_copies)
-        kind = PoolExecutor if is_todays(rerun) else FreshProcessExecutor
+        kind = PoolExecutor if (is_todays(rerun) if todays is None else todays) else FreshProcessExecutor
         self._executor: Executor = kind(worker, parallel=parallel)
         self._keep_all = keep_all
         self._numbers = itertools.count(1)  # folders of their own
@@ -142,7 +147,18 @@ class Reruns:
         if result.spec.only is not None:
             with suppress(OSError, ValueError):
                 entered = json.loads((folder / layout.ENTERED).read_text(encoding="utf-8"))
-        return Ended(place=place, result=result, recording=recording, folder=folder, entered=tuple(entered))
+        responses = None
+        if result.spec.overruled is not None and result.spec.overruled.reference:
+            with suppress(OSError, ValueError):
+                responses = tuple(json.loads((folder / layout.RESPONSES).read_text(encoding="utf-8")))
+        return Ended(
+            place=place,
+            result=result,
+            recording=recording,
+            folder=folder,
+            entered=tuple(entered),
+            responses=responses,
+        )
 
 
 def _require_same_trial(asked: TrialSpec, run: TrialSpec) -> None:

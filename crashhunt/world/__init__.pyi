@@ -4,7 +4,15 @@ from ._approach import (
     approaches as approaches,
     closest_approach as closest_approach,
 )
-from ._contact import Touch as Touch, first_contact as first_contact, reachable_m as reachable_m
+from ._contact import (
+    STANDS_MPS as STANDS_MPS,
+    Face as Face,
+    Touch as Touch,
+    contact_at as contact_at,
+    first_contact as first_contact,
+    lane_jump as lane_jump,
+    reachable_m as reachable_m,
+)
 from ._danger import (
     DangerMeter as DangerMeter,
     DangerousMoment as DangerousMoment,
@@ -29,6 +37,15 @@ from ._geometry import (
     outlines_overlap as outlines_overlap,
     rectangle_gap as rectangle_gap,
     time_to_contact as time_to_contact,
+)
+from ._safe_distances import (
+    Crossing as Crossing,
+    Neighbor as Neighbor,
+    Side as Side,
+    Surroundings as Surroundings,
+    safe_distance as safe_distance,
+    safe_speed as safe_speed,
+    time_to_drive as time_to_drive,
 )
 from ._scene import (
     PERSON as PERSON,

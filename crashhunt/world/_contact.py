@@ -1,4 +1,4 @@
-"""The first contact of two actors between two scenes, and which one drives into the other.
+"""The first contact of two actors between two scenes: when, with which sides, and which one drives into the other.
 
 Computes when two moving rectangles first overlap. Scenes are steps apart (0.1 s to 1 s), so a test of the scenes alone
 misses contacts in between and reports others too late.
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from crashhunt.world._geometry import levels, outlines, same_level, separation
 from crashhunt.world._scene import is_person
@@ -23,7 +23,13 @@ if TYPE_CHECKING:
     from crashhunt.world._geometry import Level, Rectangle
     from crashhunt.world._scene import Scene
 
-__all__ = ["Touch", "first_contact"]
+__all__ = ["STANDS_MPS", "Face", "Touch", "contact_at", "first_contact", "lane_jump"]
+
+STANDS_MPS = 0.1
+"""An actor that moves more slowly than this stands, in m/s."""
+
+Face = Literal["front", "rear", "left", "right"]
+"""A side of an actor, as seen from its driver."""
 
 _JUMP_M = 1.5  # sideways in one step: less is drift within a lane, more is an instantaneous lane change
 _LANES_M = 12.0  # sideways in one step: more is a teleport, not a lane change
@@ -32,6 +38,7 @@ _STEP_M = 1e-3  # of relative motion: shorter overlaps are not searched for
 _TOUCH = 1e-9  # m: smaller overlaps are rounding errors
 _FRONT = math.cos(math.pi / 4)  # an actor within 45° of straight ahead is in front
 _CURVE = 1 / 32  # of distance times turn: a quarter of the height of a bend above its chord
+_DRIFT_MPS = 1e-3  # towards each other: a smaller difference is a rounding error
 _SLACK_M = 0.4  # upper bound of the tolerance for unknown ways between scenes
 _KINK, _NO_TURN = 0.02, 0.01  # tolerance as a share of the distance, reached at this turn in rad: lanes have corners
 
@@ -48,6 +55,12 @@ class Touch:
         y: likewise.
         speed: of the first actor, in m/s.
         other_speed: of the second actor, in m/s.
+        face: the side of the first actor that is touched.
+        other_face: the side of the second actor that is touched.
+        turn: the heading of the second actor less that of the first, in rad, within -pi and pi.
+        jumps: whether the first actor makes the contact by an instantaneous lane change.
+        other_jumps: whether the second actor does.
+        gap_m: a lower bound of the distance between their outlines; 0 where they touch.
     """
 
     time_s: float
@@ -57,10 +70,48 @@ class Touch:
     y: float
     speed: float
     other_speed: float
+    face: Face
+    other_face: Face
+    turn: float
+    jumps: bool = False
+    other_jumps: bool = False
+    gap_m: float = 0.0
+
+    @property
+    def is_sideways(self) -> bool:
+        """Whether an instantaneous lane change makes the contact."""
+        return self.jumps or self.other_jumps
 
 
-_Party = tuple["Rectangle", bool, tuple[float, float]]
-"""A rectangle in contact, whether it is the front part of its vehicle, and its direction of motion."""
+@dataclass(frozen=True, slots=True)
+class _Party:
+    """An actor at the contact.
+
+    Args:
+        rectangle: the part of it that is touched.
+        leads: whether that is its front part.
+        trails: whether that is its back part.
+        velocity: of that part, without a jump, in m/s.
+        jump: sideways, at the contact, in m.
+    """
+
+    rectangle: Rectangle
+    leads: bool
+    trails: bool
+    velocity: tuple[float, float]
+    jump: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def stands(self) -> bool:
+        return math.hypot(*self.velocity) < STANDS_MPS
+
+    def face(self, x: float, y: float) -> Face:
+        """Return the side of it that lies in a direction."""
+        c, s = math.cos(self.rectangle[2]), math.sin(self.rectangle[2])
+        ahead, left = x * c + y * s, y * c - x * s
+        if abs(ahead) > _FRONT and (self.leads if ahead > 0 else self.trails):
+            return "front" if ahead > 0 else "rear"
+        return "left" if left > 0 else "right"
 
 
 class _Way:
@@ -113,9 +164,7 @@ class _Way:
         return x, y, heading, length, width
 
     def moving(self, share: float) -> tuple[float, float]:
-        """Return direction and speed of the centre, in m per step; at a jump, the jump."""
-        if share >= 1.0 and any(self.jump):
-            return self.jump
+        """Return direction and speed of the centre, in m per step, without a jump."""
         rest = 1 - share
         a, b, c = 3 * rest * rest, 6 * rest * share, 3 * share * share
         (x0, y0), (x1, y1), (x2, y2) = self.legs
@@ -136,15 +185,59 @@ def first_contact(previous: Scene | None, present: Scene, row: int, other: int) 
     """
     pair = (row, other)
     before = _rows_before(previous, present, pair)
+    ways = _ways(previous, present, pair, before)
+    return _first_touch(previous, present, pair, before, ways)
+
+
+def contact_at(previous: Scene | None, present: Scene, row: int, other: int, *, swept: bool = True) -> Touch:
+    """Return the contact of two actors that are known to have collided, in the same way as `first_contact`.
+
+    Args:
+        previous: the scene one step before; None examines the present one only.
+        present: the scene of the contact.
+        row: one actor.
+        other: another.
+        swept: as in `Scene`. If not, actors move in straight lines and jump nowhere, and the time is an estimate.
+
+    Returns:
+        The contact. Where the outlines do not touch, as in some collisions that a simulator reports, the two at the
+        end of the step.
+    """
+    pair = (row, other)
+    before = _rows_before(previous, present, pair)
+    ways = _ways(previous, present, pair, before, bends=swept)
+    found = _first_touch(previous, present, pair, before, ways)
+    return found or _touch(previous, present, pair, before, ways, (1.0, *_nearest(ways)))
+
+
+def _ways(
+    previous: Scene | None,
+    present: Scene,
+    pair: tuple[int, int],
+    before: tuple[int, int] | None,
+    *,
+    bends: bool = True,
+) -> list[list[_Way]]:
+    """Return the ways of the parts of both actors."""
     ways: list[list[_Way]] = []
     for place, who in enumerate(pair):
         if previous is None or before is None:
             ways.append([_Way(end, end, bends=False) for end in outlines(present, who)])
             continue
         pieces = max(_pieces(present, who), _pieces(previous, before[place]))
-        bends = not is_person(present.roster.actors[who].id)
+        drives = bends and not is_person(present.roster.actors[who].id)
         starts, ends = outlines(previous, before[place], parts=pieces), outlines(present, who, parts=pieces)
-        ways.append([_Way(start, end, bends=bends) for start, end in zip(starts, ends, strict=True)])
+        ways.append([_Way(start, end, bends=drives) for start, end in zip(starts, ends, strict=True)])
+    return ways
+
+
+def _first_touch(
+    previous: Scene | None,
+    present: Scene,
+    pair: tuple[int, int],
+    before: tuple[int, int] | None,
+    ways: list[list[_Way]],
+) -> Touch | None:
     best: tuple[float, int, int] | None = None
     heights = [levels(present, who, parts=len(way)) for who, way in zip(pair, ways, strict=True)]
     for one, way in enumerate(ways[0]):
@@ -154,24 +247,96 @@ def first_contact(previous: Scene | None, present: Scene, row: int, other: int) 
             share = _first_share(way, other_way, until=best[0] if best else 1.0, still=before is None)
             if share is not None and (best is None or share < best[0]):
                 best = share, one, two
-    if best is None:
-        return None
-    share, one, two = best
-    touching = ways[0][one], ways[1][two]
-    speeds, time_s = [present.speeds[who] for who in pair], present.time_s
+    return None if best is None else _touch(previous, present, pair, before, ways, best)
+
+
+def _nearest(ways: list[list[_Way]]) -> tuple[int, int]:
+    """Return the parts of both actors that are nearest to each other at the end of the step."""
+    return min(
+        ((one, two) for one in range(len(ways[0])) for two in range(len(ways[1]))),
+        key=lambda parts: separation(ways[0][parts[0]].end, ways[1][parts[1]].end)[0],
+    )
+
+
+def _touch(
+    previous: Scene | None,
+    present: Scene,
+    pair: tuple[int, int],
+    before: tuple[int, int] | None,
+    ways: list[list[_Way]],
+    best: tuple[float, int, int],
+) -> Touch:
+    """Describe the contact at a share of the step, of a part of each actor."""
+    share, *parts = best
+    time_s, step_s, speeds = present.time_s, 0.0, [present.speeds[who] for who in pair]
     if previous is not None and before is not None:
-        time_s = previous.time_s + share * (time_s - previous.time_s)
-        speeds = [(1 - share) * previous.speeds[was] + share * now for was, now in zip(before, speeds, strict=True)]
-        moving = [way.moving(share) for way in touching]
-    else:
-        moving = [
-            (speed * math.cos(way.end[2]), speed * math.sin(way.end[2]))
-            for speed, way in zip(speeds, touching, strict=True)
+        step_s = present.time_s - previous.time_s
+        time_s = previous.time_s + share * step_s
+        speeds = [
+            _speed_at(share, previous.speeds[was], now, way[0], step_s)
+            for was, now, way in zip(before, speeds, ways, strict=True)
         ]
-    x, y, *_ = ways[0][0].at(share)
-    first, second = (way.at(share) for way in touching)
-    drives_into = _drives_into((first, one == 0, moving[0]), (second, two == 0, moving[1]))
-    return Touch(time_s=time_s, share=share, drives_into=drives_into, x=x, y=y, speed=speeds[0], other_speed=speeds[1])
+    parties = []
+    for speed, way, part in zip(speeds, ways, parts, strict=True):
+        touching = way[part]
+        if step_s > 0:
+            vx, vy = touching.moving(share)
+            velocity = vx / step_s, vy / step_s
+        else:
+            velocity = speed * math.cos(touching.end[2]), speed * math.sin(touching.end[2])
+        jump = touching.jump if share >= 1.0 else (0.0, 0.0)
+        parties.append(
+            _Party(touching.at(share), leads=part == 0, trails=part == len(way) - 1, velocity=velocity, jump=jump)
+        )
+    first, second = parties
+    x, y, jumps = _direction(first, second)
+    front_x, front_y, heading, *_ = ways[0][0].at(share)
+    return Touch(
+        time_s=time_s,
+        share=share,
+        drives_into=_drives_into(first, second, x, y, jumps=jumps),
+        x=front_x,
+        y=front_y,
+        speed=speeds[0],
+        other_speed=speeds[1],
+        face=first.face(x, y),
+        other_face=second.face(-x, -y),
+        turn=math.remainder(ways[1][0].at(share)[2] - heading, math.tau),
+        jumps=jumps and any(first.jump),
+        other_jumps=jumps and any(second.jump),
+        gap_m=max(0.0, separation(first.rectangle, second.rectangle)[0]),
+    )
+
+
+def _speed_at(share: float, was: float, now: float, way: _Way, step_s: float) -> float:
+    """Return the speed at a share of a step, in m/s.
+
+    Simulators integrate differently: SUMO's default drives the whole step at the new speed, others with a constant
+    acceleration. The distance of the step decides which of the two, or which mixture, it was.
+    """
+    (x0, y0), *_, (x1, y1) = way.points
+    mean, driven = (was + now) / 2, math.hypot(x1 - x0, y1 - y0) / step_s
+    steady = min(1.0, max(0.0, (driven - mean) / (now - mean))) if abs(now - mean) > _TOUCH else 0.0
+    return steady * now + (1 - steady) * ((1 - share) * was + share * now)
+
+
+def lane_jump(previous: Scene, present: Scene, actor: str) -> float:
+    """Return how far an actor jumped sideways between two scenes, in m to its left; 0 where it did not jump.
+
+    SUMO changes lanes in an instant. A movement that a bend explains is no jump, nor is a teleport.
+
+    Args:
+        previous: the scene one step before.
+        present: the scene.
+        actor: its identifier.
+    """
+    was, row = previous.roster.index.get(actor), present.roster.index.get(actor)
+    if was is None or row is None or is_person(actor) or _rows_before(previous, present, (row, row)) is None:
+        return 0.0
+    pieces = max(_pieces(present, row), _pieces(previous, was))
+    way = _Way(outlines(previous, was, parts=pieces)[0], outlines(present, row, parts=pieces)[0], bends=True)
+    middle = previous.headings[was] + way.turn / 2
+    return way.jump[1] * math.cos(middle) - way.jump[0] * math.sin(middle)
 
 
 def reachable_m(speed: float, time_s: float) -> float:
@@ -256,19 +421,50 @@ def _bisect(way: _Way, other: _Way, apart: float, together: float) -> float:
     return together
 
 
-def _drives_into(first: _Party, second: _Party) -> bool:
-    """Return whether the first drives into the second: the second is in front of it, or it moves towards it faster."""
-    (own, own_leads, own_moving), (other, other_leads, other_moving) = first, second
-    _, x, y = separation(own, other)
-    own_front = own_leads and x * math.cos(own[2]) + y * math.sin(own[2]) > _FRONT
-    other_front = other_leads and -x * math.cos(other[2]) - y * math.sin(other[2]) > _FRONT
-    if own_front or other_front:
-        return own_front  # head-on: the actor in question drives into the other
-    more = (own_moving[0] + other_moving[0]) * x + (own_moving[1] + other_moving[1]) * y
-    if abs(more) > _STEP_M:
-        return more > 0
-    (x, y), (other_x, other_y) = _center(own), _center(other)
-    return (other_x - x) * math.cos(own[2]) + (other_y - y) * math.sin(own[2]) > 0
+def _direction(first: _Party, second: _Party) -> tuple[float, float, bool]:
+    """Return the unit vector from the first to the second at their contact, and whether a jump makes the contact."""
+    jump_x, jump_y = first.jump[0] - second.jump[0], first.jump[1] - second.jump[1]
+    length = math.hypot(jump_x, jump_y)
+    if length > _JUMP_M:
+        # Behind a jump the outlines overlap deeply, often in the middle of the same lane. The axis of the least
+        # overlap, or the sign of a lateral offset of 1e-14 m, then says nothing. The jump itself is the direction.
+        return jump_x / length, jump_y / length, True
+    _, x, y = separation(first.rectangle, second.rectangle)
+    (own_x, own_y), (its_x, its_y) = _center(first.rectangle), _center(second.rectangle)
+    if abs((its_x - own_x) * x + (its_y - own_y) * y) < _TOUCH:  # the sign of the axis is a rounding error
+        approach = (first.velocity[0] - second.velocity[0]) * x + (first.velocity[1] - second.velocity[1]) * y
+        if approach < 0:
+            x, y = -x, -y
+    return x, y, False
+
+
+def _drives_into(first: _Party, second: _Party, x: float, y: float, *, jumps: bool) -> bool:
+    """Return whether the first actor drives into the second.
+
+    Args:
+        first: one actor.
+        second: another.
+        x: of the unit vector from the first to the second.
+        y: likewise.
+        jumps: whether an instantaneous lane change makes the contact.
+    """
+    if jumps:  # the actor that moves into the other's lane
+        own, its = first.jump[0] * x + first.jump[1] * y, -second.jump[0] * x - second.jump[1] * y
+        return own > its - _JUMP_M / 2  # both towards each other: the actor in question, as head-on
+    if first.stands != second.stands:
+        return second.stands  # an actor that stands drives into nothing
+    own, its = (first.velocity[0] * x + first.velocity[1] * y, -second.velocity[0] * x - second.velocity[1] * y)
+    fronts = first.face(x, y) == "front", second.face(-x, -y) == "front"
+    if all(fronts):
+        return True  # head-on: the actor in question drives into the other
+    if any(fronts) and (own > 0 or its > 0 or first.stands):
+        towards, its_towards = (own, its) if fronts[0] else (its, own)
+        # The front drives into the other, unless it moves away from it, and the other reverses or slides into it.
+        return fronts[0] if towards > 0 or its_towards <= 0 else fronts[1]
+    if abs(own - its) > _DRIFT_MPS:
+        return own > its
+    (own_x, own_y), (its_x, its_y) = _center(first.rectangle), _center(second.rectangle)
+    return (its_x - own_x) * math.cos(first.rectangle[2]) + (its_y - own_y) * math.sin(first.rectangle[2]) > 0
 
 
 def _center(rectangle: Rectangle) -> tuple[float, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 
 from crashhunt.crashes import danger_course
 from crashhunt.recording import Prologue, StepRecord
+from crashhunt.report._words import about_danger
 from crashhunt.world import Actor, Roster, Scene
 
 CARS = tuple(Actor(name, "car", 5.0, 2.0) for name in ("ego", "ahead"))
@@ -42,3 +45,39 @@ def test_there_is_none_where_the_agent_is_not_and_at_the_end_where_no_one_knows(
     assert found.of_step(30) == (found.own[30], 0.0)
     assert found.of_step(100) is None
     assert danger_course(recording(5, ()), "ego") is None
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.9, -2.3])
+def test_lane_change_counts_the_vehicle_behind_in_the_target_lane(turn):
+    """The ego jumps in front of a faster vehicle, 2 m ahead of it; its own way leads through no actor."""
+    c, s = math.cos(turn), math.sin(turn)
+
+    def course(other_speed=20.0, ahead=7.0, lane=0.0, heading=0.0):
+        scenes = []
+        for step in range(40):
+            end = (step - 20) * DT
+            poses = [
+                (ahead + 10.0 * end, -3.2 if step < 20 else 0.0, 0.0),
+                (other_speed * end, lane, heading),
+            ]
+            points = [(c * x - s * y, s * x + c * y) for x, y, _ in poses]
+            scenes.append(Scene(step * DT, BOTH, points, [h + turn for *_, h in poses], [10.0, other_speed]))
+            if end > 0:
+                break
+        records = [StepRecord(number, scene) for number, scene in enumerate(scenes)]
+        return danger_course(
+            SimpleNamespace(all_steps=records, scenes=lambda: scenes, prologue=Prologue((), DT)), "ego"
+        )
+
+    found = course()
+    assert found.own[20] == pytest.approx(math.exp(-2.0 / 20.0 / 1.2))
+    assert (found.greatest.step, found.greatest.other) == (20, "ahead")
+    assert found.nearest[0] == "ahead"
+    assert found.nearest[1] == pytest.approx(1.0, abs=1e-6)  # a step later
+    for other in (course(lane=6.4), course(heading=math.pi), course(ahead=-7.0, other_speed=9.0)):
+        assert other.greatest.step != 20 or other.greatest.danger == 0.0
+    words = about_danger(replace(found, greatest=found.greatest._replace(danger=0.0)))
+    assert "no actor was on its way; ahead came nearest, 1.0 m away after step 21" in words
+    assert "no actor came within 50 m" in about_danger(
+        replace(found, greatest=found.greatest._replace(danger=0.0), nearest=None)
+    )

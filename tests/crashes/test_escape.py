@@ -12,7 +12,7 @@ from crashhunt.crashes import find_escape, partner
 from crashhunt.crashes._escape import overruled_trial, slowing
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.simulators import FullBraking
-from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import Collision, Escape, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Actor, Roster, Scene
 
 ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "passenger", 5.0, 2.0)))
@@ -49,6 +49,7 @@ class World:
     def recording(self, scenes):
         steps = [StepRecord(number, scene) for number, scene in enumerate(scenes)]
         found = SimpleNamespace(all_steps=steps, prologue=Prologue((), DT), steps=len(scenes) - 1)
+        found.like = lambda _: found  # it has every actor
         found.scene = lambda step: scenes[step]
         found.scenes = lambda: scenes
         return found
@@ -125,29 +126,31 @@ def test_no_one_asks_what_was_longer_than_ten_seconds_ago():
 
 
 def unclear(change):
-    return World(change=change).escape()
+    found = World(change=change).escape()
+    assert (found.step, found.too_late, found.braking) == (None, None, None)
+    return found.why_not
 
 
 def test_what_the_runs_do_not_say_clearly_is_not_said():
     def ending(**changes):
         return lambda result, scenes: (dataclasses.replace(result, **changes), scenes)
 
-    assert unclear(ending(outcome=Outcome.AGENT_ERROR)) is None
+    assert "the run ends before the outcome is clear" in unclear(ending(outcome=Outcome.AGENT_ERROR))
     another = dataclasses.replace(HIT, victim="third")
-    assert unclear(ending(outcome=Outcome.COLLISION, collision=another)) is None
-    assert unclear(ending(outcome=Outcome.COLLISION, collision=None)) is None
+    assert unclear(ending(outcome=Outcome.COLLISION, collision=another)).endswith("another crash follows")
+    assert "outcome is clear" in unclear(ending(outcome=Outcome.COLLISION, collision=None))
 
     def otherwise(result, scenes):
         scenes[0].points[1] = (1.0, 1.0)
         return result, scenes
 
-    assert unclear(otherwise) is None
-    assert unclear(lambda result, scenes: (result, scenes[:2])) is None
+    assert unclear(otherwise).endswith("the run deviates before the braking")
+    assert unclear(lambda result, scenes: (result, scenes[:2]))
 
     def still_closing(result, scenes):  # the episode ended before the danger had passed
         return result, scenes[:-18] if result.outcome is Outcome.SURVIVED else scenes
 
-    assert unclear(still_closing) is None
+    assert "outcome is clear" in unclear(still_closing)
 
 
 def test_danger_is_over_where_one_has_left_or_they_part():
@@ -180,7 +183,7 @@ def test_danger_is_over_where_one_has_left_or_they_part():
         return result, scenes
 
     assert World(change=parting).escape().step == world.truth()
-    assert World(change=closing).escape() is None
+    assert World(change=closing).escape().why_not
     finished = World(change=lambda result, scenes: (
         dataclasses.replace(result, outcome=Outcome.FINISHED) if result.outcome is Outcome.SURVIVED else result, scenes
     ))  # fmt: skip
@@ -194,12 +197,29 @@ def test_other_crashes_have_none():
     for changes in (
         {"outcome": Outcome.OFF_ROAD},
         {"collision": None},
-        {"collision": dataclasses.replace(HIT, role="victim")},
         {"collision": dataclasses.replace(HIT, role="alone", victim="")},
     ):
         assert find_escape(dataclasses.replace(result, **changes), recording, braking, world.run) is None
     stranger = dataclasses.replace(HIT, victim="never seen")
-    assert find_escape(dataclasses.replace(result, collision=stranger), recording, braking, world.run) is None
+    found = find_escape(dataclasses.replace(result, collision=stranger), recording, braking, world.run)
+    assert found == Escape(why_not="the recording has the two vehicles together only when they touch")
+    found = find_escape(result, recording, None, world.run)
+    assert found == Escape(why_not="the simulator does not say how ego brakes")
+    assert world.runs == []
+
+
+def test_vehicle_hit_from_the_side_has_an_answer_and_one_hit_from_behind_the_reason():
+    world = World()
+    result, recording = world.crash()
+    victim = dataclasses.replace(HIT, role="victim", collider="other", victim="ego")
+    found = find_escape(dataclasses.replace(result, collision=victim), recording, FullBraking(None, "", 8.0), world.run)
+    assert found.step == world.truth()
+    for scene in recording.scenes():  # now the other one drives into the standing ego
+        scene.points.reverse()
+        scene.speeds.reverse()
+    world.runs.clear()
+    found = find_escape(dataclasses.replace(result, collision=victim), recording, FullBraking(None, "", 8.0), world.run)
+    assert found == Escape(why_not="other drove into ego from behind")
     assert world.runs == []
 
 

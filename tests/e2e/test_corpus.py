@@ -168,11 +168,53 @@ def test_a_strangers_crash_is_added_only_with_trust(kept):
     assert names[0] == names[1]
 
 
-def test_a_large_log_is_excluded_and_the_case_still_runs(kept, monkeypatch):
+def small_case(shell, monkeypatch, number="0"):
+    """Return the folder of a case with a compact log, as of a crash with a large one."""
     monkeypatch.setattr("crashhunt.corpus._cases._MAX_BYTES_WITH_LOG", 1000)
-    added = add_case(find_bundle(kept.folder / "h", "0"), kept.folder / "small")
-    assert not list(added.case.path.rglob("log.mcap"))
-    (report,) = run_cases([added.case.path])
+    added = add_case(find_bundle(shell.folder / "h", number), shell.folder / "small")
+    assert added.case.kind_of_log() == "compact"
+    return added.case.path.relative_to(shell.folder)
+
+
+def test_every_documented_command_reads_a_case_with_a_compact_log(kept, monkeypatch):
+    case = small_case(kept, monkeypatch)
+    (report,) = run_cases([kept.folder / case])
+    assert report.got == "still"
+    whole = kept.crashhunt("show", "h", "--crash", "0", "--json").json
+    shown = kept.crashhunt("show", str(case), "--json").json
+    assert (shown["summary"], shown["fault"], shown["danger"]) == (whole["summary"], whole["fault"], None)
+    for name in ("speed", "other_speed", "gap_to_other_m"):
+        assert [one[name] for one in shown["moments"]] == [one[name] for one in whole["moments"]]
+    assert "The log is compact" in kept.crashhunt("show", str(case)).out
+    for words in (("--code", "current"), ("--from-log",), ()):
+        assert kept.crashhunt("replay", str(case), *words, "--json").json["verdict"] == "reproduced"
+    assert kept.crashhunt("check", str(case), "--json").json["fine"]
+    assert kept.crashhunt("report", str(case), "-o", "r.html", "--json").json["crashes_found"] == 1
+    kept.crashhunt("export", str(case), "case.zip")
+    assert kept.crashhunt("replay", "case.zip", "--json").json["verdict"] == "reproduced"
+    again = kept.crashhunt("corpus", "add", str(case), "--to", "other", "--note", "moved")
+    assert "with a compact log" in again.out
+    moved = kept.folder / "other" / case.name
+    assert (read_case(moved).note, read_case(moved).kind_of_log()) == ("moved", "compact")
+    assert kept.crashhunt("replay", str(moved), "--json").json["verdict"] == "reproduced"
+    drive(kept, MENDED)
+    found = kept.crashhunt("replay", str(case), "--code", "current", "--json", "--expect", "fixed").json
+    assert (found["verdict"], found["divergence"]["field"]) == ("fixed", "action[target_speed]")
+
+
+def test_case_without_log_names_the_command_that_records_it(kept, monkeypatch):
+    """As of an earlier version."""
+    case = small_case(kept, monkeypatch)
+    (log,) = (kept.folder / case).rglob("log.mcap")
+    log.unlink()
+    for command in (("show", str(case)), ("replay", str(case))):
+        (line,) = kept.crashhunt(*command, expect=2).err.splitlines()
+        assert "the case has no log" in line
+        assert f"crashhunt corpus run {case} --keep out" in line
+    kept.crashhunt("corpus", "run", str(case), "--keep", "out")
+    assert kept.crashhunt("replay", f"out/{case.name}", "--json").json["verdict"] == "reproduced"
+    assert "without a log" in kept.crashhunt("corpus", "add", str(case), "--to", "other").out  # as bisect adds it
+    (report,) = run_cases([kept.folder / "other" / case.name])
     assert report.got == "still"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import time
 from contextlib import closing
 
 import pytest
@@ -81,6 +82,7 @@ def test_hunt_that_stops_at_its_first_crash_has_an_interval_and_no_estimate(toy)
     assert 0 < rate["certain"]["low"] < rate["certain"]["high"] <= 1
 
 
+@pytest.mark.nightly
 def test_workers_change_no_rate(toy):
     found = []
     for workers in ("1", "2"):
@@ -113,6 +115,7 @@ def test_sampler_that_does_not_draw_independently_has_no_rate(toy):
     assert "the sampler halton does not draw trials independently" in rate["why_not"]
 
 
+@pytest.mark.nightly
 def test_disturbed_and_undisturbed_crashes_are_reported_apart(toy):
     toy.crashhunt("run", "h", "2", "30", *HUNT, "--keep-going", "--disturb", "brake=0.5")
     (rate,) = rates(toy, "h", "--per", "trial")
@@ -167,6 +170,36 @@ def test_resumed_hunt_decides_as_one_that_was_never_interrupted(toy):
     assert len(results(toy.folder / "parts")) == trials  # decided before, so nothing runs
 
 
+@pytest.mark.nightly
+def test_killed_hunt_decides_as_one_that_was_never_killed(toy):
+    slow = ("--set", "step_wall_s=0.002")
+    whole = until(toy, "whole", "2", "0", "0.02/trial", *slow, expect=1)["rate"]
+    process = toy.begin("run", "parts", "2", "0", *HUNT, "--until-rate", "0.02/trial", *slow)
+    deadline = time.monotonic() + 300
+    while not _has_trials(toy.folder / "parts"):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.kill()
+    process.communicate(300)
+    assert until(toy, "parts", "2", "0", "0.02/trial", *slow, expect=1)["rate"] == {**whole, "dir": "parts"}
+
+
+def _has_trials(folder):
+    try:
+        return bool(results(folder))
+    except sqlite3.Error:
+        return False
+
+
+def test_hunt_with_too_many_invalid_trials_ends_with_a_line(toy):
+    words = ("--arg", "speed=2", "--set", "fail_reset=true|false", "--until-rate", "1e-4/trial", "--seed", "3")
+    done = toy.crashhunt("run", "h", "2", "0", "20", "--scenario", "toy", *words, expect=3)
+    why = "too many trials are invalid, so more of them do not help"
+    assert f"undecided about the bar of 1.0e-4 per trial: {why}" in done.out
+    assert "more than 5%: the rest is other traffic than described" in done.out
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -185,15 +218,31 @@ def test_option_that_contradicts_a_bar_is_refused(toy, words, says):
 RARE = ("60", "--scenario", "toy", "--agent", "crashhunt.agents:CarFollowing", "--disturb", "stop=0.1", "--rare")
 
 
-def test_trials_of_rare_mode_have_no_rate_because_they_run_undisturbed(toy):
-    report = toy.crashhunt("run", "h", "2", "4", *RARE, "--seed", "3", "--json").json
-    assert report["rare"]["units"] == 4
+def test_hunt_in_rare_mode_has_no_plain_rate_and_status_reports_its_own(toy):
+    report = toy.crashhunt("run", "h", "2", "10", *RARE, "--seed", "3", "--json").json
+    assert (report["rare"]["units"], report["rare"]["trials"]) == (2, 8)
+    (state,) = toy.crashhunt("status", "h", "--json").json["hunts"]
+    assert (state["rate"]["method"], state["rate"]["units"]) == ("rare", 2)
+    assert state["rate"]["certain"] == report["rare"]["certain"]
     (per_trial,) = rates(toy, "h", "--per", "trial")
     assert (per_trial["estimate"], per_trial["certain"]) == (None, None)
     assert (
         per_trial["why_not"]
-        == "in rare mode, trials run without the hunt's disturbances; the hunt itself reports the rate"
+        == "in rare mode, one of five trials runs without disturbances; crashhunt status reports the rate"
     )
+
+
+def test_status_reports_the_certain_interval_of_any_hunt_that_has_one(toy):
+    toy.crashhunt("run", "h", "2", "12", *HUNT, "--keep-going")
+    (state,) = toy.crashhunt("status", "h", "--json").json["hunts"]
+    (rate,) = rates(toy, "h", "--per", "trial")
+    assert state["rate"]["certain"] == rate["certain"]
+    assert (state["rate"]["trials"], state["rate"]["crashes"]) == (12, rate["crashes"])
+    # A resumed hunt counts the trials of earlier runs.
+    toy.crashhunt("run", "h", "2", "16", *HUNT, "--keep-going")
+    (state,) = toy.crashhunt("status", "h", "--json").json["hunts"]
+    assert state["rate"]["certain"] == rates(toy, "h", "--per", "trial")[0]["certain"]
+    assert state["rate"]["trials"] == 16
 
 
 def test_rare_mode_and_a_bar_exclude_each_other(toy):

@@ -129,7 +129,7 @@ def test_it_may_know_better_than_this_machine_what_0_represents(mine):
     assert tomllib.loads((mine.folder / "h" / "hunt.toml").read_text())["run"]["parallel"] == 0
     (state,) = mine.crashhunt("status", "h", "--json").json["hunts"]
     assert state["nodes"] == [{"name": "there", "parallel": 2, "trials": 3, "rate_per_s": 1.5}]
-    assert re.search(r"^ +there \(2 at a time\) +3 +1\.5 *$", mine.crashhunt("status", "h").out, re.MULTILINE)
+    assert re.search(r"^ +there \(2 at a time\) +3 +1\.5/s *$", mine.crashhunt("status", "h").out, re.MULTILINE)
     mine.crashhunt("run", "g", "0", *WORDS[3:], "--executor", "mine:Logged")
     assert "nodes" not in mine.crashhunt("status", "g", "--json").json["hunts"][0]
     assert calls(mine)[0] == f"made {min(4, len(os.sched_getaffinity(0)))} 1000 "

@@ -16,7 +16,7 @@ import yaml
 ROOT = Path(__file__).resolve().parent.parent.parent
 ACTIONS = ROOT / ".github" / "actions"
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
-NAMES = ["corpus", "hunt"]
+NAMES = ["corpus", "gate", "hunt"]
 AGENT = """
 class Driver:
     def __init__(self, speed: float = 20.0):
@@ -268,3 +268,61 @@ def test_a_hunt_and_its_corpus_as_a_runner_does_it(toy):
     assert wrong.ran[-1] == "Keep what crashes"
     assert any(wrong.artifacts["corpus"].glob("*/crashes/*/crash.json"))
     assert re.search(r"^::error file=kept crashes/.*crashhunt-case\.toml,line=1,", wrong.said, re.MULTILINE)
+
+
+GATE_STUB = """#!/usr/bin/env python3
+import json, os, sys
+with open("asked.jsonl", "a") as file:
+    file.write(json.dumps(sys.argv[1:]) + "\\n")
+os.makedirs("g/base", exist_ok=True)
+print(json.dumps({"verdict": os.environ["VERDICT"]} if os.environ["VERDICT"] else {"error": {"message": "no"}}))
+sys.exit(int(os.environ["CODE"]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("verdict", "code", "strict", "fails"),
+    [
+        ("better", 0, "false", False),
+        ("worse", 1, "false", True),
+        ("undecided", 3, "false", False),
+        ("undecided", 3, "true", True),
+        ("", 2, "false", True),
+    ],
+)
+def test_gate_fails_where_the_change_is_worse_or_cannot_be_compared(tmp_path, verdict, code, strict, fails):
+    words = {"base": "a:B", "head": "a:C d", "arguments": "--agent 'x y:Z' $(touch owned)", "directory": "g//"}
+    runner = Runner("gate", tmp_path, **words, fail_on_undecided=strict)
+    (tmp_path / "bin").mkdir()
+    stub = tmp_path / "bin" / "crashhunt"
+    stub.write_text(GATE_STUB)
+    stub.chmod(0o755)
+    path = f"{stub.parent}{os.pathsep}{os.environ['PATH']}"
+    runner.environment |= {"PATH": path, "VERDICT": verdict, "CODE": str(code)}
+    told = runner.run()
+    assert runner.failed == fails, runner.said
+    assert told["verdict"] == verdict
+    assert bool(runner.artifacts) == bool(verdict)
+    (asked_for,) = asked(tmp_path)
+    assert asked_for[:5] == ["gate", "a:B", "a:C d", "--most", "1000"]
+    assert asked_for[-4:] == ["--agent", "x y:Z", "$(touch", "owned)"]
+    assert asked_for[asked_for.index("--keep") + 1] == "g"
+    assert not (tmp_path / "owned").exists()
+
+
+@pytest.mark.nightly
+def test_gate_compares_two_commits_as_a_runner_does_it(toy):
+    (toy.folder / "driver.py").write_text(AGENT.replace('float("nan") if self.steps > 1005 else ', ""))
+    who = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
+    for words in (("init", "-q"), ("add", "driver.py", "toy"), ("commit", "-qm", "slow")):
+        subprocess.run(["git", *who, *words], cwd=toy.folder, check=True)
+    (toy.folder / "driver.py").write_text(AGENT.replace("self.speed, 0", "20.0, 0"))
+    subprocess.run(["git", *who, "commit", "-qam", "fast"], cwd=toy.folder, check=True)
+    words = "--scenario toy --agent driver:Driver --arg speed=3 --max-steps 99 --seed 1"
+    runner = Runner("gate", toy.folder, base="HEAD~1", arguments=words, most=30)
+    told = runner.run()
+    assert runner.failed, runner.said
+    assert told["verdict"] == "worse"
+    assert "crashhunt gate: worse" in runner.summary.read_text()
+    assert {path.name for path in runner.artifacts["gate"].iterdir()} >= {"base", "head", "gate.json"}
+    assert re.search("^::error title=crashhunt gate%3A worse", runner.said, re.MULTILINE)

@@ -142,7 +142,7 @@ def test_the_keys_are_those_of_the_files():
 def test_every_module_is_listed_with_what_it_is_about():
     text = describe_modules()
     package = Path(crashhunt.__file__).parent
-    files = [file for kind in ("py", "cpp", "hpp", "html") for file in package.rglob(f"*.{kind}")]
+    files = [file for kind in ("py", "cpp", "hpp", "html", "css", "js") for file in package.rglob(f"*.{kind}")]
     modules = [file for file in files if file.name != "__init__.py"]
     assert sum(line.startswith("- `") for line in text.splitlines()) == len(modules)
     assert "## crashhunt/base\n" in text

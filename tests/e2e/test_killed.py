@@ -26,6 +26,7 @@ from test_bisect import git
 from test_corpus import DRIVER, MENDED
 
 from crashhunt.base.temporary import Owner, owner_in, remove_leftovers, remove_tree, start_time, this_process
+from crashhunt.base.work_trees import run_to_end
 from crashhunt.corpus import _bisect
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError
@@ -369,7 +370,7 @@ def test_what_bisect_runs_ends_with_it(tmp_path):
     pid = os.fork()
     if pid == 0:
         with suppress(BaseException):
-            _bisect._ran(["sh", "-c", f"echo $$ > '{said}'; exec sleep 600"], None, os.environ)
+            run_to_end(["sh", "-c", f"echo $$ > '{said}'; exec sleep 600"], None, os.environ)
         os._exit(0)
     wait_for(lambda: said.exists() and said.read_text())
     os.kill(pid, signal.SIGKILL)

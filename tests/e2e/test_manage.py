@@ -16,6 +16,7 @@ import pytest
 from conftest import CRASHHUNT, keeps_going
 
 from crashhunt.ledger import Ledger
+from crashhunt.rates import RateTest
 
 KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
 
@@ -256,20 +257,31 @@ def test_the_shortest_few_of_a_kind_are_kept(toy, made_once):
     assert "crashed, and its bundle is missing" in toy.crashhunt("check", "k", expect=1).out
 
 
+def rate_of_none(trials):
+    """The upper end for no crash in so many trials."""
+    test = RateTest()
+    test.add(0, 1, trials)
+    return test.interval().high
+
+
 def test_which_of_two_agents_crashes_less(toy):
     for name, speed in (("fast", "14"), ("slow", "4")):
-        toy.crashhunt("run", name, "2", "6", "99", *KEEP, "--arg", f"speed={speed}", "--set", "gap_m=20:30")
+        toy.crashhunt("run", name, "2", "9", "99", *KEEP, "--arg", f"speed={speed}", "--set", "gap_m=20:30")
     shutil.copytree(toy.folder / "fast", toy.folder / "again")  # the same trials
     found = toy.crashhunt("compare", "fast", "slow", "again", "--json", "--html", "c.html").json
     fast, slow, again = found["hunts"]
-    assert fast["crashes"] == again["crashes"] > 5
+    assert fast["crashes"] == again["crashes"] > 7  # eight decide
     assert (slow["crashes"], slow["crash_rate"], slow["median_steps_to_crash"]) == (0, 0.0, None)
     assert slow["interval"][0] == 0.0
-    assert slow["interval"][1] == pytest.approx(1 - 0.025 ** (1 / 6))  # Clopper and Pearson's, for none of 6
+    assert slow["interval"][1] == pytest.approx(rate_of_none(9))  # as `crashhunt rate` reports it
     against_slow, against_again = found["pairs"]
     assert (against_slow["only_first"], against_slow["only_second"]) == (fast["crashes"], 0)
     assert against_slow["p_value"] == pytest.approx(2 * 0.5 ** fast["crashes"])
     assert against_slow["verdict"].startswith("slow crashes less")
+    assert against_slow["answer"] == "second"
+    assert against_slow["evidence"] > 20
+    assert against_slow["difference"]["high"] < 0
+    assert against_again["difference"]["low"] < 0 < against_again["difference"]["high"]
     assert (against_again["both"], against_again["p_value"]) == (fast["crashes"], 1.0)
     assert "no difference" in against_again["verdict"]
     page = (toy.folder / "c.html").read_text()
@@ -287,9 +299,8 @@ def test_an_interval_only_where_trials_are_independent(toy):
     toy.crashhunt("run", "grid", "1", "5", "99", *words, "--keep-going")
     toy.crashhunt("run", "other", "1", "5", "99", "--scenario", "toy", "--seed", "99", "--keep-going")
     found = toy.crashhunt("compare", "first", "grid", "other")
-    assert "first: no interval, for it stopped at its first crash" in found.out
-    assert "grid: no interval, for the sampler grid does not draw" in found.out
+    assert "first: no crash rate: the hunt stops at its first crash" in found.out
+    assert "grid: no interval: the sampler grid does not draw" in found.out
     assert "first and other have no seed in common" in found.out
-    assert "use --keep-going" in found.out
     assert "nothing to compare" in toy.crashhunt("compare", "first", expect=2).err
     assert "does not exist" in toy.crashhunt("compare", "first", "nowhere", expect=2).err

@@ -187,6 +187,7 @@ def test_bad_input_is_refused_in_one_line(crash, words, said):
     assert (done.err.count("\n"), done.out) == (1, "")
 
 
+@pytest.mark.nightly
 def test_ctrl_c_counts_the_runs_that_ended(toy):
     toy.crashhunt(
         "run", "h", "1", "20", "300", "--scenario", "toy", "--arg", "speed=14", "--set", "step_wall_s=0.01",
@@ -263,6 +264,7 @@ def test_crash_of_an_earlier_version_takes_changes_and_names_what_needs_todays_c
     assert (found["runs"], found["crashed"], found["from_step"], found["code"]) == (1, 0, 3, "current")
 
 
+@pytest.mark.nightly
 def test_one_of_two_agents_is_replaced(shell):
     words = ("--scenario", "loop-two-agents", "--seed", "1")
     shell.crashhunt("run", "h", "2", "60", "400", *words)

@@ -266,3 +266,39 @@ def test_it_ends_with_its_parent_whatever_becomes_of_that():
 def test_accelerate_is_offered_in_public():
     assert "accelerate" in dir(crashhunt)
     assert callable(crashhunt.accelerate)
+
+
+ORDERS = """
+import sys, warnings
+{imports}
+warnings.simplefilter("ignore")
+
+def make():
+    return gymnasium.make("crashhunt:crashhunt/SUMO-v0", action="meta", max_steps=5)
+
+if __name__ == "__main__":
+    if len(sys.argv) == 1:
+        print(gymnasium.spec("crashhunt/SUMO-v0").entry_point)
+    else:
+        vector = gymnasium.vector.AsyncVectorEnv([make] * 2, context=sys.argv[1])
+        print(vector.reset(seed=[1, 1])[0].shape)
+        vector.close()
+"""
+
+
+@pytest.mark.parametrize("context", ["", "fork", pytest.param("spawn", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "import crashhunt, gymnasium",
+        pytest.param("import gymnasium, crashhunt", marks=pytest.mark.nightly),
+        "import crashhunt; from gymnasium.envs import registration; import gymnasium",
+        pytest.param("import crashhunt.envs, gymnasium", marks=pytest.mark.nightly),
+    ],
+)
+def test_environment_is_registered_in_either_order_of_imports(tmp_path, imports, context):
+    (tmp_path / "order.py").write_text(ORDERS.format(imports=imports))
+    command = [sys.executable, "order.py", *filter(None, [context])]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("(2, " if context else "crashhunt.envs:SumoEnv")

@@ -265,10 +265,8 @@ class FailingOracle:
         ({"make_agent": lambda *_: 1 / 0}, "invalid", 0, "ZeroDivisionError", "ego"),
         ({"oracles": [FailingOracle(2, KeyError("x"))]}, "simulator_error", 2, "KeyError", ""),
         ({"oracles": [FailingOracle(0, KeyError("x"))]}, "simulator_error", 0, "KeyError", ""),
-        ({"oracles": [FailingOracle(2, OSError("files"))]}, "agent_error", 2, "OSError", ""),
-        ({"observers": [Failing("observation", KeyError("x"))]}, "simulator_error", 0, "KeyError", ""),
-        ({"observers": [Failing("scene 0", KeyError("x"))]}, "invalid", 0, "KeyError", ""),
-        ({"observers": [Failing("scene 2", KeyError("x"))]}, "simulator_error", 2, "KeyError", ""),
+        ({"oracles": [FailingOracle(2, OSError("files"))]}, "simulator_error", 2, "OSError", ""),
+        ({"observers": [Failing("scene 2", OSError("closed"))]}, "agent_error", 2, "OSError", ""),
         ({"observers": [Failing("end", MemoryError())], "steps": 4}, "agent_error", 4, "MemoryError", ""),
     ],
 )  # fmt: skip

@@ -420,14 +420,15 @@ class Failing:
     ("error", "outcome"),
     [
         (ZeroDivisionError("oracle"), Outcome.SIMULATOR_ERROR),
-        (OSError("a file that the agent has closed"), Outcome.AGENT_ERROR),
-        (MemoryError("all gone"), Outcome.AGENT_ERROR),
+        (OSError("a file of the oracle's"), Outcome.SIMULATOR_ERROR),
+        (MemoryError("all gone"), Outcome.SIMULATOR_ERROR),
     ],
 )
-def test_what_an_oracle_or_our_own_files_raise_ends_it(run, error, outcome):
+def test_failure_of_an_oracle_of_a_users_ends_it(run, error, outcome):
     log = []
     result = run(drivers={"ego": Driver(log=log)}, oracles=(Failing(error),))
     assert (result.outcome, result.steps, result.failure.message) == (outcome, 1, str(error))
+    assert (result.failure.party, result.failure.place) == ("oracle", "check")
     assert result.digest == run.recording().digest
     assert log[-1] == "closed"
 

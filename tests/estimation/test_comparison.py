@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import closing
+from dataclasses import replace
+
+import pytest
 
 import crashhunt
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, write_settings
+from crashhunt.rates import discordance_evidence
 from crashhunt.report import describe_comparison
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
@@ -25,6 +30,7 @@ def hunt(
     disturb=(),
     plain=None,
     seeds=0,
+    rare=False,
     **run,
 ):
     """A hunt whose trials below ``crashes`` crash, without running it."""
@@ -41,13 +47,15 @@ def hunt(
         run=RunSettings(**{"keep_going": True, **run}),
         disturb=disturb,
         seeds=seeds,
+        rare=rare,
     )
     write_settings(path / "hunt.toml", settings, ["crashhunt"])
     with closing(Ledger(path / "ledger.sqlite", writable=True)) as ledger:
         for number in range(trials):
             origin = "" if plain is None else "random" if number % plain == 0 else "mutation"
             gap_m = 20 + number + (0 if origin == "random" else shift)
-            spec = TrialSpec(number, seed + number, {"ego": {"speed": 4.0}}, {"gap_m": gap_m}, 9, origin=origin)
+            place = number % seeds if seeds else number
+            spec = TrialSpec(number, seed + place, {"ego": {"speed": 4.0}}, {"gap_m": gap_m}, 9, origin=origin)
             outcome = Outcome.COLLISION if number < crashes else Outcome.SURVIVED
             ledger.record(TrialResult(spec, outcome, steps=9), snapshot="")
         facts = {} if plain is None else {"independent": False, "plain_origin": "random", "origins": True}
@@ -68,28 +76,80 @@ def test_same_seeds_are_pairs_only_in_the_same_traffic(tmp_path):
     ):  # fmt: skip
         (pair,) = crashhunt.compare(first, hunt(tmp_path / name, 2, **options)).pairs
         if not says:
-            assert (pair.trials, pair.only_first, pair.both, pair.test) == (40, 18, 2, "mcnemar"), name
+            assert (pair.trials, pair.only_first, pair.both, pair.test) == (40, 18, 2, "pairs"), name
             assert not pair.why_unpaired
+            assert (pair.p_value is None) == (name == "own draws")
+            assert pair.evidence == pytest.approx(math.exp(discordance_evidence(18, 0)))
+            assert pair.difference.low < -18 / 40 < pair.difference.high < 0
             assert "crashes less: of 40 trials with the same seeds" in pair.verdict
             continue
         assert (pair.trials, pair.only_first, pair.only_second, pair.both) == (0, 0, 0, 0), name
         assert says in pair.verdict
+        assert pair.evidence is None
         if name == "other draws":  # whose trials are not independent of each other
-            assert (pair.test, pair.p_value) == ("", 1.0)
+            assert (pair.test, pair.p_value, pair.difference) == ("", None, None)
         else:
-            assert (pair.test, pair.counts) == ("fisher", (20, 40, 2, 40))
+            assert (pair.test, pair.counts, pair.answer) == ("intervals", (20, 40, 2, 40), "second")
+            assert pair.difference.high < 0
             assert 0 < pair.p_value < 1e-4
             assert f"{name} crashes less: 20 of 40 trials crash in" in pair.verdict
 
 
-def test_of_trials_that_share_traffics_nothing_is_said_that_takes_them_for_independent(tmp_path):
-    found = crashhunt.compare(hunt(tmp_path / "shared", 20, seeds=5), hunt(tmp_path / "alone", 2))
-    assert found.hunts[0].interval is None
-    assert "its trials take place in 5 traffics" in found.hunts[0].why_not
-    assert found.hunts[1].interval
+def test_traffics_are_the_pairs_of_hunts_that_share_traffics(tmp_path):
+    found = crashhunt.compare(hunt(tmp_path / "a", 20, seeds=8), hunt(tmp_path / "b", 2, seeds=8))
+    assert all(figures.interval is not None for figures in found.hunts)
     (pair,) = found.pairs
-    assert (pair.trials, pair.test, pair.p_value) == (0, "", 1.0)
-    assert "trials take place in 5 traffics (--seeds)" in pair.verdict
+    # Of 8 traffics with 5 trials each the first crashes 2 or 3 times in each, the second once in two.
+    assert (pair.units, pair.trials, pair.only_first, pair.only_second) == (8, 40, 8, 0)
+    assert pair.p_value is None
+    assert pair.answer == "second"
+    assert "of 8 traffics with 40 trials each way, " in pair.verdict
+    assert pair.difference.low < -18 / 40 < pair.difference.high
+    (pair,) = crashhunt.compare(tmp_path / "a", hunt(tmp_path / "alone", 2)).pairs
+    assert (pair.trials, pair.p_value) == (0, None)
+    assert "have 8 traffics and one per trial (--seeds)" in pair.verdict
+
+
+def test_hunts_that_were_killed_or_stopped_are_compared_up_to_the_first_trial_that_has_not_ended(tmp_path):
+    whole, killed = hunt(tmp_path / "whole", 20), hunt(tmp_path / "killed", 2, keep_going=False)
+    with closing(Ledger(killed / "ledger.sqlite", writable=True)) as ledger:
+        ledger.replace([30, 33])
+    found = crashhunt.compare(whole, killed)
+    assert (found.hunts[1].trials, found.hunts[1].excluded) == (30, 8)
+    assert math.isnan(found.hunts[1].crash_rate)
+    assert found.hunts[1].interval is not None
+    (pair,) = found.pairs
+    assert (pair.trials, pair.only_first, pair.both, pair.excluded) == (30, 18, 2, 18)
+    assert pair.p_value is None
+    assert pair.answer == "second"
+
+
+def test_trials_that_are_invalid_for_one_agent_leave_both_sides(tmp_path):
+    few, many = hunt(tmp_path / "few", 20, trials=100), hunt(tmp_path / "many", 2, trials=100)
+    invalidate(few, 0)
+    (pair,) = crashhunt.compare(few, many).pairs
+    assert (pair.trials, pair.only_first, pair.both, pair.excluded) == (99, 18, 1, 2)
+    invalidate(many, 30, 31, 32, 33, 34)
+    (pair,) = crashhunt.compare(few, many).pairs
+    assert (pair.trials, pair.evidence) == (0, None)
+    assert "6 of 100 pairs have an invalid trial, more than 5%" in pair.verdict
+
+
+def invalidate(folder, *numbers):
+    with closing(Ledger(folder / "ledger.sqlite", writable=True)) as ledger:
+        before = [ledger.result(number) for number in numbers]
+        ledger.replace(numbers)
+        for result in before:
+            ledger.record(replace(result, outcome=Outcome.INVALID), snapshot="")
+
+
+def test_hunts_in_rare_mode_are_not_paired(tmp_path):
+    words = {"disturb": ("brake=0.1",)}
+    (pair,) = crashhunt.compare(
+        hunt(tmp_path / "a", 20, rare=True, **words), hunt(tmp_path / "b", 2, rare=True, **words)
+    ).pairs
+    assert (pair.test, pair.answer, pair.difference) == ("", "", None)
+    assert "are in rare mode" in pair.verdict
 
 
 def test_trials_of_another_length_are_no_fair_comparison(tmp_path):
@@ -112,20 +172,23 @@ def test_of_a_hunt_that_guided_its_trials_only_those_count_that_it_did_not(tmp_p
     assert "guided: counted are the trials of origin random" in describe_comparison(found)
 
 
-def test_a_hunt_that_stopped_at_a_guided_crash_states_nothing_either(tmp_path):
+def test_a_hunt_that_stopped_at_a_guided_crash_has_no_crash_rate_either(tmp_path):
     """The trials that count have not crashed, but how many there are was up to one that does not."""
     guided = hunt(tmp_path / "guided", 0, sampler="guided", plain=5, trials=13, keep_going=False)
     with closing(Ledger(guided / "ledger.sqlite", writable=True)) as ledger:
         spec = TrialSpec(13, 14, {"ego": {"speed": 4.0}}, {"gap_m": 20}, max_steps=9, origin="mutation")
         ledger.record(TrialResult(spec, Outcome.COLLISION, steps=9), snapshot="")
     figures = crashhunt.compare(guided, hunt(tmp_path / "plain", 12)).hunts[0]
-    assert (figures.crashes, figures.interval) == (0, None)
-    assert "it stopped at its first crash" in figures.why_not
+    assert (figures.trials, figures.crashes) == (3, 0)  # 0, 5 and 10
+    assert math.isnan(figures.crash_rate)
+    assert "the hunt stops at its first crash" in figures.why_not
 
 
-def test_a_hunt_without_a_last_trial_that_was_to_stop_at_kinds_has_no_interval(tmp_path):
+def test_a_hunt_without_a_last_trial_that_was_to_stop_at_kinds_has_no_crash_rate(tmp_path):
     stopped = hunt(tmp_path / "stopped", 3, distinct=2)
     path = stopped / "hunt.toml"
     path.write_text(path.read_text().replace("trials = 40", "trials = 0"))
     figures = crashhunt.compare(stopped, hunt(tmp_path / "plain", 12)).hunts[0]
-    assert "it stopped at 2 kinds of crashes" in figures.why_not
+    assert "the hunt stops at 2 kinds of crashes" in figures.why_not
+    assert math.isnan(figures.crash_rate)
+    assert figures.interval is not None

@@ -10,6 +10,7 @@ import pytest
 from crashhunt.base.errors import SimulatorError
 from crashhunt.disturbances import disturber_of, parse_rates
 from crashhunt.hunts._fork_results import CopiedCrashes
+from crashhunt.hunts._phases import PhaseClock
 from crashhunt.hunts._progress import Progress
 from crashhunt.hunts._verification import Found, VerificationRuns
 from crashhunt.trial import Branch, Branches, Disturbance, Outcome, Stress, TrialResult, TrialSpec
@@ -19,12 +20,13 @@ FOUND = Found(TrialSpec(3, 1, {"ego": {}}, {}, 9), "collision", 5)
 
 def runs(tmp_path, stops, run):
     (tmp_path / "probes" / "000001-collision").mkdir(parents=True)
-    return SimpleNamespace(place=SimpleNamespace(path=tmp_path), stops=stops, notes=[], failed=[], parallel=2, run=run)
+    return SimpleNamespace(place=SimpleNamespace(path=tmp_path), stops=stops, notes=[], failed=[], parallel=2, run=run,
+                           phases=PhaseClock(lambda _: None, 2))  # fmt: skip
 
 
 def test_the_one_that_stops_keeps_what_there_was(tmp_path):
     copies = VerificationRuns(runs(tmp_path, [2], None), None)
-    assert (copies.crashes([FOUND], "probes"), copies.is_stopped) == (((), 0), True)
+    assert (copies.crashes([FOUND], "probes", "probes"), copies.is_stopped) == (((), 0), True)
     assert [path.name for path in (tmp_path / "probes").iterdir()] == ["000001-collision"]
 
 
@@ -35,7 +37,7 @@ def test_what_cannot_be_run_is_reported_and_the_hunt_has_ended_well(tmp_path):
         raise SimulatorError("no room")
 
     again = runs(tmp_path, [], fails)
-    assert VerificationRuns(again, None).crashes([FOUND], "probes") == ((), 1)
+    assert VerificationRuns(again, None).crashes([FOUND], "probes", "probes") == ((), 1)
     assert again.notes == ["what copies have found could not be run from the start: no room"]
     assert not (tmp_path / "probes").exists()
 
@@ -47,7 +49,7 @@ def test_another_end_is_no_crash_of_it(tmp_path, outcome, step):
             yield SimpleNamespace(result=TrialResult(spec, Outcome(outcome), steps=step))
 
     again = runs(tmp_path, [], another)
-    assert VerificationRuns(again, None).crashes([FOUND], "probes") == ((), 0)
+    assert VerificationRuns(again, None).crashes([FOUND], "probes", "probes") == ((), 0)
     assert [result.steps for result in again.failed] == [step]
 
 
@@ -147,5 +149,5 @@ def test_what_is_kept_is_not_run_again_and_stays(tmp_path):
     kept.mkdir()
     bundle = SimpleNamespace(path=kept, result=SimpleNamespace(spec=FOUND.spec))
     copies = VerificationRuns(again, None, {"probes": {3: bundle}})
-    assert copies.crashes([FOUND], "probes") == ((bundle,), 0)
+    assert copies.crashes([FOUND], "probes", "probes") == ((bundle,), 0)
     assert [path.name for path in (tmp_path / "probes").iterdir()] == ["000003-collision"]

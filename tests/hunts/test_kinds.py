@@ -51,6 +51,26 @@ def test_the_last_new_kind_is_not_the_last_crash(monkeypatch):
     ]
 
 
+def test_a_screen_does_not_wait_for_groups_that_take_long(monkeypatch):
+    now, group = [0.0], _progress.groups_of
+
+    def slowly(*given):
+        now[0] += 1.0
+        return group(*given)
+
+    monkeypatch.setattr(_progress, "groups_of", slowly)
+    monkeypatch.setattr(_progress, "time", SimpleNamespace(monotonic=lambda: now[0], time=lambda: now[0]))
+    kinds = Kinds(0, [crash(1, "KeyError")])
+    assert kinds.groups(running=True)[0].count == 1
+    kinds.add(crash(2, "KeyError"), 1)
+    now[0] = 20.0
+    assert kinds.groups(running=True)[0].count == 1  # 5 % of the time
+    now[0] = 22.0
+    assert kinds.groups(running=True)[0].count == 2
+    kinds.add(crash(3, "KeyError"), 1)
+    assert kinds.groups()[0].count == 3  # what the hunt ends with
+
+
 def test_of_each_kind_the_shortest_few_are_kept_and_all_count():
     kinds = Kinds(2)
     for number, (kind, steps) in enumerate([("KeyError", 9), ("KeyError", 4), ("IndexError", 7), ("KeyError", 4)]):
@@ -84,8 +104,11 @@ def test_what_was_hunted_for_is_kept_before_what_is_shorter(monkeypatch):
     monkeypatch.setattr(_progress, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id != "c1"))
     kinds = Kinds(1, [crash(1, "KeyError", 4), crash(2, "KeyError", 9), crash(3, "KeyError", 6)], only_at_fault=True)
     assert [bundle.id for bundle in kinds.surplus(1)] == ["c2", "c1"]
-    assert kinds.at_fault == (3,)  # of those that are kept
-    assert Kinds(1, [crash(3, "KeyError", 6)], only_at_fault=True, dropped=kinds.dropped).until == 3
+    assert (kinds.at_fault, kinds.dropped_at_fault) == ((2, 3), [2])  # with or without a bundle
+    again = Kinds(
+        1, [crash(3, "KeyError", 6)], only_at_fault=True, dropped=kinds.dropped, dropped_at_fault=kinds.dropped_at_fault
+    )
+    assert (again.until, again.at_fault) == (3, (2, 3))
 
 
 def test_the_one_that_wants_several_kinds_continues_after_the_first_crash():

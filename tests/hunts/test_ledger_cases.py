@@ -8,13 +8,14 @@ import sqlite3
 import stat
 import time
 from contextlib import closing
+from dataclasses import replace
 
 import pytest
 from columns import FEWER_COLUMNS
 
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger, Turn, has_begun
-from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
 
@@ -65,6 +66,17 @@ def test_counts_are_of_what_is_there(ledger):
     assert [found.spec.number for found in ledger.results(outcomes=("survived", "hang"))] == [0, 1, 2]
     assert list(ledger.results(outcomes=("invalid",))) == []
     assert ledger.last_ended_at() == pytest.approx(time.time(), abs=60)
+
+
+def test_endings_are_in_the_order_of_trials_and_name_what_was_killed(ledger):
+    killed = replace(result(0, Outcome.INVALID), failure=Failure(KILLED, "out of memory"))
+    random = replace(result(1), spec=replace(result(1).spec, origin="random"))
+    for one in (result(2, Outcome.COLLISION), random, killed, result(5, Outcome.INVALID)):
+        ledger.record(one, snapshot="")
+    assert list(ledger.endings()) == [
+        (0, "invalid", "", True), (1, "survived", "random", False), (2, "collision", "", False),
+        (5, "invalid", "", False),
+    ]  # fmt: skip
 
 
 def test_traffic_events_are_counted_with_their_trials(ledger):

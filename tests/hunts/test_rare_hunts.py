@@ -12,10 +12,11 @@ import pytest
 import crashhunt
 from crashhunt.disturbances import DisturbanceSampler, brake
 from crashhunt.errors import UsageError
-from crashhunt.hunts._rare import Forcings, PrecisionRule
+from crashhunt.hunts import hunt_state
+from crashhunt.hunts._rare import Forcings, RareWatch
 from crashhunt.ledger import Ledger
-from crashhunt.rates import BLOCK
-from crashhunt.trial import CRASHES, Forced, ForcedCopy, Forcing, Outcome, TrialResult, TrialSpec
+from crashhunt.rates import BLOCK, TRIALS_PER_ROOT, is_root
+from crashhunt.trial import CRASHES, Disturbance, Forced, ForcedCopy, Forcing, Outcome, TrialResult, TrialSpec
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
 
@@ -83,34 +84,96 @@ def root(number, crash="", **more):
     return TrialResult(spec, Outcome.SURVIVED, 50, forced=forced)
 
 
+def plain(number, outcome=Outcome.SURVIVED):
+    return TrialResult(TrialSpec(number, number, {}, {}, 50), outcome, 50)
+
+
+def rows_of(roots):
+    """Return a ledger with roots, each with its plain trials."""
+    rows = Rows()
+    for place, first in enumerate(roots):
+        number = place * TRIALS_PER_ROOT
+        rows[number] = replace(first, spec=replace(first.spec, number=number))
+        rows |= {other: plain(other) for other in range(number + 1, number + TRIALS_PER_ROOT)}
+    return rows
+
+
+BLOCK_OF_TRIALS = BLOCK * TRIALS_PER_ROOT
+
+
+def test_every_fifth_trial_is_a_root_and_the_others_wait_for_nothing():
+    assert [number for number in range(11) if is_root(number)] == [0, 5, 10]
+    forcings = Forcings(settings(), Rows(), SAMPLER)
+    assert forcings.of(0) is not None
+    assert forcings.of(1) is None
+    assert Forcings.needed(2 * BLOCK_OF_TRIALS + 1) == 0
+
+
 def test_forcing_is_learned_from_the_blocks_before_the_previous_one():
-    rows = Rows({number: root(number, "collision") for number in range(BLOCK)})
+    rows = rows_of([root(number, "collision") for number in range(BLOCK)])
     forcings = Forcings(settings(), rows, SAMPLER)
-    assert [Forcings.needed(number) for number in (0, BLOCK, 2 * BLOCK - 1, 2 * BLOCK, 3 * BLOCK)] == [
-        0, 0, 0, BLOCK, 2 * BLOCK,
-    ]  # fmt: skip
+    many = BLOCK_OF_TRIALS
+    asked = (0, many, 2 * many - TRIALS_PER_ROOT, 2 * many, 3 * many)
+    assert [Forcings.needed(number) for number in asked] == [0, 0, 0, many, 2 * many]
     start = forcings.of(0)
-    assert (forcings.of(2 * BLOCK - 1), start.ratios) == (start, {})
-    learned = forcings.of(2 * BLOCK)
+    assert (forcings.of(2 * many - TRIALS_PER_ROOT), start.ratios) == (start, {})
+    learned = forcings.of(2 * many)
     assert learned.ratios["brake=6.0"] > 1 > learned.ratios["brake=2.0"]
     # A resumed hunt begins at any root, and has the same forcing.
-    assert Forcings(settings(), rows, SAMPLER).of(2 * BLOCK + 5) == learned
+    assert Forcings(settings(), rows, SAMPLER).of(2 * many + TRIALS_PER_ROOT) == learned
 
 
-def test_precision_rule_ends_at_a_full_block_and_excludes_incomplete_roots():
-    rows = Rows({number: root(number, "collision" if number % 2 else "") for number in range(5 * BLOCK)})
-    rows[3] = root(3, unanswered=1, why_unanswered="a copy was killed")
-    rule = PrecisionRule(settings("0.3"), rows, SAMPLER)
-    rule.read(40)
-    assert (len(rule.roots) + rule.excluded, rule.excluded, rule.is_met) == (40, 1, False)
+def test_hunt_may_end_at_a_full_block_and_incomplete_roots_are_excluded():
+    rows = rows_of([root(number, "collision" if number % 2 else "") for number in range(5 * BLOCK)])
+    incomplete = root(3, unanswered=1, why_unanswered="a copy was killed")
+    rows[15] = replace(incomplete, spec=replace(incomplete.spec, number=15))
+    rule = RareWatch(settings("0.3"), rows, SAMPLER)
+    rule.read(40 * TRIALS_PER_ROOT + 2)
+    assert (rule.roots, rule.estimate().excluded, rule.is_met) == (40, 1, False)
+    assert rule.estimate().plain == 40 * (TRIALS_PER_ROOT - 1)
     rule.read()
     assert rule.is_met
-    assert len(rule.roots) + rule.excluded == 2 * BLOCK  # of 5 blocks
+    assert rule.roots == 2 * BLOCK  # of 5 blocks
     assert rule.estimate().relative_error <= 0.3
-    del rows[7]
-    gap = PrecisionRule(settings(), rows, SAMPLER)
+    del rows[7 * TRIALS_PER_ROOT]
+    gap = RareWatch(settings(), rows, SAMPLER)
     gap.read()
-    assert len(gap.roots) + gap.excluded == 7  # a root of a higher number does not count before one that has not ended
+    assert gap.roots == 7  # a root of a higher number does not count before one that has not ended
+
+
+def test_crashes_of_plain_trials_count_for_the_undisturbed_part_and_for_the_certain_bounds():
+    rows = rows_of([root(number, "collision" if number % 2 else "") for number in range(60)])
+    calm = RareWatch(settings(), rows, SAMPLER)
+    calm.read()
+    for number in (1, 2, 8, 101, 203):
+        rows[number] = plain(number, Outcome.COLLISION)
+    rows[4] = plain(4, Outcome.INVALID)
+    rule = RareWatch(settings(), rows, SAMPLER)
+    rule.read()
+    found, before = rule.estimate(), calm.estimate()
+    assert (found.plain, found.plain_crashes, found.undisturbed_crashes) == (239, 5, 5)
+    assert before.undisturbed == 0
+    assert found.undisturbed == pytest.approx((2 / 4 + 3 / 5) / 60)  # the group of trial 4 has one trial fewer
+    assert found.disturbed == before.disturbed
+    assert found.certain[0] <= found.undisturbed + found.disturbed <= found.certain[1]
+    assert found.certain[1] > before.certain[1]
+    running = rule.running()
+    assert running["certain"] == {"low": found.certain[0], "high": found.certain[1]}
+    assert (running["method"], running["units"], running["crashes"]) == ("rare", 60, 5)
+
+
+def test_plain_trials_that_contradict_the_copies_withhold_the_interval():
+    rows = rows_of([root(number, "collision" if number % 2 else "") for number in range(60)])
+    disturbed = replace(plain(0), disturbances=(Disturbance(3, "ahead", "brake", 2.0, 1.0, "ego", vehicle="v"),))
+    for number in rows:
+        if number % TRIALS_PER_ROOT == 1:
+            spec = replace(disturbed.spec, number=number)
+            rows[number] = replace(disturbed, spec=spec, outcome=Outcome.COLLISION)
+    rule = RareWatch(settings(), rows, SAMPLER)
+    rule.read()
+    found = rule.estimate()
+    assert found.estimated is None
+    assert "plain trials crash more often than the copies explain" in found.why_not
 
 
 def estimate_of(report):
@@ -121,10 +184,10 @@ def estimate_of(report):
 @pytest.mark.nightly
 def test_a_hunt_in_rare_mode_is_the_same_with_any_number_of_workers_and_resumed(tmp_path):
     options = OPTIONS | {"disturb": ["brake=0.02", "stop=0.02"]}
-    one = crashhunt.run(tmp_path / "one", 1, 70, 60, **options)
-    three = crashhunt.run(tmp_path / "three", 3, 70, 60, **options)
-    crashhunt.run(tmp_path / "again", 2, 40, 60, **options)
-    again = crashhunt.run(tmp_path / "again", 2, 70, 60, **options)
+    one = crashhunt.run(tmp_path / "one", 1, 350, 60, **options)
+    three = crashhunt.run(tmp_path / "three", 3, 350, 60, **options)
+    crashhunt.run(tmp_path / "again", 2, 203, 60, **options)
+    again = crashhunt.run(tmp_path / "again", 2, 350, 60, **options)
     assert estimate_of(one) == estimate_of(three) == estimate_of(again)
     assert one.rare.is_verified
     assert one.rare.verified == 5
@@ -132,15 +195,23 @@ def test_a_hunt_in_rare_mode_is_the_same_with_any_number_of_workers_and_resumed(
     assert one.rare.estimate.roots == 70
     with closing(Ledger(tmp_path / "one" / "ledger.sqlite")) as ledger:
         results = list(ledger.results())
-    assert all(one.step == 1 for result in results for one in result.spec.disturbances)
-    assert results[0].spec.forcing.ratios == {} != results[69].spec.forcing.ratios
-    assert 4 < sum(len(result.forced.copies) for result in results) / 70 <= 8
+    roots = [result for result in results if is_root(result.spec.number)]
+    assert all(one.step == 1 for result in roots for one in result.spec.disturbances)
+    assert roots[0].spec.forcing.ratios == {} != roots[69].spec.forcing.ratios
+    assert 4 < sum(len(result.forced.copies) for result in roots) / 70 <= 8
+    others = [result for result in results if not is_root(result.spec.number)]
+    assert all(result.forced is None and result.spec.forcing is None for result in others)
+    assert any(one.step > 1 for result in others for one in result.spec.disturbances)
+    crashed = [result for result in others if result.outcome in CRASHES]
+    assert one.rare.estimate.plain_crashes == len(crashed)
+    found = hunt_state(tmp_path / "one").rate
+    assert found == one.rare.estimate.running()
 
 
 @pytest.mark.nightly
 def test_a_hunt_in_rare_mode_ends_where_the_error_is_small_enough(tmp_path):
     options = OPTIONS | {"disturb": ["brake=0.5", "stop=0.5"], "until_error": "60%"}
-    report = crashhunt.run(tmp_path / "h", 2, 200, 60, **options)
+    report = crashhunt.run(tmp_path / "h", 2, 1000, 60, **options)
     assert report.stopped_because == "precise"
     assert report.rare.estimate.relative_error <= 0.6
     assert report.rare.estimate.roots % BLOCK == 0

@@ -37,7 +37,9 @@ def test_plain_data_has_every_value_of_a_result():
     """A field that is added, and not written or not read, shows here, as long as it is given above."""
     assert TrialResult.from_json(json.loads(json.dumps(RESULT.to_json()))) == RESULT
     for part in (RESULT.collision, RESULT.failure, RESULT.escape, RESULT.event, RESULT.closest):
-        assert list(part.to_json()) == [item.name for item in dataclasses.fields(part)]
+        names = [item.name for item in dataclasses.fields(part)]
+        left_out = {name for name in ("party", "place", "why_not") if not getattr(part, name, None)}
+        assert list(part.to_json()) == [name for name in names if name not in left_out]
 
 
 def test_a_row_has_every_column():

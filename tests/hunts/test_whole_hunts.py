@@ -69,7 +69,8 @@ def test_a_hunt_records_confirms_audits_and_keeps_near_misses(tmp_path):
     assert [bundle.confirmed for bundle in report.near_misses] == [True, True]
     assert list_near_misses(hunt) == list(report.near_misses)
     assert {status.phase for status in seen} >= {"hunting", "done"}
-    assert (seen[-1].done, seen[-1].planned, seen[-1].crashes) == (8, 8, len(list_bundles(hunt)))
+    assert (seen[-1].done, seen[-1].planned, seen[-1].crashes) == (8, 8, len(crashed))
+    assert (data := report.to_json())["crashes_found"] == len(crashed) > len(list_bundles(hunt))
     data = report.to_json()
     assert json.loads(json.dumps(data)) == data
     assert data["trials_run"] == data["trials_planned"] == 8

@@ -85,7 +85,7 @@ def test_a_report_is_believed_where_the_outlines_do_not_say():
     assert [hit.agent for hit in hits(ReportedCollision(), view, agents=["other", "ego"])] == ["other"]  # once
     view.contacts = (Contact("ego", "", "fell", "b_0", 7.0, math.nan), reported)
     alone, hit = hits(ReportedCollision(), view)
-    assert (alone.role, alone.lane, alone.collider, alone.victim) == ("alone", "b_0", "ego", "")
+    assert (alone.role, alone.lane, alone.collider, alone.victim) == ("alone", "a_0", "ego", "")
     assert hit.role == "collider"
 
 

@@ -12,7 +12,7 @@ from crashhunt.base.errors import ArgumentError
 from crashhunt.plans import Owners, Takes, takes_of
 
 TWO = Owners({"ego": Takes(("speed", "gain")), "ego.2": Takes(("speed", "x"))}, ("vehicles", "gain"))
-OPEN = Owners({"ego": Takes(("speed",), open=True)}, ("vehicles", "speed"))
+OPEN = Owners({"ego": Takes(("speed",), open=True, defaults={"speed": 5.0})}, ("vehicles", "speed"))
 
 
 @pytest.mark.parametrize(
@@ -90,8 +90,8 @@ class Open(Agent):
 
 def test_an_agent_states_what_it_takes(tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(AGENTS)
-    assert takes_of("mine:Agent", folder=tmp_path) == Takes(("speed", "model"))
-    assert takes_of("mine:Open", (str(tmp_path),)) == Takes(("speed",), open=True)
+    assert takes_of("mine:Agent", folder=tmp_path) == Takes(("speed", "model"), defaults={"speed": 5.0})
+    assert takes_of("mine:Open", (str(tmp_path),)) == Takes(("speed",), open=True, defaults={"speed": 5.0})
     assert takes_of("mine:Gone", folder=tmp_path) == Takes(open=True)  # whoever runs it will say so
     assert "speed" in takes_of("keep-lane").names
 

@@ -98,7 +98,7 @@ def test_an_option_that_is_added_to_the_list_is_everywhere(toy):
     asked("-m", "crashhunt", "run", "h", "1", "1", "5", *words)
     assert 'witnesses = [\n    "x",\n    "y",\n]\n' in (toy.folder / "h" / "hunt.toml").read_text()
     assert "--warm-up S           driven before anything counts, in s; default: 2.5" in asked(
-        "-m", "crashhunt", "run", "-h"
+        "-m", "crashhunt", "run", "--help-all"
     )
     (toy.folder / "suite.toml").write_text(
         '[[hunts]]\nid="a"\nscenario="toy"\nwarm_up_s=5\nwitnesses=["z"]\nhints={n=2}\n'

@@ -290,14 +290,14 @@ def test_of_a_record_the_code_is_asked_only_where_it_does_not_know():
 
 
 def test_code_states_what_an_agent_takes(folder):
-    assert takes_of("drives:Agent") == Takes(("speed", "mode", "needed"))
+    assert takes_of("drives:Agent") == Takes(("speed", "mode", "needed"), defaults={"speed": 7.0, "mode": "a|b"})
     assert takes_of("drives:Open") == Takes((), open=True)
     assert takes_of("drives:Nothing") == Takes(open=True)  # whoever runs it says why
     other = folder / "other"
     other.mkdir()
     (other / "drives.py").write_text("class Agent:\n    def __init__(self, other: int = 1): ...\n")
-    assert takes_of("drives:Agent", [str(other)]) == Takes(("other",))
-    assert takes_of("drives:Agent", folder=other) == Takes(("other",))
+    assert takes_of("drives:Agent", [str(other)]) == Takes(("other",), defaults={"other": 1})
+    assert takes_of("drives:Agent", folder=other) == Takes(("other",), defaults={"other": 1})
     assert "speed" in takes_of("keep-lane").names
 
 

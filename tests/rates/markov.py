@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.disturbances import Choices, DisturbanceSampler, FirstOnsets, first_forcing
-from crashhunt.rates import BLOCK, learn_forcing, root_of
+from crashhunt.rates import BLOCK, TRIALS_PER_ROOT, learn_forcing, root_of, with_plain
 from crashhunt.trial import CRASHES, Disturbance, Forced, ForcedCopy, Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
@@ -101,10 +101,10 @@ class Model:
 
 @dataclass
 class Episode:
-    """A running trial; a copy of it is a fork, with the same generator."""
+    """A running trial; a copy of it is a fork, with the same random numbers."""
 
     model: Model
-    rng: np.random.Generator
+    draws: list[list[float]]  # of each step
     planned: list[Disturbance]
     steps: int = 0
     there: bool = False
@@ -119,7 +119,6 @@ class Episode:
 
     def fork(self, planned):
         made = copy.copy(self)
-        made.rng = copy.deepcopy(self.rng)
         made.planned = list(planned)
         made.told = []
         return made
@@ -130,11 +129,12 @@ class Episode:
 
     def step(self):
         self.steps += 1
-        # Draw always the same numbers, so that a fork sees the same vehicles.
-        fails, hidden, moves = self.rng.random(3)
-        for name in ("late_action", "brake", "stop"):
-            for one in [one for one in self.planned if one.step == self.steps and one.what == name]:
-                self._begin(one, fails)
+        fails, hidden, moves = self.draws[self.steps - 1]
+        now = [one for one in self.planned if one.step == self.steps]
+        for name in ("late_action", "brake", "stop") if now else ():
+            for one in now:
+                if one.what == name:
+                    self._begin(one, fails)
                 if self.crashed:
                     return
         if hidden < self.model.hidden:
@@ -156,10 +156,15 @@ class Episode:
             self.crashed = fails < self.model.fails
 
 
+def episode_of(model, seed, planned):
+    """Return an episode before its first step."""
+    return Episode(model, np.random.default_rng(seed + 1).random((model.steps, 3)).tolist(), list(planned))
+
+
 def run_root(model, sampler, forcing, seed):
     """Return the result of a root, as an episode gives it."""
     spec = TrialSpec(0, seed, {}, {}, model.steps, disturbances=sampler.draw(seed, 1), forcing=forcing)
-    episode = Episode(model, np.random.default_rng(seed + 1), list(spec.disturbances))
+    episode = episode_of(model, seed, spec.disturbances)
     onsets, copies, steps = FirstOnsets(sampler, forcing, seed, model.steps), [], 0
     while True:
         for onset in onsets.after(episode.steps, episode.has_target):
@@ -180,8 +185,19 @@ def run_root(model, sampler, forcing, seed):
     return replace(TrialResult(spec, outcome, steps=episode.steps), forced=forced, disturbances=there)
 
 
-def run_roots(model, count, seed, *, sampler=None):
-    """Return the values of roots, with the forcing learned as a hunt learns it."""
+def run_plain(model, sampler, seed):
+    """Return the result of a plain trial."""
+    spec = TrialSpec(0, seed, {}, {}, model.steps, disturbances=sampler.draw(seed, model.steps))
+    episode = episode_of(model, seed, spec.disturbances)
+    while not episode.over:
+        episode.step()
+    there = spec.disturbances if episode.disturbed else ()
+    outcome = Outcome.COLLISION if episode.crashed else Outcome.SURVIVED
+    return replace(TrialResult(spec, outcome, steps=episode.steps), disturbances=there)
+
+
+def run_roots(model, count, seed, *, sampler=None, plain=True):
+    """Return the values of roots with their plain trials, with the forcing learned as a hunt learns it."""
     sampler = sampler or model.sampler()
     start = first_forcing(sampler, model.steps)
     results: list[TrialResult] = []
@@ -190,4 +206,11 @@ def run_roots(model, count, seed, *, sampler=None):
         if number % BLOCK == 0:
             forcing = learn_forcing([one.forced for one in results[: max(0, block - 1) * BLOCK]], start)
         results.append(run_root(model, sampler, forcing, seed * 1_000_003 + 7 * number))
-    return [root_of(result, CRASHES, model.hazard) for result in results]
+    roots = [root_of(result, CRASHES, model.hazard) for result in results]
+    if not plain:
+        return roots
+    seeds = iter(range(seed * 1_000_003 + 10**9, 10**12))
+    return [
+        with_plain(root, [run_plain(model, sampler, next(seeds)) for _ in range(TRIALS_PER_ROOT - 1)], CRASHES)
+        for root in roots
+    ]

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import random
 
 import pytest
 from hypothesis import given, strategies as st
 
 from crashhunt.plans import check_rate, rate_of
-from crashhunt.rates import BarWatch, CountingRule, RateCounter, TrialFacts, UnitSequence, make_rate
+from crashhunt.rates import (
+    MAX_INVALID_SHARE,
+    BarWatch,
+    CountingRule,
+    Paced,
+    RateCounter,
+    RateWatch,
+    TrialFacts,
+    UnitSequence,
+    make_rate,
+)
 from crashhunt.report import format_rate
 
 RULE = CountingRule(max_steps=100)
@@ -133,6 +144,37 @@ def test_decision_depends_on_no_order(outcomes, seed):
     assert first.interval() == second.interval()
 
 
+def test_rate_at_the_bar_ends_undecided_once_it_certainly_is_near_it():
+    watch = BarWatch(RULE, 0.25, "trial", ("collision",))
+    for number in range(20_000):
+        watch.add(data(number, "survived" if number % 4 else "collision"))
+        if watch.decided_at is not None:
+            break
+    assert (watch.verdict, watch.decided_at) == ("undecided", number)
+    assert watch.why_undecided == "the rate certainly is within 20% of the bar, so more trials do not help"
+    low, high = watch.interval()
+    assert 0.2 <= low < 0.25 < high <= 0.3
+    assert number < 2500
+
+
+def test_many_invalid_trials_end_a_hunt_undecided_and_few_do_not():
+    few = watched((["invalid"] + ["survived"] * 24) * 8, bar=0.001)
+    assert (few.decided_at, few.sequence.invalid_share) == (None, 0.04)
+    many = watched((["survived"] * 3 + ["invalid"]) * 200, bar=0.001)
+    assert (many.verdict, many.decided_at) == ("undecided", many.sequence.hopeless_at)
+    assert many.why_undecided == "too many trials are invalid, so more of them do not help"
+    assert many.decided_at < 60
+    shuffled = watched((["survived"] * 3 + ["invalid"]) * 200, bar=0.001, order=[*range(799, -1, -1)])
+    assert (shuffled.decided_at, shuffled.counter.units) == (many.decided_at, many.counter.units)
+
+
+def test_trial_without_exposure_ends_a_hunt_undecided():
+    watch = BarWatch(RULE, 1.0, "hour", ("collision",))
+    watch.add(data(0, driven_s=None, step_length_s=None))
+    assert (watch.verdict, watch.decided_at) == ("undecided", 0)
+    assert watch.why_undecided == "trial 0 has no driven distance and time"
+
+
 @pytest.mark.nightly
 def test_bars_are_decided_soon_and_rarely_wrongly():
     """At a third of the bar the median is at most 15 / bar trials, and at most 1 % of the decisions are wrong."""
@@ -186,3 +228,33 @@ def test_any_text_is_a_rate_or_is_refused(text):
 )  # fmt: skip
 def test_rates_have_two_digits(rate, text):
     assert format_rate(rate) == text
+
+
+@given(st.lists(st.sampled_from(["fine", "crash", "invalid", "killed"]), max_size=60), st.randoms())
+def test_running_rate_is_that_of_the_trials_in_a_row_and_no_bar_ends_it(kinds, random):
+    trials = [
+        trial(number, crashed=kind == "crash", valid=kind != "invalid", has_ended=kind != "killed")
+        for number, kind in enumerate(kinds)
+    ]
+    first = kinds.index("killed") if "killed" in kinds else len(kinds)
+    random.shuffle(trials)
+    watch = RateWatch(RULE, "trial", ["collision"])
+    for one in trials:
+        watch.add_facts(one)
+    found, row = watch.running(now=True), kinds[:first]
+    valid, invalid = len(row) - row.count("invalid"), row.count("invalid")
+    assert (found["trials"], found["crashes"]) == (valid, row.count("crash"))
+    if not valid or invalid > MAX_INVALID_SHARE * len(row):
+        assert found["certain"] is None
+        assert found["why_not"]
+    else:
+        low, high = watch.interval()
+        assert found["certain"] == {"low": low, "high": high}
+    json.dumps(found, allow_nan=False)
+
+
+def test_running_rate_is_made_again_only_where_something_has_changed():
+    made = []
+    paced = Paced(lambda: made.append(1) or len(made))
+    assert [paced(1), paced(1), paced(1, now=True)] == [1, 1, 1]
+    assert paced(2, now=True) == 2

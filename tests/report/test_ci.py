@@ -62,7 +62,9 @@ def test_a_failure_is_reported_where_it_was_in_the_agents_code(groups):
     assert lines[0].startswith("::error title=rear end%2C the agent into the other::ego drove into a|b at step 5.")
     assert lines[1].startswith("::error file=src/my planner.py,line=13,title=ValueError in my planner.py%3Aact::")
     assert "50 %25, or: |" in lines[1]
-    assert len(crash_annotations([fault] * 12)) == 10
+    notice, *shown = crash_annotations([fault] * 12)
+    assert notice.startswith("::notice title=10 of 12 new crash types shown::")
+    assert len(shown) == 10
 
 
 def test_the_same_kind_has_the_same_fingerprint_and_another_has_another(groups, tmp_path):

@@ -55,5 +55,5 @@ def test_page_counts_trials_that_are_not_fully_asked_apart_from_the_least_margin
         for number, stress in enumerate([Stress(0.5, moments=9, moments_asked=9), half, None]):
             spec = TrialSpec(number, number, {}, {}, max_steps=20)
             ledger.record(TrialResult(spec, Outcome.SURVIVED, steps=20, stress=stress), snapshot="")
-    found = _trials(tmp_path)
+    found = _trials(tmp_path, SimpleNamespace(crash_on=("collision",)))
     assert (found["stress"], found["not_fully_asked"]) == ({"margin": 0.5, "trial": 0}, 1)

@@ -12,7 +12,8 @@ import pytest
 from conftest import needed
 
 from crashhunt.crashes import list_bundles
-from crashhunt.hunts import HuntResults
+from crashhunt.hunts import HuntResults, hunt_state
+from crashhunt.report import describe_running
 
 selenium = pytest.importorskip("selenium")
 from selenium import webdriver  # noqa: E402
@@ -79,6 +80,9 @@ def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
     assert text(browser, "title") == "<b>bold&"  # as text, not as markup
     assert text(browser, "tiles").split("\n")[:4] == ["3 of 3", "trials", str(len(bundles)), "crashes"]
     assert "collision" in text(browser, "outcomes")
+    rate = hunt_state(hunt.folder / "<b>bold&").rate
+    assert text(browser, "crash-rate") == describe_running(rate).removeprefix("rate: ")
+    assert browser.find_element(By.CSS_SELECTOR, "#crash-rate-scale .certain").size["width"] > 2
     listed = browser.find_elements(By.CSS_SELECTOR, "#list button")
     assert sorted(button.text.split("\n")[0] for button in listed) == [bundle.id for bundle in bundles]
     assert [bundle["id"] for bundle in page_data(browser)["crashes"]] == done["crashes"]

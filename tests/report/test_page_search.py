@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from crashhunt.base import layout
 from crashhunt.crashes import list_bundles
-from crashhunt.hunts import HuntResults
+from crashhunt.hunts import HuntResults, find_crashes
 from crashhunt.ledger import Ledger
 from crashhunt.report import _page, report_data
 from crashhunt.report._page import importance_of, lineage_of
@@ -79,7 +80,7 @@ def test_of_many_trials_those_that_are_drawn_are_of_all_origins(tmp_path, monkey
             spec = TrialSpec(number, 1, {"ego": {}}, {}, max_steps=1, origin=origin)
             ledger.record(TrialResult(spec, Outcome.SURVIVED, danger=0.5), snapshot="")
     ledger.close()
-    drawn = _page._trials(tmp_path)["trials"]
+    drawn = _page._trials(tmp_path, SimpleNamespace(crash_on=("collision",)))["trials"]
     assert 36 <= len(drawn) <= 44
     assert 4 <= [trial["origin"] for trial in drawn].count("random") <= 12
     assert max(after["number"] - before["number"] for before, after in pairwise(drawn)) < 3 * trials / 40
@@ -92,7 +93,9 @@ def test_the_page_knows_from_which_trials_a_crash_was_made(shell):
     words = ("--scenario", "toy", "--arg", "speed=10:18.5", "--sampler", "mutation", "--seed", "3")
     shell.crashhunt("run", "hunt", "1", "100", "50", *words)
     (crash,) = list_bundles(shell.folder / "hunt")
-    data = report_data(shell.folder / "hunt", [crash], name="hunt")
+    data = report_data(
+        shell.folder / "hunt", [crash], found=find_crashes(shell.folder / "hunt", 1), near_misses=0, name="hunt"
+    )
     (line,) = data["lineages"].values()
     rows = {row["number"]: row for row in HuntResults(shell.folder / "hunt").rows()}
     above = HuntResults(shell.folder / "hunt").trial(crash.result.spec.number).spec

@@ -14,7 +14,7 @@ from rich.console import Console
 from crashhunt.executors import NodeFigures
 from crashhunt.hunts import HuntStatus, SearchStatus, StrategyStatus
 from crashhunt.recording import BlackBoxHeader, Phase
-from crashhunt.report import Watcher
+from crashhunt.report import Watcher, describe_running
 from crashhunt.report._status_screen import _line, describe_kinds
 from crashhunt.trial import Disturbance, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
@@ -197,3 +197,51 @@ def test_a_hunt_without_a_last_trial_goes_by_the_clock():
     assert "123 trials" in line
     assert "3:15 left" in line
     assert line.count("━") == 7 + 23 or "╸" in line  # a quarter of the time is over
+
+
+PLAIN = {
+    "method": "plain", "per": "trial", "confidence": 95.0, "units": 500, "trials": 500, "crashes": 0, "origin": "",
+    "certain": {"low": 0.0, "high": 0.0067}, "estimate": None, "estimated": None, "why_not": "", "bar": None,
+    "verdict": "",
+}  # fmt: skip
+RARE = PLAIN | {
+    "method": "rare", "units": 400, "trials": 1600, "certain": {"low": 1.1e-5, "high": 1.9e-3}, "estimate": 2.0e-5,
+    "estimated": {"low": 1.3e-5, "high": 2.7e-5},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("rate", "words"),
+    [
+        (PLAIN, "rate: at most 6.7e-3 per trial (0 crashes in 500 trials, 95 %)"),
+        (
+            PLAIN | {"crashes": 1, "origin": "random", "certain": {"low": 1e-4, "high": 0.02}},
+            "rate: at least 1.0e-4, at most 0.020 per trial (1 crash in 500 trials drawn at random, 95 %)",
+        ),
+        (PLAIN | {"certain": None, "why_not": "no trial counts yet"}, "rate: not known yet (no trial counts yet)"),
+        (
+            PLAIN | {"per": "hour", "certain": {"low": 2.0, "high": None}, "bar": 1.0, "verdict": "above"},
+            "rate: at least 2.0, at most any number per hour (0 crashes in 500 trials, 95 %); bar 1.0 per hour: above",
+        ),
+        (
+            RARE,
+            (
+                "rate: 2.0e-5 per trial (1.3e-5 to 2.7e-5, estimated from 400 roots); "
+                "certain: at least 1.1e-5, at most 1.9e-3 (95 %)"
+            ),
+        ),
+        (
+            RARE | {"estimated": None, "units": 1, "certain": None},
+            "rate: 2.0e-5 per trial (no interval from 1 root yet)",
+        ),
+        (RARE | {"estimate": None, "why_not": "none", "certain": None}, "rate: not known yet (none)"),
+    ],
+)
+def test_running_rate_is_on_the_screen_and_in_the_line(rate, words):
+    assert describe_running(rate) == words
+    found = replace(status(2), rate=rate)
+    assert _line(found).endswith(f"; {words}")
+    console = Console(width=160, height=12, force_terminal=True, color_system=None)
+    with console.capture() as shown:
+        console.print(Watcher(console, TITLE)._screen(found))
+    assert words in shown.get()

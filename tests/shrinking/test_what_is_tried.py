@@ -65,7 +65,9 @@ def test_where_each_is_needed_none_is_excluded_and_nothing_of_nothing():
         ("firm", "gentle", ["gentle"]),
         ("firm", None, []),
         (float("nan"), None, []),
-        (3.0, 1, []),
+        (3.0, 1, [1.0]),
+        (3, 1.0, []),
+        (True, 1, []),
     ],
 )
 def test_values_become_plainer(value, default, plainer):
@@ -118,6 +120,7 @@ class Runs:
 
     def __init__(self, scripted):
         self.most_steps, self.left, self.lengths = 100, scripted, []
+        self.found_steps = 100
 
     def entered(self, spec):
         return OTHERS
@@ -288,6 +291,7 @@ class Takes:
 
     def __init__(self, crashes=lambda spec: True, entered=OTHERS):
         self.most_steps, self.tried, self.again = 100, [], []
+        self.found_steps = 100
         self._crashes, self._entered = crashes, entered
 
     def entered(self, spec):
@@ -654,3 +658,57 @@ def test_a_crash_can_be_scripted_where_the_crashhunt_that_runs_it_can(tmp_path, 
     snapshot = SimpleNamespace(path=tmp_path, manifest={"files": files})
     rerun = SimpleNamespace(worker=SimpleNamespace(scenario=scenario, code=code), snapshot=snapshot)
     assert _scripting.can_be_scripted(rerun) is can
+
+
+class Lasting(Takes):
+    """Runs of candidates that crash after as many steps as a function of the specification says, or never."""
+
+    def first(self, specs, *, again=False):
+        for place, spec in enumerate(specs):
+            self.tried.append((self.most_steps, spec))
+            steps = self._crashes(spec)
+            if steps is not None and steps <= min(self.most_steps, spec.max_steps):
+                self.found_steps = steps
+                return place
+        return None
+
+
+def test_plainer_arguments_never_make_the_crash_longer():
+    def steps(spec):
+        few = spec.only is not None and len(spec.only) == 1
+        slow = spec.arguments["ego"]["speed"] != 17.2345  # every other value takes longer
+        return (60 if few else 100) + (15 if slow else 0) if spec.only is None or "c" in spec.only else None
+
+    search = Search(crash(), Lasting(steps), "traffic")
+    assert search.run(lambda: False) == ("done", "")
+    assert search.best.only == ("c",)
+    assert search.best.arguments == {"ego": {"speed": 17.2345}}  # 75 steps are less than 100 and more than 60
+    assert search.best.scenario_arguments == {"demand": 40}
+    assert search._steps == 60
+
+
+@pytest.mark.parametrize("scripted_steps", [40, 130])
+def test_few_actors_with_which_the_crash_takes_longer_are_scripted_from_later_on(monkeypatch, scripted_steps):
+    def steps(spec):
+        if spec.script is not None:
+            return scripted_steps if spec.script.names == ("b",) and spec.max_steps == 60 else None
+        return 100 if spec.only is None else 180 if "b" in spec.only else None
+
+    monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS))
+    monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
+    search = Search(crash(arguments={"ego": {}}, scenario_arguments={}), Lasting(steps), "either")
+    search._scripting = FromLaterOn()
+    assert search.run(lambda: False)[0] == "done"
+    if scripted_steps == 40:
+        assert (search.best.script.names, search._steps) == (("b",), 40)
+    else:
+        assert (search.best.only, search._steps) == (("b",), 180)  # longer, as an actor less is worth more
+
+
+def test_the_default_of_the_agents_own_code_is_tried_before_that_of_the_scenario():
+    runs = Takes()
+    search = Search(crash(), runs, "traffic", {("ego", "speed"): 5})
+    search._plainer_arguments()
+    first_tried = runs.tried[0][1].arguments["ego"]["speed"]
+    assert (first_tried, type(first_tried)) == (5.0, float)
+    assert search.best.arguments["ego"]["speed"] == 5.0

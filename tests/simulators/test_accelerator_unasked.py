@@ -5,6 +5,7 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
+from engines import engine
 
 # First: this imports highway-env without what takes most of that time.
 from crashhunt.simulators.highway import HighwaySimulator
@@ -19,6 +20,10 @@ from test_highway import drive, simulator_of
 
 from crashhunt.accelerator import SkippedObservation, switch_off, switch_on
 from crashhunt.scenario import ObservationSetup
+
+assert engine  # a fixture
+pytestmark = pytest.mark.usefixtures("engine")
+
 
 assert HighwaySimulator
 SMALL = {"vehicles_count": 6, "simulation_frequency": 4, "duration": 9}

@@ -7,6 +7,7 @@ import pickle
 import highway_env
 import numpy as np
 import pytest
+from engines import both_engines
 from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.road import road
 from highway_env.road.lane import StraightLane
@@ -15,11 +16,14 @@ from highway_env.vehicle.kinematics import Vehicle
 
 from crashhunt.accelerator import _roads, switch_off, switch_on
 
+assert both_engines  # a fixture
+
+
 assert highway_env
 NAMES = ["position", "heading", "speed", "crashed", "impact", "lane_index", "target_lane_index", "timer", "route"]
 
 
-pytestmark = pytest.mark.usefixtures("plain_highway_env")
+pytestmark = pytest.mark.usefixtures("plain_highway_env", "both_engines")
 
 
 def plain(value):

@@ -50,17 +50,18 @@ def drive(tmp_path):
     made = []
 
     def run(act, *, route="across", traffic="", steps=300, dt=0.1, warmup_s=0.0, crash_on=CRASHES, **more):
-        limits, options, setup = more.pop("limits", {}), more.pop("options", {}), {"type": "car", **more}
+        limits, options, net = more.pop("limits", {}), more.pop("options", {}), more.pop("net", NET)
+        routes, setup = more.pop("routes", ROUTES), {"type": "car", **more}
         folder = tmp_path / f"scenario{len(made)}"
         (folder / "stage").mkdir(parents=True)
-        shutil.copy(NET, folder)
-        (folder / "r.rou.xml").write_text(ROUTES.format(traffic=traffic))
+        shutil.copy(net, folder)
+        (folder / "r.rou.xml").write_text(routes.format(traffic=traffic))
         agents = {"ego": AgentSetup(**({} if setup.get("existing") else {"route": route}), **setup)}
         scenario = Scenario(
             step_length_s=dt,
             warmup_s=warmup_s,
             agents=agents,
-            tables={"sumo": SumoSetup(net=NET.name, routes=("r.rou.xml",), options=options)},
+            tables={"sumo": SumoSetup(net=net.name, routes=("r.rou.xml",), options=options)},
             events=limits,
             folder=folder,
         )
@@ -129,6 +130,35 @@ def test_red_lights_are_those_that_another_way_of_counting_finds(drive, route, d
         assert result.outcome in (Outcome.FINISHED, Outcome.SURVIVED)
         total += expected
     assert 6 <= total <= 14
+
+
+def test_red_light_of_the_second_junction_in_a_step_is_seen(drive):
+    """The first junction has no light. The signal's own state and the edges before and after each step say the same."""
+    routes = '<routes><vType id="car" sigma="0"/><route id="on" edges="west middle east"/>{traffic}</routes>'
+    both = expected = 0
+    for departs in range(0, 90, 3):
+        seen, speed = [], 28.0 + departs % 13
+
+        def act(step, seen=seen, speed=speed):
+            seen.append((edge(libsumo.vehicle.getLaneID("ego")), libsumo.trafficlight.getRedYellowGreenState("two")))
+            return speed, 0
+
+        net = NET.parent / "nets" / "lights.net.xml"
+        _, told = drive(
+            act, net=net, routes=routes, route="on", dt=1.0, warmup_s=departs, steps=16, depart_speed=f"{speed}"
+        )
+        links = [source for ((source, _, _),) in libsumo.trafficlight.getControlledLinks("two")]
+        passed = [
+            (before, state[links.index("middle_0")])
+            for (before, _), (after, state) in pairwise(seen)
+            if before != "east" and not before.startswith(":two") and (after == "east" or after.startswith(":two"))
+        ]
+        ran = [before for before, state in passed if state == "r"]
+        assert kinds(told) == ["red_light"] * len(ran)
+        expected += len(ran)
+        both += sum(before in ("west", ":one_1") for before in ran)
+    assert expected >= 5
+    assert both >= 3, (expected, both)
 
 
 def edge(lane):

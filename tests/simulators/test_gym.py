@@ -188,11 +188,11 @@ def test_a_flattened_action_has_the_type_of_its_space_or_is_refused(tmp_path):
         form.encode(encoded.astype(complex))
 
 
-class Endless(Tray):
-    observation_space = spaces.Sequence(spaces.Discrete(3))
+class Spaceless(Tray):
+    observation_space = None
 
 
-gymnasium.register("Endless-v0", entry_point=Endless)
+gymnasium.register("Spaceless-v0", entry_point=Spaceless)
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ gymnasium.register("Endless-v0", entry_point=Endless)
     [
         ("Carpole-v1", {}, "Carpole"),
         ("Tray-v0", {"colour": "red"}, "colour"),
-        ("Endless-v0", {}, "no fixed size"),
+        ("Spaceless-v0", {}, "its observation_space is None, not a gymnasium.Space; set it"),
         ("no_such_module:make", {}, "no_such_module"),
         (f"{__name__}:make_nested", {"config": {"friction": {"of": -1}}}, "friction is negative"),
         (f"{__name__}:make_nothing", {}, "this factory returned a str"),
@@ -312,3 +312,63 @@ def test_a_danger_that_names_nothing_or_is_no_number_is_one_line(tmp_path):
     simulator.reset(seed=1)
     with pytest.raises(ScenarioError, match=r"gym\.danger = 'info\.word' is 'far'; it must be a number"):
         simulator.step({"ball": simulator.actions["ball"].encode({"tilt": np.zeros(2, np.float32), "kick": 0})})
+
+
+class Kinds(Tray):
+    def step(self, action):
+        *rest, info = super().step(action)
+        kind = {1: "left  edge\n", 2: 7, 3: "", 4: "a" * 200}.get(self.size, "right edge")
+        return *rest, {**info, "crash_kind": kind}
+
+
+gymnasium.register("Kinds-v0", entry_point=Kinds)
+
+
+def kind_of(observation, reward, terminated, truncated, info):
+    return f"beyond {observation['ball'][0]:.0f}" if info["fell"] else 1 / 0
+
+
+@pytest.mark.parametrize(
+    ("size", "rule", "kind"),
+    [
+        (1, {"info": "fell"}, "left edge"),
+        (2, {"info": "fell"}, "fell"),  # a number is no text
+        (3, {"info": "fell"}, "fell"),
+        (4, {"info": "fell"}, "a" * 80),
+        (5, {"info": "fell"}, "right edge"),
+        (5, {"info": "fell", "kind": f"{__name__}:kind_of"}, "beyond 5"),
+    ],
+)
+def test_environment_or_function_names_the_crash_type(tmp_path, size, rule, kind):
+    simulator = simulator_of(tmp_path, "Kinds-v0", crash=rule, size=size)
+    fall(simulator)
+    (contact,) = simulator.scene().contacts
+    assert contact.kind == kind
+
+
+TWO_KINDS = """
+import gymnasium
+import numpy as np
+
+class Env(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-9, 9, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.side = int(self.np_random.integers(2))
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), -7.5 - self.side, True, False, {"crash_kind": ("ice", "wall 3")[self.side]}
+"""
+
+
+def test_hunt_groups_crashes_by_the_kind_that_the_environment_names(shell):
+    (shell.folder / "two.py").write_text(TWO_KINDS)
+    crash = "crash = { termination = true }"
+    scenario = SCENARIO.replace("straying:make_straying", "two:Env").replace("[agents", f"{crash}\n[agents")
+    (shell.folder / "two.toml").write_text(scenario)
+    done = shell.crashhunt("run", "h", "1", "6", "4", "--scenario", "two.toml", "--seed", "1", "--keep-going", "--json")
+    assert sorted(kind["words"] for kind in done.json["kinds"]) == ["ice", "wall #"]
+    assert sum(kind["count"] for kind in done.json["kinds"]) == 6

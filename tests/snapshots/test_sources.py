@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 
 from crashhunt.snapshots._take import find_sources, git
 
@@ -28,3 +29,17 @@ def test_a_name_that_would_be_folders_elsewhere_is_excluded_and_reported(tmp_pat
     assert not [place for place in found.files if "\\" in place]
     (said,) = found.excluded
     assert said.endswith("unit-x2d\\x2d1.service: its name has a backslash, which elsewhere parts folders")
+
+
+def test_installed_package_with_libraries_next_to_it_is_not_copied(tmp_path, monkeypatch):
+    installed = tmp_path / "site-packages"
+    for name in ("boxed_world", "plain_world"):
+        (installed / name).mkdir(parents=True)
+        (installed / name / "__init__.py").write_text("")
+    (installed / "boxed_world.libs").mkdir()
+    monkeypatch.syspath_prepend(installed)
+    kept = find_sources([], ["boxed_world", "plain_world"]).files
+    for name in ("boxed_world", "plain_world"):
+        monkeypatch.delitem(sys.modules, name)
+    assert "code/plain_world/__init__.py" in kept
+    assert not [place for place in kept if place.startswith("code/boxed_world")]

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from crashhunt.crashes import Bundle
+from crashhunt.crashes._contact import ContactRecord
 from crashhunt.crashes._fault import fault_in, fault_of, safe_gap_m
-from crashhunt.crashes._lanes import Case, LaneMap
+from crashhunt.crashes._lanes import LaneMap
 from crashhunt.scenario import load_scenario
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Actor, Event, Link, RightOfWay, Roster, Scene
@@ -75,7 +76,7 @@ def case_of(data):
         Link(junction, source, target, tuple(inside), signalised, tuple(map(tuple, shape)))
         for junction, source, target, inside, signalised, shape in data["links"]
     )
-    return Case(
+    return ContactRecord(
         data["actors"][0][0],
         data["actors"][1][0],
         [*started, *scenes],
@@ -85,6 +86,7 @@ def case_of(data):
         tuple((time_s, Event(kind, agent, what)) for time_s, kind, agent, what in data["events"]),
         RightOfWay(links, frozenset(map(tuple, data["gives_way"]))) if links else None,
         lane=data["lane"],
+        swept="highway" not in data["name"] and "roundabout" not in data["name"],
     )
 
 
@@ -137,7 +139,7 @@ def drive(ego, other, *, seconds=5.0, dt=0.1, began_s=-20.0, **more):
             Scene(-step * dt, roster, [pose[:2] for pose in poses], [pose[2] for pose in poses],
                   [pose[3] for pose in poses])
         )  # fmt: skip
-    return Case("ego", roster.actors[1].id, scenes, 0.0, began_s, more.pop("lanes", LANES), **more)
+    return ContactRecord("ego", roster.actors[1].id, scenes, 0.0, began_s, more.pop("lanes", LANES), **more)
 
 
 def straight(speed, at=0.0, y=0.0, *, before=None, since=0.0):
@@ -350,7 +352,7 @@ def test_the_right_of_way_decides_where_lanes_cross_and_no_light_does():
         return verdict(case)
 
     rights = RightOfWay(tuple(ways), frozenset({(1, 0)}))
-    for stood_s, expected in ((2.5, "the other"), (9.0, "nobody can tell")):
+    for stood_s, expected in ((2.5, "the other"), (3.9, "nobody can tell"), (9.0, "ego")):
         stands = drive(
             straight(14), lambda t, s=stood_s: (0.0, -8 * max(0.0, t - s), math.pi / 2, 8.0 if t > s else 0.0),
             right_of_way=rights,

@@ -109,7 +109,7 @@ def test_json_lists_the_runs():
         "avoidable": True, "manoeuvre": "brake", "last_step": 7, "runs": 2, "why_not": "",
         "attempts": [
             {"manoeuvre": "brake", "endings": {"7": "avoided", "8": "hit"}, "last_step": 7, "too_late_step": 8,
-             "all_later_run": True, "deceleration": 8.0},
+             "all_later_run": True, "deceleration": 8.0, "changed": []},
         ],
         "verdict": "avoidable", "visible_step": None,
     }  # fmt: skip

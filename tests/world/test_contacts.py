@@ -106,11 +106,25 @@ def test_who_drives_through_another_between_two_steps_is_seen():
 
 def test_speeds_are_those_of_the_first_contact():
     before = scene(0.0, ("ego", 0, 0, 0, 20), ("other", 12.2, 0, 0, 6))
-    after = scene(1.0, ("ego", 16, 0, 0, 12), ("other", 14.2, 0, 0, 0))
+    after = scene(1.0, ("ego", 16, 0, 0, 12), ("other", 15.2, 0, 0, 0))
     hit = found(before, after)
     assert (hit.time_s, hit.collider_speed, hit.victim_speed) == pytest.approx(
-        (7.2 / 14, 20 - 8 * 7.2 / 14, 6 - 6 * 7.2 / 14)
+        (7.2 / 13, 20 - 8 * 7.2 / 13, 6 - 6 * 7.2 / 13)
     )
+
+
+def test_speeds_agree_with_the_distance_of_the_step():
+    """SUMO drives a whole step at its new speed: the vehicle behind is the faster one, though it was the slower one."""
+    before = scene(0.0, ("ego", 0, 0, 0, 5), ("other", 5.5, 0, 0, 12))
+    after = scene(1.0, ("ego", 8, 0, 0, 8), ("other", 12.5, 0, 0, 7))
+    hit = found(before, after)
+    assert (hit.time_s, hit.collider_speed, hit.victim_speed) == pytest.approx((0.5, 8, 7))
+    halfway = scene(1.0, ("ego", 7.25, 0, 0, 8), ("other", 12.0, 0, 0, 7))  # half of the way between both ways
+    assert found(before, halfway).collider_speed == pytest.approx((8 + 5 + 3 * hit_share(before, halfway)) / 2)
+
+
+def hit_share(before, after):
+    return found(before, after).time_s
 
 
 @pytest.mark.parametrize("contacts", [(), (Contact("other", "ego", "collision", "a_0", 4.0, 25.0),)])

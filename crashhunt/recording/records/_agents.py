@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.recording._divergence import Divergence, first_difference
+from crashhunt.recording._values import describe_value, is_opaque
 from crashhunt.recording.records._type import Form, RecordType, TextForm
 
 if TYPE_CHECKING:
@@ -86,24 +87,38 @@ def array_difference(
     columns: tuple[str, ...],
     was: NDArray[np.generic] | None,
     now: NDArray[np.generic] | None,
+    *,
+    opaque: bool = False,
 ) -> Divergence | None:
-    """Return the first difference between two arrays of an agent, either of which may be missing."""
+    """Return the first difference between two arrays of an agent, either of which may be missing.
+
+    Args:
+        step: at which step.
+        agent: the agent.
+        kind: ``observation`` or ``action``.
+        columns: the names of the columns, if they are known.
+        was: the recorded array.
+        now: the replayed array.
+        opaque: whether the arrays hold the texts of values.
+    """
     if was is None and now is None:
         return None
     if was is None or now is None:
-        return Divergence(step=step, agent=agent, field=kind, recorded=_plain(was), replayed=_plain(now))
+        recorded, replayed = (
+            None if array is None else describe_value(array) if opaque else array.tolist() for array in (was, now)
+        )
+        return Divergence(step=step, agent=agent, field=kind, recorded=recorded, replayed=replayed)
     if was.tobytes() == now.tobytes():
         return None
+    if was.shape != now.shape or opaque:  # texts of values
+        recorded, replayed = (describe_value(array) for array in (was, now))
+        return Divergence(step=step, agent=agent, field=kind, recorded=recorded, replayed=replayed)
     where = first_difference(was, now)
     name = ", ".join((*map(str, where[:-1]), columns[where[-1]] if columns else str(where[-1]))) if where else ""
     field = f"{kind}[{name}]" if name else kind
     return Divergence(
         step=step, agent=agent, field=field, recorded=was[where].item(), replayed=now[where].item(), place=(kind, where)
     )
-
-
-def _plain(array: NDArray[np.generic] | None) -> object:
-    return None if array is None else array.tolist()
 
 
 def _array_record(tag: int, what: str) -> RecordType:
@@ -123,7 +138,8 @@ def _array_record(tag: int, what: str) -> RecordType:
         if agent is None:
             return None
         was, now = (getattr(step, f"{what}s").get(agent.id) for step in (left, right))
-        return array_difference(left.step, agent.id, what, getattr(agent, f"{what}_names"), was, now)
+        opaque = is_opaque(getattr(agent, f"{what}_shape"))
+        return array_difference(left.step, agent.id, what, getattr(agent, f"{what}_names"), was, now, opaque=opaque)
 
     def value(step: StepRecord, agent: str, index: tuple[int, ...]) -> object:
         array = getattr(step, f"{what}s").get(agent)

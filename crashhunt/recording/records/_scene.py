@@ -35,7 +35,10 @@ __all__ = [
     "encode_lanes",
     "encode_roster",
     "encode_spines",
+    "points_of",
     "roster_difference",
+    "select_actors",
+    "step_of",
     "time_of",
 ]
 
@@ -318,3 +321,41 @@ def _read_lanes(reading: Reading, _aux: int, payload: bytes) -> None:
 LANES = RecordType(
     tag=7, name="lanes", topic="/scene/lanes", form=TextForm(), read=_read_lanes, difference=scene_texts("lanes")
 )
+
+
+def step_of(payload: bytes) -> int:
+    """Return the number of a step."""
+    step: int = _STEP_HEAD.unpack_from(payload)[0]
+    return step
+
+
+def points_of(payload: bytes, agents: int) -> NDArray[np.float64]:
+    """Return the positions of the actors of a step, in m, shape (actors, 2), of a recording with so many agents."""
+    values = np.frombuffer(payload, "<f8", offset=_STEP_HEAD.size)[agents:]
+    return values[: len(values) // 2].reshape(-1, 2)
+
+
+def select_actors(tag: int, payload: bytes, mask: NDArray[np.bool_], agents: int) -> bytes:
+    """Return the payload of a record about some of the actors of its roster; of another type, the payload as it is.
+
+    Args:
+        tag: of the record.
+        payload: of the record, about all actors of the roster.
+        mask: whether to keep each actor of the roster, shape (actors,).
+        agents: number of controlled vehicles.
+    """
+    if tag == STEP.tag:
+        values = np.frombuffer(payload, "<f8", offset=_STEP_HEAD.size)
+        rewards, scene = values[:agents], values[agents:]
+        count = len(mask)
+        points = scene[: 2 * count].reshape(-1, 2)[mask].ravel()
+        columns = (rewards, points, scene[2 * count : 3 * count][mask], scene[3 * count :][mask])
+        return payload[: _STEP_HEAD.size] + np.concatenate(columns).astype("<f8").tobytes()
+    if tag == HEIGHTS.tag:
+        return np.ascontiguousarray(np.frombuffer(payload, "<f8").reshape(2, -1)[:, mask]).tobytes()
+    if tag == LANES.tag:
+        return encode_lanes(np.array(payload.decode().split("\n"), object)[mask].tolist())
+    if tag == SPINES.tag:
+        rows = np.cumsum(mask) - 1
+        return _encode_spines({int(rows[row]): spine for row, spine in _decode_spines(payload).items() if mask[row]})
+    return payload

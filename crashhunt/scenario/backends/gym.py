@@ -28,12 +28,15 @@ class CrashRule:
         reward_below: the reward of the step is below this.
         function: ``module:function``, called with observation, reward, terminated, truncated, info; what it returns is
             taken as true or false, and a text as what happened.
+        kind: ``module:function``, called in the same way for the step of a crash; it returns the crash type as text.
+            Without it, ``info["crash_kind"]`` is the crash type if it is a text.
     """
 
     info: str = ""
     termination: bool = False
     reward_below: float | None = None
     function: str = ""
+    kind: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +47,9 @@ class GymSetup:
         id: as `gymnasium.make` takes it, or ``module:factory``, which is called with ``kwargs``.
         kwargs: of the environment.
         crash: what counts as a crash.
+        learner: of a parallel environment of PettingZoo, the agent that is tested; empty for the first.
+        others: of a parallel environment, ``module:function``, which is called with name, observation, action space and
+            random generator of each other agent and returns its action. Empty for random actions.
         danger: the criticality of a step without a scene. ``info.KEY`` is a number of the info from 0 to 1.
             ``-info.KEY`` is a number x that falls with criticality, such as a distance, and gives 1 / (1 + x). A trial
             has the greatest value of its steps. Empty if criticality is unknown.
@@ -53,6 +59,8 @@ class GymSetup:
     kwargs: dict[str, object] = field(default_factory=dict)
     crash: CrashRule = field(default_factory=CrashRule)
     danger: str = ""
+    learner: str = ""
+    others: str = ""
 
 
 def _check(scenario: Scenario, where: str) -> None:
@@ -71,7 +79,7 @@ def _check(scenario: Scenario, where: str) -> None:
 
 def _modules(scenario: Scenario) -> Iterable[str]:
     setup = scenario.table(GymSetup)
-    return setup.id, setup.crash.function
+    return setup.id, setup.crash.function, setup.crash.kind, setup.others
 
 
 def _side_effect(scenario: Scenario, values: Mapping[str, Value], _specifications: Iterable[str]) -> str:

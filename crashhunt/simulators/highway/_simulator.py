@@ -26,6 +26,7 @@ from highway_env.envs.parking_env import ParkingEnv
 from highway_env.vehicle.objects import Obstacle, RoadObject
 
 from crashhunt.accelerator import Onlooker, SkippedObservation, switch_off, switch_on
+from crashhunt.base.boundaries import Party
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.highway import BACKEND, HighwaySetup
@@ -130,6 +131,8 @@ class HighwaySimulator:
         self._look(())
         return self._show(self.agents, shown), {}
 
+    party = Party.SIMULATOR
+    foreign_packages = ("highway_env",)
     why_no_reseeding = ""
 
     def reseed(self, seed: int) -> None:
@@ -275,7 +278,7 @@ class HighwaySimulator:
             self.observation_names = self._kinematics.features
         else:
             self.observation_spaces = {agent: form.space for agent, form in self._forms.items()}
-            self.shown_spaces = {agent: form.original for agent, form in self._forms.items() if form.flattened}
+            self.shown_spaces = {agent: form.original for agent, form in self._forms.items() if form.structured}
             kind = env.observation_type.agents_observation_types[0] if self._many_see else env.observation_type
             self.observation_names = tuple(getattr(kind, "features", ())) if len(seen[0].shape or ()) == 2 else ()
 

@@ -70,15 +70,33 @@ class Driving:
 
     def _change_lane(self, agent: str, change: int) -> bool:
         """Change to a neighbouring lane at once; return False if there is no lane that the vehicle may use."""
+        lane = self.neighboring_lane(agent, change)
+        if lane is None:
+            return True  # inside a junction there are no neighbouring lanes, and no road to leave
+        exists, direction = lane
+        if exists:
+            sumo.vehicle_changeLane(agent, sumo.vehicle_getLaneIndex(agent) + direction, self._step_length_s)
+        return exists
+
+    def neighboring_lane(self, agent: str, change: int) -> tuple[bool, int] | None:
+        """Return whether a neighbouring lane exists that the vehicle may use, and by how much SUMO's index differs.
+
+        None inside a junction, where no lane has neighbours.
+
+        Args:
+            agent: identifier of the vehicle.
+            change: 1 to the left, -1 to the right.
+        """
         edge = sumo.vehicle_getRoadID(agent)
         if edge.startswith(":"):
-            return True  # inside a junction there are no neighbouring lanes, and no road to leave
+            return None
         lanes, _ = self.edge(edge)
-        target = sumo.vehicle_getLaneIndex(agent) + (-change if self.left_hand else change)
-        if not 0 <= target < lanes or self._is_closed(f"{edge}_{target}", sumo.vehicle_getVehicleClass(agent)):
-            return False
-        sumo.vehicle_changeLane(agent, target, self._step_length_s)
-        return True
+        direction = -change if self.left_hand else change
+        target = sumo.vehicle_getLaneIndex(agent) + direction
+        exists = 0 <= target < lanes
+        if exists and self._is_closed(f"{edge}_{target}", sumo.vehicle_getVehicleClass(agent)):
+            exists = False
+        return exists, direction
 
     def edge(self, edge: str) -> tuple[int, float]:
         """Return the number of lanes of an edge, and the width of its first lane in m."""

@@ -12,6 +12,7 @@ import libsumo
 # some two hundred values.
 from libsumo import _libsumo as sumo
 
+from crashhunt.base.boundaries import Party
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
 from crashhunt.native import core_for, reseed_generators, why_no_reseeding
 from crashhunt.scenario import ObservationSetup
@@ -26,6 +27,7 @@ from crashhunt.simulators.sumo._fast_step import Present, UsualSteps
 from crashhunt.simulators.sumo._loading import VERSION, Loading, ready_xml
 from crashhunt.simulators.sumo._scene_reader import Sight
 from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents
+from crashhunt.simulators.sumo._surroundings import surroundings_of
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
 from crashhunt.world import PERSON, Lane, is_person
 
@@ -39,7 +41,7 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.simulators._protocol import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Paths, Scene
+    from crashhunt.world import Paths, Scene, Surroundings
 
 __all__ = ["SumoSimulator"]
 
@@ -170,6 +172,9 @@ class SumoSimulator:
             usual.begin()
         return observations, {}
 
+    party = Party.SIMULATOR
+    foreign_packages = ("libsumo", "sumolib", "traci")
+
     @property
     def why_no_reseeding(self) -> str:
         """Why SUMO's random generators cannot be re-seeded; empty if they can."""
@@ -247,6 +252,11 @@ class SumoSimulator:
         if setup.speed_mode & _KEEPS_DECELERATION:
             return FullBraking((0.0, 0), "all that its type can do", float(libsumo.vehicle.getDecel(agent)))
         return FullBraking((0.0, 0), f"as hard as its speed mode {setup.speed_mode} allows")
+
+    def surroundings(self, agent: str) -> Surroundings:
+        """Return what a careful driver of a vehicle would consider now."""
+        self.scene()  # brings SUMO to the current step
+        return surroundings_of(agent, self._driving.neighboring_lane)
 
     def resolve_target(self, disturbance: Disturbance) -> str:
         """Return the identifier of the actor at the disturbance's place around its agent; empty if none is there."""

@@ -275,10 +275,10 @@ class SumoEvents:
     def _entered(self, agent: str, before: str, lane: str, scene: Scene, found: list[Event]) -> None:
         """Add an event if a controlled vehicle that entered a new lane ran a red light."""
         left, edge = before.rpartition("_")[0], lane.rpartition("_")[0]
-        if left == edge or left.startswith(":"):
-            return  # the vehicle has changed lanes, or passed the signal in an earlier step
-        states = _states(before, edge)
-        if states and states.issubset(_RED):
+        if left == edge:
+            return  # the vehicle has changed lanes
+        ways = _ways_between(before, edge)
+        if ways and all(any(state in _RED for state in states) for states in ways):
             speed = scene.speeds[scene.roster.index[agent]]
             what = f"{agent} ran a red light at {speed:.1f} m/s, coming from lane {before}"
             found.append(self._of(scene, agent, "red_light", what))
@@ -353,21 +353,24 @@ class SumoEvents:
                 found.append(self._of(scene, near[1], "teleport", what, (vehicle,)))
 
 
-def _states(lane: str, edge: str) -> set[str]:
-    """Return the signal states of the links by which a vehicle can get from a lane to an edge in one step."""
-    links = sumo.lane_getLinks(lane)
-    for reach in range(_LINKS_AT_ONCE):  # shortest path first, because a vehicle cannot drive a detour in one step
-        states = {link[5] for link in links if _leads_to(link[4] or link[0], edge, reach)}
-        if states:
-            return states
-    return set()
+def _ways_between(lane: str, edge: str) -> list[tuple[str, ...]]:
+    """Return the signal states of the links on each shortest way by which a vehicle can get from a lane to an edge.
 
-
-def _leads_to(lane: str, edge: str, links: int) -> bool:
-    """Whether a lane belongs to an edge, or leads to it over at most this number of links."""
-    if lane.rpartition("_")[0] == edge:
-        return True
-    return links > 0 and any(_leads_to(link[4] or link[0], edge, links - 1) for link in sumo.lane_getLinks(lane))
+    In a long step a vehicle passes several links, and each of them may have a signal. Links inside a junction count as
+    none, because the signal stands where a vehicle enters.
+    """
+    ways: list[tuple[str, tuple[str, ...]]] = [(lane, ())]
+    for _ in range(_LINKS_AT_ONCE):  # shortest way first, because a vehicle cannot drive a detour in one step
+        further = []
+        for place, states in ways:
+            for link in sumo.lane_getLinks(place):
+                following = link[4] or link[0]
+                further.append((following, states if place.startswith(":") else (*states, link[5])))
+        found = [states for following, states in further if following.rpartition("_")[0] == edge]
+        if found:
+            return found
+        ways = further
+    return []
 
 
 def _gap(scene: Scene, one: str, two: str) -> float:

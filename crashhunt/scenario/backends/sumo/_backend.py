@@ -26,6 +26,10 @@ _VEHICLE = ("existing", "replaces", "type", "route", "edges", "depart_s", "depar
 _DRIVING = ("action", "target_speeds", "speed_mode")
 
 
+OSM_ENDINGS, OPENDRIVE_ENDINGS = (".osm", ".osm.gz", ".osm.xml", ".pbf"), (".xodr", ".xodr.gz")
+MAP_ARGUMENTS = ("demand", "imperfection", "speed_spread", "trucks_per_100_cars", "ego_route")
+
+
 # A listing of backends imports this module, so everything else is imported where it is needed.
 
 
@@ -82,6 +86,12 @@ def _load(path: Path, ego: str) -> Scenario:
     from crashhunt.scenario.backends.sumo._sumocfg import load_sumocfg
 
     return load_sumocfg(path, ego=ego)
+
+
+def _load_map(path: Path, ego: str) -> Scenario:
+    from crashhunt.scenario.backends.sumo._map import load_map
+
+    return load_map(path, ego)
 
 
 def _explained(message: str, output: str, scenario: Scenario) -> ScenarioError | None:
@@ -154,7 +164,24 @@ BACKEND = Backend(
     reported_events=tuple(EVENT_WORDS),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "step_out", "ignore_priority", "unseen"),
     actions=("continuous", "meta"),
-    configurations=(Configuration(endings=(".sumocfg", ".sumo.cfg"), load=_load, arguments=("scale", "vehicle")),),
+    configurations=(
+        Configuration(
+            endings=(".sumocfg", ".sumo.cfg"),
+            load=_load,
+            arguments=("scale", "vehicle"),
+            waiting="simulating the plain traffic, to find vehicles that enter (60 s of processor time at most)",
+        ),
+        *(
+            Configuration(
+                endings=endings,
+                load=_load_map,
+                arguments=MAP_ARGUMENTS,
+                takes_ego=False,
+                waiting="making a scenario from the map, which is kept for the next hunt",
+            )
+            for endings in (OSM_ENDINGS, OPENDRIVE_ENDINGS)
+        ),
+    ),
     plays_paths=True,
     forkable=True,
     core=CompiledCore(switched_off=_without_core, why_not=_why_no_core),

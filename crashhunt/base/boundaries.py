@@ -1,0 +1,92 @@
+"""The boundaries of crashhunt: calls of foreign code in an episode, by the party whose code is called.
+
+Every call of foreign code stands alone inside a boundary. An exception that comes out of the call is wrapped, and the
+wrapper says whose code raised it. Therefore an exception without a wrapper is crashhunt's own.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec, TypeVar
+
+from crashhunt.base.errors import SimulatorError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+__all__ = ["Boundary", "ForeignError", "Party", "is_ours"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class Party(StrEnum):
+    """Whose code runs in an episode."""
+
+    AGENT = "agent"
+    ENVIRONMENT = "environment"
+    SIMULATOR = "simulator"
+    ORACLE = "oracle"
+    CRASHHUNT = "crashhunt"
+
+
+class ForeignError(SimulatorError):
+    """An exception of foreign code; its cause is the exception itself.
+
+    Args:
+        party: Whose code raised it.
+        place: What the code was called for, such as ``step``.
+        error: The exception.
+    """
+
+    def __init__(self, party: Party, place: str, error: BaseException) -> None:
+        super().__init__(f"the {party} failed ({place})")
+        self.party = party
+        self.place = place
+        self.error = error
+
+
+class Boundary:
+    """Surrounds calls of one party's code for one purpose: ``with boundary: call()``.
+
+    Args:
+        party: Whose code is called.
+        place: What it is called for, such as ``step``.
+    """
+
+    __slots__ = ("_party", "_place")
+
+    def __init__(self, party: Party, place: str) -> None:
+        self._party = party
+        self._place = place
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is not None:
+            self.wrap(error)
+
+    def wrap(self, error: BaseException) -> NoReturn:
+        """Raise the wrapper of an exception that a call inside this boundary has raised."""
+        raise ForeignError(self._party, self._place, error) from error
+
+    def around(self, function: Callable[P, R]) -> Callable[P, R]:
+        """Return a function whose calls are inside this boundary."""
+
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            try:
+                return function(*args, **kwargs)
+            except BaseException as error:
+                self.wrap(error)
+
+        return call
+
+
+def is_ours(thing: Any) -> bool:
+    """Whether the class of an object, or a function, is defined in crashhunt itself."""
+    kind = thing if isinstance(thing, type) else type(thing)
+    return str(type.__dict__["__module__"].__get__(kind)).startswith("crashhunt.")

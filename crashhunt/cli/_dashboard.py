@@ -1,0 +1,73 @@
+"""``crashhunt dashboard``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.cli._common import DONE, add_json, integer, say
+
+if TYPE_CHECKING:
+    import argparse
+
+    from crashhunt.cli._common import Commands
+    from crashhunt.dashboard import Address
+
+__all__ = ["add_dashboard"]
+
+
+def add_dashboard(commands: Commands) -> None:
+    """Add the command."""
+    dashboard = commands.add_parser(
+        "dashboard",
+        help="show hunts live in the browser",
+        description="Show hunts live in the browser: all of them in a table, each with its curves, arguments and crash "
+        "types, and each crash as an animation. Prints the address and runs until Ctrl-C. Without --allow-control it "
+        "only reads: it writes nothing into the folders of hunts, and runs no code of a bundle.",
+    )
+    dashboard.add_argument(
+        "paths", metavar="PATH", type=Path, nargs="*",
+        help="hunts, suites, folders with hunts below them, or files that crashhunt export wrote; default: the current "
+        "folder",
+    )  # fmt: skip
+    dashboard.add_argument("--port", metavar="N", type=integer, default=8642, help="default: 8642; 0: any free one")
+    dashboard.add_argument(
+        "--host", metavar="HOST", default="127.0.0.1",
+        help="to listen on; any but a loopback address needs a token; default: 127.0.0.1",
+    )  # fmt: skip
+    dashboard.add_argument(
+        "--token", metavar="TEXT", default="", help="that each reader needs; default: a random one where it is needed"
+    )
+    dashboard.add_argument("--no-browser", action="store_true", help="do not open a browser")
+    dashboard.add_argument(
+        "--allow-control", action="store_true",
+        help="let the page stop running hunts, and replay, judge and minimize crashes",
+    )  # fmt: skip
+    add_json(dashboard)
+    dashboard.set_defaults(command=_dashboard)
+
+
+def _dashboard(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.dashboard import serve
+
+    def announce(address: Address) -> None:
+        if options.json:
+            found = {"url": address.url, "host": address.host, "port": address.port, "token": address.token}
+            print(json.dumps(found), flush=True)
+        say(f"{address.url}\nCtrl-C ends the dashboard.", as_json=options.json)
+        sys.stdout.flush()
+
+    with suppress(KeyboardInterrupt):  # the usual end
+        serve(
+            options.paths or [Path()],
+            host=options.host,
+            port=options.port,
+            token=options.token,
+            browser=not options.no_browser and not options.json,
+            allow_control=options.allow_control,
+            announce=announce,
+        )
+    return DONE

@@ -1,0 +1,229 @@
+"""``crashhunt gate``."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections import defaultdict
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import UsageError
+from crashhunt.base.files import whole_file
+from crashhunt.cli._common import (
+    DONE,
+    INTERRUPTED,
+    NO_ANSWER,
+    THE_ANSWER_IS_NO,
+    add_ci_options,
+    add_json,
+    add_options,
+    add_trust,
+    chosen_options,
+    integer,
+    number,
+    say,
+    tell,
+)
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable, Iterator
+
+    from crashhunt.cli._common import Commands
+    from crashhunt.estimation import GateReport
+    from crashhunt.suites import GateProgress, RunRequest
+
+__all__ = ["add_gate"]
+
+_OPTIONS = (
+    "scenario", "ego", "action", "agents", "arguments", "scenario_arguments", "oracles", "seed", "crash_on", "disturb",
+    "timeout_s", "accelerate", "native", "executor", "snapshot_roots", "snapshot_limit_mb",
+)  # fmt: skip
+_OF_TRIALS = tuple(name for name in _OPTIONS if name != "executor")  # which a suite says itself
+_MOST, _MAX_STEPS, _MARGIN = 1000, 1500, 0.01
+_LINE_EVERY_S = 30.0  # where there is no terminal
+
+
+def add_gate(commands: Commands) -> None:
+    """Add the command."""
+    gate = commands.add_parser(
+        "gate",
+        help="give a verdict on a change: better, worse, no difference or undecided",
+        description="Compare HEAD with BASE in the same traffic, trial by trial, until the verdict is certain. Both "
+        "are commits of the repository around this folder, or agents. Exit code 0: HEAD is better, or there is no "
+        "difference above --margin; 1: HEAD is worse; 3: undecided.",
+    )
+    gate.add_argument("base", metavar="BASE", help="a commit, or an agent as [ID=]MODULE:ATTR or by its name")
+    gate.add_argument("head", metavar="HEAD", help="the same for the version with the change")
+    what = gate.add_argument_group("what is compared")
+    what.add_argument(
+        "--suite", metavar="FILE", type=Path, help="compare in every hunt of a suite.toml, instead of --scenario"
+    )
+    what.add_argument(
+        "--corpus", metavar="CORPUS", type=Path,
+        help="run the crashes of this corpus of HEAD first: HEAD is worse where a fixed one comes back; default: "
+        "crashes, if HEAD is a commit that has such a folder",
+    )  # fmt: skip
+    how = gate.add_argument_group("how it is compared")
+    how.add_argument(
+        "--most", metavar="N", type=integer, default=_MOST, help=f"pairs of trials at most; default: {_MOST}"
+    )
+    how.add_argument("--for", metavar="TIME", dest="duration", default="", help="end after this time, such as 30m")
+    how.add_argument(
+        "--max-steps", metavar="N", type=integer, default=None,
+        help=f"the bound on each trial, in steps; default: {_MAX_STEPS}, or as the suite says",
+    )  # fmt: skip
+    how.add_argument(
+        "--margin", metavar="SHARE", default=str(_MARGIN),
+        help="the greatest difference in crashes per trial that counts as none, such as 0.01 or 1%%; 0: give no such "
+        f"verdict; default: {_MARGIN}",
+    )  # fmt: skip
+    how.add_argument("--confidence", metavar="PERCENT", type=number, default=95.0, help="of the verdict; default: 95")
+    how.add_argument(
+        "--parallel", metavar="N", type=integer, default=0,
+        help="trials at a time, of both together, at least 2; default: one per core",
+    )  # fmt: skip
+    how.add_argument(
+        "--keep", metavar="DIR", type=Path,
+        help="keep both hunts there, for crashhunt compare, rate and report; the same command resumes them",
+    )  # fmt: skip
+    add_options(defaultdict(lambda: how, what=what), _OPTIONS)
+    add_trust(gate)
+    gate.add_argument("--markdown", metavar="FILE", type=Path, help="write the verdict as Markdown, for a pull request")
+    gate.add_argument("--junit", metavar="FILE", type=Path, help="write the verdict as JUnit's XML")
+    add_ci_options(gate)
+    add_json(gate)
+    gate.set_defaults(command=_gate)
+
+
+def _gate(options: argparse.Namespace, words: list[str]) -> int:
+    from crashhunt.plans import check_duration, seconds_of
+    from crashhunt.report import describe_gate, gate_annotations, gate_summary, write_gate_junit
+    from crashhunt.suites import Gate, GateVersion
+
+    if fix := check_duration(options.duration):
+        raise UsageError(f"--for is {options.duration}", fix=fix)
+    folder = Path.cwd()
+    hunts = _of_suite(options, words) if options.suite is not None else _of_options(options, folder)
+    gate = Gate(
+        base=GateVersion.of(options.base, folder),
+        head=GateVersion.of(options.head, folder),
+        hunts=hunts,
+        folder=folder,
+        most=options.most,
+        duration_s=seconds_of(options.duration),
+        margin=_margin(options.margin),
+        confidence=options.confidence,
+        corpus=options.corpus,
+        parallel=options.parallel,
+        is_suite=options.suite is not None,
+        trusted=options.trust,
+        machine={"executor": options.executor} if options.suite is None or "--executor" in _flags(words) else None,
+    )
+    with _watched(as_json=options.json) as watch:
+        found = gate.run(options.keep, watch)
+    say(describe_gate(found), as_json=options.json)
+    summary = gate_summary(found)
+    if options.markdown is not None:
+        with whole_file(options.markdown) as temporary:
+            temporary.write_text(f"{summary}\n", encoding="utf-8")
+    if options.junit is not None:
+        write_gate_junit(found, options.junit)
+    tell(options, summary, gate_annotations(found))
+    if options.json:
+        print(json.dumps(found.to_json()))
+    return _exit_code(found)
+
+
+def _exit_code(found: GateReport) -> int:
+    if found.is_interrupted and found.verdict == "undecided":
+        return INTERRUPTED
+    if found.verdict == "worse":
+        return THE_ANSWER_IS_NO
+    return NO_ANSWER if found.verdict == "undecided" else DONE
+
+
+def _margin(text: str) -> float:
+    try:
+        return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        raise UsageError(f"--margin is {text}", fix="give a share from 0 to below 1, such as 0.01 or 1%") from None
+
+
+def _of_options(options: argparse.Namespace, folder: Path) -> dict[str, RunRequest]:
+    """Return the one hunt that the options describe."""
+    from dataclasses import replace
+
+    from crashhunt.plans import HuntOptions, SnapshotChoices, fields_of, request_of
+    from crashhunt.scenario import shipped_scenarios
+    from crashhunt.suites import RunRequest
+
+    asked = HuntOptions(**chosen_options(options, _OPTIONS))
+    max_steps = _MAX_STEPS if options.max_steps is None else options.max_steps
+    request = request_of(asked, trials=1, max_steps=max_steps).checked()
+    scenario = str(request.scenario)
+    if scenario not in shipped_scenarios():
+        scenario = str((folder / scenario).resolve())
+    choices = SnapshotChoices(**{name: getattr(asked, name) for name in fields_of(SnapshotChoices)})
+    run = RunRequest(replace(request, scenario=scenario), str(folder), choices)
+    return {Path(scenario).stem or scenario: run}
+
+
+def _of_suite(options: argparse.Namespace, words: list[str]) -> dict[str, RunRequest]:
+    """Return every run of a suite by name."""
+    from dataclasses import replace
+
+    from crashhunt.plans import hunt_options
+    from crashhunt.suites import Suite
+
+    flags = {option.about.flag for option in hunt_options() if option.name in _OF_TRIALS and option.name != "seed"}
+    if both := sorted(flags & _flags(words)):
+        raise UsageError(f"--suite and {both[0]} exclude each other", fix=f"write {both[0]} into {options.suite}")
+    suite = Suite.read(options.suite)
+    found = {}
+    for entry in suite.entries:
+        for run in range(entry.runs):
+            asked = suite.request(replace(entry, seed=options.seed) if options.seed is not None else entry, run)
+            steps = asked.request.max_steps if options.max_steps is None else options.max_steps
+            request = replace(asked.request, max_steps=steps).checked()
+            if entry.seed is None and options.seed is None:
+                request = replace(request, seed=None)  # it follows from that of the gate, which a resumed gate keeps
+            found[f"{entry.id}.{run}"] = replace(asked, request=request)
+    return found
+
+
+def _flags(words: list[str]) -> set[str]:
+    """Return the options that the command line gives."""
+    return {word.partition("=")[0] for word in words}
+
+
+@contextmanager
+def _watched(*, as_json: bool) -> Iterator[Callable[[GateProgress], None]]:
+    """Yield what shows how far a gate is: a line that changes on a terminal, a line every half minute elsewhere."""
+    from rich.console import Console
+    from rich.status import Status
+
+    console = Console(stderr=True, highlight=False)
+    if console.is_terminal and not as_json:
+        with Status("preparing", console=console) as status:
+            yield lambda progress: status.update(_progress(progress).replace("[", r"\["))
+        return
+    said = time.monotonic()
+
+    def tell_now_and_then(progress: GateProgress) -> None:
+        nonlocal said
+        if time.monotonic() - said >= _LINE_EVERY_S:
+            said = time.monotonic()
+            print(_progress(progress), file=sys.stderr, flush=True)
+
+    yield tell_now_and_then
+
+
+def _progress(progress: GateProgress) -> str:
+    return (
+        f"{progress.name}: {progress.done:,} of {progress.most:,} pairs, {progress.only_base} crash only with BASE, "
+        f"{progress.only_head} only with HEAD (evidence {progress.evidence:.3g})"
+    )

@@ -1,0 +1,149 @@
+"""``crashhunt init``."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import NoValidTrialError, UsageError
+from crashhunt.cli._common import DONE, add_json, say
+
+if TYPE_CHECKING:
+    import argparse
+
+    from crashhunt.cli._common import Commands
+    from crashhunt.maps import MapSource, PlainTrial
+
+__all__ = ["add_init"]
+
+_FILES = {"osm": "osm", "opendrive": "opendrive", "net": "net"}
+
+
+def add_init(commands: Commands) -> None:
+    """Add the command."""
+    init = commands.add_parser(
+        "init",
+        help="make a scenario from a map",
+        description="Make a scenario from a map: the network, traffic that flows, a starting agent, and a README with "
+        "the next commands. It tries the scenario before it writes DIR. Needs: pip install 'crashhunt[maps]'.",
+    )
+    init.add_argument("directory", metavar="DIR", type=Path, help="of the scenario; must be new or empty")
+    maps = init.add_argument_group("the map (exactly one)").add_mutually_exclusive_group(required=True)
+    maps.add_argument("--osm", metavar="FILE", type=Path, help="OpenStreetMap: .osm, .osm.gz, .pbf")
+    maps.add_argument("--opendrive", metavar="FILE", type=Path, help="OpenDRIVE: .xodr")
+    maps.add_argument("--net", metavar="FILE", type=Path, help="a network of SUMO: .net.xml, .net.xml.gz")
+    maps.add_argument("--grid", metavar="NxM", default="", help="a generated grid of N by M junctions, such as 4x4")
+    maps.add_argument("--spider", metavar="NxM", default="", help="a generated web of N arms and M rings, such as 5x3")
+    how = init.add_argument_group("what is made of it")
+    how.add_argument(
+        "--bbox", metavar="W,S,E,N", default="", help="only this part of the map, in degrees; write --bbox=W,S,E,N"
+    )
+    how.add_argument(
+        "--demand", metavar="LOW:HIGH", default="0.2:1.5",
+        help="range of the factor on the traffic (default: %(default)s); the traffic flows at HIGH",
+    )  # fmt: skip
+    how.add_argument("--people", action="store_true", help="add persons on foot, on sidewalks and crossings")
+    how.add_argument("--bicycles", action="store_true", help="add cyclists, and lanes for bicycles")
+    how.add_argument("--lefthand", action="store_true", help="traffic keeps to the left")
+    how.add_argument("--agent", metavar="NAME", default="", help="who drives (default: car-following)")
+    how.add_argument("--workflow", choices=["github"], default="", help="add a workflow for this CI")
+    add_json(how)
+    init.set_defaults(command=_init)
+
+
+def _init(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.maps import MapOptions, describe_place, make_scenario, parse_bbox
+
+    asked = MapOptions(
+        bbox=parse_bbox(options.bbox) if options.bbox else None,
+        demand=_demand(options.demand),
+        people=options.people,
+        bicycles=options.bicycles,
+        left_hand=options.lefthand,
+        agent=options.agent,
+        workflow=options.workflow,
+    )
+    if options.agent:
+        _check_agent(options.agent)
+
+    def tell(text: str) -> None:
+        if sys.stderr.isatty():
+            print(f"\r\x1b[K{text} …" if text else "\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+    try:
+        made = make_scenario(_source(options), asked, options.directory, try_out=_try_out, tell=tell)
+    finally:
+        tell("")
+    lines = [f"made {options.directory}", "", *describe_place(made), "", "Next:"]
+    say("\n".join([*lines, *(f"  {command}" for command in made.commands)]), as_json=options.json)
+    if options.json:
+        print(json.dumps(made.to_json()))
+    return DONE
+
+
+def _source(options: argparse.Namespace) -> MapSource:
+    from crashhunt.maps import MapSource, parse_shape
+
+    if options.grid:
+        return MapSource(kind="grid", shape=parse_shape(options.grid, "--grid"))
+    if options.spider:
+        return MapSource(kind="spider", shape=parse_shape(options.spider, "--spider"))
+    if options.osm is not None:
+        return MapSource(kind="osm", path=options.osm)
+    if options.opendrive is not None:
+        return MapSource(kind="opendrive", path=options.opendrive)
+    if options.net is not None:
+        return MapSource(kind="net", path=options.net)
+    raise UsageError("names no map", fix="give one of --osm, --opendrive, --net, --grid, --spider")
+
+
+def _demand(text: str) -> tuple[float, float]:
+    """Return the range.
+
+    Raises:
+        UsageError: it is none.
+    """
+    fix = "give two factors above 0, such as --demand 0.2:1.5"
+    low, colon, high = text.partition(":")
+    try:
+        found = float(low), float(high if colon else low)
+    except ValueError:
+        raise UsageError(f"--demand {text!r} is not a range", fix=fix) from None
+    if not 0 < found[0] <= found[1] <= _MAX_DEMAND:  # NaN is neither
+        raise UsageError(f"--demand {text!r} is not a range within 0 and {_MAX_DEMAND:g}", fix=fix)
+    return found
+
+
+_MAX_DEMAND = 100.0
+
+
+def _check_agent(name: str) -> None:
+    from crashhunt.base.plugins import locate
+
+    locate("agents", name)
+
+
+def _try_out(folder: Path, steps: int) -> PlainTrial:
+    """Run one trial.
+
+    Raises:
+        NoValidTrialError: the controlled vehicle does not enter.
+    """
+    from crashhunt.api import run
+    from crashhunt.base.temporary import temporary_folder
+    from crashhunt.maps import PlainTrial
+
+    began = time.monotonic()
+    with temporary_folder("try") as place:
+        report = run(place / "hunt", 1, 1, steps, scenario=folder, seed=1)
+        outcome = next((str(kind) for kind, count in report.outcomes.items() if count), "")
+        steps_run = report.trial_steps
+    if report.stopped_because == "interrupted":
+        raise KeyboardInterrupt  # the hunt has collected the signal
+    if report.stopped_because == "no_valid_trial" or not outcome:
+        message = "no trial of the new scenario is valid: the controlled vehicle does not enter"
+        raise NoValidTrialError(message, fix="lower --demand, or choose another part of the map")
+    return PlainTrial(outcome=outcome, steps=steps_run, wall_s=time.monotonic() - began)

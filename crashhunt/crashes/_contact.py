@@ -1,0 +1,480 @@
+"""The record of a contact: when, where and with which sides two actors touched, and how they had moved before.
+
+Everything that describes a collision reads this record: its type, the fault, the lane, the speeds and the words. The
+contact itself is that of `crashhunt.world.contact_at`, by which the oracles determine the role of the agent as well.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crashhunt.base import layout
+from crashhunt.crashes._lanes import LaneMap
+from crashhunt.world import STANDS_MPS, contact_at, is_person, lane_jump
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.recording import Recording
+    from crashhunt.trial import Collision
+    from crashhunt.world import Event, RightOfWay, Scene, Touch
+
+
+__all__ = ["SAME_WAY", "ContactRecord", "Way", "contact_record", "record_in"]
+
+
+_WINDOW_S = 4.0  # earlier movements have not led to the contact
+_EVENTS_S = 10.0  # before the contact
+SAME_WAY = math.radians(45)
+_OPPOSITE = math.radians(135)
+_NOT_SWEPT = "crashed"  # highway-env's collisions: its vehicles drive through several collision checks in a step
+_LATELY_S = 1.5
+_BEFORE_S = 1.0  # as long as the first half of a lane change takes
+_SIDEWAYS_M = 0.3  # less is drifting
+_STRAIGHT = math.radians(10)
+_DRIFTS_M = 0.1
+_ACROSS_M = 50.0  # from the line of a junction to where it ends; there are larger ones
+_BESIDE_M = 1.2  # of the path that another one drives; less is in its way
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """How an actor moved: before the crash, a row a scene.
+
+    Args:
+        id: of the actor.
+        points: x and y of its front bumper, shape (n, 2), in m.
+        headings: shape (n,), in rad.
+        speeds: shape (n,), in m/s.
+        length: in m.
+        width: in m.
+    """
+
+    id: str
+    points: NDArray[np.float64]
+    headings: NDArray[np.float64]
+    speeds: NDArray[np.float64]
+    length: float
+    width: float
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """The centre of its outline, shape (n, 2), in m."""
+        return self.points - self.length / 2 * np.stack((np.cos(self.headings), np.sin(self.headings)), axis=1)
+
+
+@dataclass(frozen=True)
+class ContactRecord:
+    """The contact of an agent with another actor, and the seconds before it.
+
+    Args:
+        agent: the controlled vehicle.
+        other: The collision partner.
+        scenes: to the end of the step in which they touched.
+        time_s: of the first contact.
+        began_s: when the episode began.
+        lanes: around the place.
+        events: of the last seconds, each with its simulation time.
+        right_of_way: of the map, where it says.
+        lane: The lane of the agent at the contact; empty if it is unknown.
+        swept: whether actors drive from scene to scene, and change lanes in an instant, as in `Scene`.
+    """
+
+    agent: str
+    other: str
+    scenes: Sequence[Scene]
+    time_s: float
+    began_s: float
+    lanes: LaneMap
+    events: tuple[tuple[float, Event], ...] = ()
+    right_of_way: RightOfWay | None = None
+    lane: str = ""
+    swept: bool = True
+
+    @cached_property
+    def before(self) -> list[Scene]:
+        """The last scenes before the contact in which both were there, over at least 4 s where there are as many.
+
+        The first scene is the last one that is 4 s or more before the contact. Otherwise the part of a long step in
+        which they touch would decide how long the rules can look back.
+        """
+        found: list[Scene] = []
+        for scene in reversed(self.scenes):
+            if scene.time_s >= self.time_s - 1e-6:
+                continue
+            index = scene.roster.index
+            if self.agent not in index or self.other not in index:
+                if found:
+                    break
+                continue
+            found.append(scene)
+            if scene.time_s <= self.time_s - _WINDOW_S + 1e-6:
+                break
+        return found[::-1] or list(self.scenes[-1:])
+
+    @cached_property
+    def through(self) -> list[Scene]:
+        """The same and the scene after the contact."""
+        last = self.scenes[-1]
+        there = self.agent in last.roster.index and self.other in last.roster.index
+        return [*self.before, last] if there and last is not self.before[-1] else self.before
+
+    @cached_property
+    def times(self) -> NDArray[np.float64]:
+        """Of the scenes before, in s before the contact; the first one is the longest ago."""
+        return np.array([self.time_s - scene.time_s for scene in self.before])
+
+    def way(self, actor: str) -> Way:
+        """Return how one of them moved before the contact."""
+        return self._ways[actor]
+
+    @cached_property
+    def _ways(self) -> dict[str, Way]:
+        return {actor: self._way(actor) for actor in (self.agent, self.other)}
+
+    def _way(self, actor: str) -> Way:
+        rows = [(scene, scene.roster.index[actor]) for scene in self.before]
+        scene, row = rows[-1]
+        known = scene.roster.actors[row]
+        return Way(
+            id=actor,
+            points=np.array([scene.points[row] for scene, row in rows]),
+            headings=np.unwrap(np.array([scene.headings[row] for scene, row in rows])),
+            speeds=np.array([scene.speeds[row] for scene, row in rows]),
+            length=known.length,
+            width=known.width,
+        )
+
+    def partner(self, actor: str) -> str:
+        """Return the other one of the two."""
+        return self.other if actor == self.agent else self.agent
+
+    @cached_property
+    def touch(self) -> Touch:
+        """The contact, with the agent as the first actor."""
+        last = self.scenes[-1]
+        previous = self.scenes[-2] if len(self.scenes) > 1 else None
+        index = last.roster.index
+        return contact_at(previous, last, index[self.agent], index[self.other], swept=self.swept)
+
+    @property
+    def collider(self) -> str:
+        """The actor that drove into the other."""
+        return self.agent if self.touch.drives_into else self.other
+
+    @property
+    def jumpers(self) -> tuple[str, ...]:
+        """The actors whose instantaneous lane change made the contact."""
+        jumps = ((self.agent, self.touch.jumps), (self.other, self.touch.other_jumps))
+        return tuple(actor for actor, jumped in jumps if jumped)
+
+    def speed_at_contact(self, actor: str) -> float:
+        """Return the speed of an actor at the contact, in m/s."""
+        return self.touch.speed if actor == self.agent else self.touch.other_speed
+
+    @property
+    def manner(self) -> str:
+        """The manner of the collision, as in `Signature`."""
+        if is_person(self.agent) or is_person(self.other):
+            return "pedestrian"
+        turn = self.touch.turn
+        if abs(turn) > _OPPOSITE:
+            return "head-on"
+        if not self.same_way:
+            return "crossing from the right" if turn > 0 else "crossing from the left"
+        return "rear end" if self.follower else "side swipe"
+
+    @property
+    def turn(self) -> float:
+        """The angle between their headings at the contact, in rad, within 0 and pi."""
+        return abs(self.touch.turn)
+
+    @property
+    def same_way(self) -> bool:
+        """Whether they drove in the same direction at the contact."""
+        return self.turn < SAME_WAY
+
+    def turned(self, since_s: float) -> float:
+        """The greatest angle between their headings from so many s before the contact on, in rad."""
+        own, other = self.way(self.agent), self.way(self.other)
+        turns = np.abs((own.headings - other.headings + math.pi) % math.tau - math.pi)
+        return float(turns[self.times <= since_s + 1e-6].max(initial=self.turn))
+
+    def ahead_m(self, actor: str, back: int = -1) -> float:
+        """How far an actor's centre is ahead of the other's, along the other's heading, in m."""
+        own, other = self.way(actor), self.way(self.partner(actor))
+        dx, dy = own.centers[back] - other.centers[back]
+        return float(dx * math.cos(other.headings[back]) + dy * math.sin(other.headings[back]))
+
+    def gap_m(self, actor: str, back: int = -1) -> float:
+        """How far an actor's rear is ahead of the other's front, along the other's heading, in m; at that scene."""
+        own, other = self.way(actor), self.way(self.partner(actor))
+        return self.ahead_m(actor, back) - (own.length + other.length) / 2
+
+    def aside_m(self, actor: str, back: int = -1) -> float:
+        """How far an actor's centre is to the left of the other's, across the other's heading, in m."""
+        own, other = self.way(actor), self.way(self.partner(actor))
+        dx, dy = own.centers[back] - other.centers[back]
+        return float(dy * math.cos(other.headings[back]) - dx * math.sin(other.headings[back]))
+
+    @cached_property
+    def follower(self) -> str:
+        """The actor whose front touched the other's rear, in the same direction; empty if there was none."""
+        if not self.same_way or self.touch.is_sideways:
+            return ""
+        faces = self.touch.face, self.touch.other_face
+        return self.agent if faces == ("front", "rear") else self.other if faces == ("rear", "front") else ""
+
+    def in_its_way_s(self, leader: str) -> float:
+        """For how long a leader had been in the follower's way, in s: the follower drove over where it had been."""
+        lead, follow = self.way(leader), self.way(self.partner(leader))
+        straight = np.array([math.cos(follow.headings[-1]), math.sin(follow.headings[-1])])
+        path = np.vstack((follow.centers, follow.centers[-1] + straight * np.array([[5.0], [60.0]])))
+        found = 0.0
+        for back in range(len(self.before) - 1, -1, -1):
+            if _distance(path[back:], lead.centers[back]) > _BESIDE_M:
+                break
+            found = float(self.times[back])
+        return found
+
+    def turns_off_s(self, leader: str) -> float | None:
+        """How long before the contact a leader left the way of a follower that drove straight on; None if it did not.
+
+        It had been in its way before, as long as is known.
+        """
+        lead, follow = self.way(leader), self.way(self.partner(leader))
+        straight = bool(np.ptp(follow.headings) < _STRAIGHT) and self.ahead_m(leader) > 0
+        before = abs(math.remainder(lead.headings[0] - follow.headings[0], math.tau))
+        if not straight or before >= _STRAIGHT or self.turn < _STRAIGHT:
+            return None
+        asides = [abs(self.aside_m(leader, back)) for back in range(len(self.before))]
+        left = next((back for back, aside in enumerate(asides) if aside > _BESIDE_M), len(asides))
+        parting = all(after > before - _DRIFTS_M for before, after in pairwise(asides[max(0, left - 1) :]))
+        return float(self.times[left - 1]) if left > 0 and parting else None
+
+    def changed_s(self, actor: str) -> float | None:
+        """How long before the contact an actor last came from one lane into the next, or was about to; None if not."""
+        return self._changes[actor]
+
+    @cached_property
+    def _changes(self) -> dict[str, float | None]:
+        return {actor: self._changed_s(actor) for actor in (self.agent, self.other)}
+
+    def _changed_s(self, actor: str) -> float | None:
+        if actor in self.jumpers:
+            return 0.0
+        through = self.until_contact(actor)
+        left = self.lanes.left_sideways(self.before, actor)
+        since = left or 0
+        if self.lanes.left_sideways(through[since:], actor) or any(
+            self.lanes.reaches_over(scenes[since:], actor) for scenes in (through, self.before)
+        ):
+            return float(self.times[-1])
+        return None if left is None else float(self.times[left])
+
+    def until_contact(self, actor: str) -> list[Scene]:
+        """Return the scenes before the contact and the one after it, without a lane change after the contact."""
+        jumped = self.swept and len(self.through) > 1 and lane_jump(self.through[-2], self.through[-1], actor)
+        return self.before if jumped and actor not in self.jumpers else self.through
+
+    def lane_changers(self, within_s: float) -> tuple[str, ...]:
+        """Return the actors that changed lanes at the contact, or up to a time in s before it."""
+        found = []
+        for actor in (self.agent, self.other):
+            scenes = [scene for scene in self.until_contact(actor) if scene.time_s >= self.time_s - within_s]
+            if actor in self.jumpers or self.lanes.leaves_sideways(scenes, actor):
+                found.append(actor)
+        if found or self.manner not in ("side swipe", "rear end"):
+            return tuple(found)
+        for actor in (self.agent, self.other):  # they touched before half a lane had been crossed
+            scenes = [scene for scene in self.until_contact(actor) if scene.time_s >= self.time_s - within_s]
+            late = [scene for scene in scenes if scene.time_s >= self.time_s - within_s / 2]
+            if self.lanes.reaches_over(scenes, actor) or self.lanes.reaches_over(late, actor):
+                found.append(actor)
+        return tuple(found)
+
+    def drifted(self, actor: str) -> bool:
+        """Whether an actor was moving over the side of its lane when they touched, or had done so before."""
+        return self.changed_s(actor) is not None
+
+    def meets_sideways(self, actor: str) -> bool:
+        """Whether an actor moved towards the other's side."""
+        if self.touch.is_sideways:
+            return actor in self.jumpers
+        last = self.through[-1]
+        own, its = (last.centers[last.roster.index[name]] for name in (actor, self.partner(actor)))
+        heading = last.headings[last.roster.index[self.partner(actor)]]
+        aside = (own[1] - its[1]) * math.cos(heading) - (own[0] - its[0]) * math.sin(heading)
+        lately = [abs(self.aside_m(actor, back)) for back, time_s in enumerate(self.times) if time_s <= _LATELY_S]
+        return max(lately, default=0.0) - abs(float(aside)) > _SIDEWAYS_M
+
+    def was_off_path(self, actor: str, back: int) -> bool:
+        """Whether an actor was off the path of the other actor just before a scene."""
+        return any(
+            abs(self.aside_m(actor, place)) > _BESIDE_M
+            for place in range(back + 1)
+            if self.times[place] - self.times[back] <= _BEFORE_S
+        )
+
+    def is_between_junctions(self, *actors: str) -> bool:
+        """Whether all of them were on roads of SUMO's, in none of its junctions, in the last seconds."""
+        lanes = {
+            actor: [
+                scene.lanes[scene.roster.index[actor]]
+                for scene in self.scenes
+                if scene.lanes and actor in scene.roster.index and scene.time_s >= self.time_s - _WINDOW_S
+            ]
+            for actor in actors
+        }
+        return all(
+            bool(found) and not any(lane.startswith(":") or not lane for lane in found) for found in lanes.values()
+        )
+
+    def was_in_junction(self, actor: str, before_s: float) -> bool:
+        """Whether an actor was in a junction of SUMO's so many s before the contact."""
+        lanes = [
+            scene.lanes[scene.roster.index[actor]]
+            for scene in self.scenes
+            if scene.lanes and actor in scene.roster.index and scene.time_s <= self.time_s - before_s
+        ]
+        return bool(lanes) and lanes[-1].startswith(":")
+
+    def is_past(self, event: Event, time_s: float) -> bool:
+        """Whether the actor of an event at a junction had already left the junction.
+
+        Args:
+            event: on the first of the junction's lanes.
+            time_s: when.
+        """
+        after = [scene for scene in self.scenes if scene.time_s >= time_s and event.agent in scene.roster.index]
+        points = [scene.points[scene.roster.index[event.agent]] for scene in after]
+        driven = sum(math.dist(a, b) for a, b in pairwise(points))
+        # In a long step, its front may have passed the junction when the event was found, but not its back.
+        is_behind = bool(event.lane) and not event.lane.startswith(":")
+        if driven > (self.way(event.agent).length if is_behind else _ACROSS_M):
+            return True
+        lanes = [event.lane, *(scene.lanes[scene.roster.index[event.agent]] for scene in after if scene.lanes)]
+        if event.agent == self.agent:
+            lanes.append(self.lane)
+        junctions = {lane.rsplit("_", 2)[0] for lane in lanes if lane.startswith(":")}
+        return len(junctions) > 1
+
+    def speed_mps(self, actor: str, before_s: float) -> float:
+        """How fast an actor was so many s before the contact, or as long before as is known."""
+        return float(self.way(actor).speeds[int(np.argmin(np.abs(self.times - before_s)))])
+
+    def stood_s(self, actor: str) -> float:
+        """For how long an actor had stood until the contact, in s; 0 where it moved when they touched."""
+        if self.speed_at_contact(actor) >= STANDS_MPS:
+            return 0.0
+        found = 0.0
+        for scene in reversed(self.scenes):
+            row = scene.roster.index.get(actor)
+            if scene.time_s >= self.time_s - 1e-6:
+                continue
+            if row is None or scene.speeds[row] >= STANDS_MPS:
+                break
+            found = self.time_s - scene.time_s
+        return found
+
+    def slowed(self, actor: str, since_s: float) -> float:
+        """How hard an actor braked on average, from so many s before the contact on, in m/s²."""
+        way = self.way(actor)
+        back = int(np.argmin(np.abs(self.times - since_s)))
+        took = float(self.times[back] - self.times[-1])
+        return float(way.speeds[back] - way.speeds[-1]) / took if took > 0 else 0.0
+
+    def hardest_braking(self, actor: str) -> float:
+        """The greatest deceleration of an actor between two scenes, in m/s²."""
+        way = self.way(actor)
+        steps = -np.diff(self.times)
+        return float((-np.diff(way.speeds) / np.maximum(steps, 1e-9)).max(initial=0.0))
+
+    def links(self, actor: str) -> tuple[int, ...]:
+        """The places of the ways across a junction that an actor may have been on."""
+        assert self.right_of_way is not None
+        lanes = [
+            scene.lanes[scene.roster.index[actor]]
+            for scene in self.scenes
+            if scene.lanes and actor in scene.roster.index and scene.time_s >= self.time_s - 3 * _WINDOW_S
+        ]
+        if actor == self.agent and self.lane:
+            lanes.append(self.lane)
+        x, y = self.way(actor).points[-1].tolist()
+        return self.right_of_way.places(tuple(lane for lane in lanes if lane), x, y)
+
+
+def record_in(scenes: Sequence[Scene], hit: Collision) -> ContactRecord | None:
+    """Return the record of a contact at the end of some scenes, without a map; None where an actor is missing there."""
+    agent, other = hit.agent, hit.other
+    if not scenes or not all(name in scenes[-1].roster.index for name in (agent, other)):
+        return None
+    time_s = scenes[-1].time_s
+    lanes = LaneMap((), (0.0, 0.0))
+    return ContactRecord(
+        agent=agent,
+        other=other,
+        scenes=scenes,
+        time_s=time_s,
+        began_s=scenes[0].time_s,
+        lanes=lanes,
+        swept=hit.kind != _NOT_SWEPT,
+    )
+
+
+def contact_record(bundle: Bundle, recording: Recording | None = None) -> ContactRecord | None:
+    """Return the record of a collision of two actors; no code of the bundle is run.
+
+    Args:
+        bundle: the crash.
+        recording: of it, where it has been read already.
+
+    Returns:
+        None where there was no contact, or where the last scene lacks one of the two.
+
+    Raises:
+        BundleError: the log is missing or damaged.
+    """
+    hit = bundle.result.collision
+    if hit is None or not hit.other:
+        return None
+    from crashhunt.recording import read_lanes  # MCAP takes longer than a list of software faults
+
+    found = recording or bundle.recording()
+    scenes = found.scenes()
+    if not scenes or not all(name in scenes[-1].roster.index for name in (hit.agent, hit.other)):
+        return None
+    last = scenes[-1]
+    events = tuple(
+        (step.scene.time_s, event)
+        for step in found.all_steps
+        if step.scene is not None and step.scene.time_s >= last.time_s - _EVENTS_S
+        for event in step.scene.events
+    )
+    return ContactRecord(
+        agent=hit.agent,
+        other=hit.other,
+        scenes=scenes,
+        time_s=hit.time_s if last.time_s - found.prologue.step_length_s <= hit.time_s <= last.time_s else last.time_s,
+        began_s=scenes[0].time_s,
+        lanes=LaneMap(read_lanes(bundle.path / layout.LOG), (hit.x, hit.y)),
+        events=events,
+        # Earlier versions wrote the lane of SUMO's report, which may be the other actor's.
+        swept=hit.kind != _NOT_SWEPT,
+        lane=(last.lanes[last.roster.index[hit.agent]] if last.lanes else "") or hit.lane,
+    )
+
+
+def _distance(path: NDArray[np.float64], point: NDArray[np.float64]) -> float:
+    start, leg = path[:-1], np.diff(path, axis=0)
+    along = np.clip(np.einsum("ij,ij->i", point - start, leg) / np.maximum((leg**2).sum(axis=1), 1e-12), 0.0, 1.0)
+    return float(np.hypot(*(point - start - along[:, None] * leg).T).min())

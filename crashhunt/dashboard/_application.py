@@ -1,0 +1,388 @@
+"""The pages and the API of the dashboard, as an ASGI application."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import tempfile
+import threading
+import time
+from collections import OrderedDict
+from contextlib import suppress
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from starlette.applications import Starlette
+from starlette.background import BackgroundTask
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Route
+
+from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
+from crashhunt.base.version import __version__
+from crashhunt.crashes import export_crash, read_bundle
+from crashhunt.dashboard._compared import Compared
+from crashhunt.dashboard._control import Jobs, stop_hunt
+from crashhunt.dashboard._crashes import CrashList
+from crashhunt.dashboard._details import detail_of, importance_of_points
+from crashhunt.dashboard._hunt import HuntView
+from crashhunt.dashboard._security import Guard
+from crashhunt.report import argument_units, player_parts
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from starlette.requests import Request
+    from starlette.types import ASGIApp
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.dashboard._catalog import Catalog, Found
+
+__all__ = ["API_VERSION", "Application", "make_application"]
+
+API_VERSION: Final = 1
+"""Of the shapes below ``/api``. Keys may be added; a change of a key raises it."""
+
+_MAX_COMPARED = 8
+_NO_STORE = {"cache-control": "no-store"}
+_TYPES = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
+_SCRIPTS = ("common.js", "list.js", "hunt.js", "crash.js", "compare.js", "style.css")
+_PAGES = ("list", "hunt", "crash", "compare")
+
+
+class Application(NamedTuple):
+    """What answers requests.
+
+    Args:
+        asgi: the ASGI application.
+        close: ends what it has started.
+    """
+
+    asgi: ASGIApp
+    close: Callable[[], None]
+
+
+def make_application(catalog: Catalog, *, host: str, token: str = "", allow_control: bool = False) -> Application:
+    """Return the application, guarded.
+
+    Args:
+        catalog: of the hunts that it shows.
+        host: that it listens on.
+        token: that requests need; empty for none.
+        allow_control: whether requests may stop hunts and start commands.
+    """
+    shown = _Shown(catalog)
+    jobs = Jobs()
+
+    def asset(request: Request) -> Response:
+        name = request.path_params["name"]
+        if name == "plotly.js":
+            return FileResponse(_plotly(), media_type="text/javascript", headers=_lasting(request, name))
+        text = _assets().get(name)
+        if text is None:
+            return _error(404, "there is no such file")
+        kind = _TYPES[name.rpartition(".")[2]]
+        return Response(text, media_type=kind, headers=_lasting(request, name))
+
+    def page(name: str) -> Callable[[Request], Response]:
+        def show(_request: Request) -> Response:
+            return Response(_page(name), media_type="text/html", headers={"cache-control": "no-cache"})
+
+        return show
+
+    def api(request: Request) -> Response:
+        about = {"crashhunt": __version__, "control": allow_control, "roots": [str(root) for root in catalog.roots]}
+        return _answer(request, about)
+
+    def hunts(request: Request) -> Response:
+        return _answer(request, shown.rows(request.query_params.get("since", "")))
+
+    def hunt(request: Request) -> Response:
+        view = shown.view(request.path_params["hunt"])
+        return _gone() if view is None else _answer(request, detail_of(view))
+
+    def trials(request: Request) -> Response:
+        view = shown.view(request.path_params["hunt"])
+        if view is None:
+            return _gone()
+        view.refresh(points=True)
+        sample = view.sample
+        if sample is None:
+            return _answer(request, {"points": [], "cursor": "", "replace": True, "share": 1.0, "crash_share": 1.0})
+        points, cursor, is_all = sample.since(request.query_params.get("since", ""))
+        return _answer(
+            request,
+            {
+                "points": points,
+                "cursor": cursor,
+                "replace": is_all,
+                "share": sample.share,
+                "crash_share": sample.crash_share,
+            },
+        )
+
+    def importance(request: Request) -> Response:
+        view = shown.view(request.path_params["hunt"])
+        if view is None:
+            return _gone()
+        view.refresh(points=True)
+        units: dict[str, str] = {}
+        if view.settings is not None:
+            several = len(view.settings.agents) > 1
+            with suppress(CrashhuntError, OSError):
+                found = argument_units(view.path, view.settings)
+                units = {
+                    f"{agent}.{name}" if agent and several else name: unit for (agent, name), unit in found.items()
+                }
+        points = view.sample.points if view.sample is not None else []
+        return _answer(request, {"importance": importance_of_points(points), "units": units})
+
+    def crashes(request: Request) -> Response:
+        found = shown.crashes(request.path_params["hunt"])
+        return _gone() if found is None else _answer(request, found.rows())
+
+    def where(request: Request) -> Response:
+        found = shown.crashes(request.path_params["hunt"])
+        return _gone() if found is None else _answer(request, found.map())
+
+    def crash(request: Request) -> Response:
+        found = shown.crashes(request.path_params["hunt"])
+        if found is None:
+            return _gone()
+        detail = found.detail(request.path_params["crash"])
+        return _error(404, "there is no such crash in this hunt") if detail is None else _answer(request, detail)
+
+    def log(request: Request) -> Response:
+        name = request.path_params["crash"]
+        found = shown.crashes(request.path_params["hunt"])
+        path = found.log(name) if found is not None else None
+        if path is None:
+            return _error(404, "there is no such log")
+        return FileResponse(path, media_type="application/octet-stream", filename=f"{name}.mcap", headers=_NO_STORE)
+
+    def export(request: Request) -> Response:
+        name = request.path_params["crash"]
+        found = shown.crashes(request.path_params["hunt"])
+        folder = found.folder(name) if found is not None else None
+        if found is None or folder is None or found.log(name) is None:
+            return _error(404, "there is no such crash in this hunt")
+        place = tempfile.TemporaryDirectory(prefix="crashhunt-export-")
+        target = Path(place.name) / f"{name}.zip"
+        try:
+            export_crash(read_bundle(folder), target)
+        except BaseException:
+            place.cleanup()
+            raise
+        after = BackgroundTask(place.cleanup)
+        return FileResponse(
+            target, media_type="application/zip", filename=target.name, headers=_NO_STORE, background=after
+        )
+
+    def compare(request: Request) -> Response:
+        names = [name for name in request.query_params.get("hunts", "").split(",") if name][:_MAX_COMPARED]
+        views = [view for name in dict.fromkeys(names) if (view := shown.view(name)) is not None]
+        return _answer(request, shown.compared.compare(views))
+
+    def stop(request: Request) -> Response:
+        view = shown.view(request.path_params["hunt"])
+        if view is None:
+            return _gone()
+        stop_hunt(view)
+        return _answer(request, {})
+
+    def job_list(request: Request) -> Response:
+        found = jobs.list(request.path_params["hunt"], request.path_params["crash"])
+        return _answer(request, {"jobs": found})
+
+    def job_add(request: Request) -> Response:
+        identifier, name = request.path_params["hunt"], request.path_params["crash"]
+        found = shown.crashes(identifier)
+        folder = found.folder(name) if found is not None else None
+        if found is None or folder is None or found.log(name) is None:
+            return _error(404, "there is no such crash in this hunt")
+        return _answer(request, jobs.add(identifier, folder.parent.parent, name, request.path_params["job"]))
+
+    routes = [
+        Route("/", page("list")),
+        Route("/hunts/{hunt}", page("hunt")),
+        Route("/hunts/{hunt}/crashes/{crash}", page("crash")),
+        Route("/compare", page("compare")),
+        Route("/static/{name}", asset),
+        Route("/api", api),
+        Route("/api/hunts", hunts),
+        Route("/api/hunts/{hunt}", hunt),
+        Route("/api/hunts/{hunt}/trials", trials),
+        Route("/api/hunts/{hunt}/importance", importance),
+        Route("/api/hunts/{hunt}/map", where),
+        Route("/api/hunts/{hunt}/crashes", crashes),
+        Route("/api/hunts/{hunt}/crashes/{crash}", crash),
+        Route("/api/hunts/{hunt}/crashes/{crash}/log", log),
+        Route("/api/hunts/{hunt}/crashes/{crash}/export", export),
+        Route("/api/compare", compare),
+    ]
+    if allow_control:
+        routes += [
+            Route("/api/hunts/{hunt}/stop", stop, methods=["POST"]),
+            Route("/api/hunts/{hunt}/crashes/{crash}/jobs", job_list),
+            Route("/api/hunts/{hunt}/crashes/{crash}/jobs/{job}", job_add, methods=["POST"]),
+        ]
+    handlers: Any = {
+        404: lambda _request, _: _error(404, "there is no such page"),
+        405: lambda _request, _: _error(405, "the dashboard only reads"),
+        CrashhuntError: lambda _request, error: _from_error(error),
+        OSError: lambda _request, error: _error(500, str(error.strerror or error)),
+        500: lambda _request, error: _error(500, f"this should not happen: {type(error).__name__}"),
+    }
+    inner = Starlette(routes=routes, exception_handlers=handlers)
+    return Application(Guard(inner, host=host, token=token, control=allow_control), jobs.close)
+
+
+class _Shown:
+    """The views of all hunts, kept between requests.
+
+    Args:
+        catalog: of the hunts.
+    """
+
+    def __init__(self, catalog: Catalog) -> None:
+        self._catalog = catalog
+        self._views: dict[str, HuntView] = {}
+        self._crashes: OrderedDict[str, CrashList] = OrderedDict()
+        self._rows: dict[str, tuple[int, bytes]] = {}  # revision in which a row changed, and its digest
+        self._revision = 0
+        self._lock = threading.Lock()
+        self.compared = Compared()
+
+    def view(self, identifier: str) -> HuntView | None:
+        """Return a hunt by its identifier; None where it is unknown or gone."""
+        found = self._catalog.find(identifier)
+        return None if found is None else self._view(found)
+
+    def _view(self, found: Found) -> HuntView:
+        with self._lock:
+            view = self._views.get(found.id)
+            if view is None or view.found != found:
+                view = self._views[found.id] = HuntView(found)
+            return view
+
+    def crashes(self, identifier: str) -> CrashList | None:
+        """Return the crashes of a hunt; None where it is unknown or gone."""
+        found = self._catalog.find(identifier)
+        if found is None:
+            return None
+        with self._lock:
+            known = self._crashes.pop(identifier, None) or CrashList(found)
+            self._crashes[identifier] = known
+            while len(self._crashes) > 20:
+                self._crashes.popitem(last=False)
+            return known
+
+    def rows(self, since: str) -> JsonObject:
+        """Return the rows that have changed since a revision, and the identifiers of all hunts.
+
+        Args:
+            since: revision that an earlier call returned; any other text returns all rows.
+        """
+        found = self._catalog.hunts()
+        rows = {name: self._view(hunt).row() for name, hunt in found.items()}
+        with self._lock:
+            self._views = {name: view for name, view in self._views.items() if name in found}
+            digests = {name: _digest(row) for name, row in rows.items()}
+            changed = [name for name, digest in digests.items() if self._rows.get(name, (0, b""))[1] != digest]
+            if changed or self._rows.keys() != rows.keys():
+                self._revision += 1
+            known = {name: self._rows[name] for name in rows if name in self._rows}
+            self._rows = known | {name: (self._revision, digests[name]) for name in changed}
+            after = int(since) if since.isascii() and since.isdecimal() and len(since) < 10 else 0
+            after = after if after <= self._revision else 0
+            return {
+                "hunts": [row for name, row in rows.items() if self._rows[name][0] > after],
+                "ids": list(rows),
+                "revision": self._revision,
+                "roots": [str(root) for root in self._catalog.roots],
+                "is_cut": self._catalog.is_cut,
+            }
+
+
+def _answer(request: Request, data: JsonObject) -> Response:
+    """Return data as JSON, or 304 where the reader has it already."""
+    text = json.dumps(_finite({"version": API_VERSION, **data}), ensure_ascii=False, separators=(",", ":"))
+    body = text.encode("utf-8", "replace")
+    tag = f'"{hashlib.blake2b(body, digest_size=12).hexdigest()}"'
+    headers = {"etag": tag, "cache-control": "no-cache", "x-crashhunt-now": f"{time.time():.3f}"}
+    if request.headers.get("if-none-match") == tag:
+        return Response(status_code=304, headers=headers)
+    return Response(body, media_type="application/json", headers=headers)
+
+
+def _finite(value: object) -> object:
+    """Return plain data without numbers that JSON has no word for."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(key): _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return value
+
+
+def _digest(row: JsonObject) -> bytes:
+    """Return the digest of what makes a row another one: without what changes with the clock only."""
+    row = {name: value for name, value in row.items() if name != "newest_kind_s"}
+    return hashlib.blake2b(json.dumps(row, default=str).encode("utf-8", "replace"), digest_size=12).digest()
+
+
+def _error(status: int, message: str, fix: str = "", where: str = "") -> Response:
+    data = {"error": {"message": message, "fix": fix, "where": where}}
+    return JSONResponse(data, status, headers=_NO_STORE)
+
+
+def _gone() -> Response:
+    return _error(404, "this hunt is not there (any more)", "go back to the list of hunts")
+
+
+def _from_error(error: Exception) -> Response:
+    assert isinstance(error, CrashhuntError)
+    status = 422 if isinstance(error, BundleError) else 409 if isinstance(error, UsageError) else 500
+    return JSONResponse(error.to_json(), status, headers=_NO_STORE)
+
+
+@cache
+def _assets() -> dict[str, bytes]:
+    """Return the scripts and the style by name; the player is the one of the report."""
+    player = player_parts()
+    folder = resources.files("crashhunt.dashboard").joinpath("static")
+    found = {name: folder.joinpath(name).read_bytes() for name in _SCRIPTS}
+    return {**found, "player.js": player.script.encode(), "player.css": player.style.encode()}
+
+
+def _plotly() -> Path:
+    """Return the script of plotly that its package ships."""
+    return Path(str(resources.files("plotly").joinpath("package_data", "plotly.min.js")))
+
+
+@cache
+def _stamp(name: str) -> str:
+    """Return what changes when a file does."""
+    if name == "plotly.js":
+        found = _plotly().stat()
+        return f"{found.st_size:x}-{found.st_mtime_ns:x}"
+    return hashlib.blake2b(_assets()[name], digest_size=6).hexdigest()
+
+
+def _lasting(request: Request, name: str) -> dict[str, str]:
+    """Return for how long a browser may keep a file: for ever, where its address says which version it is."""
+    fits = request.query_params.get("v") == _stamp(name)
+    return {"cache-control": "public, max-age=31536000, immutable" if fits else "no-cache"}
+
+
+@cache
+def _page(name: str) -> bytes:
+    """Return a page, with the player in its place and a version in the address of each script."""
+    text = resources.files("crashhunt.dashboard").joinpath("static", f"{name}.html").read_text(encoding="utf-8")
+    text = text.replace("<!--PLAYER-->", player_parts().controls)
+    for asset in (*_assets(), "plotly.js"):
+        text = text.replace(f'"/static/{asset}"', f'"/static/{asset}?v={_stamp(asset)}"')
+    return text.encode()

@@ -1,0 +1,152 @@
+"""Finds the hunts below the folders that the user named, and gives each an identifier for links.
+
+No path of a request reaches the file system: a request names an identifier, and the catalog knows its folder. A hunt is
+listed only if its files lie inside one of the named folders after all symbolic links are resolved.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import threading
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.hunts import is_hunt
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+__all__ = ["Catalog", "Found", "is_inside", "outside_link"]
+
+_DEPTH = 4  # of hunts below a named folder: a folder of suites has DIR/SUITE/ID/RUN
+_MAX_FOLDERS = 20_000  # looked into; a home folder may have millions
+_SCAN_EVERY_S = 1.0
+_SHARE_OF_TIME = 0.05  # that looking for hunts may take
+_SKIPPED = frozenset({"__pycache__", "node_modules", "site-packages", layout.CRASHES, layout.SNAPSHOTS, *layout.BESIDE})
+_OWN_FILES = (
+    layout.HUNT, layout.LEDGER, f"{layout.LEDGER}-wal", f"{layout.LEDGER}-shm", layout.REQUEST, layout.CRASHES,
+    *layout.BESIDE, layout.SNAPSHOTS, layout.RUN_LOG, layout.ERROR_LOG,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A hunt that was found.
+
+    Args:
+        id: of it in links: 16 hexadecimal digits that depend on its path only.
+        path: of its folder, resolved.
+        root: the named folder that it lies in.
+        name: its path below that folder, or the folder's own name.
+        suite: the folder that it shares with other hunts, below the named one; empty for none.
+        exported: whether it was unpacked from a file that ``crashhunt export`` wrote.
+    """
+
+    id: str
+    path: Path
+    root: Path
+    name: str
+    suite: str
+    exported: bool = False
+
+
+class Catalog:
+    """The hunts below some folders; they are looked for again while requests come.
+
+    Args:
+        roots: the folders, which exist.
+        exported: unpacked exports, by the name of the file.
+    """
+
+    def __init__(self, roots: Sequence[Path], exported: dict[str, Path] | None = None) -> None:
+        self.roots = tuple(dict.fromkeys(root.resolve() for root in roots))
+        self._exported = dict(exported or {})
+        self._found: dict[str, Found] = {}
+        self._due = 0.0
+        self._lock = threading.Lock()
+        self.is_cut = False
+
+    def hunts(self) -> dict[str, Found]:
+        """Return the hunts by identifier, in the order of the named folders."""
+        with self._lock:
+            began = time.monotonic()
+            if began >= self._due:
+                self._found = {found.id: found for found in self._scan()}
+                ended = time.monotonic()
+                self._due = ended + max(_SCAN_EVERY_S, (ended - began) / _SHARE_OF_TIME)
+            return self._found
+
+    def find(self, identifier: str) -> Found | None:
+        """Return a hunt by its identifier; None where it is unknown, or its folder is gone."""
+        found = self._found.get(identifier) or self.hunts().get(identifier)
+        return found if found is not None and found.path.is_dir() else None
+
+    def _scan(self) -> Iterator[Found]:
+        for name, path in self._exported.items():
+            place = path.resolve()
+            yield Found(id=_identifier(path, name), path=place, root=place, name=name, suite="", exported=True)
+        self.is_cut = False
+        seen: set[Path] = set()
+        for root in self.roots:
+            for path in self._below(root):
+                if path not in seen:
+                    seen.add(path)
+                    below = path.relative_to(root)
+                    suite = below.parent.as_posix()
+                    name = below.as_posix() if path != root else root.name or str(root)
+                    suite = "" if suite == "." else suite
+                    yield Found(id=_identifier(path), path=path, root=root, name=name, suite=suite)
+
+    def _below(self, root: Path) -> Iterator[Path]:
+        """Yield the folders of hunts, parents before children; a hunt has no hunts inside."""
+        folders, looked = [(root, 0)], 0
+        while folders:
+            folder, depth = folders.pop(0)
+            looked += 1
+            if looked > _MAX_FOLDERS:
+                self.is_cut = True
+                return
+            if is_hunt(folder):
+                yield folder
+                continue
+            if depth < _DEPTH:
+                folders += [(path, depth + 1) for path in self._folders_in(folder)]
+
+    def _folders_in(self, folder: Path) -> list[Path]:
+        try:
+            with os.scandir(folder) as entries:
+                names = sorted(entry.name for entry in entries if entry.is_dir())
+        except OSError:
+            return []
+        wanted = (name for name in names if name[0] != "." and layout.REPLACED not in name and name not in _SKIPPED)
+        found = [(folder / name).resolve() for name in wanted]
+        return [path for path in found if is_inside(path, self.roots)]
+
+
+def is_inside(path: Path, roots: Sequence[Path]) -> bool:
+    """Whether a resolved path is one of some folders, or lies in one."""
+    return any(path == root or root in path.parents for root in roots)
+
+
+def outside_link(folder: Path, root: Path, names: Sequence[str] = _OWN_FILES) -> str:
+    """Return the name of a file of a folder that is a symbolic link out of another folder; empty for none.
+
+    Args:
+        folder: whose files are checked.
+        root: that they must lie in.
+        names: of the files; those of a hunt by default.
+    """
+    for name in names:
+        path = folder / name
+        if path.is_symlink() and not is_inside(path.resolve(), [root]):
+            return name
+    return ""
+
+
+def _identifier(path: Path, salt: str = "") -> str:
+    text = os.fsencode(str(path)) if not salt else b"export:" + os.fsencode(salt)
+    return hashlib.blake2b(text, digest_size=8).hexdigest()

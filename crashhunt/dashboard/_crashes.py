@@ -1,0 +1,265 @@
+"""The saved crashes and near misses of a hunt: what each is, and where it happened. Runs no code of a bundle."""
+
+from __future__ import annotations
+
+import math
+import shlex
+import threading
+from typing import TYPE_CHECKING, NamedTuple
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError, CrashhuntError
+from crashhunt.crashes import crash_folders, fault_of, read_bundle, signature_of
+from crashhunt.dashboard._catalog import is_inside, outside_link
+from crashhunt.dashboard._hunt import read_tail
+from crashhunt.hunts import TrialRow
+from crashhunt.ledger import Ledger, has_begun
+from crashhunt.recording import read_lanes
+from crashhunt.report import Story, player_data
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.crashes import Bundle
+    from crashhunt.dashboard._catalog import Found
+
+__all__ = ["CrashList"]
+
+_PLACES = (layout.CRASHES, layout.NEAR_MISSES)
+_FILES = (layout.CRASH, layout.LOG, layout.RUN_LOG, layout.ERROR_LOG)
+_MAX_LISTED = 2_000
+_MAX_LANES = 4_000
+_MAP_LOGS = 40  # that lanes are read from
+_GENERATIONS = 50  # of a lineage
+
+
+class _Entry(NamedTuple):
+    """A bundle, as of the time when its ``crash.json`` was written."""
+
+    written: tuple[int, int]
+    row: JsonObject
+
+
+class CrashList:
+    """The bundles of a hunt, each read once.
+
+    Args:
+        found: the hunt.
+    """
+
+    def __init__(self, found: Found) -> None:
+        self._found = found
+        self._entries: dict[str, _Entry] = {}
+        self._analysed: dict[str, tuple[tuple[int, int], JsonObject]] = {}
+        self._lanes: dict[str, list[list[float]]] = {}
+        self._lock = threading.RLock()
+        self._thread: threading.Thread | None = None
+
+    def folder(self, crash: str) -> Path | None:
+        """Return the folder of a crash or near miss by its identifier; None where there is none in this hunt."""
+        return self._folders().get(crash)
+
+    def _folders(self) -> dict[str, Path]:
+        path = self._found.path
+        found: dict[str, Path] = {}
+        for place in reversed(_PLACES):  # a crash hides a near miss of the same name
+            found |= {folder.name: folder for folder in crash_folders(path, place)}
+        return found
+
+    def rows(self) -> JsonObject:
+        """Return ``crashes``, one entry each, and ``pending``, how many are still being analysed.
+
+        Reading the log of a crash takes 50 ms and more, so a thread of its own does it.
+        """
+        with self._lock:
+            folders = self._folders()
+            rows, unknown = [], []
+            self._entries = {name: entry for name, entry in self._entries.items() if name in folders}
+            for name, folder in sorted(folders.items())[:_MAX_LISTED]:
+                row = self._row(name, folder)
+                if not row["damaged"] and not row["near_miss"] and self._is_unknown(name):
+                    unknown.append((name, folder))
+                analysed = self._analysed.get(name)
+                rows.append({**row, **(analysed[1] if analysed else {"type": None, "fault": None})})
+            if unknown and (self._thread is None or not self._thread.is_alive()):
+                self._thread = threading.Thread(target=self._analyse, args=(unknown,), daemon=True)
+                self._thread.start()
+            return {"crashes": rows, "pending": len(unknown), "count": len(folders)}
+
+    def _row(self, name: str, folder: Path) -> JsonObject:
+        written = _written(folder / layout.CRASH)
+        known = self._entries.get(name)
+        if known is not None and known.written == written:
+            return known.row
+        try:
+            row = _summary(self._read(folder))
+        except BundleError as error:
+            row = {"id": name, "damaged": str(error), "near_miss": folder.parent.name == layout.NEAR_MISSES}
+        self._entries[name] = _Entry(written, row)
+        return row
+
+    def _read(self, folder: Path) -> Bundle:
+        """Read a bundle.
+
+        Raises:
+            BundleError: it is damaged, or has links out of the hunt.
+        """
+        root = self._found.path
+        if not is_inside(folder.resolve(), [root]) or (name := outside_link(folder, root, _FILES)):
+            what = name if is_inside(folder.resolve(), [root]) else folder.name
+            raise BundleError(f"{what} is a link to a place outside of the hunt", where=str(folder))
+        return read_bundle(folder)
+
+    def _is_unknown(self, name: str) -> bool:
+        analysed = self._analysed.get(name)
+        return analysed is None or analysed[0] != self._entries[name].written
+
+    def _analyse(self, unknown: Sequence[tuple[str, Path]]) -> None:
+        for name, folder in unknown:
+            written = _written(folder / layout.CRASH)
+            said: JsonObject = {"type": None, "fault": None}
+            try:
+                bundle = self._read(folder)
+                recording = bundle.recording() if bundle.result.collision is not None else None
+                said = {
+                    "type": str(signature_of(bundle, recording)),
+                    "fault": fault_of(bundle, recording).verdict,
+                }
+            except (CrashhuntError, OSError) as error:
+                said["damaged"] = str(error)
+            with self._lock:
+                self._analysed[name] = written, said
+
+    def detail(self, crash: str) -> JsonObject | None:
+        """Return a crash for its page: the player's data, words, table, and commands; None where there is none.
+
+        Raises:
+            BundleError: it is damaged.
+        """
+        folder = self.folder(crash)
+        if folder is None:
+            return None
+        bundle = self._read(folder)
+        story = Story(bundle)
+        result, root = bundle.result, self._found.path
+        return {
+            **player_data(bundle, story),
+            "near_miss": bundle.is_near_miss,
+            "table_lines": story.table(),
+            "parameters": {agent: dict(given) for agent, given in result.spec.arguments.items()},
+            "scenario_parameters": dict(result.spec.scenario_arguments),
+            "judged": story.judgement.to_json() if story.judgement is not None else None,
+            "fault": story.fault.to_json(),
+            "run_log": read_tail(folder / layout.RUN_LOG, root),
+            "error_log": read_tail(folder / layout.ERROR_LOG, root),
+            "lineage": self._lineage(result.spec.number),
+            "commands": _commands(root, crash, bundle),
+            "path": str(folder),
+        }
+
+    def _lineage(self, number: int) -> list[list[object]]:
+        """Return the trials that a trial was made from: number, origin and danger."""
+        path = self._found.path / layout.LEDGER
+        if not has_begun(path):
+            return []
+        found: list[list[object]] = []
+        ledger = Ledger(path, read_only=True)
+        try:
+            data = ledger.plain_trial(number)
+            while data is not None and len(found) < _GENERATIONS:
+                row = TrialRow(data)
+                if row.parent is None or row.parent >= row.number:
+                    break
+                data = ledger.plain_trial(row.parent)
+                if data is not None:
+                    parent = TrialRow(data)
+                    found.append([parent.number, parent.origin, parent.danger])
+        finally:
+            ledger.close()
+        return found
+
+    def log(self, crash: str) -> Path | None:
+        """Return the file of a crash's log, inside of the hunt; None where there is none."""
+        folder = self.folder(crash)
+        if folder is None:
+            return None
+        path = (folder / layout.LOG).resolve()
+        return path if is_inside(path, [self._found.path]) and path.is_file() else None
+
+    def map(self) -> JsonObject:
+        """Return the roads around the crashes, and where each crash and near miss happened.
+
+        Returns:
+            ``lanes``: for each lane, x and y of its two borders in m, right and then left. ``points``: for each crash
+            its identifier, x and y in m, type, and whether it is a near miss.
+        """
+        with self._lock:
+            rows = self.rows()["crashes"]
+            folders = self._folders()
+            for name in [row["id"] for row in rows if not row["damaged"]][:_MAP_LOGS]:
+                if name not in self._lanes and (path := self.log(name)) is not None:
+                    try:
+                        borders = read_lanes(path)
+                    except (BundleError, OSError, ValueError):
+                        borders = []
+                    self._lanes[name] = [
+                        [round(float(value), 2) for side in (right, left[::-1]) for point in side for value in point]
+                        for right, left in borders
+                        if len(right) > 1
+                    ]
+            unique = {tuple(lane): None for name in folders for lane in self._lanes.get(name, ())}
+            return {
+                "lanes": [list(lane) for lane in list(unique)[:_MAX_LANES]],
+                "points": [
+                    {name: row.get(name) for name in ("id", "x", "y", "type", "near_miss", "outcome")}
+                    for row in rows
+                    if row.get("x") is not None
+                ],
+            }
+
+
+def _written(path: Path) -> tuple[int, int]:
+    try:
+        found = path.stat()
+    except OSError:
+        return 0, 0
+    return found.st_mtime_ns, found.st_size
+
+
+def _summary(bundle: Bundle) -> JsonObject:
+    result = bundle.result
+    place = result.collision or result.event
+    x, y = (place.x, place.y) if place is not None else (math.nan, math.nan)
+    known = math.isfinite(x) and math.isfinite(y)
+    return {
+        "id": bundle.id,
+        "damaged": "",
+        "near_miss": bundle.is_near_miss,
+        "trial": result.spec.number,
+        "outcome": str(result.outcome),
+        "category": result.outcome.category,
+        "summary": result.summary,
+        "steps": result.steps,
+        "danger": result.danger,
+        "confirmed": bundle.confirmed,
+        "why_unconfirmed": bundle.why_unconfirmed,
+        "disturbed": result.disturbed,
+        "x": round(x, 2) if known else None,
+        "y": round(y, 2) if known else None,
+    }
+
+
+def _commands(hunt: Path, crash: str, bundle: Bundle) -> list[list[str]]:
+    """Return name and text of the commands for a crash, ready to be pasted into a shell."""
+    near = bundle.is_near_miss
+    words = {
+        "show": ["show", str(hunt), "--crash", crash],
+        "replay": ["replay", str(hunt), "--crash", crash],
+        **({} if near else {"judge": ["judge", str(hunt), "--crash", crash]}),
+        **({} if near else {"minimize": ["shrink", str(hunt), "--crash", crash]}),
+        "export": ["export", str(hunt), f"{crash}.zip", "--crash", crash],
+        **({} if near else {"add to corpus": ["corpus", "add", str(bundle.path), "--to", "corpus"]}),
+    }
+    return [[name, shlex.join(["crashhunt", *given])] for name, given in words.items()]

@@ -1,0 +1,127 @@
+"""What the page of one hunt shows besides its trials: settings, command, logs, workers and events."""
+
+from __future__ import annotations
+
+import re
+import socket
+import time
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.dashboard._hunt import read_tail
+from crashhunt.recording import Phase, read_header
+from crashhunt.report import UNCHOSEN, importance_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.dashboard._hunt import HuntView
+    from crashhunt.dashboard._trials import Point
+    from crashhunt.plans import HuntSettings
+    from crashhunt.trial import Value
+
+__all__ = ["detail_of", "importance_of_points"]
+
+_MAX_WORKERS = 256
+_MAX_EVENTS = 50
+_PHASES = {
+    Phase.SETUP: "sets up the simulator",
+    Phase.ACT: "the agent decides",
+    Phase.SIMULATE: "simulates",
+    Phase.DONE: "has ended",
+}
+
+
+def detail_of(view: HuntView) -> JsonObject:
+    """Return a hunt as ``/api/hunts/ID`` does: its row, and what its page shows."""
+    row = view.row()
+    settings, counts = view.settings, view.counts
+    return {
+        **row,
+        "path": str(view.path),
+        "command": _command(view.path / layout.HUNT),
+        "settings": _settings(settings) if settings is not None else {},
+        "columns": _columns(settings) if settings is not None else [],
+        "scenario_columns": list(settings.scenario_arguments) if settings is not None else [],
+        "kinds": row.get("kinds"),
+        "parts": counts.parts() if counts is not None else [],
+        "curve": counts.curve() if counts is not None else [],
+        "events": [[at, state, why] for at, state, why in view.events[-_MAX_EVENTS:]],
+        "dropped": {words: len(numbers) for words, numbers in (view.facts.get("dropped") or {}).items()},
+        "until_rate": view.facts.get("until_rate"),
+        "workers": _workers(view) if row["state"] == "running" else [],
+        "run_log": read_tail(view.path / layout.RUN_LOG, view.path),
+        "problems": view.sample.problems if view.sample is not None else [],
+    }
+
+
+def _settings(settings: HuntSettings) -> JsonObject:
+    """Return settings for people, in the words of the command line."""
+    found: JsonObject = {
+        "scenario": settings.scenario,
+        **{f"agent {name}": agent.agent for name, agent in settings.agents.items()},
+        "trials": settings.trials or "no limit",
+        "max steps": settings.max_steps,
+        "hunt seed": settings.seed,
+        "sampler": settings.sampler,
+        "counts as a crash": ", ".join(settings.crash_on_words),
+        "oracles": ", ".join(settings.oracles),
+        "disturbances": ", ".join(settings.disturb),
+        "probe": settings.probe,
+        "branch": settings.branch,
+        "seeds": settings.seeds,
+        "keep going": settings.run.keep_going,
+        "crash types wanted": settings.run.distinct,
+    }
+    return {name: value for name, value in found.items() if value not in ("", None, False, 0)}
+
+
+def _columns(settings: HuntSettings) -> list[str]:
+    """Return the arguments that may vary, by the names that points have for them."""
+    several = len(settings.agents) > 1
+    names = [
+        f"{agent}.{name}" if several else name for agent, chosen in settings.agents.items() for name in chosen.arguments
+    ]
+    return [*names, *settings.scenario_arguments]
+
+
+def _command(path: Path) -> str:
+    """Return the command line in the first line of ``hunt.toml``; empty where there is none."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            first = file.readline(20_000)
+    except OSError:
+        return ""
+    return first[2:].rstrip("\n") if first.startswith("# ") else ""
+
+
+def _workers(view: HuntView) -> list[JsonObject]:
+    """Return where each running trial is, from the header of its black box."""
+    owner = view.facts.get("owner")
+    is_here = owner is not None and owner["host"] == socket.gethostname()
+    now, found = time.monotonic(), {}  # the clock of black boxes, which counts from the start of a machine
+    for path in sorted(view.path.glob(f".scratch-*/trial-*/{layout.BLACK_BOX}"))[:_MAX_WORKERS]:
+        header = read_header(path)
+        if header is None or header.phase is Phase.DONE or not re.fullmatch(r"trial-\d+", path.parent.name):
+            continue
+        found[header.trial] = {
+            "trial": header.trial,
+            "step": max(0, header.step),
+            "doing": _PHASES[header.phase],
+            "since_s": round(max(0.0, now - header.started), 1) if is_here else None,
+        }
+    return [found[trial] for trial in sorted(found)]
+
+
+def importance_of_points(points: Sequence[Point]) -> list[JsonObject]:
+    """Return how much of the differences in criticality each argument explains, as the static report does."""
+    trials: list[tuple[Mapping[str, Value], float]] = []
+    for point in points:
+        danger = 1.0 if point["category"] != "no crash" else point["danger"]
+        if point["origin"] in UNCHOSEN and point["parent"] is None and isinstance(danger, float):
+            values = point["values"]
+            assert isinstance(values, dict)
+            trials.append((values, danger))
+    return [dict(found) for found in importance_of(trials)]

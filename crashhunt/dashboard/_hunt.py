@@ -1,0 +1,294 @@
+"""One hunt as the dashboard shows it. It is read again when its files have changed, and only what is new."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import threading
+import time
+from contextlib import suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError, HuntDirectoryError
+from crashhunt.crashes import crash_folders
+from crashhunt.dashboard._catalog import outside_link
+from crashhunt.dashboard._trials import Sample, TrialCounts
+from crashhunt.estimation import counts_suffice, rate_of_counts, rate_of_trials
+from crashhunt.hunts import HuntState, hunt_state, state_of_facts, sums_of_branches, sums_of_probes
+from crashhunt.ledger import Ledger, damaged, has_begun
+from crashhunt.plans import read_settings
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.dashboard._catalog import Found
+    from crashhunt.ledger import Facts, KindData
+    from crashhunt.plans import HuntSettings
+    from crashhunt.rates import CrashRate
+
+__all__ = ["HuntView", "read_tail"]
+
+_SPARKLINE = 48  # points of the curve in the list
+_SHARE_OF_TIME = 0.05  # that figures may take which read all trials
+_MAX_TRIALS_READ = 200_000  # for such a figure
+_TAIL = 20_000  # bytes of a log
+_DETAIL = 2_000  # characters of an error, at most
+
+_Key = tuple[object, ...]
+
+
+class HuntView:
+    """What is known of a hunt, kept between requests.
+
+    Args:
+        found: the hunt.
+    """
+
+    def __init__(self, found: Found) -> None:
+        self.found = found
+        self._lock = threading.RLock()
+        self._key: _Key = ()
+        self._replaced = 0
+        self._file: tuple[int, int] = (0, 0)
+        self._settings_key: tuple[int, int] = (0, 0)
+        self.settings: HuntSettings | None = None
+        self.facts: Facts = {}
+        self.events: list[tuple[float, str, str]] = []
+        self.counts: TrialCounts | None = None
+        self.sample: Sample | None = None
+        self._last: float | None = None
+        self._state: HuntState | None = None
+        self._copies: JsonObject = {}
+        self._copies_due = 0.0
+        self._rate: JsonObject | None = None
+        self._rate_key: object = None
+        self._rate_due = 0.0
+
+    @property
+    def path(self) -> Path:
+        """The folder of the hunt."""
+        return self.found.path
+
+    def refresh(self, *, points: bool = False) -> HuntState:
+        """Read what is new; return the state of the hunt.
+
+        Args:
+            points: whether the sample for plots is wanted as well.
+        """
+        with self._lock:
+            try:
+                return self._refresh(points=points)
+            except CrashhuntError as error:
+                self._forget()
+                return self._broken(str(error))
+            except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+                self._forget()
+                text = f"a fact cannot be read: {type(error).__name__}: {error}"
+                return self._broken(str(damaged(self.path / layout.LEDGER, text)))
+
+    def _broken(self, why: str) -> HuntState:
+        return HuntState(str(self.path), "error", why[:_DETAIL], damaged=True)
+
+    def _forget(self) -> None:
+        self._key, self.counts, self.sample = (), None, None
+
+    def _refresh(self, *, points: bool) -> HuntState:
+        if name := outside_link(self.path, self.found.root):
+            raise HuntDirectoryError(f"{name} is a link to a place outside of the folders that are shown")
+        self._read_settings()
+        ledger = self.path / layout.LEDGER
+        if not has_begun(ledger):
+            self._forget()
+            return HuntState(str(self.path), "finished") if self.found.exported else hunt_state(self.path)
+        if self.settings is None:
+            raise HuntDirectoryError(f"it has no {layout.HUNT}", fix=f"crashhunt check {self.path} says what is left")
+        key = (_sign(ledger), _sign(ledger.with_name(f"{ledger.name}-wal")))
+        if key != self._key or self.counts is None or (points and self.sample is None):
+            self._read(ledger, points=points)
+            self._key = key
+        assert self.counts is not None
+        state = state_of_facts(self.path, self.facts, dict(self.counts.outcomes), self._last)
+        saved = len(crash_folders(self.path))
+        dropped = sum(len(numbers) for numbers in (self.facts.get("dropped") or {}).values())
+        found = max(saved + dropped, self.counts.crashes)  # a bundle is written before its row
+        return replace(
+            state,
+            state="crashed" if state.state == "finished" and found else state.state,
+            crashes=found,
+            crashes_saved=saved if saved < found else None,
+            **self._copies,
+        )
+
+    def _read_settings(self) -> None:
+        path = self.path / layout.HUNT
+        try:
+            found = path.stat()
+        except OSError:
+            self.settings, self._settings_key = None, (0, 0)
+            return
+        key = found.st_mtime_ns, found.st_size
+        if key != self._settings_key:
+            self.settings = read_settings(path)
+            self._settings_key = key
+            self._forget()
+
+    def _read(self, path: Path, *, points: bool) -> None:
+        settings = self.settings
+        assert settings is not None
+        ledger = Ledger(path, read_only=True)
+        try:
+            with ledger.one_moment():
+                file = path.stat().st_ino, ledger.replaced_count()
+                if file != self._file:  # another ledger, or trials that run again
+                    self._file, self.counts, self.sample = file, None, None
+                self.facts = ledger.facts()
+                self.events = ledger.events()
+                self._last = ledger.last_ended_at()
+                if self.counts is None:
+                    self.counts = TrialCounts(settings.crash_on)
+                began = self.counts.last >= 0
+                new = self.counts.refresh(ledger)
+                if self.sample is not None and began:
+                    self.sample.add(ledger, new)
+                elif points and self.counts.last >= 0:
+                    sample = Sample(settings.crash_on)
+                    sample.begin(ledger, self.counts.last, self.counts.crashes)
+                    self.sample = sample
+                self._read_copies(ledger)
+        finally:
+            ledger.close()
+
+    def _read_copies(self, ledger: Ledger) -> None:
+        """Sum up probes and branches, which reads all trials: not more often than their share of time allows."""
+        if not self.facts.get("copies"):
+            self._copies = {}
+            return
+        began = time.monotonic()
+        is_last = self.facts.get("state") != "running"
+        if began < self._copies_due and not is_last:
+            return
+        self._copies = {"probes": sums_of_probes(ledger, self.facts), "branches": sums_of_branches(ledger, self.facts)}
+        ended = time.monotonic()
+        self._copies_due = ended + (ended - began) / _SHARE_OF_TIME
+
+    # What the pages show.
+
+    def row(self) -> JsonObject:
+        """Return the hunt as an entry of ``/api/hunts``: what ``status --json`` says, and a few keys more."""
+        with self._lock:
+            state = self.refresh()
+            settings, counts = self.settings, self.counts
+            kinds = self.kinds()
+            row: JsonObject = {
+                **state.to_json(),
+                "id": self.found.id,
+                "name": self.found.name,
+                "suite": self.found.suite,
+                "exported": self.found.exported,
+                "scenario": settings.scenario if settings else "",
+                "agents": {name: agent.agent for name, agent in settings.agents.items()} if settings else {},
+                "sampler": settings.sampler if settings else "",
+                "max_steps": settings.max_steps if settings else 0,
+                "crashed_trials": counts.crashes if counts else 0,
+                "kinds_count": len(kinds) if kinds is not None else None,
+                "rate": self.rate(state),
+                "curve": [[trials, crashes] for trials, _, crashes in counts.curve(_SPARKLINE)] if counts else [],
+                "newest_kind_at": self.facts.get("newest_kind") if kinds is not None else None,
+                "kind_firsts": self.kind_firsts(),
+                "active_at": self.active_at(),
+            }
+            return row
+
+    def kinds(self) -> list[KindData] | None:
+        """Return the crash types that the hunt has noted; None where the first crash ends it."""
+        return self.facts.get("kinds") if self.counts is not None else None
+
+    def kind_firsts(self) -> list[int]:
+        """Return the numbers of the trials with which a crash type came first, in order."""
+        found = []
+        for kind in self.kinds() or []:
+            number = str(kind.get("first", "")).partition("-")[0]
+            if number.isascii() and number.isdecimal():
+                found.append(int(number))
+        return sorted(found)
+
+    def active_at(self) -> float:
+        """Return when something happened last, in s since the epoch; 0 where that is unknown."""
+        times = [self._last or 0.0, self.facts.get("heartbeat", 0.0), self.facts.get("began", 0.0)]
+        if self.counts is None:
+            with suppress(OSError):
+                times.append(self.path.stat().st_mtime)
+        return max(times)
+
+    def rate(self, state: HuntState) -> JsonObject | None:
+        """Return the rate per trial as ``rate --json`` does; None where there is no trial, or it is not known yet."""
+        settings, counts = self.settings, self.counts
+        if settings is None or counts is None or not counts.trials:
+            return None
+        if counts_suffice(settings, self.facts):
+            key = counts.prefix
+            if key != self._rate_key:
+                found = rate_of_counts(self.path, settings, self.facts, **key._asdict())
+                self._rate, self._rate_key = _rate_data(found), key
+            return self._rate
+        return self._rate_of_all(state, settings, counts)
+
+    def _rate_of_all(self, state: HuntState, settings: HuntSettings, counts: TrialCounts) -> JsonObject | None:
+        """Measure a rate that needs all trials, within its share of time."""
+        if counts.trials > _MAX_TRIALS_READ:
+            why = f"it reads all trials, of which there are more than {_MAX_TRIALS_READ:,}"
+            return {"why_not": f"{why}; run: {shlex.join(['crashhunt', 'rate', str(self.path)])}"}
+        began = time.monotonic()
+        key = (self._key, counts.trials)
+        if key != self._rate_key and (began >= self._rate_due or state.state != "running"):
+            ledger = Ledger(self.path / layout.LEDGER, read_only=True)
+            try:
+                found = rate_of_trials(self.path, settings, self.facts, ledger.plain_results())
+                self._rate, self._rate_key = _rate_data(found), key
+            except HuntDirectoryError as error:
+                self._rate, self._rate_key = {"why_not": str(error)}, key
+            finally:
+                ledger.close()
+            ended = time.monotonic()
+            self._rate_due = ended + (ended - began) / _SHARE_OF_TIME
+        return self._rate
+
+
+def _rate_data(rate: CrashRate) -> JsonObject:
+    """Return what the page needs of a rate, under the keys of ``rate --json``."""
+    data = rate.to_json()
+    names = ("per", "confidence", "method", "units", "crashes", "estimate", "certain", "why_not", "left_out")
+    return {name: data[name] for name in names}
+
+
+def _sign(path: Path) -> tuple[int, int, int]:
+    """Return what changes when a file does."""
+    try:
+        found = path.stat()
+    except OSError:
+        return 0, 0, 0
+    return found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def read_tail(path: Path, root: Path, most: int = _TAIL) -> str:
+    """Return the end of a text file, from the beginning of a line; empty where it is missing or outside of a folder.
+
+    Args:
+        path: of the file.
+        root: that it must lie in, after links are resolved.
+        most: bytes.
+    """
+    resolved = path.resolve()
+    if root not in resolved.parents:
+        return ""
+    try:
+        with resolved.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - most))
+            text = file.read(most).decode("utf-8", "replace")
+    except OSError:
+        return ""
+    return text if size <= most else text.partition("\n")[2]

@@ -1,0 +1,243 @@
+"""Refuses requests that are not the user's, before anything is read for them.
+
+The page shows files of this machine, so other sites in the same browser, and other users of the network, are kept out:
+
+- The name in the Host header must be ours. A site that lets its own name point to this machine (DNS rebinding) sends
+  its own name.
+- Without a loopback address, a token is needed. It is compared in constant time, and kept in a cookie that scripts
+  cannot read and other sites cannot send.
+- Requests of other sites are refused by the headers Sec-Fetch-Site and Origin, which scripts cannot set.
+- Sizes are bounded, and so is the number of requests at a time.
+- Each answer forbids scripts, styles, connections and frames that are not ours.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import socket
+from http.cookies import CookieError, SimpleCookie
+from typing import TYPE_CHECKING, Final
+from urllib.parse import parse_qsl, urlencode, urlsplit
+
+from starlette.responses import JSONResponse, RedirectResponse, Response
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+__all__ = ["MAX_BODY", "MAX_HEADERS", "MAX_REQUESTS", "MIN_TOKEN", "Guard", "is_loopback", "names_of"]
+
+MAX_TARGET: Final = 4_096
+"""Characters of path and query, at most."""
+MAX_BODY: Final = 16_384
+"""Bytes of a request's body, at most."""
+MAX_HEADERS: Final = 16_384
+"""Bytes of a request's headers, at most."""
+MAX_REQUESTS: Final = 64
+"""Requests at a time, at most."""
+MIN_TOKEN: Final = 16
+"""Characters of a token that the user chooses, at least."""
+
+_COOKIE = "crashhunt-token"
+_POLICY = (
+    "default-src 'none'; script-src 'self'; connect-src 'self'; img-src 'self' data: blob:; "
+    # plotly sets styles from its script. No text of a hunt becomes markup, so no style of a stranger gets in.
+    "style-src 'self' 'unsafe-inline'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_HEADERS = {
+    b"content-security-policy": _POLICY.encode(),
+    b"x-content-type-options": b"nosniff",
+    b"x-frame-options": b"DENY",
+    b"referrer-policy": b"no-referrer",
+    b"cross-origin-opener-policy": b"same-origin",
+    b"cross-origin-resource-policy": b"same-origin",
+    b"permissions-policy": b"camera=(), microphone=(), geolocation=()",
+}
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host to listen on can be reached from this machine only."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def names_of(host: str) -> frozenset[str]:
+    """Return the names that a request may call this machine by, besides any IP address.
+
+    Args:
+        host: to listen on.
+    """
+    names = {"localhost", host.lower()}
+    if not is_loopback(host):
+        names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
+    return frozenset(names)
+
+
+class Guard:
+    """Passes on the requests of the user, and refuses all others.
+
+    Args:
+        app: that answers requests.
+        host: that the server listens on.
+        token: that every request needs; empty for none.
+        control: whether requests may ask for more than to read.
+    """
+
+    def __init__(self, app: ASGIApp, *, host: str, token: str = "", control: bool = False) -> None:
+        self._app = app
+        self._names = names_of(host)
+        self._addresses = not is_loopback(host)  # by which other machines may call this one
+        self._token = token.encode()
+        self._control = control
+        self._requests = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        if scope["type"] != "http":
+            return  # uvicorn refuses the handshake of a web socket
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                given = message.setdefault("headers", [])
+                there = {name.lower() for name, _ in given}
+                message["headers"] = [*given, *((k, v) for k, v in _HEADERS.items() if k not in there)]
+            await send(message)
+
+        headers = _Headers(scope["headers"])
+        refusal = self._refusal(scope, headers)
+        if refusal is not None:
+            await refusal(scope, receive, send_with_headers)
+            return
+        self._requests += 1
+        try:
+            if self._requests > MAX_REQUESTS:
+                busy = _refused(503, f"more than {MAX_REQUESTS} requests at a time", "try again in a second")
+                await busy(scope, receive, send_with_headers)
+                return
+            await self._app(scope, _bounded(receive), send_with_headers)
+        finally:
+            self._requests -= 1
+
+    def _refusal(self, scope: Scope, headers: _Headers) -> Response | None:
+        if len(scope.get("raw_path") or b"") + len(scope["query_string"]) > MAX_TARGET:
+            return _refused(414, "the address is too long", f"give at most {MAX_TARGET} characters")
+        if headers.size > MAX_HEADERS:
+            return _refused(431, "the headers are too large", f"send at most {MAX_HEADERS} bytes")
+        host = headers.only("host")
+        if host is None or not self._is_ours(host):
+            fix = "open the address that crashhunt dashboard printed"
+            return _refused(421, "the Host header names another machine", fix)
+        if (length := headers.only("content-length")) is not None and not _is_small(length):
+            return _refused(413, "the request is too large", f"send at most {MAX_BODY} bytes")
+        reads = scope["method"] in ("GET", "HEAD")
+        if not reads and not (self._control and scope["method"] == "POST"):
+            return _refused(405, "the dashboard only reads", "start it with --allow-control to control hunts")
+        if self._is_foreign(scope, headers, host):
+            return _refused(403, "another site sent this request", "open the page itself")
+        return self._without_token(scope, headers) if self._token else None
+
+    def _is_ours(self, host: str) -> bool:
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        if name in self._names:
+            return True
+        try:
+            address = ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return self._addresses or address.is_loopback
+
+    def _is_foreign(self, scope: Scope, headers: _Headers, host: str) -> bool:
+        """Whether another site sent a request that is more than a link to a page."""
+        is_page = scope["method"] in ("GET", "HEAD") and not scope["path"].startswith("/api")
+        site = headers.only("sec-fetch-site")
+        if site in ("cross-site", "same-site") and not (is_page and headers.only("sec-fetch-mode") == "navigate"):
+            return True
+        origin = headers.only("origin")
+        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+            return True
+        # A form of another site cannot set this header, and a script of it would have to ask first.
+        return scope["method"] == "POST" and headers.only("x-crashhunt") != "1"
+
+    def _without_token(self, scope: Scope, headers: _Headers) -> Response | None:
+        """Return the answer to a request without the token; None where the request has it."""
+        query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True, max_num_fields=100)
+        given = [value for name, value in query if name == "token"]
+        if given and self._fits(given[-1]) and scope["method"] in ("GET", "HEAD"):
+            rest = urlencode([(name, value) for name, value in query if name != "token"])
+            # One slash: two would be the address of another machine.
+            path = "/" + scope["path"].lstrip("/\\")
+            answer = RedirectResponse(f"{path}?{rest}" if rest else path, status_code=303)
+            answer.set_cookie(_COOKIE, self._token.decode(), httponly=True, samesite="strict", path="/")
+            return answer
+        kind, _, bearer = (headers.only("authorization") or "").partition(" ")
+        if kind.lower() == "bearer" and self._fits(bearer.strip()):
+            return None
+        if self._fits(_cookie(headers)):
+            return None
+        return _refused(401, "the token is missing or wrong", "open the address that crashhunt dashboard printed")
+
+    def _fits(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode("utf-8", "surrogateescape"), self._token)
+
+
+class _Headers:
+    """The headers of a request, of which none counts that is there twice."""
+
+    def __init__(self, raw: Iterable[tuple[bytes, bytes]]) -> None:
+        self._found: dict[str, list[str]] = {}
+        self.size = 0
+        for name, value in raw:
+            self.size += len(name) + len(value)
+            self._found.setdefault(name.decode("latin-1").lower(), []).append(value.decode("latin-1"))
+
+    def only(self, name: str) -> str | None:
+        """Return the value of a header; None where it is missing or there twice."""
+        values = self._found.get(name, ())
+        return values[0] if len(values) == 1 else None
+
+
+def _cookie(headers: _Headers) -> str:
+    try:
+        found = SimpleCookie(headers.only("cookie") or "").get(_COOKIE)
+    except CookieError:
+        return ""
+    return found.value if found is not None else ""
+
+
+def _is_small(length: str) -> bool:
+    return length.isascii() and length.isdecimal() and len(length) < 10 and int(length) <= MAX_BODY
+
+
+def _bounded(receive: Receive) -> Receive:
+    """Return what ends a body that is longer than it may be, also where its length is not given."""
+    taken = 0
+
+    async def bounded() -> Message:
+        nonlocal taken
+        message = await receive()
+        taken += len(message.get("body", b""))
+        if taken > MAX_BODY:
+            return {"type": "http.disconnect"}
+        return message
+
+    return bounded
+
+
+def _refused(status: int, message: str, fix: str) -> Response:
+    """Return an error in the shape of every command's ``--json``."""
+    return JSONResponse(
+        {"error": {"message": message, "fix": fix, "where": ""}}, status, headers={"cache-control": "no-store"}
+    )

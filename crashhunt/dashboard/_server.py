@@ -1,0 +1,189 @@
+"""Runs the server of the dashboard until Ctrl-C."""
+
+from __future__ import annotations
+
+import errno
+import importlib.util
+import os
+import secrets
+import socket
+import sys
+import threading
+import webbrowser
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+from crashhunt.base.errors import UsageError
+from crashhunt.base.text import near_path
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+__all__ = ["Address", "has_dashboard", "serve"]
+
+_EXTRA = ("starlette", "uvicorn", "plotly")
+_TRIED_PORTS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """Where the dashboard is.
+
+    Args:
+        host: that the server listens on.
+        port: likewise.
+        token: that requests need; empty for none.
+    """
+
+    host: str
+    port: int
+    token: str = ""
+
+    @property
+    def url(self) -> str:
+        """The link to open."""
+        host = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(self.host, self.host)
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.port}/" + (f"?token={quote(self.token, safe='')}" if self.token else "")
+
+
+def serve(
+    paths: Sequence[Path],
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8642,
+    token: str = "",
+    browser: bool = True,
+    allow_control: bool = False,
+    announce: Callable[[Address], None],
+) -> None:
+    """Serve the dashboard until an interrupt.
+
+    Args:
+        paths: hunts, suites, folders with hunts below them, or files that ``crashhunt export`` wrote.
+        host: to listen on.
+        port: likewise; 0 for any that is free.
+        token: that requests need; a random one where it is empty and the host is no loopback address.
+        browser: whether to open a browser where there is one.
+        allow_control: whether the page may stop hunts and start commands.
+        announce: called with the address once it can be opened.
+
+    Raises:
+        UsageError: a path does not exist, the port is taken, the token is short, or the extra is missing.
+    """
+    if missing := _missing():
+        raise UsageError(f"the dashboard needs {', '.join(missing)}", fix="run: pip install 'crashhunt[dashboard]'")
+    from crashhunt.dashboard._application import make_application
+    from crashhunt.dashboard._catalog import Catalog
+    from crashhunt.dashboard._security import MIN_TOKEN, is_loopback
+    from crashhunt.dashboard._serving import run_server
+
+    if token and (len(token) < MIN_TOKEN or not (token.isascii() and token.isprintable() and " " not in token)):
+        raise UsageError(
+            f"--token has {len(token)} characters (allowed: at least {MIN_TOKEN}, printable ASCII without spaces)",
+            fix="give a longer one, or none for a random one",
+        )
+    if not token and not is_loopback(host):
+        token = secrets.token_urlsafe(24)
+    with ExitStack() as opened:
+        folders, exported = _roots(paths, opened)
+        listening = opened.enter_context(_listen(host, port))
+        address = Address(host, listening.getsockname()[1], token)
+        application = make_application(Catalog(folders, exported), host=host, token=token, allow_control=allow_control)
+        opened.callback(application.close)
+        run_server(application.asgi, listening, lambda: _begin(address, announce, browser=browser))
+
+
+def has_dashboard() -> bool:
+    """Whether what the dashboard needs is installed; imports nothing of it."""
+    return not _missing()
+
+
+def _missing() -> list[str]:
+    return [name for name in _EXTRA if importlib.util.find_spec(name) is None]
+
+
+def _begin(address: Address, announce: Callable[[Address], None], *, browser: bool) -> None:
+    announce(address)
+    if browser and _has_screen():
+        # In a thread of its own, because a browser may take seconds to start.
+        threading.Thread(target=_open, args=(address.url,), daemon=True).start()
+
+
+def _open(url: str) -> None:
+    with suppress(webbrowser.Error, OSError):
+        webbrowser.open(url)
+
+
+def _has_screen() -> bool:
+    """Whether a browser with a window could be opened; one in the terminal would take the terminal."""
+    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _roots(paths: Sequence[Path], opened: ExitStack) -> tuple[list[Path], dict[str, Path]]:
+    """Return the folders to look into, and the folders of unpacked exports by the name of the file."""
+    folders: list[Path] = []
+    exported: dict[str, Path] = {}
+    for path in paths:
+        if path.is_dir():
+            folders.append(path)
+        elif path.is_file():
+            from crashhunt.crashes import open_archive
+
+            exported[path.name] = opened.enter_context(open_archive(path)).directory
+        else:
+            raise UsageError(
+                f"{str(path)!r} does not exist",
+                fix=f"{near_path(path, '.zip')}give a folder of hunts, or a file that crashhunt export wrote",
+            )
+    return folders, exported
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """Return a socket that listens.
+
+    Raises:
+        UsageError: the port is taken, not allowed or out of range, or the host is not one of this machine.
+    """
+    if not 0 <= port < 65536:
+        raise UsageError(f"--port is {port} (allowed: 0 to 65535)", fix="give a port in that range")
+    try:
+        family, _, _, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except (OSError, UnicodeError) as error:
+        raise UsageError(f"--host {host!r} is not known ({error})", fix="give an address of this machine") from None
+    try:
+        return _bound(family, target)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            free = _next_free(family, target)
+            fix = f"give --port {free}, which is free" if free else "give another --port"
+            raise UsageError(f"port {port} of {host} is taken", fix=fix) from None
+        if error.errno == errno.EACCES:
+            raise UsageError(f"port {port} needs privileges", fix="give a --port from 1024 to 65535") from None
+        raise UsageError(f"cannot listen on {host} port {port}: {error.strerror}", fix="give another --host") from None
+
+
+def _bound(family: int, target: tuple[object, ...]) -> socket.socket:
+    found = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # of a dashboard that ended a moment ago
+        found.bind(target)
+        found.listen(128)
+    except BaseException:
+        found.close()
+        raise
+    return found
+
+
+def _next_free(family: int, target: tuple[object, ...]) -> int:
+    """Return the next port above that is free; 0 where none is near."""
+    host, port, *rest = target
+    assert isinstance(port, int)
+    for number in range(port + 1, min(port + _TRIED_PORTS, 65536)):
+        with suppress(OSError):
+            _bound(family, (host, number, *rest)).close()
+            return number
+    return 0

@@ -1,0 +1,59 @@
+/* The page of one crash: the player of the report, and what is said of the crash. */
+import { $, copyButton, get, make, mayControl, onScheme, poll, post, setText, tell } from "/static/common.js";
+
+const [, , ID, , CRASH] = location.pathname.split("/"), API = `/api/hunts/${ID}/crashes/${CRASH}`;
+$("hunt").href = `/hunts/${ID}`;
+
+function facts(crash) {
+  const lineage = crash.lineage.map(([number, origin, danger]) => `trial ${number} (${origin || "no strategy"}${danger === null ? "" : `, criticality ${danger.toFixed(2)}`})`);
+  const fault = crash.fault?.findings?.map((one) => `${one.rule}: ${one.words} (${one.source})`) ?? [];
+  return [["arguments", crash.arguments], ...(lineage.length ? [["made from", lineage.join(", ")]] : []), ...Object.entries(crash.facts), ...(fault.length ? [["rules", fault.join("\n")]] : []), ["folder", crash.path]];
+}
+
+async function begin() {
+  let crash;
+  try { crash = await get(API, { always: true }); } catch (error) {
+    setText($("title"), decodeURIComponent(CRASH));
+    tell(error.message ?? String(error));
+    document.body.dataset.complete = "true";
+    return;
+  }
+  document.title = `${crash.id} - crashhunt`;
+  setText($("title"), crash.id);
+  setText($("summary"), crash.summary);
+  for (const id of ["player", "about", "more"]) $(id).hidden = false;
+  await window.load(crash);
+  $("words").replaceChildren(...window.paragraphs(crash.words));
+  $("facts").replaceChildren(...facts(crash).flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
+  $("commands").replaceChildren(...crash.commands.flatMap(([name, command]) => [make("span", name), make("code", command), copyButton(command, name)]));
+  $("log").href = `${API}/log`;
+  $("export").href = `${API}/export`;
+  setText($("steps"), crash.table_lines.join("\n"));
+  const output = [crash.run_log, crash.error_log].filter((text) => text).join("\n");
+  $("logs").hidden = !output;
+  setText($("output"), output);
+  window.show(crash);
+  window.addEventListener("resize", window.draw);
+  onScheme(window.draw);
+  document.body.dataset.complete = "true";
+}
+/* With --allow-control: commands for the crash, one after the other on the server. */
+async function control() {
+  if (!(await mayControl())) return;
+  $("control").hidden = false;
+  const refresh = async () => {
+    const found = await get(`${API}/jobs`);
+    if (!found) return;
+    $("jobs").replaceChildren(...found.jobs.flatMap((job) => {
+      const said = job.state === "ended" ? `ended with exit code ${job.exit_code}` : job.state, output = make("pre", job.output, "log", { tabindex: "0", role: "region", "aria-label": `Output of ${job.name}` });
+      return [make("p", `${job.name}: ${said}`), ...(job.output ? [output] : [])];
+    }));
+  };
+  for (const button of document.querySelectorAll("[data-job]")) {
+    button.onclick = async () => {
+      try { await post(`${API}/jobs/${button.dataset.job}`); await refresh(); } catch (error) { tell(error.message); }
+    };
+  }
+  poll(refresh, 1500);
+}
+begin().then(control);

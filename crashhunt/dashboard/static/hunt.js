@@ -1,0 +1,486 @@
+/* The page of one hunt. */
+import { $, PALETTE, Refused, copyButton, count, css, draw, get, interval, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, spelled, tell } from "/static/common.js";
+
+const ID = location.pathname.split("/")[2], API = `/api/hunts/${ID}`;
+const COLORS = { "traffic crash": "--crash", "traffic event": "--crash", "software fault": "--fault", "no crash": "--fine" };
+let hunt = null, crashes = [], points = [], cursor = "", units = {}, road = null, shares = { share: 1, crash_share: 1 };
+const byNumber = new Map(), brushes = new Map();
+
+/* The choices are in the address, so that a reload or a link shows the same. */
+const words = new URLSearchParams(location.search);
+const CHOICES = { over: "0", across: "", up: "", colour: "outcome", "crash-filter": "", near: "", density: "" };
+const chosen = Object.fromEntries(Object.entries(CHOICES).map(([name, usual]) => [name, words.get(name) ?? usual]));
+function choose(name, value) {
+  chosen[name] = value;
+  const kept = new URLSearchParams(Object.entries(chosen).filter(([key, now_]) => now_ && now_ !== CHOICES[key]));
+  history.replaceState(null, "", kept.size ? `?${kept}` : location.pathname);
+}
+
+function table(columns, lines, name) {
+  const made = make("table"), head = make("thead"), body = make("tbody"), top = make("tr");
+  made.append(make("caption", name, "sr"));
+  for (const [label, kind] of columns) top.append(make("th", label, kind === "number" ? "number" : "", { scope: "col" }));
+  head.append(top);
+  for (const cells of lines) {
+    const line = make("tr");
+    cells.forEach((cell, place) => {
+      const [label, kind] = columns[place], data = make("td", undefined, kind === "number" ? "number" : "", { "data-label": label });
+      data.append(cell instanceof Node ? cell : String(cell ?? ""));
+      line.append(data);
+    });
+    body.append(line);
+  }
+  made.append(head, body);
+  return made;
+}
+/* A part of the page is made again only where what it shows is another. */
+const shown = new Map();
+function renew(id, data, fill) {
+  const text = JSON.stringify(data);
+  if (shown.get(id) === text) return;
+  shown.set(id, text);
+  const within = $(id).contains(document.activeElement) ? document.activeElement : null, key = within?.getAttribute("href") ?? within?.textContent;
+  fill();
+  if (within) [...$(id).querySelectorAll("a, button")].find((node) => (node.getAttribute("href") ?? node.textContent) === key)?.focus();
+}
+
+function link(crash, text) { return make("a", text ?? crash, "", { href: `/hunts/${ID}/crashes/${encodeURIComponent(crash)}` }); }
+
+function showHunt() {
+  document.title = `${hunt.name} - crashhunt`;
+  setText($("title"), hunt.name);
+  setText($("state"), hunt.exported ? "exported" : hunt.state);
+  $("state").className = `state ${hunt.state}`;
+  const agents = Object.entries(hunt.agents).map(([id, agent]) => `${id}: ${agent}`).join(", ");
+  setText($("subtitle"), [hunt.scenario && `scenario ${hunt.scenario}`, agents, hunt.sampler && `sampler ${hunt.sampler}`].filter((part) => part).join("; "));
+  const problems = [hunt.detail, ...hunt.problems].filter((part) => part);
+  $("detail").hidden = !problems.length;
+  setText($("detail"), problems.join("\n"));
+  $("progress").hidden = !hunt.trials_planned || hunt.state !== "running";
+  $("progress").value = hunt.trials_planned ? hunt.trials_run / hunt.trials_planned : 0;
+  const rate = hunt.rate, newest = hunt.newest_kind_at;
+  const tiles = [
+    ["trials", hunt.trials_planned ? `${count(hunt.trials_run)} of ${count(hunt.trials_planned)}` : count(hunt.trials_run)],
+    ["crashed trials", count(hunt.crashed_trials)],
+    ...(hunt.kinds_count === null ? [] : [["crash types", count(hunt.kinds_count)]]),
+    ...(newest ? [["since the last new type", seconds(Math.max(0, now() - newest))]] : []),
+    ["trials/s", hunt.rate_per_s ? hunt.rate_per_s.toFixed(1) : "-"],
+    ...(hunt.seconds_left === null ? [] : [["time left", seconds(hunt.seconds_left)]]),
+    ...(rate?.certain ? [["crash rate per trial, certain", interval(rate)]] : []),
+    ...(rate && rate.estimate !== null && rate.estimate !== undefined ? [["crash rate per trial, estimated", rateOf(rate.estimate)]] : []),
+    ...(hunt.until_rate ? [[`bar ${hunt.until_rate.bar}`, hunt.until_rate.verdict]] : []),
+  ];
+  renew("tiles", tiles, () => $("tiles").replaceChildren(...tiles.map(([name, value]) => {
+    const tile = make("div", undefined, "card tile");
+    tile.append(make("b", value), make("span", name, "faint"));
+    return tile;
+  })));
+  if (rate?.why_not) $("tiles").title = `No estimate: ${rate.why_not}`;
+  renew("settings", hunt.settings, () => $("settings").replaceChildren(...Object.entries(hunt.settings).flatMap(([name, value]) => [make("dt", name), make("dd", value === true ? "yes" : value, "mono")])));
+  renew("command", hunt.command, () => $("command").replaceChildren(...(hunt.command ? [make("span", "command"), make("code", hunt.command), copyButton(hunt.command, "repeat this hunt")] : [make("span", "No command is known.")])));
+  $("workers-card").hidden = !hunt.workers.length && !(hunt.nodes ?? []).length;
+  renew("workers", hunt.workers, () => $("workers").replaceChildren(...(hunt.workers.length ? [table([["Trial", "number"], ["Step", "number"], ["Doing"], ["Since", "number"]], hunt.workers.map((one) => [count(one.trial), count(one.step), one.doing, seconds(one.since_s)]), "Running trials")] : [])));
+  renew("nodes", hunt.nodes, () => $("nodes").replaceChildren(...(hunt.nodes?.length ? [table([["Node"], ["Trials at a time", "number"], ["Trials", "number"], ["Trials/s", "number"]], hunt.nodes.map((one) => [one.name, one.parallel, count(one.trials), (one.rate_per_s ?? 0).toFixed(1)]), "Nodes")] : [])));
+  const copies = [["probes", hunt.probes], ["branches", hunt.branches]].flatMap(([name, sums]) => (sums ? Object.entries(sums).map(([key, value]) => [`${name}: ${key.replaceAll("_", " ")}`, value]) : []));
+  $("copies-card").hidden = !copies.length;
+  renew("copies", copies, () => $("copies").replaceChildren(...copies.flatMap(([name, value]) => [make("dt", name), make("dd", value ?? "-", "mono")])));
+  renew("events", hunt.events, () => $("events").replaceChildren(table([["At"], ["State"], ["Detail"]], [...hunt.events].reverse().map(([at, state, why]) => [new Date(at * 1000).toLocaleString("en-GB"), state, why]), "Events")));
+  showControl();
+  $("run-log-box").hidden = !hunt.run_log;
+  setText($("run-log"), hunt.run_log);
+}
+
+function showKinds() {
+  const kinds = hunt.kinds ?? [...Map.groupBy(crashes.filter((one) => one.type), (one) => one.type)].map(([type, members]) => ({ words: type, count: members.length, first: members[0].id, shortest: [...members].sort((a, b) => a.steps - b.steps)[0].id }));
+  const faults = new Map([...Map.groupBy(crashes.filter((one) => one.type), (one) => one.type)].map(([type, members]) => [type, [...new Set(members.map((one) => one.fault))].join(", ")]));
+  const kept = new Set(crashes.map((one) => one.id));
+  $("kinds-section").hidden = !kinds.length;
+  const lines = kinds.map((kind) => [kind.words, kind.count, kind.first, kind.shortest, faults.get(kind.words) ?? ""]);
+  renew("kinds", [lines, [...kept]], () => {
+    const named = (crash) => (kept.has(crash) ? link(crash) : crash);
+    $("kinds").replaceChildren(table([["Crash type"], ["Crashes", "number"], ["First"], ["Shortest"], ["At fault"]], lines.map(([type, number, first, shortest, fault]) => {
+      const button = make("button", type);
+      button.onclick = () => { choose("crash-filter", type); $("crash-filter").value = type; showCrashes(); $("crashes-section").scrollIntoView(); };
+      return [button, count(number), named(first), named(shortest), fault];
+    }), "Crash types"));
+  });
+}
+
+function showCrashes() {
+  $("crashes-section").hidden = !crashes.length;
+  const types = [...new Set(crashes.map((one) => one.type).filter((type) => type))].sort();
+  renew("crash-filter", types, () => {
+    const near = crashes.some((one) => one.near_miss);
+    $("crash-filter").replaceChildren(make("option", "all", "", { value: "" }), ...(near ? [make("option", "near misses", "", { value: "near misses" })] : []), ...types.map((type) => make("option", type)));
+    $("crash-filter").value = chosen["crash-filter"];
+  });
+  const filter = $("crash-filter").value;
+  const lines = crashes.filter((one) => !filter || (filter === "near misses" ? one.near_miss : one.type === filter));
+  renew("crashes", lines, () => $("crashes").replaceChildren(table([["Crash"], ["What happened"], ["Type"], ["At fault"], ["Steps", "number"], ["Confirmed"]], lines.map((one) => [
+    one.damaged && !one.summary ? one.id : link(one.id), one.damaged || one.summary, one.near_miss ? "near miss" : one.type ?? "", one.fault ?? "", one.steps === undefined ? "" : count(one.steps),
+    one.near_miss ? "" : one.confirmed === true ? "yes" : one.confirmed === false ? "no: flaky" : one.why_unconfirmed || "not yet",
+  ]), "Crashes")));
+}
+
+/* Charts */
+const firstNumbers = () => (hunt.kinds ?? crashes.filter((one) => one.type).map((one) => ({ first: one.id, words: one.type }))).reduce((found, kind) => found.set(kind.words, Math.min(found.get(kind.words) ?? Infinity, Number.parseInt(kind.first, 10))), new Map());
+function drawProgress() {
+  $("progress-section").hidden = !hunt.parts.length;
+  if (!hunt.parts.length) return;
+  const bySteps = $("over").value === "1", curve = hunt.curve, at = curve.map((one) => one[bySteps ? 1 : 0]);
+  const stepsAt = (number) => {
+    let trials = 0;
+    for (let place = 0; place < hunt.parts.length; place++) {
+      const part = hunt.parts[place], inside = Object.values(part.outcomes).reduce((sum, one) => sum + one, 0);
+      if (number <= part.last) return bySteps ? curve[place][1] + (part.steps * (number - part.first + 1)) / Math.max(1, part.last - part.first + 1) : Math.min(trials + number - part.first + 1, hunt.trials_run);
+      trials += inside;
+    }
+    return at[at.length - 1];
+  };
+  const firsts = [...firstNumbers().values()].sort((a, b) => a - b);
+  const types = { x: [0], y: [0] };
+  firsts.forEach((number, place) => { types.x.push(stepsAt(number)); types.y.push(place + 1); });
+  types.x.push(at[at.length - 1]);
+  types.y.push(firsts.length);
+  const title = bySteps ? "simulated steps" : "trials";
+  draw($("discovery"), [
+    { x: at, y: curve.map((one) => one[2]), name: "crashes", mode: "lines", line: { color: css("--crash"), width: 2 } },
+    { ...types, name: "crash types", mode: "lines", yaxis: "y2", line: { color: css("--accent"), width: 2, shape: "hv", dash: "dash" } },
+  ], { xaxis: { title, rangemode: "tozero" }, yaxis: { title: "crashes", rangemode: "tozero", tickformat: ",d", nticks: 6 }, yaxis2: { title: { text: "crash types" }, overlaying: "y", side: "right", rangemode: "tozero", showgrid: false, automargin: true, ...(firsts.length < 6 ? { dtick: 1 } : { tickformat: ",d", nticks: 6 }) } },
+  `Crashes and crash types over ${title}: ${plural(hunt.crashed_trials, "crash", "crashes")}, ${plural(firsts.length, "type", "types")}`);
+  const outcomes = [...new Set(hunt.parts.flatMap((part) => Object.keys(part.outcomes)))].sort();
+  const plain = ["survived", "finished", "invalid"];
+  outcomes.sort((a, b) => plain.includes(b) - plain.includes(a));
+  const size = Math.max(1, Math.ceil(hunt.parts.length / 48)), groups = [];
+  for (let place = 0; place < hunt.parts.length; place += size) groups.push(hunt.parts.slice(place, place + size));
+  const tones = { survived: "--fine", finished: "--s0", invalid: "--line", collision: "--crash", off_road: "--ego" };
+  draw($("outcomes"), outcomes.map((outcome, place) => ({
+    type: "bar", name: spelled(outcome), x: groups.map((group) => group[0].first), width: groups.map((group) => group[group.length - 1].last - group[0].first + 1), offset: 0,
+    y: groups.map((group) => group.reduce((sum, part) => sum + (part.outcomes[outcome] ?? 0), 0)), marker: { color: css(tones[outcome] ?? PALETTE[place % PALETTE.length]) },
+  })), { barmode: "stack", bargap: 0, xaxis: { title: "trial" }, yaxis: { title: "trials" } }, `Outcomes over the hunt: ${Object.entries(hunt.outcomes).map(([name, number]) => `${name} ${number}`).join(", ")}`);
+}
+
+const about = (one) => spelled([`trial ${one.number}: ${one.outcome}`, one.danger === null ? "" : `criticality ${one.danger.toFixed(2)}`, one.origin && `from ${one.origin}`, ...Object.entries(one.values).map(([name, value]) => `${name} ${short(value)}${units[name] ? ` ${units[name]}` : ""}`)].filter((part) => part).join("\n")).replaceAll("\n", "<br>");
+function drawTrials() {
+  const measured = points.filter((one) => one.danger !== null || one.crash), origins = [...new Set(points.map((one) => one.origin))].sort();
+  $("criticality-figure").hidden = !measured.length;
+  if (measured.length) {
+    const traces = origins.map((origin, place) => {
+      const own = measured.filter((one) => one.origin === origin && !one.crash);
+      return { type: "scatter", mode: "markers", name: spelled(origin || "trials"), x: own.map((one) => one.number), y: own.map((one) => one.danger), customdata: own.map((one) => one.number), text: own.map(about), hovertemplate: "%{text}<extra></extra>", marker: { color: css(origin ? PALETTE[place % PALETTE.length] : "--fine"), size: 5, opacity: 0.6 } };
+    });
+    const crashed = measured.filter((one) => one.crash);
+    traces.push({ type: "scatter", mode: "markers", name: "crash", x: crashed.map((one) => one.number), y: crashed.map(() => 1.05), customdata: crashed.map((one) => one.number), text: crashed.map(about), hovertemplate: "%{text}<extra></extra>", marker: { color: css("--crash"), size: 7, symbol: "x-thin", line: { color: css("--crash"), width: 1.5 } } });
+    draw($("criticality"), traces, { xaxis: { title: "trial" }, yaxis: { title: "criticality", range: [-0.03, 1.1] } }, `Criticality of ${plural(measured.length, "trial", "trials")} over their numbers`);
+  }
+  $("origins-figure").hidden = origins.length < 2;
+  if (origins.length > 1) {
+    const plain = points.filter((one) => !one.crash || shares.share === 1), last = Math.max(1, ...points.map((one) => one.number)), bins = 24;
+    const counts = origins.map(() => new Array(bins).fill(0));
+    for (const one of plain) counts[origins.indexOf(one.origin)][Math.min(bins - 1, Math.floor((bins * one.number) / (last + 1)))]++;
+    const sums = counts[0].map((_, bin) => counts.reduce((sum, own) => sum + own[bin], 0));
+    draw($("origins"), origins.map((origin, place) => ({ type: "scatter", mode: "lines", stackgroup: "one", name: spelled(origin || "none"), x: counts[place].map((_, bin) => ((bin + 0.5) * last) / bins), y: counts[place].map((number, bin) => (sums[bin] ? (100 * number) / sums[bin] : 0)), line: { color: css(PALETTE[place % PALETTE.length]), width: 0.5 } })), { xaxis: { title: "trial" }, yaxis: { title: "share in %", range: [0, 100] } }, "Share of the trials that each strategy proposed");
+  }
+  const some = shares.share < 1 ? `The plots show ${count(points.length)} of ${count(hunt.trials_run)} trials: ${shares.crash_share < 1 ? "an even share of the crashes and of the others" : "all crashes, and an even share of the others"}.` : "";
+  setText($("thinned"), some);
+}
+
+const varying = () => hunt.columns.filter((name) => new Set(points.map((one) => String(one.values[name]))).size > 1);
+function drawArguments() {
+  const names = points.length ? varying() : [];
+  $("arguments-section").hidden = !points.length;
+  if (!points.length) return;
+  for (const [id, place] of [["across", 0], ["up", 1]]) {
+    const known = [...names, "criticality", "trial"];
+    renew(id, known, () => {
+      $(id).replaceChildren(...known.map((name) => make("option", units[name] ? `${name} (${units[name]})` : name, "", { value: name })));
+      $(id).value = known.includes(chosen[id]) ? chosen[id] : known[Math.min(place, known.length - 1)];
+    });
+  }
+  const valueOf = (one, name) => (name === "criticality" ? (one.crash ? 1 : one.danger) : name === "trial" ? one.number : one.values[name]);
+  const [across, up] = [$("across").value, $("up").value], byDanger = $("colour").value === "danger";
+  const titled = (name) => spelled(units[name] ? `${name} (${units[name]})` : name);
+  const axis = (name) => ({ title: titled(name), ...(points.every((one) => typeof valueOf(one, name) === "number" || valueOf(one, name) === null) ? {} : { type: "category" }) });
+  const trace = (own, more) => ({ type: "scatter", mode: "markers", x: own.map((one) => valueOf(one, across)), y: own.map((one) => valueOf(one, up)), customdata: own.map((one) => one.number), text: own.map(about), hovertemplate: "%{text}<extra></extra>", ...more });
+  const traces = byDanger
+    ? [trace(points, { name: "criticality", showlegend: false, marker: { size: 6, color: points.map((one) => (one.crash ? 1 : one.danger ?? 0)), cmin: 0, cmax: 1, colorscale: "Cividis", colorbar: { title: { text: "criticality" }, thickness: 12 } } })]
+    : Object.keys(COLORS).reverse().map((category) => [category, points.filter((one) => one.category === category)]).filter(([, own]) => own.length).map(([category, own]) => trace(own, { name: category, marker: { color: css(COLORS[category]), size: category === "no crash" ? 5 : 8, opacity: category === "no crash" ? 0.55 : 0.95, symbol: category === "no crash" ? "circle" : category === "software fault" ? "diamond" : "x" } }));
+  draw($("scatter"), traces, { xaxis: axis(across), yaxis: axis(up) }, `${plural(points.length, "trial", "trials")} by ${across} and ${up}, coloured by ${byDanger ? "criticality" : "outcome"}`);
+  drawParallel(names);
+}
+
+/* Parallel coordinates on a canvas: those of plotly need WebGL and a script made from text, which the page forbids. */
+const parallel = { names: [], axes: new Map(), drag: null };
+function drawParallel(names) {
+  $("parallel-figure").hidden = names.length < 2;
+  if (names.length < 2) return;
+  const canvas = $("parallel"), ratio = devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
+  canvas.width = Math.round(width * ratio);
+  canvas.height = Math.round(height * ratio);
+  const context = canvas.getContext("2d"), top = 34, bottom = height - 22, left = 34, right = width - 34;
+  context.scale(ratio, ratio);
+  parallel.names = names;
+  parallel.axes = new Map(names.map((name, place) => {
+    const values = points.map((one) => one.values[name]).filter((value) => value !== undefined), numeric = values.every((value) => typeof value === "number");
+    const known = numeric ? [] : [...new Set(values.map(String))].sort();
+    const low = numeric ? values.reduce((a, b) => Math.min(a, b)) : 0, high = numeric ? values.reduce((a, b) => Math.max(a, b)) : known.length - 1;
+    const number = (value) => (value === undefined ? null : numeric ? value : known.indexOf(String(value)));
+    return [name, { x: left + ((right - left) * place) / (names.length - 1), low, high, numeric, known, number, y: (value) => bottom - ((bottom - top) * (value - low)) / (high - low || 1), value: (y) => low + ((high - low) * (bottom - y)) / (bottom - top) }];
+  }));
+  const kept = (one) => [...brushes].every(([name, [from, to]]) => {
+    const axis = parallel.axes.get(name), value = axis?.number(one.values[name]);
+    return axis === undefined || (value !== null && value >= from && value <= to);
+  });
+  const inside = points.filter(kept), faint = css("--line");
+  const stroke = (own, color, alpha, thick) => {
+    context.strokeStyle = color;
+    context.globalAlpha = alpha;
+    context.lineWidth = thick;
+    for (const one of own) {
+      context.beginPath();
+      let down = false;
+      for (const axis of parallel.axes.values()) {
+        const index = [...parallel.axes.values()].indexOf(axis), value = axis.number(one.values[names[index]]);
+        if (value === null) { down = false; continue; }
+        context[down ? "lineTo" : "moveTo"](axis.x, axis.y(value));
+        down = true;
+      }
+      context.stroke();
+    }
+  };
+  const every = Math.max(1, Math.ceil(inside.length / 1500)), calm = inside.filter((one) => !one.crash);
+  if (brushes.size) stroke(points.filter((one) => !kept(one)).slice(0, 400), faint, 0.6, 1);
+  stroke(calm.filter((_, place) => place % every === 0), css("--fine"), calm.length > 300 ? 0.25 : 0.5, 1);
+  stroke(inside.filter((one) => one.crash), css("--crash"), 0.8, 1.3);
+  context.globalAlpha = 1;
+  context.font = "12px system-ui";
+  for (const [name, axis] of parallel.axes) {
+    context.strokeStyle = css("--faint");
+    context.lineWidth = 1;
+    context.beginPath();
+    context.moveTo(axis.x, top);
+    context.lineTo(axis.x, bottom);
+    context.stroke();
+    context.fillStyle = css("--text");
+    context.textAlign = axis.x < left + 20 ? "left" : axis.x > right - 20 ? "right" : "center";
+    const at = context.textAlign === "left" ? 4 : context.textAlign === "right" ? width - 4 : axis.x;
+    const place = names.indexOf(name);
+    context.fillText(name, at, place % 2 ? 12 : 12, (right - left) / Math.max(1, names.length - 1) - 6);
+    context.fillStyle = css("--faint");
+    context.fillText(axis.numeric ? short(axis.high) : axis.known[axis.known.length - 1], at, top - 6);
+    context.fillText(axis.numeric ? short(axis.low) : axis.known[0], at, height - 6);
+    if (brushes.has(name)) {
+      const [from, to] = brushes.get(name);
+      context.fillStyle = css("--accent");
+      context.globalAlpha = 0.35;
+      context.fillRect(axis.x - 6, axis.y(to), 12, Math.max(3, axis.y(from) - axis.y(to)));
+      context.globalAlpha = 1;
+    }
+  }
+  const crashed = inside.filter((one) => one.crash).length;
+  setText($("brushed"), brushes.size ? `${plural(inside.length, "trial", "trials")} in these ranges, ${count(crashed)} crashed. Click an axis to remove its range.` : "Drag along an axis to keep the trials in a range, or set the ranges below.");
+  renew("ranges", names.map((name) => [name, parallel.axes.get(name).low, parallel.axes.get(name).high, brushes.get(name) ?? null]), () => {
+    if ($("ranges").contains(document.activeElement)) return shown.delete("ranges");
+    $("ranges").replaceChildren(...names.filter((name) => parallel.axes.get(name).numeric).map((name) => {
+      const axis = parallel.axes.get(name), box = make("fieldset"), given = brushes.get(name) ?? [axis.low, axis.high];
+      box.append(make("legend", name));
+      const inputs = ["from", "to"].map((side, place) => {
+        const label = make("label", `${side} `), input = make("input", undefined, "", { type: "number", step: "any" });
+        input.value = Number(given[place].toPrecision(6));
+        input.onchange = () => {
+          const [from, to] = inputs.map((one) => Number(one.value));
+          if (from <= axis.low && to >= axis.high) brushes.delete(name); else brushes.set(name, [from, to]);
+          drawParallel(parallel.names);
+        };
+        label.append(input);
+        box.append(label);
+        return input;
+      });
+      return box;
+    }));
+    return undefined;
+  });
+}
+{
+  const canvas = $("parallel"), at = (event) => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+  canvas.onpointerdown = (event) => {
+    const [x, y] = at(event), near = [...parallel.axes].sort((a, b) => Math.abs(a[1].x - x) - Math.abs(b[1].x - x))[0];
+    if (!near || Math.abs(near[1].x - x) > 40) return;
+    parallel.drag = { name: near[0], axis: near[1], from: y };
+    brushes.delete(near[0]);
+    canvas.setPointerCapture(event.pointerId);
+  };
+  canvas.onpointermove = (event) => {
+    if (!parallel.drag) return;
+    const { name, axis, from } = parallel.drag, y = at(event)[1];
+    if (Math.abs(y - from) > 3) brushes.set(name, [axis.value(y), axis.value(from)].sort((a, b) => a - b));
+    drawParallel(parallel.names);
+  };
+  canvas.onpointerup = canvas.onpointercancel = () => { parallel.drag = null; drawParallel(parallel.names); };
+}
+
+/* A trial that was chosen: its crash, or how to run its arguments again. */
+function pick(number) {
+  const crash = crashes.find((one) => one.trial === number && !one.near_miss) ?? crashes.find((one) => one.trial === number);
+  if (crash) { location.href = link(crash.id).href; return; }
+  const one = byNumber.get(number), panel = $("picked");
+  panel.hidden = false;
+  if (!one) { panel.replaceChildren(make("p", `Trial ${number} is not in the plots. Run: crashhunt trials ${quoted(hunt.path)}`)); return; }
+  const run = ["crashhunt", "run", "again", "0", "100", String(hunt.max_steps), "--scenario", hunt.scenario];
+  const agents = Object.entries(hunt.agents), scenario = new Set(hunt.scenario_columns);
+  for (const [id, agent] of agents) run.push("--agent", agents.length > 1 ? `${id}=${agent}` : agent);
+  for (const [name, value] of Object.entries(one.values)) run.push(scenario.has(name) ? "--set" : "--arg", `${name}=${value}`);
+  if (hunt.settings.disturbances) run.push("--disturb", hunt.settings.disturbances);
+  const command = run.map(quoted).join(" "), box = make("div", undefined, "command");
+  box.append(make("span", "run its arguments again, with other seeds"), make("code", command), copyButton(command, `the arguments of trial ${number}`));
+  const facts = make("dl");
+  facts.append(...[["outcome", one.outcome], ["steps", one.steps], ["criticality", one.danger ?? "-"], ["least time to collision", one.ttc === null ? "-" : `${one.ttc.toFixed(2)} s`], ["came from", [one.origin, one.parent === null ? "" : `trial ${one.parent}`].filter((part) => part).join(", ") || "-"], ...Object.entries(one.values).map(([name, value]) => [name, `${short(value)}${units[name] ? ` ${units[name]}` : ""}`])].flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
+  panel.replaceChildren(make("h3", `Trial ${number}`), facts, box);
+  panel.scrollIntoView({ block: "nearest" });
+}
+
+/* Where the crashes were */
+function drawMap() {
+  $("where-section").hidden = !road || !road.points.length;
+  if ($("where-section").hidden) return;
+  const x = [], y = [];
+  for (const lane of road.lanes) {
+    for (let place = 0; place < lane.length; place += 2) { x.push(lane[place]); y.push(lane[place + 1]); }
+    x.push(lane[0], null);
+    y.push(lane[1], null);
+  }
+  const crashed = road.points.filter((one) => !one.near_miss), near = road.points.filter((one) => one.near_miss), types = [...new Set(crashed.map((one) => one.type ?? one.outcome))].sort();
+  $("near-box").hidden = !near.length;
+  const traces = [{ type: "scatter", mode: "lines", x, y, fill: "toself", fillcolor: css("--road"), line: { color: css("--mark"), width: 1 }, hoverinfo: "skip", showlegend: false }];
+  if ($("density").checked && crashed.length > 1) traces.push({ type: "histogram2dcontour", x: crashed.map((one) => one.x), y: crashed.map((one) => one.y), colorscale: [[0, "rgba(0,0,0,0)"], [1, css("--crash")]], opacity: 0.5, showscale: false, hoverinfo: "skip", ncontours: 8, line: { width: 0 } });
+  const dots = (own, more) => ({ type: "scatter", mode: "markers", x: own.map((one) => one.x), y: own.map((one) => one.y), customdata: own.map((one) => one.id), text: own.map((one) => spelled(`${one.id}: ${one.type ?? one.outcome}`)), hovertemplate: "%{text}<extra></extra>", ...more });
+  types.forEach((type, place) => traces.push(dots(crashed.filter((one) => (one.type ?? one.outcome) === type), { name: spelled(type), marker: { color: place ? css(PALETTE[place % PALETTE.length]) : css("--crash"), size: 10, symbol: ["circle", "square", "diamond", "triangle-up", "cross"][place % 5], line: { color: css("--card"), width: 1 } } })));
+  if ($("near").checked && near.length) traces.push(dots(near, { name: "near misses", marker: { color: css("--faint"), size: 8, symbol: "circle-open" } }));
+  draw($("map"), traces, { xaxis: { title: "x in m", showgrid: false, zeroline: false }, yaxis: { title: "y in m", scaleanchor: "x", showgrid: false, zeroline: false }, dragmode: "pan" }, `Map of ${plural(crashed.length, "crash", "crashes")}`);
+}
+function zoomMap(factor) {
+  const { xaxis, yaxis } = $("map")._fullLayout, scaled = (range) => { const middle = (range[0] + range[1]) / 2; return range.map((end) => middle + (end - middle) * factor); };
+  Plotly.relayout($("map"), factor ? { "xaxis.range": scaled(xaxis.range), "yaxis.range": scaled(yaxis.range) } : { "xaxis.autorange": true, "yaxis.autorange": true });
+}
+$("zoom-in").onclick = () => zoomMap(0.6);
+$("zoom-out").onclick = () => zoomMap(1 / 0.6);
+$("zoom-all").onclick = () => zoomMap(0);
+
+/* With --allow-control: a second click stops the hunt, as Ctrl-C does. */
+let controls = false;
+mayControl().then((allowed) => { controls = allowed; if (hunt) showControl(); }).catch(() => {});
+function showControl() { $("control").hidden = !(controls && hunt.state === "running"); }
+$("stop").onclick = async () => {
+  if ($("stop").dataset.asked !== "true") {
+    $("stop").dataset.asked = "true";
+    $("stop").textContent = "Click again to stop the hunt";
+    return;
+  }
+  $("stop").dataset.asked = "false";
+  $("stop").textContent = "Stop the hunt";
+  try {
+    await post(`${API}/stop`);
+    setText($("stopped"), "The hunt is ending. Its command resumes it.");
+  } catch (error) { setText($("stopped"), error.message); }
+};
+
+/* Live */
+const loaded = window.Plotly ? Promise.resolve() : new Promise((resolve) => { document.querySelector('script[src^="/static/plotly.js"]').addEventListener("load", resolve); });
+let bound = false;
+function bind() {
+  if (bound || !$("scatter").on) return;
+  bound = true;
+  for (const id of ["scatter", "criticality"]) $(id).on?.("plotly_click", (event) => { const number = event.points[0]?.customdata; if (number !== undefined) pick(number); });
+  $("map").on?.("plotly_click", (event) => { const crash = event.points.find((one) => one.customdata)?.customdata; if (crash) location.href = link(crash).href; });
+}
+function drawAll() {
+  if (!hunt || !window.Plotly) return;
+  drawProgress();
+  drawTrials();
+  drawArguments();
+  drawMap();
+  bind();
+}
+async function showWeights() {
+  const found = await get(`${API}/importance`);
+  if (!found) return;
+  units = found.units;
+  $("weights-figure").hidden = !found.importance.length;
+  $("weights").replaceChildren(...found.importance.flatMap(({ name, share, low, high }) => {
+    const box = make("div", undefined, "weight"), bar = make("div", undefined, "bar"), span = make("div", undefined, "span"), percent = (value) => (100 * value).toFixed(0);
+    bar.style.width = `${100 * share}%`;
+    span.style.left = `${100 * low}%`;
+    span.style.width = `${100 * (high - low)}%`;
+    box.append(bar, span);
+    return [make("span", name), box, make("span", `${percent(share)} % (${percent(low)} to ${percent(high)} %)`)];
+  }));
+}
+let trialsSeen = -1, crashesSeen = "", mapSeen = "";
+async function refresh() {
+  let data;
+  try { data = await get(API); } catch (error) {
+    if (error instanceof Refused && error.status === 404) { setText($("state"), "gone"); $("state").className = "state error"; }
+    throw error;
+  }
+  if (data) {
+    hunt = data;
+    showHunt();
+    showKinds();
+  }
+  if (!hunt) return;
+  let changed = Boolean(data);
+  if (hunt.trials_run !== trialsSeen || hunt.damaged) {
+    const found = await get(`${API}/trials?since=${cursor}`, { always: true });
+    if (found.replace) { points = []; byNumber.clear(); }
+    points.push(...found.points);
+    for (const one of found.points) byNumber.set(one.number, one);
+    cursor = found.cursor;
+    shares = found;
+    trialsSeen = hunt.trials_run;
+    changed = true;
+  }
+  const key = `${hunt.crashes} ${hunt.state} ${hunt.trials_run}`;
+  if (key !== crashesSeen) {
+    const found = await get(`${API}/crashes`);
+    if (found) {
+      crashes = found.crashes;
+      setText($("pending"), found.pending ? `${plural(found.pending, "crash is", "crashes are")} still being analysed` : "");
+      if (!found.pending) crashesSeen = key;
+      showCrashes();
+      showKinds();
+      changed = true;
+    } else crashesSeen = key;
+    const saved = crashes.map((one) => `${one.id} ${one.type}`).join();
+    if (saved && saved !== mapSeen) {
+      road = (await get(`${API}/map`)) ?? road;
+      mapSeen = saved;
+    }
+  }
+  if (changed) {
+    await loaded;
+    drawAll();
+  }
+  document.body.dataset.complete = "true";
+}
+let weighedAt = 0;
+async function turn() {
+  await refresh();
+  /* Reads nothing but the sample; often enough for a figure that changes slowly. */
+  if (hunt && points.length >= 40 && now() - weighedAt > (weighedAt ? 30 : 0)) {
+    weighedAt = now();
+    await showWeights();
+    drawArguments();
+  }
+}
+for (const id of ["over", "across", "up", "colour", "crash-filter"]) {
+  if (CHOICES[id]) $(id).value = chosen[id];
+  $(id).onchange = () => { choose(id, $(id).value); if (id === "crash-filter") showCrashes(); else drawAll(); };
+}
+for (const id of ["density", "near"]) {
+  $(id).checked = chosen[id] === "1";
+  $(id).onchange = () => { choose(id, $(id).checked ? "1" : ""); drawMap(); };
+}
+$("pick").onsubmit = (event) => { event.preventDefault(); pick(Number($("trial-number").value)); };
+window.addEventListener("resize", () => { if (hunt && points.length) drawParallel(parallel.names); });
+onScheme(drawAll);
+poll(turn, 2000);

@@ -1,0 +1,204 @@
+"""Whose code an exception comes from: the simulator's, a user's environment or oracle, or crashhunt's own."""
+
+from __future__ import annotations
+
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from crashhunt.base import layout
+from crashhunt.base.boundaries import Boundary, ForeignError, Party, is_ours
+from crashhunt.base.capabilities import supports
+from crashhunt.base.errors import CrashhuntError, InternalError
+from crashhunt.base.exceptions import format_error, in_words, is_users
+from crashhunt.oracles import Finding
+from crashhunt.simulators import RunsForeignCode
+from crashhunt.world import Scene
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+    from crashhunt.simulators import Simulator
+
+__all__ = [
+    "Blame",
+    "blame",
+    "guarded_check",
+    "guarded_reset",
+    "guarded_scene",
+    "guarded_step",
+    "has_users_code",
+    "internal_error",
+    "party_of_simulator",
+]
+
+_RESOURCES: Final = (OSError, MemoryError)
+_MAX_CAUSES: Final = 16
+_MAX_FRAMES: Final = 2_000
+_REPORT: Final = "report it with the output of the same command with CRASHHUNT_TRACEBACK=1: {}"
+_ISSUES: Final = "https://github.com/crashhunt/crashhunt/issues"
+
+
+@dataclass(frozen=True, slots=True)
+class Blame:
+    """The party that an exception comes from.
+
+    Args:
+        error: The exception itself, without its wrapper.
+        party: Whose code raised it.
+        place: What that code was called for; empty if it is not known.
+        is_resource: Whether memory or files ran out in crashhunt's own code, so that the party is not known.
+    """
+
+    error: BaseException
+    party: Party
+    place: str = ""
+    is_resource: bool = False
+
+
+def party_of_simulator(simulator: Simulator) -> Party:
+    """Return whose code a simulator runs: that of an environment, or of a simulator."""
+    return simulator.party if supports(simulator, RunsForeignCode) else Party.SIMULATOR
+
+
+def blame(error: BaseException, simulator: Simulator, place: str = "") -> Blame:
+    """Return whose code an exception comes from that is not an agent's.
+
+    The wrapper of a boundary says it. Without a wrapper the exception is crashhunt's own. Two kinds are not: an error
+    that an adapter raises on purpose (`SimulatorError`), and an error that has come through `foreign_packages`.
+
+    Args:
+        error: The exception.
+        simulator: The simulator of the episode.
+        place: What the simulator was called for, if it was called.
+    """
+    if type(error) is ForeignError:
+        return Blame(error.error, error.party, error.place)
+    if issubclass(type(error), CrashhuntError) and not issubclass(type(error), InternalError):
+        return Blame(error, party_of_simulator(simulator), place)
+    if supports(simulator, RunsForeignCode) and _has_passed(error, simulator.foreign_packages):
+        return Blame(error, Party.SIMULATOR, place)
+    if has_users_code(error):
+        # No boundary was passed: a signal handler, a finalizer, or a function that replaces another.
+        party = party_of_simulator(simulator)
+        is_agents = party is Party.SIMULATOR and is_ours(simulator)
+        return Blame(error, Party.AGENT if is_agents else party, place)
+    return Blame(error, Party.CRASHHUNT, place, is_resource=issubclass(type(error), _RESOURCES))
+
+
+def has_users_code(error: BaseException) -> bool:
+    """Whether an exception, or what led to it, has come through code that is neither crashhunt's nor a library's."""
+    seen: set[int] = set()
+    left: list[BaseException | None] = [error]
+    while left and len(seen) < _MAX_CAUSES:
+        one = left.pop()
+        if one is None or id(one) in seen:
+            continue
+        seen.add(id(one))
+        left += (one.__cause__, one.__context__)
+        link, frames = one.__traceback__, 0
+        while link is not None and frames < _MAX_FRAMES:
+            if is_users(link.tb_frame.f_code.co_filename):
+                return True
+            link, frames = link.tb_next, frames + 1
+    return False
+
+
+def _has_passed(error: BaseException, packages: Sequence[str]) -> bool:
+    """Whether an exception is of a class of one of these packages, or has come through code of them."""
+    modules: set[object] = {type.__dict__["__module__"].__get__(type(error))}
+    link: TracebackType | None = error.__traceback__
+    while link is not None:
+        modules.add(link.tb_frame.f_globals.get("__name__"))
+        link = link.tb_next
+    return any(isinstance(name, str) and name.partition(".")[0] in packages for name in modules)
+
+
+# What foreign code returns is checked inside its boundary: otherwise crashhunt's own code would fail over it.
+
+
+def guarded_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the reset of a foreign simulator inside a boundary."""
+
+    def checked(**given: object) -> tuple[dict[str, NDArray[Any]], object]:
+        observations, info = reset(**given)
+        return _arrays(observations), info
+
+    return Boundary(Party.SIMULATOR, "reset").around(checked)
+
+
+def guarded_step(step: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return the step of a foreign simulator inside a boundary."""
+
+    def checked(actions: object) -> tuple[object, ...]:
+        observations, rewards, terminations, truncations, infos = step(actions)
+        _arrays(observations)
+        for reward in rewards.values():
+            float(reward)
+        dict(terminations), dict(truncations)
+        return observations, rewards, terminations, truncations, infos
+
+    return Boundary(Party.SIMULATOR, "step").around(checked)
+
+
+def guarded_scene(scene: Callable[[], Any]) -> Callable[[], Scene]:
+    """Return the method ``scene`` of a foreign simulator inside a boundary."""
+
+    def checked() -> Scene:
+        found = scene()
+        if not isinstance(found, Scene):
+            raise TypeError(f"scene() returned a {type(found).__name__}; it must return a Scene")
+        return found
+
+    return Boundary(Party.SIMULATOR, "scene").around(checked)
+
+
+def guarded_check(check: Callable[..., Any]) -> Callable[..., Sequence[Finding]]:
+    """Return the check of a user's oracle inside a boundary."""
+
+    def checked(scene: Scene, agents: Sequence[str]) -> Sequence[Finding]:
+        found = list(check(scene, agents) or ())
+        for one in found:
+            if not isinstance(one, Finding):
+                raise TypeError(f"check() returned a {type(one).__name__}; it must return a list of Finding")
+        return found
+
+    return Boundary(Party.ORACLE, "check").around(checked)
+
+
+def _arrays(observations: Any) -> dict[str, NDArray[Any]]:
+    for name, array in observations.items():
+        if not isinstance(array, np.ndarray):
+            raise TypeError(f"the observation of {name} is a {type(array).__name__}; it must be a NumPy array")
+    found: dict[str, NDArray[Any]] = observations
+    return found
+
+
+def internal_error(error: BaseException, trial: int | None = None, steps: int | None = None) -> InternalError:
+    """Return the error that ends a hunt because crashhunt itself failed.
+
+    Args:
+        error: The exception.
+        trial: Number of the trial; None if it is not known.
+        steps: Number of steps that were complete, -1 for the set-up; None if it is not known.
+    """
+    if type(error) is InternalError:
+        return error
+    frames = [
+        frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(str(layout.PACKAGE))
+    ]
+    where = ""
+    if frames:
+        where = f"{Path(frames[-1].filename).relative_to(layout.PACKAGE.parent)}:{frames[-1].lineno}"
+    when = "" if steps is None else f" after {steps} steps" if steps >= 0 else " while the episode was being set up"
+    trial_words = "" if trial is None else f" in trial {trial}{when}"
+    message = f"crashhunt itself failed{trial_words}: {in_words(error)}"
+    fault = InternalError(message, fix=_REPORT.format(_ISSUES), where=where)
+    fault.traceback = format_error(error) or message
+    return fault

@@ -1,0 +1,271 @@
+"""Pairs of hunts that run, read as they grow, and what a gate reports of them.
+
+A gate compares two versions, BASE and HEAD, in pairs of trials with the same number, seed, traffic and disturbances.
+Its pairs are in one order that does not depend on results: hunt after hunt, and in each by number. So `PairWatch` may
+decide after any pair, whatever the number of workers.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from contextlib import closing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.base.errors import HuntDirectoryError
+from crashhunt.base.json_types import finite_values
+from crashhunt.estimation._comparison import why_unpaired
+from crashhunt.hunts import counting_rule
+from crashhunt.ledger import Ledger, has_begun
+from crashhunt.plans import read_settings
+from crashhunt.rates import PairSequence, PairTest, facts_of_plain
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.rates import CrashRate, Interval, Pair, PairVerdict, PairWatch, TrialFacts
+
+__all__ = ["GateCase", "GateReport", "PairedHunts", "ScenarioCounts"]
+
+_FAILED = ("no_valid_trial", "error")
+
+
+@dataclass(frozen=True, slots=True)
+class GateCase:
+    """What became of a case of HEAD's corpus.
+
+    Args:
+        name: of its folder.
+        expected: ``still`` or ``fixed``.
+        got: ``still``, ``fixed``, ``changed`` or ``cannot_run``.
+        now: the result in words.
+    """
+
+    name: str
+    expected: str
+    got: str
+    now: str
+
+    @property
+    def has_come_back(self) -> bool:
+        """Whether it has to stay fixed, and crashes."""
+        return self.expected == "fixed" and self.got in ("still", "changed")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScenarioCounts:
+    """The pairs of one hunt of BASE and HEAD.
+
+    Args:
+        name: of the hunt: its id and run in the suite, or the scenario.
+        pairs: that count.
+        only_base: of them, in which only BASE crashes.
+        only_head: in which only HEAD does.
+        both: in which both do.
+        invalid: pairs with an invalid trial, which leave both sides.
+    """
+
+    name: str
+    pairs: int
+    only_base: int
+    only_head: int
+    both: int
+    invalid: int = 0
+
+    def to_json(self) -> JsonObject:
+        """Return plain data."""
+        return {
+            "name": self.name, "pairs": self.pairs, "only_base": self.only_base, "only_head": self.only_head,
+            "both": self.both, "invalid": self.invalid,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GateReport:
+    """What a gate reports.
+
+    Args:
+        verdict: ``better``, ``worse``, ``no_difference`` or ``undecided``: of HEAD, compared with BASE.
+        base: what was compared: a commit, or an agent.
+        head: likewise.
+        pairs: that count.
+        only_base: of them, in which only BASE crashes.
+        only_head: in which only HEAD does.
+        both: in which both crash.
+        evidence: e-value that they do not crash equally often.
+        difference: interval of the difference in crashes per trial, HEAD minus BASE; None without a pair.
+        margin: the greatest difference that counts as none; 0 for no such verdict.
+        confidence: in percent, of the verdict and of the interval.
+        seed: of the hunts.
+        scenarios: the same counts for each hunt.
+        rates: of BASE and of HEAD, where there is one hunt of each that has begun.
+        corpus: the cases that were run; None where there is no corpus.
+        why: why the verdict is not that of the pairs, or why there is none; empty where nothing has to be said.
+        is_interrupted: whether a request to stop came before the end.
+        dir: where the hunts are; empty where they are not kept.
+    """
+
+    verdict: PairVerdict
+    base: str
+    head: str
+    pairs: int = 0
+    only_base: int = 0
+    only_head: int = 0
+    both: int = 0
+    evidence: float = 1.0
+    difference: Interval | None = None
+    margin: float = 0.0
+    confidence: float = 95.0
+    seed: int | None = None
+    scenarios: tuple[ScenarioCounts, ...] = ()
+    rates: tuple[CrashRate, CrashRate] | None = None
+    corpus: tuple[GateCase, ...] | None = None
+    why: str = ""
+    is_interrupted: bool = False
+    dir: str = ""
+
+    @property
+    def back(self) -> tuple[GateCase, ...]:
+        """The cases that had to stay fixed, and crash with HEAD."""
+        return tuple(case for case in self.corpus or () if case.has_come_back)
+
+    def to_json(self) -> JsonObject:
+        """Return the shape that ``gate --json`` prints; what is no finite number is null."""
+        corpus = None
+        if self.corpus is not None:
+            corpus = {
+                "ok": not self.back,
+                "cases": len(self.corpus),
+                "failed": [case.name for case in self.back],
+                "cannot_run": [case.name for case in self.corpus if case.got == "cannot_run"],
+            }
+        base, head = self.rates or (None, None)
+        return {
+            "verdict": self.verdict,
+            "pairs": self.pairs,
+            "base": None if base is None else finite_values(base.to_json()),
+            "head": None if head is None else finite_values(head.to_json()),
+            "difference": None if self.difference is None else self.difference._asdict(),
+            "corpus": corpus,
+            "compared": {"base": self.base, "head": self.head},
+            "only_base": self.only_base,
+            "only_head": self.only_head,
+            "both": self.both,
+            "evidence": self.evidence if math.isfinite(self.evidence) else None,
+            "margin": self.margin,
+            "confidence": self.confidence,
+            "seed": self.seed,
+            "scenarios": [one.to_json() for one in self.scenarios],
+            "why": self.why,
+            "interrupted": self.is_interrupted,
+            "dir": self.dir or None,
+        }
+
+
+class PairedHunts:
+    """The hunts of BASE and HEAD in one scenario, which other processes run.
+
+    Args:
+        name: of the hunt.
+        base: directory of BASE's hunt.
+        head: of HEAD's.
+        pairs: how many trials each has at most.
+    """
+
+    def __init__(self, name: str, base: Path, head: Path, pairs: int) -> None:
+        self.name, self.folders, self.most = name, (base, head), pairs
+        self._sequence: PairSequence | None = None
+        self._crash_on: tuple[str, ...] = ()
+        self._test = PairTest()
+        self._began = time.time()  # as ledgers have it
+
+    def take(self, watch: PairWatch, *, may_end: bool = True) -> None:
+        """Give the pairs that are complete by now to a watch, until one decides.
+
+        Args:
+            watch: of all pairs of the gate.
+            may_end: whether better and no difference are verdicts yet; worse always is one.
+
+        Raises:
+            HuntDirectoryError: the two hunts are not of the same traffic, or a ledger is damaged.
+        """
+        sequence = self._sequence = self._sequence or self._begun()
+        if sequence is None:
+            return
+        for pair in self._read(sequence):
+            if watch.verdict != "undecided" or sequence.position > self.most:
+                return
+            self._test.add(pair)
+            watch.test.add(pair)
+            if not self.why_not:
+                watch.decide(may_end=may_end)
+
+    @property
+    def counts(self) -> ScenarioCounts:
+        """The pairs so far."""
+        test, sequence = self._test, self._sequence
+        return ScenarioCounts(
+            name=self.name,
+            pairs=test.pairs,
+            only_base=test.only_first,
+            only_head=test.only_second,
+            both=test.both,
+            invalid=0 if sequence is None else sequence.invalid,
+        )
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all pairs have been counted."""
+        return self._sequence is not None and self._sequence.position >= self.most
+
+    @property
+    def why_not(self) -> str:
+        """Why the pairs so far say nothing; empty where they do."""
+        return "" if self._sequence is None else self._sequence.why_not
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether certainly too many pairs have an invalid trial, so that more of them change nothing.
+
+        Without any valid pair it is False: the hunt itself ends then, and reports why.
+        """
+        return self._sequence is not None and self._sequence.valid > 0 and self._sequence.is_hopeless
+
+    def failure(self) -> tuple[str, str, str] | None:
+        """Return ``base`` or ``head``, the state in which its hunt failed, and why; None where both can run.
+
+        Failures of an earlier run of the gate do not count: this run may do better.
+        """
+        for side, folder in zip(("base", "head"), self.folders, strict=True):
+            if has_begun(folder / layout.LEDGER):
+                with closing(Ledger(folder / layout.LEDGER)) as ledger:
+                    entered = [event for event in ledger.events() if event[1] != "remark"]
+                when, state, why = entered[-1] if entered else (0.0, "", "")
+                if state in _FAILED and when >= self._began:
+                    return side, state, why or "no trial is valid"
+        return None
+
+    def _begun(self) -> PairSequence | None:
+        """Return the sequence of the pairs once both hunts have begun, and see that they are of the same traffic."""
+        if not all((folder / layout.HUNT).exists() and has_begun(folder / layout.LEDGER) for folder in self.folders):
+            return None
+        base, head = (read_settings(folder / layout.HUNT) for folder in self.folders)
+        if why := why_unpaired(base, head):
+            raise HuntDirectoryError(f"the hunts of BASE and HEAD cannot be compared: {why}", where=self.name)
+        self._crash_on = tuple(map(str, base.crash_on))
+        return PairSequence((counting_rule(base, {}), counting_rule(head, {})), _is_same)
+
+    def _read(self, sequence: PairSequence) -> Iterator[Pair]:
+        for side, folder in enumerate(self.folders):
+            with closing(Ledger(folder / layout.LEDGER)) as ledger:
+                for data in ledger.plain_results_where("number >= ?", sequence.position):
+                    tags = (str(data["spec"]["seed"]),)
+                    yield from sequence.add(side, facts_of_plain(data, self._crash_on, tags))
+
+
+def _is_same(base: TrialFacts, head: TrialFacts) -> bool:
+    return base.tags == head.tags

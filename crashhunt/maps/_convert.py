@@ -1,0 +1,266 @@
+"""From a map to a network of SUMO, by netconvert or netgenerate."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import ScenarioError
+from crashhunt.maps._network import BICYCLE, CAR, PERSON, Network, read_network
+from crashhunt.maps._tools import first_error
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from crashhunt.maps._source import BBox, MapSource
+    from crashhunt.maps._tools import Tools
+
+__all__ = ["NET", "ConvertOptions", "Converted", "convert"]
+
+NET = "map.net.xml"
+_RAIL = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
+_LEFT_HAND = re.compile(rb"""\brule\s*=\s*["']LHT["']""")
+_LANELET = re.compile(rb"""\bv\s*=\s*["']lanelet["']""")
+_COMMENT = re.compile(r"<!--.*?-->\s*", re.DOTALL)
+_HEAD_BYTES = 1 << 20
+
+# From SUMO's own recommendations for imports (osmWebWizard.py): junctions of several nodes become one, ramps get
+# their acceleration lanes, and lights of one junction switch together.
+_OSM = (
+    "--geometry.remove", "--ramps.guess", "--junctions.join", "--tls.guess-signals", "--tls.discard-simple",
+    "--tls.join", "--output.street-names",
+)  # fmt: skip
+_GENERATED = ("--default.lanenumber", "2", "--default.speed", "13.89", "--tls.guess", "--no-turnarounds")
+_BLOCK_M = "150"
+_IGNORING = ("--ignore-errors", "--ignore-errors.connections")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConvertOptions:
+    """What a network is made with.
+
+    Args:
+        bbox: the part of the map, in degrees; None for all of it.
+        people: sidewalks and crossings.
+        bicycles: lanes and paths for bicycles.
+        left_hand: traffic keeps to the left.
+    """
+
+    bbox: BBox | None = None
+    people: bool = False
+    bicycles: bool = False
+    left_hand: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Converted:
+    """A network.
+
+    Args:
+        network: what it holds.
+        notes: what the user should know of how it was made.
+    """
+
+    network: Network
+    notes: tuple[str, ...]
+
+
+def convert(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> Converted:
+    """Write the network of a map as ``map.net.xml``.
+
+    Args:
+        source: a file that `check_source` has accepted, or the shape of a map.
+        options: what to make of it.
+        tools: the programs.
+        folder: into which the network is written; other files in it are left behind.
+
+    Raises:
+        ScenarioError: a program refuses the map, or the map has no road for cars.
+    """
+    notes: list[str] = []
+    if source.path is not None:
+        _bring(source.path, folder)
+        if source.kind == "opendrive" and not options.left_hand and _keeps_left(source.path):
+            options = replace(options, left_hand=True)
+            notes.append("traffic keeps to the left: the map has roads with rule LHT")
+    elif options.left_hand:
+        notes.append("traffic keeps to the left")
+    if source.kind == "net" and options == ConvertOptions():
+        (folder / _given(source)).rename(folder / f"{NET}.gz" if _is_packed(folder / _given(source)) else folder / NET)
+        _unpack(folder)
+    else:
+        notes += _make(source, options, tools, folder)
+        _strip_comment(folder / NET)
+    network = read_network(folder / NET)
+    if not network.drivable():
+        raise _no_road(source, options, tools, folder)
+    return Converted(network, tuple(notes))
+
+
+def _given(source: MapSource) -> str:
+    """The name of the map in the folder: SUMO splits names at commas and blanks, and a user's may have any."""
+    assert source.path is not None
+    lower = source.path.name.lower()
+    stem = {"osm": "given.osm", "opendrive": "given.xodr", "net": "given.net.xml"}[source.kind]
+    if lower.endswith(".pbf"):
+        return "given.osm"
+    return f"{stem}.gz" if lower.endswith(".gz") else stem
+
+
+def _bring(path: Path, folder: Path) -> None:
+    from crashhunt.maps._source import MapSource, kind_of_file
+
+    kind = kind_of_file(path)
+    assert kind is not None
+    target = folder / _given(MapSource(kind=kind, path=path))
+    if path.name.lower().endswith(".pbf"):
+        _unpack_pbf(path, target)
+    else:
+        shutil.copyfile(path, target)
+
+
+def _unpack_pbf(path: Path, target: Path) -> None:
+    """Write an OpenStreetMap PBF as XML: netconvert does not read it.
+
+    Raises:
+        ScenarioError: osmium is not installed, or the file is damaged.
+    """
+    try:
+        import osmium
+    except ImportError:
+        message = "the map is a PBF, and the package osmium is not installed"
+        raise ScenarioError(message, fix="pip install 'crashhunt[maps]'", where=str(path)) from None
+    try:
+        with osmium.SimpleWriter(str(target)) as writer:
+            for one in osmium.FileProcessor(str(path)):
+                writer.add(one)
+    except RuntimeError as error:
+        fix = "download the map again"
+        raise ScenarioError(f"osmium refuses the map: {error}", fix=fix, where=str(path)) from None
+
+
+def _keeps_left(path: Path) -> bool:
+    with path.open("rb") as file:
+        return _LEFT_HAND.search(file.read(_HEAD_BYTES)) is not None
+
+
+def _is_lanelet(path: Path) -> bool:
+    """Return whether a map without roads is one of Lanelet2, which borrows the file format of OpenStreetMap."""
+    return not _is_packed(path) and _LANELET.search(path.read_bytes()) is not None
+
+
+def _is_packed(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(2) == b"\x1f\x8b"
+
+
+def _unpack(folder: Path) -> None:
+    import gzip
+
+    packed = folder / f"{NET}.gz"
+    if packed.exists():
+        with gzip.open(packed) as read, (folder / NET).open("wb") as write:
+            shutil.copyfileobj(read, write)
+        packed.unlink()
+
+
+def _make(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> Iterator[str]:
+    """Run the program, and yield notes on what it omitted."""
+    program = "netconvert" if source.path is not None else "netgenerate"
+    words = [*_words(source, options, tools), "--output-file", NET, "--xml-validation", "never"]
+    done = tools.run(program, words, folder)
+    if done.code == 0:
+        return
+    error = first_error(done.output) or "it says no more than that"
+    if source.path is not None:
+        again = tools.run(program, [*words, *_IGNORING], folder)
+        if again.code == 0 and (folder / NET).is_file() and read_network(folder / NET).drivable():
+            count = sum(line.startswith("Error:") for line in done.output.splitlines())
+            yield (
+                f"warning: the map has {count} error{'s' * (count != 1)}, and netconvert omitted the parts that they "
+                f"concern; the first is: {error}"
+            )
+            return
+    if "o nodes loaded" in error or "o edges loaded" in error or "could not be found" in error:
+        raise _no_road(source, options, tools, folder)
+    fix = "correct the map, or choose a part of it with --bbox W,S,E,N" if source.kind == "osm" else "correct the map"
+    raise ScenarioError(f"{program} refuses the map: {error}", fix=fix, where=_where(source))
+
+
+def _where(source: MapSource) -> str:
+    return str(source.path) if source.path is not None else f"--{source.kind}"
+
+
+def _words(source: MapSource, options: ConvertOptions, tools: Tools, *, everything: bool = False) -> list[str]:
+    """Return the arguments for a map, apart from the file to write."""
+    words = _input(source, options, tools)
+    classes = [CAR, *([BICYCLE] if options.bicycles else []), *([PERSON] if options.people else [])]
+    if source.path is not None and not everything:
+        # Rails and footways that no trial uses would still bring crossings and lights.
+        words += ["--keep-edges.by-vclass", ",".join(classes)]
+    if source.path is not None:
+        words += ["--no-turnarounds.except-deadend"]
+    if source.path is not None and source.kind != "net" and not everything:
+        words += ["--keep-edges.components", "1"]  # a vehicle reaches nothing else
+    if options.bbox is not None:
+        words += ["--keep-edges.in-geo-boundary", ",".join(f"{number:.9g}" for number in options.bbox)]
+    if options.left_hand:
+        words += ["--lefthand"]
+    if options.people:
+        words += ["--sidewalks.guess", "--crossings.guess", "--walkingareas"]
+    if options.bicycles:
+        words += ["--bikelanes.guess"]
+    return words
+
+
+def _input(source: MapSource, options: ConvertOptions, tools: Tools) -> list[str]:
+    first, second = (str(number) for number in source.shape)
+    if source.kind == "grid":
+        sizes = ["--grid.x-number", first, "--grid.y-number", second]
+        return ["--grid", *sizes, "--grid.length", _BLOCK_M, "--grid.attach-length", _BLOCK_M, *_GENERATED]
+    if source.kind == "spider":
+        sizes = ["--spider.arm-number", first, "--spider.circle-number", second]
+        return ["--spider", *sizes, "--spider.space-radius", _BLOCK_M, "--spider.attach-length", _BLOCK_M, *_GENERATED]
+    if source.kind == "net":
+        return ["--sumo-net-file", _given(source)]
+    types = [f"{source.kind}Netconvert"]
+    types += [f"{types[0]}Bicycle"] * options.bicycles + [f"{types[0]}Pedestrians"] * options.people
+    files = ",".join(str(tools.home / "data" / "typemap" / f"{name}.typ.xml") for name in types)
+    if source.kind == "opendrive":
+        return ["--opendrive-files", _given(source), "--type-files", files, "--geometry.remove"]
+    more = ["--osm.sidewalks", "--osm.crossings"] * options.people + ["--osm.bike-access"] * options.bicycles
+    return ["--osm-files", _given(source), "--type-files", files, *_OSM, *more]
+
+
+def _strip_comment(path: Path) -> None:
+    """Remove the comment with date and paths of this machine, so that the same map gives the same file."""
+    text = path.read_text(encoding="utf-8")
+    begin, comment, end = text.partition("<net ")
+    path.write_text(_COMMENT.sub("", begin) + comment + end, encoding="utf-8")
+
+
+def _no_road(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> ScenarioError:
+    """Return the error about a map without a road for cars, with what the map has instead."""
+    words = [*_words(source, options, tools, everything=True), *_IGNORING, "--xml-validation", "never"]
+    (folder / NET).unlink(missing_ok=True)
+    if source.path is not None:
+        tools.run("netconvert", [*words, "--output-file", NET], folder)
+    held = read_network(folder / NET) if (folder / NET).is_file() else Network()
+    lanes = [lane for edge in held.edges.values() for lane in edge.lanes]
+    fix = "choose a map or a --bbox with streets"
+    if not lanes and source.kind == "osm" and _is_lanelet(folder / _given(source)):
+        what = "the map is in the format Lanelet2, not OpenStreetMap's"
+        fix = "export it as OpenDRIVE, or as a network of SUMO"
+    elif not lanes:
+        what = "the map has no road in this --bbox" if options.bbox else "the map has no road"
+    elif all(any(map(lane.admits, _RAIL)) and not lane.admits(PERSON) for lane in lanes):
+        what = f"the map has rails only (tracks: {len(held.edges)})"
+    elif all(lane.admits(PERSON) or lane.admits(BICYCLE) or lane.allowed == frozenset() for lane in lanes):
+        what = f"the map has only ways for pedestrians and bicycles (ways: {len(held.edges)})"
+    else:
+        classes = sorted({name for lane in lanes for name in lane.allowed or ()})
+        what = f"the map has no road for cars; its {len(held.edges)} ways are for {', '.join(classes[:5])}"
+    return ScenarioError(what, fix=fix, where=_where(source))

@@ -1,0 +1,412 @@
+"""Makes the folder of a scenario from a map, whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
+
+from crashhunt.base import layout
+from crashhunt.base.errors import HuntDirectoryError, ScenarioError, UsageError
+from crashhunt.base.files import cannot_write, is_empty_folder, sync_tree
+from crashhunt.base.git import work_tree
+from crashhunt.base.temporary import temporary_beside, temporary_folder
+from crashhunt.maps._convert import NET, ConvertOptions, convert
+from crashhunt.maps._demand import ROUTES, Demand, find_demand, route_file
+from crashhunt.maps._folder import (
+    WORKFLOW,
+    agent_module,
+    arguments_of,
+    next_commands,
+    readme,
+    scenario_toml,
+    workflow,
+)
+from crashhunt.maps._network import CAR, Network
+from crashhunt.maps._picture import draw_map
+from crashhunt.maps._plain_run import RUN_S, PlainRun, calibrate
+from crashhunt.maps._source import check_source
+from crashhunt.maps._tools import find_tools
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from crashhunt.maps._source import BBox, MapSource
+    from crashhunt.maps._tools import Tools
+
+__all__ = ["DEMAND", "MadeScenario", "MapOptions", "PlainTrial", "describe_place", "make_scenario"]
+
+DEMAND = (0.2, 1.5)
+"""The usual range of the argument ``demand``."""
+PICTURE, README, AGENT_FILE = "map.png", "README.md", "agent.py"
+_WARMUP_S = (20.0, 90.0)
+_STEPS = (300, 3000)
+_STEPS_ROUNDED = 100
+_STEP_S = 0.1
+_BUSIEST = 5
+_THIN_PER_KM = 1.0
+_KMH = 3.6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapOptions:
+    """What a scenario is made with.
+
+    Args:
+        bbox: the part of the map, in degrees; None for all of it.
+        demand: the smallest and the largest factor on the traffic.
+        people: persons walk, on sidewalks and crossings.
+        bicycles: cyclists ride.
+        left_hand: traffic keeps to the left.
+        agent: who drives; crashhunt's car-following agent by default.
+        workflow: the CI for which a workflow is written; empty for none.
+        picture: whether ``map.png`` is drawn.
+    """
+
+    bbox: BBox | None = None
+    demand: tuple[float, float] = DEMAND
+    people: bool = False
+    bicycles: bool = False
+    left_hand: bool = False
+    agent: str = ""
+    workflow: Literal["", "github"] = ""
+    picture: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlainTrial:
+    """What came of one trial in the new scenario.
+
+    Args:
+        outcome: how it ended.
+        steps: after how many steps.
+        wall_s: how long it took, in s, with the start of its processes.
+    """
+
+    outcome: str
+    steps: int
+    wall_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MadeScenario:
+    """A scenario that has been made and tried.
+
+    Args:
+        folder: of it.
+        source: the map.
+        network: what the map holds.
+        demand: its traffic.
+        plain: what the traffic did at its usual demand.
+        busy: what it did at the largest.
+        steps: a bound on trials, from the longest route.
+        notes: what the user should know.
+        trial: what came of one trial; None where none ran.
+    """
+
+    folder: Path
+    source: MapSource
+    network: Network
+    demand: Demand
+    plain: PlainRun
+    busy: PlainRun
+    steps: int
+    notes: tuple[str, ...] = ()
+    trial: PlainTrial | None = None
+    commands: list[str] = field(default_factory=list)
+
+    def to_json(self) -> dict[str, object]:
+        """Return the shape of ``crashhunt init --json``."""
+        drivable = self.network.drivable()
+        return {
+            "dir": str(self.folder),
+            "map": self.source.title,
+            "lanes_km": round(_lanes_km(self.network), 3),
+            "roads": len(drivable),
+            "junctions": sum(self.network.junctions.values()),
+            "traffic_lights": _lights(self.network),
+            "crossings": self.network.crossings,
+            "routes": len(self.demand.routes),
+            "ego_routes": len(self.demand.ego_routes),
+            "vehicles_per_hour": round(self.demand.vehicles_per_hour, 1),
+            "plain": [_run_to_json(run) for run in (self.plain, self.busy)],
+            "trial": None
+            if self.trial is None
+            else {"outcome": self.trial.outcome, "steps": self.trial.steps, "wall_s": round(self.trial.wall_s, 3)},
+            "max_steps": self.steps,
+            "notes": list(self.notes),
+            "next": self.commands,
+        }
+
+
+def _run_to_json(run: PlainRun) -> dict[str, object]:
+    return {
+        "demand": run.demand, "simulated_s": RUN_S, "wanted": run.wanted, "entered": run.entered,
+        "arrived": run.arrived, "running": run.running, "halting": run.halting, "teleports": run.teleports,
+        "collisions": run.collisions, "mean_speed_mps": run.mean_speed_mps, "persons": run.persons,
+    }  # fmt: skip
+
+
+def make_scenario(
+    source: MapSource,
+    options: MapOptions,
+    directory: Path,
+    *,
+    try_out: Callable[[Path, int], PlainTrial] | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> MadeScenario:
+    """Make the folder of a scenario from a map, and try what it made.
+
+    Args:
+        source: the map.
+        options: what to make of it.
+        directory: where the folder is to be; it must not exist, or be empty.
+        try_out: runs one trial, given the folder and a bound on its steps.
+        tell: receives in a few words what happens now.
+
+    Raises:
+        ScenarioError: the map cannot be used, with the fix.
+        HuntDirectoryError: the directory has files, or cannot be written.
+        UsageError: options that do not go with the map.
+    """
+    _check_directory(directory)
+    _check_options(source, options)
+    check_source(source)
+    tools = find_tools()
+    say = tell or (lambda _text: None)
+    target = directory.absolute()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with temporary_beside(target) as building:
+            building.mkdir(mode=0o755)
+            found = _build(source, options, tools, building, target, say)
+            if try_out is not None:
+                say("running one trial")
+                found = replace(found, trial=try_out(building, found.steps))
+            _write_texts(found, options, building, target)
+            sync_tree(building)
+            _put_in_place(building, target, directory)
+    except OSError as error:
+        raise cannot_write(directory, error) from error
+    return replace(found, folder=directory, commands=next_commands(str(directory), found.steps))
+
+
+def _check_directory(directory: Path) -> None:
+    if directory.is_symlink() or directory.exists():
+        try:
+            if is_empty_folder(directory):
+                return
+        except OSError as error:
+            raise cannot_write(directory, error) from error
+        what = "exists and is not empty" if directory.is_dir() else "exists and is not a folder"
+        raise HuntDirectoryError(what, fix="name another folder, or remove it", where=str(directory))
+
+
+def _put_in_place(building: Path, target: Path, directory: Path) -> None:
+    try:
+        if target.is_dir() and not target.is_symlink():
+            target.rmdir()
+        building.rename(target)
+    except OSError as error:
+        # Another process has made it in the meantime: its folder stays as it is.
+        if target.exists():
+            fix = "name another folder"
+            raise HuntDirectoryError("was made by another process", fix=fix, where=str(directory)) from error
+        raise
+
+
+def _check_options(source: MapSource, options: MapOptions) -> None:
+    if options.bbox is not None and source.path is None:
+        raise UsageError(f"--bbox does not go with --{source.kind}", fix="choose the size of the map instead")
+    if options.left_hand and source.kind == "net":
+        fix = "leave it out: a network keeps the side that it was made for"
+        raise UsageError("--lefthand does not go with --net", fix=fix)
+
+
+def _build(
+    source: MapSource, options: MapOptions, tools: Tools, building: Path, target: Path, say: Callable[[str], None]
+) -> MadeScenario:
+    """Write network, routes and picture into the folder."""
+    with temporary_folder("map") as work:
+        say("making the network")
+        made = convert(
+            source,
+            ConvertOptions(
+                bbox=options.bbox, people=options.people, bicycles=options.bicycles, left_hand=options.left_hand
+            ),
+            tools,
+            work,
+        )
+        say("drawing trips")
+        try:
+            demand = find_demand(made.network, tools, work, net=NET, people=options.people)
+            warmup_s = _warmup_s(demand)
+            say(f"simulating {RUN_S} s of the plain traffic")
+            arguments = arguments_of(demand, options.demand, bicycles=options.bicycles)
+            values = {argument.name: argument.default for argument in arguments}
+            low, high = options.demand
+            demand, plain, busy = calibrate(
+                demand, made.network, tools, work, values, net=NET, scales=(min(max(1.0, low), high), high),
+                probes_at_s=warmup_s, bicycles=options.bicycles,
+            )  # fmt: skip
+        except ScenarioError as error:
+            raise ScenarioError(error.message, fix=error.fix, where=error.where or source.title) from None
+        shutil.copyfile(work / NET, building / NET)
+    text = route_file(demand, made.network, bicycles=options.bicycles)
+    (building / ROUTES).write_text(text, encoding="utf-8")
+    notes = list(made.notes)
+    density = plain.running / _lanes_km(made.network)
+    if density < _THIN_PER_KM:
+        notes.append(
+            f"the traffic is thin: {density:.1f} vehicles on a km of lane, because each vehicle costs time in every "
+            "trial; a part of the map has more: --bbox W,S,E,N"
+        )
+    if options.people and not demand.walks:
+        notes.append("warning: no persons walk: the map has no connected ways for pedestrians")
+    found = MadeScenario(
+        folder=target, source=source, network=made.network, demand=demand, plain=plain, busy=busy,
+        steps=_steps(demand), notes=tuple(notes),
+    )  # fmt: skip
+    (building / layout.SCENARIO).write_text(
+        scenario_toml(
+            f"{source.name}: made from {source.title}",
+            arguments_of(demand, options.demand, bicycles=options.bicycles),
+            warmup_s=warmup_s,
+            speed_limit_mps=_speed_limit_mps(demand),
+            agent=options.agent,
+        ),
+        encoding="utf-8",
+    )
+    if options.picture:
+        _draw(found, building)
+    return found
+
+
+def _draw(found: MadeScenario, folder: Path) -> None:
+    try:
+        draw_map(
+            found.network,
+            found.busy.edge_vehicles,
+            folder / PICTURE,
+            title=f"{found.source.name}: traffic at demand {found.busy.demand:g}",
+            hours=RUN_S / 3600,
+            busiest=_busiest(found),
+        )
+    except ImportError:
+        raise ScenarioError("the picture of the map needs Pillow", fix="pip install 'crashhunt[maps]'") from None
+
+
+def _write_texts(found: MadeScenario, options: MapOptions, building: Path, target: Path) -> None:
+    """Write what describes the place, when the trial has run."""
+    (building / AGENT_FILE).write_text(agent_module(_speed_limit_mps(found.demand)), encoding="utf-8")
+    (building / README).write_text(
+        readme(
+            found.source.name, describe_place(found), demand=found.demand, steps=found.steps, run_s=RUN_S,
+            from_osm=found.source.kind == "osm", workflow_file=WORKFLOW if options.workflow else "",
+        ),
+        encoding="utf-8", errors="replace",
+    )  # fmt: skip
+    if options.workflow:
+        top = work_tree(target.parent)
+        folder = os.path.relpath(os.path.realpath(target), top) if top is not None else "."
+        file = building / WORKFLOW
+        file.parent.mkdir(parents=True)
+        file.write_text(workflow(folder, found.steps), encoding="utf-8", errors="replace")
+
+
+def _warmup_s(demand: Demand) -> float:
+    """Return how long traffic fills the roads: as long as a usual trip takes."""
+    weight = sum(route.weight for route in demand.routes)
+    low, high = _WARMUP_S
+    return round(min(max(1.2 * sum(route.free_s * route.weight for route in demand.routes) / weight, low), high))
+
+
+def _steps(demand: Demand) -> int:
+    """Return a bound on trials: twice the time of the longest route of the agent on free roads."""
+    longest = max(route.free_s for route in demand.routes if route.id in demand.ego_routes)
+    low, high = _STEPS
+    return min(max(round(2 * longest / _STEP_S / _STEPS_ROUNDED) * _STEPS_ROUNDED, low), high)
+
+
+def _speed_limit_mps(demand: Demand) -> float:
+    """Return the mean speed limit on the routes of the agent, in m/s."""
+    routes = [route for route in demand.routes if route.id in demand.ego_routes]
+    mean = sum(route.length_m for route in routes) / max(sum(route.free_s for route in routes), 0.1)
+    return float(min(max(round(mean, 1), 5.0), 40.0))
+
+
+def _busiest(found: MadeScenario) -> list[tuple[str, float]]:
+    """Return the edges with the most vehicles per hour, at most one of each street."""
+    order = sorted(found.busy.edge_vehicles.items(), key=lambda item: -item[1])
+    chosen: dict[str, tuple[str, float]] = {}
+    for name, count in order:
+        edge = found.network.edges.get(name)
+        if edge is not None and count:
+            chosen.setdefault(edge.name or name, (name, count * 3600 / RUN_S))
+        if len(chosen) == _BUSIEST:
+            break
+    return list(chosen.values())
+
+
+def _lanes_km(network: Network) -> float:
+    return sum(lane.length_m for edge in network.drivable() for lane in edge.open_lanes(CAR)) / 1000
+
+
+def _lights(network: Network) -> int:
+    return sum(count for kind, count in network.junctions.items() if kind.startswith("traffic_light"))
+
+
+def describe_place(found: MadeScenario) -> list[str]:
+    """Return what the place is, in about ten lines."""
+    network, demand, plain, busy = found.network, found.demand, found.plain, found.busy
+    drivable = network.drivable()
+    roads_km = sum(edge.length_m for edge in drivable) / 1000
+    lanes = [edge.open_lanes(CAR) for edge in drivable]
+    counts = [len(open_lanes) for open_lanes in lanes]
+    speeds = [lane.speed_mps * _KMH for open_lanes in lanes for lane in open_lanes]
+    side = "left" if network.left_hand else "right"
+    others = [f"{count} {kind.replace('_', ' ')}" for kind, count in network.junctions.most_common() if _is_plain(kind)]
+    busiest = "; ".join(
+        f"{network.edges[name].name or name} {rate:,.0f}/h" for name, rate in _busiest(found)[:3]
+    )  # fmt: skip
+    walkers = f", {len(demand.walks)} flows of persons" if demand.walks else ""
+    waits = [busy.probe_delays_s[route] for route in demand.ego_routes]
+    lines = [
+        f"map: {found.source.title}; traffic keeps to the {side}",
+        f"roads: {roads_km:,.1f} km in {len(drivable)} edges, {_lanes_km(network):,.1f} km of lanes",
+        f"lanes: {_span(counts, 'd')} per direction; speed limits {_span(speeds, '.0f')} km/h",
+        f"junctions: {sum(network.junctions.values())}: {_lights(network)} with traffic lights"
+        + "".join(f", {words}" for words in others[:3])
+        + f"; {network.crossings} pedestrian crossings",
+        f"traffic: {len(demand.routes)} routes, {demand.vehicles_per_hour:,.0f} vehicles/h at demand 1{walkers}",
+        f"at demand {plain.demand:g}: {_run_in_words(plain)}",
+        f"at demand {busy.demand:g}: {_run_in_words(busy)}",
+        f"busiest: {busiest or 'no road'}",
+        f"agent: {len(demand.ego_routes)} routes; it enters within {max(waits):.1f} s at demand {busy.demand:g}",
+    ]
+    if found.trial is not None:
+        lines.append(
+            f"one trial: {found.trial.outcome} after {found.trial.steps} steps ({found.trial.wall_s:.1f} s, "
+            "with the start of its processes)"
+        )
+    return [*lines, *(f"note: {note}" for note in found.notes)]
+
+
+def _is_plain(kind: str) -> bool:
+    return not kind.startswith("traffic_light")
+
+
+def _span(values: list[int] | list[float], form: str) -> str:
+    low, high = format(min(values), form), format(max(values), form)
+    return low if low == high else f"{low} to {high}"
+
+
+def _run_in_words(run: PlainRun) -> str:
+    teleports = f"{run.teleports} stood for 300 s" if run.teleports else "no jam"
+    collisions = f", {run.collisions} collisions among them" if run.collisions else ""
+    return (
+        f"{run.entered} of {run.wanted} vehicles entered in {RUN_S} s, {run.arrived} arrived at "
+        f"{run.mean_speed_mps:.1f} m/s on average, {teleports}{collisions}"
+    )

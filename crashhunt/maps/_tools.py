@@ -1,0 +1,124 @@
+"""The programs of the distribution eclipse-sumo: where they are, and how one of them runs."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import ScenarioError
+from crashhunt.base.processes import die_with
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["Outcome", "Tools", "find_tools", "first_error"]
+
+_TIME_LIMIT_S = 1800.0
+"""Of one program. netconvert takes 3 s for a town of 6,000 roads; a whole country is no place to hunt in."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a program did.
+
+    Args:
+        code: its exit code; 0 means success.
+        output: everything that it printed.
+    """
+
+    code: int
+    output: str
+
+
+@dataclass(frozen=True, slots=True)
+class Tools:
+    """An installation of eclipse-sumo.
+
+    Args:
+        home: the folder that SUMO's documentation calls SUMO_HOME.
+        version: of the distribution, such as ``1.28.0``.
+    """
+
+    home: Path
+    version: str
+
+    def run(self, program: str, words: Sequence[str], folder: Path) -> Outcome:
+        """Run a program to its end.
+
+        Args:
+            program: such as ``netconvert``, or a script below ``tools`` such as ``randomTrips.py``.
+            words: its arguments.
+            folder: in which it runs; names in its arguments are relative to it.
+
+        Raises:
+            ScenarioError: it cannot be started, or it takes too long.
+        """
+        command = [str(self.home / "bin" / program), *words]
+        if program.endswith(".py"):
+            command = [sys.executable, str(self.home / "tools" / program), *words]
+        # Only the child sees SUMO_HOME: libsumo of this process and of trials keeps what the user has set.
+        environment = {**os.environ, "SUMO_HOME": str(self.home), "PYTHONDONTWRITEBYTECODE": "1"}
+        log = folder / f"{program}.log"
+        try:
+            with log.open("wb") as file:
+                child = subprocess.Popen(
+                    command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=file, stderr=file,
+                    preexec_fn=partial(die_with, os.getpid()),
+                )  # fmt: skip
+                try:
+                    code = child.wait(_TIME_LIMIT_S)
+                except subprocess.TimeoutExpired:
+                    fix = "choose a smaller map, or a part of it with --bbox W,S,E,N"
+                    raise ScenarioError(f"{program} takes over {_TIME_LIMIT_S / 60:g} minutes", fix=fix) from None
+                finally:
+                    child.kill()
+                    child.wait()
+        except OSError as error:
+            fix = "install it again: pip install --force-reinstall 'crashhunt[maps]'"
+            raise ScenarioError(f"{program} cannot be started: {error.strerror}", fix=fix) from None
+        return Outcome(code, log.read_text(encoding="utf-8", errors="replace"))
+
+
+@cache
+def find_tools() -> Tools:
+    """Return the installed programs.
+
+    Raises:
+        ScenarioError: eclipse-sumo is not installed, or does not go with libsumo.
+    """
+    install = "pip install 'crashhunt[maps]'"
+    # The package is called sumo, and so is many a folder of users: only the one of the distribution has programs.
+    found = importlib.util.find_spec("sumo")
+    home = Path(found.origin).parent if found is not None and found.origin else None
+    if home is None or not (home / "bin" / "netconvert").is_file():
+        message = "a map becomes a scenario by netconvert, and the package eclipse-sumo is not installed"
+        raise ScenarioError(message, fix=install)
+    try:
+        version, simulator = metadata.version("eclipse-sumo"), metadata.version("libsumo")
+    except metadata.PackageNotFoundError as error:
+        raise ScenarioError(f"the package {error.name} is not installed", fix=install) from None
+    if _release(version) > _release(simulator):
+        # A network may hold what came with its version, and an older simulator ignores it or ends.
+        message = f"eclipse-sumo {version} is newer than libsumo {simulator}, which would read its networks"
+        raise ScenarioError(message, fix=f"pip install 'eclipse-sumo=={simulator}'")
+    return Tools(home, version)
+
+
+def _release(version: str) -> tuple[int, ...]:
+    """Return major and minor number: releases that differ in the third one have the same file formats."""
+    return tuple(int(part) for part in version.split(".")[:2] if part.isdecimal())
+
+
+def first_error(output: str) -> str:
+    """Return the first error in what a program has printed, without its prefix; empty where there is none."""
+    for line in output.splitlines():
+        if line.startswith("Error:"):
+            return line.removeprefix("Error:").strip()
+    return ""

@@ -1,0 +1,218 @@
+"""The rate of a running hunt: its certain interval after every trial, and the decision on a bar.
+
+Cost: constant for each trial. A new interval takes milliseconds, so it is made for people who watch only, in a small
+share of the time.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+
+from crashhunt.rates._units import MAX_INVALID_SHARE, RateCounter, UnitSequence, facts_of, facts_of_plain
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from crashhunt.ledger import RunningRate, UntilRate
+    from crashhunt.rates._betting import Interval, RateTest
+    from crashhunt.rates._units import CountingRule, Per, TrialFacts, Unit
+    from crashhunt.trial import TrialResult
+
+__all__ = ["BarWatch", "Paced", "RateWatch"]
+
+_SHARE_OF_TIME = 0.05  # that running intervals may take
+_LONGEST_PAUSE_S = 10.0  # the first interval takes long, because it imports SciPy
+_MOST_FACTORS = 64  # per trial there are two different units
+_EQUAL = 0.2  # relative difference from a bar that counts as none; it takes some 300 crashes to be certain of it
+
+T = TypeVar("T")
+
+
+class Paced(Generic[T]):
+    """Makes a value again once it is out of date, in a small share of the time.
+
+    Args:
+        make: makes it.
+    """
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        self._make = make
+        self._made: tuple[int, T] | None = None
+        self._due = 0.0
+
+    def __call__(self, version: int, *, now: bool = False) -> T:
+        """Return the value.
+
+        Args:
+            version: of what it is made from.
+            now: whether one that is out of date will not do.
+        """
+        began = time.monotonic()
+        if self._made is not None and (self._made[0] == version or (began < self._due and not now)):
+            return self._made[1]
+        found = self._make()
+        ended = time.monotonic()
+        self._made = version, found
+        self._due = ended + min((ended - began) / _SHARE_OF_TIME, _LONGEST_PAUSE_S)
+        return found
+
+
+class RateWatch:
+    """Counts the trials of a running hunt, and returns the certain interval at any time.
+
+    Args:
+        rule: how trials count.
+        per: what the rate is per.
+        crash_on: the outcomes that count as a crash.
+        alpha: the probability that the interval ever excludes the rate, at most.
+    """
+
+    def __init__(self, rule: CountingRule, per: Per, crash_on: Sequence[str], alpha: float = 0.05) -> None:
+        self.rule, self.per, self.alpha = rule, per, alpha
+        self._crash_on = crash_on
+        self.sequence, self.counter = UnitSequence(rule), RateCounter(rule, per)
+        self._paced: Paced[RunningRate] = Paced(self._running)
+
+    def add(self, result: TrialResult | Mapping[str, Any]) -> None:
+        """Add a trial that has ended, in any order, as a result or as a ledger has it."""
+        make = facts_of_plain if isinstance(result, dict) else facts_of
+        self.add_facts(make(result, self._crash_on))  # type: ignore[arg-type]
+
+    def add_facts(self, trial: TrialFacts) -> None:
+        """Add a trial that has ended."""
+        for unit in self.sequence.add(trial):
+            self._count(unit)
+
+    def _count(self, unit: Unit) -> tuple[float, float] | None:
+        """Count a unit; return its crashes and exposure, or None where it does not count."""
+        return self.counter.add(unit)
+
+    def interval(self) -> Interval | None:
+        """Return the certain interval; None where there is no unit, or an exposure is not known."""
+        return self.counter.interval(self.alpha)
+
+    def running(self, *, now: bool = False) -> RunningRate:
+        """Return the rate so far.
+
+        Args:
+            now: whether that of some moments ago will not do, where a new one takes too much of the time.
+        """
+        version = self.sequence.valid + self.sequence.invalid + self.sequence.not_random
+        return self._paced(version, now=now)
+
+    def _running(self) -> RunningRate:
+        counter, sequence = self.counter, self.sequence
+        why = counter.why_not or ("" if counter.units else "no trial counts yet")
+        if not why and sequence.invalid_share > MAX_INVALID_SHARE:
+            why = f"{sequence.invalid} of {sequence.invalid + sequence.valid} trials are invalid"
+        found = None if why else self.interval()
+        high = None if found is None or not math.isfinite(found.high) else found.high
+        return {
+            "method": "plain",
+            "per": self.per,
+            "confidence": 100 * (1 - self.alpha),
+            "units": counter.units,
+            "trials": counter.trials,
+            "crashes": counter.crashes,
+            "origin": self.rule.plain_origin,
+            "certain": None if found is None else {"low": found.low, "high": high},
+            "estimate": None,
+            "estimated": None,
+            "why_not": why,
+            "bar": None,
+            "verdict": "",
+        }
+
+
+class BarWatch(RateWatch):
+    """Watches a hunt until its rate is certainly below or above a bar, or until more trials are of no use.
+
+    The evidence against the bar is updated with each unit, at constant cost. Once it decides, later units do not count.
+    So any number of workers gives the same decision, the same interval and the same estimate.
+
+    The watch ends undecided where the rate certainly is within 20 % of the bar: a rate that equals the bar would never
+    be decided. It ends so too where too many trials are invalid, or where trials have no exposure.
+
+    Args:
+        rule: how trials count.
+        bar: the rate.
+        per: what it is per.
+        crash_on: the outcomes that count as a crash.
+        alpha: the probability of a wrong decision, at most.
+    """
+
+    def __init__(self, rule: CountingRule, bar: float, per: Per, crash_on: Sequence[str], alpha: float = 0.05) -> None:
+        super().__init__(rule, per, crash_on, alpha)
+        self.bar = bar
+        # Against the bar, and against the ends of what counts as equal to it.
+        self._rates = (bar, bar * (1 - _EQUAL), bar * (1 + _EQUAL))
+        self._log_capitals: list[Any] = [0.0, 0.0, 0.0]
+        self._log_factors: dict[tuple[float, float], list[Any]] = {}  # of the units so far
+        self.verdict: Literal["below", "above", "undecided"] = "undecided"
+        self.why_undecided = ""
+        self.decided_at: int | None = None
+
+    def add_facts(self, trial: TrialFacts) -> None:
+        """Add a trial that has ended."""
+        if self.decided_at is not None:
+            return
+        for unit in self.sequence.add(trial):
+            if self.sequence.hopeless_at is None:
+                self._count(unit)
+            if self.decided_at is not None or self.sequence.hopeless_at is not None:
+                break
+        if self.decided_at is None and self.sequence.hopeless_at is not None:
+            self.decided_at = self.sequence.hopeless_at
+            self.why_undecided = "too many trials are invalid, so more of them do not help"
+
+    def _count(self, unit: Unit) -> tuple[float, float] | None:
+        found = super()._count(unit)
+        test = self.counter.test
+        if self.counter.why_not:
+            self.decided_at, self.why_undecided = unit[-1].number, self.counter.why_not
+        if found is None or test is None or self.counter.why_not:
+            return found
+        for place, factors in enumerate(self._factors(found, test)):
+            self._log_capitals[place] = self._log_capitals[place] + factors
+        if self.sequence.invalid_share > MAX_INVALID_SHARE:
+            return found
+        if self._rejects(0, test):
+            self.verdict = "below" if test.events < self.bar * test.exposure else "above"
+            self.decided_at = unit[-1].number
+        elif self._is_at_bar(test):
+            self.decided_at = unit[-1].number
+            self.why_undecided = f"the rate certainly is within {_EQUAL:.0%} of the bar, so more trials do not help"
+        return found
+
+    def _factors(self, found: tuple[float, float], test: RateTest) -> list[Any]:
+        """Return the logarithms by which a unit multiplies the capitals, for the bar and its two ends."""
+        import numpy as np
+
+        factors = self._log_factors.get(found)
+        if factors is None:
+            events, exposure = found
+            factors = [np.log1p(test.bets.stakes(rate) * (events - rate * exposure)) for rate in self._rates]
+            if len(self._log_factors) < _MOST_FACTORS:
+                self._log_factors[found] = factors
+        return factors
+
+    def _rejects(self, place: int, test: RateTest) -> bool:
+        return test.bets.log_evidence(self._log_capitals[place]) >= -math.log(self.alpha)
+
+    def _is_at_bar(self, test: RateTest) -> bool:
+        _, low, high = self._rates
+        if not low * test.exposure < test.events < high * test.exposure:
+            return False
+        is_below = high >= 1 and self.per == "trial"  # no rate per trial is greater
+        return self._rejects(1, test) and (is_below or self._rejects(2, test))
+
+    def noted(self) -> UntilRate:
+        """Return what the ledger says of it."""
+        return {"bar": f"{self.bar!r}/{self.per}", "decided_at": self.decided_at, "verdict": self.verdict}
+
+    def _running(self) -> RunningRate:
+        found = super()._running()
+        found["bar"], found["verdict"] = self.bar, self.verdict
+        return found

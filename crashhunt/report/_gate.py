@@ -1,0 +1,181 @@
+"""The verdict of a gate: lines for the terminal, Markdown for a pull request, JUnit for CI, and an annotation."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree as Xml
+
+from crashhunt.base.files import whole_file
+from crashhunt.base.text import in_lines, one_line, visible
+from crashhunt.report._rate import format_interval
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from crashhunt.estimation import GateReport
+    from crashhunt.rates import CrashRate
+
+__all__ = ["describe_gate", "gate_annotations", "gate_summary", "write_gate_junit"]
+
+_SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|~])")
+_ICONS = {"better": "✅", "no_difference": "✅", "worse": "❌", "undecided": "❔"}
+
+
+def describe_gate(found: GateReport) -> str:
+    """Return a verdict for people: the answer first, then what it rests on, then the next command."""
+    lines = [_answer(found)]
+    if found.why:
+        lines.append(f"  {found.why}")
+    lines += [f"  {line}" for line in _evidence(found)]
+    if found.rates is not None:
+        lines += [f"  {name}: {_rate(rate)}" for name, rate in zip(("BASE", "HEAD"), found.rates, strict=True)]
+    if len(found.scenarios) > 1:
+        lines += [f"  {line}" for line in _scenarios(found)]
+    lines += [f"  {line}" for line in _corpus(found)]
+    if found.seed is not None:
+        lines.append(f"  seed of the hunts: {found.seed}")
+    if found.dir:
+        lines.append(f"see crashhunt compare {found.dir}")
+    return in_lines(lines)
+
+
+def _answer(found: GateReport) -> str:
+    base, head = f"BASE {found.base}", f"HEAD {found.head}"
+    if found.verdict == "worse":
+        if found.back:
+            return f"worse: {head}"
+        return f"worse: {head} crashes more often than {base}"
+    if found.verdict == "better":
+        return f"better: {head} crashes less often than {base}"
+    if found.verdict == "no_difference":
+        return f"no difference above {found.margin:.3g} crashes per trial: {head}, {base}"
+    return f"undecided: {head}, {base}"
+
+
+def _evidence(found: GateReport) -> list[str]:
+    if not found.pairs:
+        return ["no pair of trials has ended"]
+    counts = f"{found.only_base} crash only with BASE, {found.only_head} only with HEAD, {found.both} with both"
+    needed = 1 / (1 - found.confidence / 100)
+    lines = [f"of {found.pairs:,} pairs of trials, {counts} (evidence {found.evidence:.3g}; {needed:.3g} decides)"]
+    if found.difference is not None:
+        low, high = found.difference
+        confidence = f"{found.confidence:g} %, valid whenever you look"
+        lines.append(f"difference: {low:+.2%} to {high:+.2%} crashes per trial (HEAD minus BASE, {confidence})")
+    return lines
+
+
+def _rate(rate: CrashRate) -> str:
+    crashes = f"{rate.crashes} {'crash' if rate.crashes == 1 else 'crashes'} in {rate.trials:,} trials"
+    if rate.certain is None:
+        return f"{crashes}, no rate: {rate.why_not}"
+    return f"{crashes}, {format_interval(rate.certain)} per trial"
+
+
+def _scenarios(found: GateReport) -> list[str]:
+    return [
+        f"{one.name}: {one.pairs:,} pairs, {one.only_base} crash only with BASE, {one.only_head} only with HEAD, "
+        f"{one.both} with both"
+        for one in found.scenarios
+    ]
+
+
+def _corpus(found: GateReport) -> list[str]:
+    if found.corpus is None:
+        return []
+    cases = f"{len(found.corpus)} {'case' if len(found.corpus) == 1 else 'cases'}"
+    lines = [f"corpus of HEAD: {cases}, {len(found.back)} crash again"]
+    lines += [f"  {case.name} was fixed, now: {case.now}" for case in found.back]
+    lines += [f"  {case.name} cannot run: {case.now}" for case in found.corpus if case.got == "cannot_run"]
+    return lines
+
+
+def gate_summary(found: GateReport) -> str:
+    """Return a verdict as Markdown, for a pull request or the summary of a job."""
+    lines = [f"### {_ICONS[found.verdict]} crashhunt gate: {_plain(_answer(found))}", ""]
+    if found.why:
+        lines += [f"{_plain(found.why)}.", ""]
+    if found.pairs:
+        lines += [_row("pairs of trials", "crash only with BASE", "only with HEAD", "with both", "evidence")]
+        lines += [_row(*["---:"] * 5)]
+        counts = (found.pairs, found.only_base, found.only_head, found.both)
+        lines += [_row(*(f"{count:,}" for count in counts), f"{found.evidence:.3g}"), ""]
+    if found.difference is not None:
+        low, high = found.difference
+        confidence = f"{found.confidence:g} %, valid whenever you look"
+        lines += [f"Difference: **{low:+.2%} to {high:+.2%}** crashes per trial (HEAD minus BASE, {confidence}).", ""]
+    if found.rates is not None:
+        lines += [f"- {name}: {_rate(rate)}" for name, rate in zip(("BASE", "HEAD"), found.rates, strict=True)]
+        lines.append("")
+    if len(found.scenarios) > 1:
+        lines += [_row("hunt", "pairs", "only BASE", "only HEAD", "both"), _row("---", *["---:"] * 4)]
+        lines += [
+            _row(_plain(one.name), f"{one.pairs:,}", str(one.only_base), str(one.only_head), str(one.both))
+            for one in found.scenarios
+        ]
+        lines.append("")
+    if found.corpus is not None:
+        first, *others = _corpus(found)
+        lines += [f"{_plain(first)}.", "", *(f"- {_plain(other.strip())}" for other in others)]
+        lines += [""] if others else []
+    return "\n".join(lines)
+
+
+def gate_annotations(found: GateReport) -> list[str]:
+    """Return a GitHub annotation command, where HEAD is worse or nothing is decided."""
+    if found.verdict in ("better", "no_difference"):
+        return []
+    level = "error" if found.verdict == "worse" else "warning"
+    title, *words = describe_gate(found).splitlines()
+    text = "\n".join(words).replace("%", "%25").replace("\n", "%0A")
+    heading = title.replace("%", "%25").replace(":", "%3A").replace(",", "%2C")
+    return [f"::{level} title=crashhunt gate%3A {heading}::{text}"]
+
+
+def write_gate_junit(found: GateReport, path: Path) -> None:
+    """Write a verdict as JUnit's XML: a test for the pairs, and one for each case of the corpus.
+
+    *Worse* is a failure, *undecided* an error. A case that cannot run is an error as well.
+
+    Raises:
+        HuntDirectoryError: it cannot be written.
+    """
+    suite = Xml.Element("testsuite", name="crashhunt gate")
+    for case in found.corpus or ():
+        test = Xml.SubElement(suite, "testcase", classname="crashhunt.gate.corpus", name=_text(case.name))
+        if case.has_come_back:
+            Xml.SubElement(test, "failure", message=_text(f"was fixed, now: {case.now}"), type="came_back")
+        elif case.got == "cannot_run":
+            Xml.SubElement(test, "error", message=_text(case.now), type="cannot_run")
+    if found.pairs or not found.back:
+        test = Xml.SubElement(suite, "testcase", classname="crashhunt.gate", name="paired trials")
+        said = _text(describe_gate(found))
+        if found.verdict == "worse" and not found.back:
+            Xml.SubElement(test, "failure", message=_text(_answer(found)), type="worse").text = said
+        elif found.verdict == "undecided":
+            Xml.SubElement(test, "error", message=_text(_answer(found)), type="undecided").text = said
+        else:
+            Xml.SubElement(test, "system-out").text = said
+    suite.set("tests", str(len(suite)))
+    suite.set("failures", str(sum(test.find("failure") is not None for test in suite)))
+    suite.set("errors", str(sum(test.find("error") is not None for test in suite)))
+    root = Xml.Element("testsuites")
+    root.append(suite)
+    Xml.indent(root)
+    with whole_file(path) as temporary:
+        Xml.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
+
+
+def _text(text: str) -> str:
+    """Return text that XML can hold."""
+    return visible(text)
+
+
+def _row(*cells: str) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _plain(text: str) -> str:
+    """Return text for Markdown with all special characters escaped."""
+    return _SPECIAL.sub(r"\\\1", one_line(text))

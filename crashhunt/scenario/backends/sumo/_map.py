@@ -1,0 +1,32 @@
+"""Loads a map, OpenStreetMap or OpenDRIVE, as the scenario that is made from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import ScenarioError
+from crashhunt.maps import cached_scenario
+from crashhunt.scenario._load import load_scenario
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from crashhunt.scenario._scenario import Scenario
+
+__all__ = ["load_map"]
+
+
+def load_map(path: Path, ego: str) -> Scenario:
+    """Return the scenario of a map; it is made once, and kept in the user's cache.
+
+    Raises:
+        ScenarioError: the map cannot be used, or a vehicle is named.
+    """
+    if ego:
+        fix = "leave it out, or make the scenario yourself: crashhunt init DIR"
+        raise ScenarioError(f"--ego {ego!r} does not go with a map", fix=fix, where=str(path))
+    folder = cached_scenario(path)
+    scenario = load_scenario(folder)
+    note = f"the scenario of {path.name} is {folder}; crashhunt init makes one that you can edit"
+    return replace(scenario, name=path.name.partition(".")[0] or path.name, notes=(note, *scenario.notes))

@@ -1,0 +1,121 @@
+"""A parallel environment of PettingZoo, with many agents, as a Gymnasium environment with one learner."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard
+
+import gymnasium
+import numpy as np
+
+from crashhunt.base.capabilities import supports
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+__all__ = ["OneLearner", "is_parallel", "takes_turns"]
+
+
+class TakesTurns(Protocol):
+    """An environment of PettingZoo whose agents act one after the other."""
+
+    def agent_iter(self) -> Iterator[Any]:
+        """Yield the agents in their order."""
+
+
+class Parallel(Protocol):
+    """An environment of PettingZoo whose agents act at the same time: its ``ParallelEnv``."""
+
+    possible_agents: Sequence[Any]
+    """All agents that may take part."""
+    agents: Sequence[Any]
+    """The agents that act in the next step."""
+
+    def observation_space(self, agent: Any) -> Any:
+        """Return the observation space of an agent."""
+
+    def action_space(self, agent: Any) -> Any:
+        """Return the action space of an agent."""
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        """Begin an episode."""
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """Let all agents act."""
+
+
+def is_parallel(made: Any) -> TypeGuard[Parallel]:
+    """Whether an object has the interface of PettingZoo's ``ParallelEnv``, whose agents do not take turns."""
+    return supports(made, Parallel) and callable(made.observation_space) and not takes_turns(made)
+
+
+def takes_turns(made: Any) -> bool:
+    """Whether an object is an environment of PettingZoo whose agents act one after the other."""
+    return supports(made, TakesTurns)
+
+
+class OneLearner(gymnasium.Env[Any, Any]):
+    """Shows the environment as the learner sees it. The other agents act by a policy that the seed determines.
+
+    An episode terminates when the learner's does, or when the learner is not among the agents any more.
+
+    Args:
+        parallel: The environment, with the interface of PettingZoo's ``ParallelEnv``.
+        learner: The agent that crashhunt tests, which is one of ``possible_agents``; empty for the first.
+        policy: Called with name, observation, action space and random generator of another agent, returns its action.
+            None for random actions, inside the mask of possible actions if the environment gives one.
+    """
+
+    def __init__(self, parallel: Any, learner: str = "", policy: Callable[..., object] | None = None) -> None:
+        agents = {str(name): name for name in parallel.possible_agents}
+        self._parallel = parallel
+        self._learner = agents[learner or next(iter(agents))]
+        self._policy = policy
+        self.observation_space = parallel.observation_space(self._learner)
+        self.action_space = parallel.action_space(self._learner)
+        self._seen: Mapping[Any, Any] = {}
+        self._infos: Mapping[Any, Any] = {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        super().reset(seed=seed)
+        self._seen, self._infos = self._parallel.reset(seed=seed, options=options)
+        if self._learner not in self._seen:
+            raise RuntimeError(f"the learner {self._learner!r} does not take part from the beginning")
+        return self._seen[self._learner], dict(self._infos.get(self._learner, {}))
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Let all agents act."""
+        learner = self._learner
+        actions = {
+            name: action if name == learner else self._act(name) for name in self._parallel.agents if name in self._seen
+        }
+        before = self._seen[learner]
+        self._seen, rewards, ended, cut, self._infos = self._parallel.step(actions)
+        over = ended.get(learner, True)
+        gone = not over and learner not in self._parallel.agents and not cut.get(learner, False)
+        shown = self._seen.get(learner, before)
+        info = dict(self._infos.get(learner, {}))
+        return shown, float(rewards.get(learner, 0.0)), bool(over or gone), bool(cut.get(learner, False)), info
+
+    def render(self) -> Any:
+        """Return what the environment renders."""
+        return self._parallel.render()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._parallel.close()
+
+    def _act(self, name: Any) -> object:
+        seen, space = self._seen[name], self._parallel.action_space(name)
+        mask = self._infos.get(name, {}).get("action_mask")
+        if mask is None and isinstance(seen, dict):
+            mask = seen.get("action_mask")
+        if self._policy is None:
+            return _random_action(space, self.np_random, mask)
+        return self._policy(str(name), seen, space, self.np_random)
+
+
+def _random_action(space: Any, rng: np.random.Generator, mask: Any = None) -> object:
+    space.seed(int(rng.integers(2**31)))  # the space may be another object, or have been used before
+    is_possible = mask is not None and np.any(mask)
+    return space.sample(np.asarray(mask, np.int8)) if is_possible else space.sample()

@@ -1,0 +1,611 @@
+"""A gate: a verdict on a change, from hunts of two versions in the same traffic.
+
+BASE and HEAD are two commits of a Git repository, each imported from a temporary work tree, or two agents. Their hunts
+run at the same time, each in a process of its own, with the same seed. Trials, traffic and disturbances follow from the
+seed and the number of a trial, and not from what the agent does. The hunts end as soon as `PairWatch` decides.
+
+The hunts of a suite run one pair after the other: the order of all pairs must not depend on results.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import math
+import os
+import secrets
+import sys
+import time
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, NoValidTrialError, UsageError
+from crashhunt.base.files import whole_file
+from crashhunt.base.plugins import registered
+from crashhunt.base.temporary import temporary_folder
+from crashhunt.base.work_trees import checked_out, commit_of, import_environment, run_to_end, top_of
+from crashhunt.corpus import find_cases
+from crashhunt.estimation import GateCase, GateReport, PairedHunts, measure_rates
+from crashhunt.hunts import HuntDirectory, hunt_state, is_hunt
+from crashhunt.plans import read_settings
+from crashhunt.rates import PairWatch
+from crashhunt.scenario import load_scenario
+from crashhunt.suites._processes import (
+    REQUEST,
+    RunRequest,
+    refuse_untrusted_hunt,
+    run_all,
+    slots_of,
+    write_request,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from crashhunt.plans import Given
+    from crashhunt.rates import CrashRate, PairVerdict
+
+__all__ = ["Gate", "GateProgress", "GateVersion"]
+
+GATE: Final = "gate.json"
+"""What a gate compares, in the folder with its hunts."""
+_LOCK = ".lock"
+BASE, HEAD = "base", "head"
+_BUNDLES_PER_TYPE = 3  # kept of each crash type: a gate counts crashes, and shows some
+_USUAL_CORPUS = "crashes"  # as in the action `corpus`
+_BUSY_S, _LOOK_EVERY_S = 15.0, 0.1
+_LEAST_SLOTS = 2  # trials at a time: BASE and HEAD run side by side
+_ORIGIN = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"
+
+
+@dataclass(frozen=True, slots=True)
+class GateVersion:
+    """BASE or HEAD.
+
+    Args:
+        word: as the user gave it.
+        agents: vehicle to who drives it, as in ``--agent``; empty where the version is a commit.
+        commit: its digits; empty where the version is an agent.
+    """
+
+    word: str
+    agents: Mapping[str, str]
+    commit: str = ""
+
+    @classmethod
+    def of(cls, word: str, folder: Path) -> GateVersion:
+        """Return what a word means: an agent where it names one, else a commit of the repository of a folder.
+
+        Raises:
+            UsageError: it is neither.
+        """
+        vehicle, equals, locator = word.rpartition("=")
+        if ":" in locator or locator in registered("agents"):
+            return cls(word, {vehicle: locator})
+        if equals or not word:
+            raise UsageError(f"{word!r} is no agent and no commit", fix="give [ID=]MODULE:ATTR, or a revision")
+        try:
+            return cls(word, {}, commit_of(top_of(folder), word))
+        except CrashhuntError as error:
+            fix = "give a revision of the repository around this folder, or an agent as module:attribute"
+            raise UsageError(f"{word!r} is no agent and no commit: {error.message}", fix=fix) from None
+
+    def __str__(self) -> str:
+        """The name of the agent, or the revision with the first digits of its commit."""
+        if not self.commit:
+            return self.word
+        return self.word if self.commit.startswith(self.word) else f"{self.word} ({self.commit[:10]})"
+
+
+@dataclass(frozen=True, slots=True)
+class GateProgress:
+    """How far a gate is, for people who watch.
+
+    Args:
+        name: of the hunt that runs.
+        done: pairs of trials that have ended, of all hunts.
+        most: how many there are at most.
+        only_base: in which only BASE crashes.
+        only_head: in which only HEAD does.
+        evidence: e-value that they do not crash equally often.
+    """
+
+    name: str
+    done: int
+    most: int
+    only_base: int
+    only_head: int
+    evidence: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gate:
+    """What a gate compares, and when it ends.
+
+    Args:
+        base: the version before the change.
+        head: the version with it.
+        hunts: name to what a hunt of either version is; its ``trials`` do not count.
+        folder: from which the user imports agents.
+        most: how many pairs of trials, of all hunts together.
+        duration_s: the most wall time, in s; infinite for no limit.
+        margin: the greatest difference in crashes per trial that counts as none; 0 for no such verdict.
+        confidence: of the verdict, in percent.
+        corpus: of HEAD, as a path from the folder; where it is None, ``crashes``, if HEAD is a commit that has it.
+        parallel: trials at a time, of both together; 0 for one per core.
+        is_suite: whether there may be several hunts; then only *worse* ends the gate before the last of them.
+        trusted: whether hunts that are there already, and the corpus, may run in any case.
+        machine: options such as ``executor`` that hold for all hunts.
+    """
+
+    base: GateVersion
+    head: GateVersion
+    hunts: Mapping[str, RunRequest]
+    folder: Path
+    most: int
+    duration_s: float = math.inf
+    margin: float = 0.0
+    confidence: float = 95.0
+    corpus: Path | None = None
+    parallel: int = 0
+    is_suite: bool = False
+    trusted: bool = False
+    machine: Given | None = None
+
+    def run(self, directory: Path | None = None, watch: Callable[[GateProgress], None] | None = None) -> GateReport:
+        """Compare the two until the verdict is certain, the last pair, the end of the time, or an interrupt.
+
+        Args:
+            directory: where the hunts are kept; what has ended there is not run again. None for a temporary folder.
+            watch: called about once a second.
+
+        Raises:
+            CrashhuntError: a hunt cannot be run, or the directory is of another gate.
+        """
+        self._check()
+        with ExitStack() as stack:
+            place = directory if directory is not None else stack.enter_context(temporary_folder("gate"))
+            stack.enter_context(_locked(place))
+            return _Run(self, place, stack, watch, is_kept=directory is not None).report()
+
+    def _check(self) -> None:
+        if bool(self.base.commit) != bool(self.head.commit):
+            kinds = [f"{one.word!r} is {'a commit' if one.commit else 'an agent'}" for one in (self.base, self.head)]
+            raise UsageError(" and ".join(kinds), fix="give two commits, or two agents")
+        if self.most < 1:
+            raise UsageError(f"--most is {self.most}", fix="give at least 1")
+        if self.most < len(self.hunts):
+            raise UsageError(
+                f"--most is {self.most} for {len(self.hunts)} hunts", fix="give at least one pair for each"
+            )
+        if not 0 <= self.margin < 1:
+            raise UsageError(f"--margin is {self.margin:g}", fix="give a share from 0 to below 1, such as 0.01")
+        if not 50 <= self.confidence < 100:
+            raise UsageError(
+                f"--confidence is {self.confidence:g}", fix="give percent from 50 to below 100, such as 95"
+            )
+        slots_of(self.parallel)
+        for name, run in self.hunts.items():
+            _check_request(run, f"{name}: " if self.is_suite else "")
+
+
+@contextmanager
+def _locked(place: Path) -> Iterator[None]:
+    """Keep other gates out of a folder, by a lock that dies with this process; the folder is made.
+
+    Raises:
+        HuntDirectoryError: another gate runs there, or the folder is of something else, or unwritable.
+    """
+    try:
+        place.mkdir(exist_ok=True)
+        if is_hunt(place) or (not (place / GATE).exists() and any(place.iterdir())):
+            raise HuntDirectoryError(
+                "the folder is not empty and not that of a gate", fix="give --keep a new folder", where=str(place)
+            )
+        with (place / _LOCK).open("a") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                fix = "wait for it, stop it, or give --keep another folder"
+                raise BusyError("another gate is running there", fix=fix, where=str(place)) from None
+            yield
+    except OSError as error:
+        fix = "choose one below a folder that exists and is writable"
+        raise HuntDirectoryError(f"cannot be used: {error.strerror}", fix=fix, where=str(place)) from error
+
+
+def _check_request(run: RunRequest, where: str) -> None:
+    """Refuse hunts whose trials are no pairs, or whose end depends on crashes."""
+    request = run.request
+    options: dict[str, object] = {
+        f"the sampler {request.sampler}": request.sampler != "random", "--seeds": request.seeds, "--rare": request.rare,
+        "--until-rate": request.run.until_rate, "--distinct": request.run.distinct,
+        "--only-at-fault": request.run.only_at_fault,
+    }  # fmt: skip
+    if given := next((option for option, value in options.items() if value), ""):
+        raise UsageError(f"{where}a gate compares plain trials, one by one, so not with {given}", fix="leave it out")
+
+
+class _Run:
+    """One run of a gate in a directory."""
+
+    def __init__(
+        self, gate: Gate, place: Path, stack: ExitStack, watch: Callable[[GateProgress], None] | None, *, is_kept: bool
+    ) -> None:
+        self._gate, self._place, self._watch, self._is_kept = gate, place, watch, is_kept
+        self._until = time.monotonic() + gate.duration_s
+        self._pairs = PairWatch(gate.margin, 1 - gate.confidence / 100)
+        self._seed = self._begin()
+        self._trees: dict[str, Path] = {}
+        if gate.base.commit:
+            top = top_of(gate.folder)
+            for side, version in self._versions.items():
+                tree = checked_out(top, version.commit, purpose="gate", name=side)
+                self._trees[side] = stack.enter_context(tree)
+            self._top = top.resolve()
+            self._check_origins()
+        self._hunts = list(self._planned())
+        self._corpus: tuple[GateCase, ...] | None = None
+        self._why = ""
+        self._is_interrupted = False
+
+    @property
+    def _versions(self) -> dict[str, GateVersion]:
+        return {BASE: self._gate.base, HEAD: self._gate.head}
+
+    def report(self) -> GateReport:
+        """Run the corpus and the hunts, and return what came of it."""
+        try:
+            self._corpus = self._run_corpus()
+            if any(case.has_come_back for case in self._corpus or ()):
+                self._why = "a crash of the corpus that was fixed has come back"
+                return self._found(verdict="worse")
+            self._run_hunts()
+        except KeyboardInterrupt:
+            self._is_interrupted = True
+            self._why = "interrupted"
+        return self._found()
+
+    # What is compared.
+
+    def _begin(self) -> int:
+        """Write what the folder is, or see that it is the same already; return the seed of the hunts."""
+        gate, file = self._gate, self._place / GATE
+        given = next(iter(gate.hunts.values())).request.seed
+        asked = {
+            side: version.commit or dict(version.agents) for side, version in self._versions.items()
+        } | {"hunts": list(gate.hunts)}  # fmt: skip
+        try:
+            before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
+            is_other = before is not None and (
+                any(before.get(name) != value for name, value in asked.items()) or given not in (None, before["seed"])
+            )
+            if is_other:
+                raise HuntDirectoryError(
+                    "another gate is there: of other versions, other hunts or another seed",
+                    fix="give --keep another directory", where=str(self._place),
+                )  # fmt: skip
+            seed = before["seed"] if before is not None and given is None else given
+            seed = secrets.randbits(32) if seed is None else int(seed)
+            with whole_file(file) as temporary:
+                temporary.write_text(json.dumps({**asked, "seed": seed, "schema": 1}), encoding="utf-8")
+        except OSError as error:
+            raise HuntDirectoryError(
+                f"cannot be written: {error.strerror}", fix="choose another directory", where=str(file)
+            ) from error
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise HuntDirectoryError(f"is damaged: {error}", fix="remove it", where=str(file)) from None
+        return seed
+
+    def _planned(self) -> Iterator[PairedHunts]:
+        gate = self._gate
+        for number, (name, run) in enumerate(gate.hunts.items()):
+            most = gate.most // len(gate.hunts) + (number < gate.most % len(gate.hunts))
+            folder = self._place / name if gate.is_suite else self._place
+            paired = PairedHunts(name, folder / BASE, folder / HEAD, most)
+            for side, place in zip((BASE, HEAD), paired.folders, strict=True):
+                self._plan(place, self._request(run, side, most, number))
+            yield paired
+
+    def _request(self, run: RunRequest, side: str, most: int, number: int) -> RunRequest:
+        """Return the hunt of one version; ``number`` is its place among the hunts."""
+        asked = run.request
+        settings = replace(asked.run, keep_going=True, keep=_BUNDLES_PER_TYPE, parallel=1)
+        seed = asked.seed
+        if seed is None and not self._gate.is_suite:
+            seed = self._seed
+        elif seed is None:  # each hunt of a suite has its own
+            seed = int(np.random.SeedSequence(self._seed, spawn_key=(number,)).generate_state(1)[0])
+        agents = {**asked.agents, **self._versions[side].agents}
+        request = replace(asked, agents=agents, seed=seed, trials=most, run=settings)
+        folder = self._folder_of(side, Path(run.folder))
+        return replace(run, request=request, folder=str(folder))
+
+    def _folder_of(self, side: str, folder: Path) -> Path:
+        """Return where a version is imported from, instead of from a folder of the user's."""
+        tree = self._trees.get(side)
+        if tree is None:
+            return folder
+        resolved = folder.resolve()
+        return tree / resolved.relative_to(self._top) if resolved.is_relative_to(self._top) else tree
+
+    def _plan(self, place: Path, request: RunRequest) -> None:
+        """Write what a hunt will be, or see that the one that is there is the same; its folder may have moved."""
+        try:
+            if (place / REQUEST).exists():
+                before = RunRequest.read(place / REQUEST)
+                same = replace(request, folder=before.folder, request=replace(request.request, trials=0))
+                if replace(before, request=replace(before.request, trials=0)).to_plain() != same.to_plain():
+                    raise HuntDirectoryError(
+                        "the gate was begun there with other options",
+                        fix="give --keep another directory", where=str(place),
+                    )  # fmt: skip
+                if not self._gate.trusted:
+                    refuse_untrusted_hunt(place)
+                _wait_until_free(place)
+            place.mkdir(parents=True, exist_ok=True)
+            write_request(place, request)
+        except OSError as error:
+            raise HuntDirectoryError(
+                f"cannot be made: {error.strerror}", fix="choose another directory", where=str(place)
+            ) from error
+
+    def _check_origins(self) -> None:
+        """See that what drives comes from the work trees.
+
+        Raises:
+            UsageError: it does not, so that both versions would be the same.
+        """
+        modules = sorted({module for run in self._gate.hunts.values() for module in _modules_of(run)})
+        for side, tree in self._trees.items():
+            folder = self._folder_of(side, self._gate.folder)
+            places = [_origin_of(module, folder, import_environment(folder, tree)) for module in modules]
+            elsewhere = [
+                (module, place) for module, place in zip(modules, places, strict=True) if not place.is_relative_to(tree)
+            ]
+            if modules and len(elsewhere) == len(modules):
+                module, place = elsewhere[0]
+                raise UsageError(
+                    f"{module!r} comes from {place}, whatever commit is checked out",
+                    fix="run it from the folder of the repository that holds the module, with --agent module:attribute",
+                )
+
+    # The corpus.
+
+    def _run_corpus(self) -> tuple[GateCase, ...] | None:
+        """Run the cases of HEAD with its code, in a process of its own; None where there is no corpus."""
+        gate = self._gate
+        given = gate.corpus or Path(_USUAL_CORPUS)
+        folder = self._folder_of(HEAD, gate.folder)
+        corpus = folder / given
+        tree = self._trees.get(HEAD)
+        if tree is None and gate.corpus is None:
+            return None
+        if not corpus.is_dir():
+            if gate.corpus is None:
+                return None
+            raise UsageError(f"--corpus {gate.corpus} is no folder of HEAD", fix="give the folder of a corpus")
+        try:
+            cases = find_cases([corpus])
+        except CrashhuntError:
+            if gate.corpus is None:
+                return None
+            raise
+        if tree is None:
+            drivers = set(gate.head.agents.values())
+            cases = [case for case in cases if drivers & _drivers_of(case)]
+            if not cases:
+                message = f"--corpus {gate.corpus} has no case of {gate.head.word}"
+                raise UsageError(message, fix="leave it out, or give the corpus of that agent")
+        command = [sys.executable, "-m", "crashhunt", "corpus", "run", *map(str, cases), "--json"]
+        command += ["--parallel", str(slots_of(gate.parallel))]
+        if gate.trusted or tree is not None:  # a commit's corpus is trusted as its code is
+            command.append("--trust")
+        environment = dict(os.environ) if tree is None else import_environment(folder, tree)
+        done = run_to_end(command, folder, environment)
+        try:
+            reports = json.loads(done.stdout)["cases"]
+            return tuple(
+                GateCase(name=Path(one["path"]).name, expected=one["expected"], got=one["got"], now=one.get("now", ""))
+                for one in reports
+            )
+        except (ValueError, KeyError, TypeError):
+            said = " ".join(done.stderr.split())[-300:].removeprefix("crashhunt: ")
+            raise CrashhuntError(f"the corpus of HEAD cannot be run: {said}", fix="see crashhunt corpus run") from None
+
+    # The hunts.
+
+    def _run_hunts(self) -> None:
+        slots = max(_LEAST_SLOTS, slots_of(self._gate.parallel))
+        for number, paired in enumerate(self._hunts):
+            is_last = number == len(self._hunts) - 1
+            self._look(paired, is_last=is_last)
+            if not self._is_enough(paired):
+                waiting = [folder for folder in paired.folders if not self._is_done(folder, paired.most)]
+                environments = {
+                    folder: import_environment(self._folder_of(side, self._gate.folder), self._trees[side])
+                    for side, folder in zip((BASE, HEAD), paired.folders, strict=True)
+                    if side in self._trees
+                }
+                run_all(
+                    waiting, slots, watch=lambda: self._look(paired, is_last=is_last),  # noqa: B023 - called here
+                    machine={**(self._gate.machine or {}), "trials": paired.most},
+                    is_enough=lambda: self._is_enough(paired), environments=environments,  # noqa: B023
+                )  # fmt: skip
+                self._look(paired, is_last=is_last)
+            if self._refuse_failed(paired) or self._pairs.verdict != "undecided" or time.monotonic() > self._until:
+                break
+        if self._pairs.verdict == "undecided" and not self._why:
+            self._why = self._why_undecided()
+
+    @staticmethod
+    def _is_done(folder: Path, most: int) -> bool:
+        """Return whether a hunt has run all its trials."""
+        state = hunt_state(folder)
+        return state.state in ("finished", "crashed") and state.trials_run >= most
+
+    def _look(self, paired: PairedHunts, *, is_last: bool) -> None:
+        paired.take(self._pairs, may_end=is_last)
+        if self._watch is not None:
+            test = self._pairs.test
+            done = sum(one.counts.pairs for one in self._hunts)
+            evidence = math.exp(min(test.log_evidence, 700.0))
+            self._watch(
+                GateProgress(
+                    name=paired.name,
+                    done=done,
+                    most=self._gate.most,
+                    only_base=test.only_first,
+                    only_head=test.only_second,
+                    evidence=evidence,
+                )
+            )
+
+    def _is_enough(self, paired: PairedHunts) -> bool:
+        return (
+            self._pairs.verdict != "undecided"
+            or paired.is_complete
+            or paired.is_hopeless
+            or time.monotonic() > self._until
+            or paired.failure() is not None
+        )
+
+    def _refuse_failed(self, paired: PairedHunts) -> bool:
+        """Raise the error of a hunt that could not run; return whether no more hunts are to run.
+
+        Raises:
+            NoValidTrialError: no trial of it was valid.
+            HuntDirectoryError: any other failure.
+        """
+        if paired.is_hopeless:
+            self._why = f"{paired.name}: {paired.why_not}"
+            return True
+        failure = paired.failure()
+        if failure is None:
+            return False
+        side, state, why = failure
+        where = f"{side.upper()} ({self._versions[side]})"
+        if state == "no_valid_trial":
+            raise NoValidTrialError(f"no trial can be set up: {why}", where=where)
+        raise HuntDirectoryError(f"cannot be hunted: {why}", where=where)
+
+    def _why_undecided(self) -> str:
+        invalid = next((f"{one.name}: {one.why_not}" for one in self._hunts if one.why_not), "")
+        if invalid:
+            return invalid
+        if time.monotonic() > self._until:
+            return "the time is up; give --for more, or --most fewer pairs with a greater --margin"
+        if ended := next((said for one in self._hunts if not one.is_complete and (said := _ended_early(one))), ""):
+            return ended
+        return f"all {self._gate.most} pairs have ended; give more with --most, or a greater --margin"
+
+    # What came of it.
+
+    def _found(self, *, verdict: PairVerdict | None = None) -> GateReport:
+        gate, test = self._gate, self._pairs.test
+        found: PairVerdict = verdict or self._pairs.verdict
+        why = self._why
+        unable = [case.name for case in self._corpus or () if case.got == "cannot_run"]
+        if unable and found in ("better", "no_difference"):
+            found, why = "undecided", f"HEAD cannot run {len(unable)} of the corpus: {', '.join(unable[:3])}"
+        alpha = 1 - gate.confidence / 100
+        is_valid = not any(one.why_not for one in self._hunts)
+        report = GateReport(
+            verdict=found,
+            base=str(gate.base),
+            head=str(gate.head),
+            pairs=test.pairs,
+            only_base=test.only_first,
+            only_head=test.only_second,
+            both=test.both,
+            evidence=math.exp(min(test.log_evidence, 700.0)),
+            difference=test.difference(alpha) if is_valid else None,
+            margin=gate.margin,
+            confidence=gate.confidence,
+            seed=self._seed,
+            scenarios=tuple(one.counts for one in self._hunts),
+            rates=self._rates(),
+            corpus=self._corpus,
+            why=why,
+            is_interrupted=self._is_interrupted,
+            dir=str(self._place) if self._is_kept else "",
+        )
+        self._write(report)
+        return report
+
+    def _rates(self) -> tuple[CrashRate, CrashRate] | None:
+        """Return the rates of the only two hunts; None where there are several, or one has not begun."""
+        (paired, *others) = self._hunts
+        if others or not all((folder / layout.HUNT).exists() for folder in paired.folders) or not paired.counts.pairs:
+            return None
+        base, head = (
+            measure_rates(folder, per="trial", confidence=self._gate.confidence)[0] for folder in paired.folders
+        )
+        return base, head
+
+    def _write(self, report: GateReport) -> None:
+        """Add the report to the file that says what the folder is."""
+        file = self._place / GATE
+        known = json.loads(file.read_text(encoding="utf-8"))
+        with whole_file(file) as temporary:
+            temporary.write_text(json.dumps({**known, "report": report.to_json()}), encoding="utf-8")
+
+
+def _wait_until_free(hunt: Path) -> None:
+    """Wait for the process of a hunt whose gate was killed: it stops on its own, and saves what has ended.
+
+    Raises:
+        BusyError: it is still there after some seconds.
+    """
+    deadline = time.monotonic() + _BUSY_S
+    while True:
+        try:
+            with HuntDirectory(hunt).locked():
+                return
+        except BusyError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(_LOOK_EVERY_S)
+
+
+def _ended_early(paired: PairedHunts) -> str:
+    """Return which hunt ended without all its trials, and the last line that it printed; empty where neither did."""
+    for side, folder in zip((BASE, HEAD), paired.folders, strict=True):
+        state = hunt_state(folder).state
+        if state not in ("finished", "crashed"):
+            log = folder / layout.RUN_LOG
+            lines = log.read_text(encoding="utf-8", errors="replace").split("\n") if log.exists() else []
+            last = next((line.strip() for line in reversed(lines) if line.strip()), "no output")
+            return f"the hunt of {side.upper()} ended early ({state}): {last}"
+    return ""
+
+
+def _modules_of(run: RunRequest) -> set[str]:
+    """Return the modules that drive in a hunt, where they are not crashhunt's own."""
+    agents = dict(run.request.agents)
+    if not agents:
+        try:
+            agents = {agent: setup.agent for agent, setup in load_scenario(run.request.scenario).agents.items()}
+        except CrashhuntError:
+            return set()  # the hunt reports it
+    points = registered("agents")
+    targets = [points[name].value if name in points else name for name in agents.values()]
+    return {target.partition(":")[0] for target in targets}
+
+
+def _origin_of(module: str, folder: Path, environment: Mapping[str, str]) -> Path:
+    """Return the file of a module as a work tree finds it; the tree's own folder where it cannot be found there."""
+    done = run_to_end([sys.executable, "-c", _ORIGIN, module], folder, environment)
+    return Path(done.stdout.strip()).resolve() if done.returncode == 0 else folder
+
+
+def _drivers_of(case: Path) -> set[str]:
+    try:
+        return {chosen.agent for chosen in read_settings(case / layout.HUNT).agents.values()}
+    except CrashhuntError:
+        return set()

@@ -1,0 +1,130 @@
+"""Divides crash types by cause: judges some crashes of each type, and gives the others the cause of the nearest one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.temporary import temporary_folder
+from crashhunt.crashes import (
+    Cause,
+    CauseGroup,
+    Judgement,
+    cause_of,
+    features_of,
+    judgement_of,
+    representatives,
+    spread,
+    with_judgement,
+)
+from crashhunt.replays import ReplayOptions, prepare
+from crashhunt.trial import Outcome
+from crashhunt.whatif._avoidability import judge
+from crashhunt.whatif._omissions import find_omission
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from crashhunt.crashes import Bundle, Group
+
+__all__ = ["REPRESENTATIVES", "divide_by_cause", "find_cause"]
+
+REPRESENTATIVES = 8
+"""How many crashes of each type are judged; six bugs in one type have been seen."""
+
+_REFERENCE_RUNS, _WHY_RUNS = 16, 24
+
+
+def find_cause(
+    bundle: Bundle,
+    options: ReplayOptions | None = None,
+    *,
+    parallel: int = 1,
+    stopped: Callable[[], bool] = lambda: False,
+) -> tuple[Cause, Bundle]:
+    """Return the cause of a crash, and its bundle with the runs that say so; runs only what is not known yet.
+
+    A reference driver comes first. Only where it finds no omission, one thing at a time is removed, as `judge` does.
+
+    Args:
+        bundle: the crash.
+        options: of the replays.
+        parallel: runs at a time.
+        stopped: returns whether to stop.
+
+    Raises:
+        CrashhuntError: no trial can be run.
+    """
+    result = bundle.result
+    if result.outcome.is_software_fault or result.outcome is Outcome.HANG or bundle.is_near_miss:
+        return cause_of(bundle, None), bundle
+    found = judgement_of(bundle)
+    found = Judgement() if found is None else found
+    if found.reference is None and result.outcome in (Outcome.COLLISION, Outcome.OFF_ROAD):
+        rerun = prepare(bundle, options or ReplayOptions())
+        with temporary_folder("causes") as scratch:
+            reference = find_omission(
+                rerun, scratch, most=_REFERENCE_RUNS, parallel=parallel, stopped=stopped, tell=lambda _: None
+            )
+        found = replace(found, reference=reference)
+    if found.why is None and (found.reference is None or found.reference.omission is None):
+        new = judge(bundle, options, runs=1, why=_WHY_RUNS, parallel=parallel, stopped=stopped)
+        found = replace(found, why=new.why)
+    return cause_of(bundle, found), with_judgement(bundle, found)
+
+
+def divide_by_cause(
+    group: Group,
+    options: ReplayOptions | None = None,
+    *,
+    most: int = REPRESENTATIVES,
+    parallel: int = 1,
+    write: bool = True,
+    stopped: Callable[[], bool] = lambda: False,
+) -> tuple[CauseGroup, ...]:
+    """Return the crashes of one type divided by cause, the most frequent cause first.
+
+    Args:
+        group: the crashes of one type.
+        options: of the replays.
+        most: how many of them to judge at most.
+        parallel: runs at a time.
+        write: whether to write what the runs have shown into the bundles, so that the next call needs no run.
+        stopped: returns whether to stop; the rest then has the cause of the nearest crash that was judged.
+    """
+    bundles = group.bundles
+    features = [features_of(bundle) for bundle in bundles]
+    known: dict[int, Cause] = {}
+    for place in representatives(features, [bundle.result.steps for bundle in bundles], most):
+        if stopped():
+            break
+        try:
+            known[place], judged = find_cause(bundles[place], options, parallel=parallel, stopped=stopped)
+        except CrashhuntError:
+            continue  # one crash that cannot be run again does not keep the others from being divided
+        if write and not stopped() and judged is not bundles[place]:
+            judged.write()
+    known = _without_chance_lengths(known)
+    causes = spread(features, known or {0: Cause("unknown")})
+    members: dict[Cause, list[int]] = {}
+    for place, cause in enumerate(causes):
+        members.setdefault(cause, []).append(place)
+    found = [
+        CauseGroup(
+            cause=cause,
+            members=tuple(bundles[place] for place in places),
+            judged=tuple(bundles[place] for place in places if place in known),
+        )
+        for cause, places in members.items()
+    ]
+    return tuple(sorted(found, key=lambda one: (-len(one.members), one.cause)))
+
+
+def _without_chance_lengths(known: dict[int, Cause]) -> dict[int, Cause]:
+    """Keep that an actor was long only where all of them were: where cars were hit as well, length is no cause."""
+    mixed = {replace(cause, actor="") for cause in known.values() if not cause.actor}
+    return {
+        place: replace(cause, actor="") if replace(cause, actor="") in mixed else cause
+        for place, cause in known.items()
+    }

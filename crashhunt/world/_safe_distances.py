@@ -1,0 +1,182 @@
+"""Safe distances of Responsibility-Sensitive Safety (RSS), and the surroundings for which they are computed.
+
+Source: Shalev-Shwartz, Shammah, Shashua: On a Formal Model of Safe and Scalable Self-driving Cars (2017),
+arXiv:1708.06374. The safe longitudinal distance is definition 1 and lemma 2 there. The same distance to the followers
+and leaders of the target lane decides about a lane change, because a change takes a single step in SUMO.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["Crossing", "Neighbor", "Side", "Surroundings", "safe_distance", "safe_speed", "time_to_drive"]
+
+NeighborKind = Literal["vehicle", "red light", "crossing"]
+
+
+def safe_distance(
+    rear_mps: float,
+    front_mps: float,
+    *,
+    response_s: float,
+    acceleration_mps2: float,
+    braking_mps2: float,
+    front_braking_mps2: float,
+) -> float:
+    """Return the smallest gap from which the rear vehicle can avoid the front one, in m.
+
+    During the response time the rear vehicle accelerates as hard as it can, and then brakes. The front vehicle brakes
+    from the beginning.
+
+    >>> round(safe_distance(20, 20, response_s=0.5, acceleration_mps2=2, braking_mps2=4, front_braking_mps2=8), 3)
+    40.375
+
+    Args:
+        rear_mps: speed of the rear vehicle, in m/s; at least 0.
+        front_mps: speed of the front vehicle, in m/s; at least 0.
+        response_s: response time of the rear vehicle, in s.
+        acceleration_mps2: greatest acceleration of the rear vehicle, in m/s².
+        braking_mps2: least deceleration with which the rear vehicle brakes, in m/s²; more than 0.
+        front_braking_mps2: greatest deceleration of the front vehicle, in m/s²; more than 0.
+    """
+    later = rear_mps + response_s * acceleration_mps2
+    driven = (rear_mps + later) / 2 * response_s + later * later / (2 * braking_mps2)
+    return max(0.0, driven - front_mps * front_mps / (2 * front_braking_mps2))
+
+
+def safe_speed(
+    gap_m: float,
+    front_mps: float,
+    *,
+    response_s: float,
+    acceleration_mps2: float,
+    braking_mps2: float,
+    front_braking_mps2: float,
+) -> float:
+    """Return the greatest speed of the rear vehicle for which a gap is safe, in m/s; 0 where none is.
+
+    This is the inverse of `safe_distance`, with the same arguments: the positive root of a quadratic equation.
+
+    Args:
+        gap_m: between the vehicles, in m.
+        front_mps: as in `safe_distance`.
+        response_s: as in `safe_distance`.
+        acceleration_mps2: as in `safe_distance`.
+        braking_mps2: as in `safe_distance`.
+        front_braking_mps2: as in `safe_distance`.
+    """
+    # With the response time t: later² / (2 b) + later t - a t² / 2 = gap + front² / (2 b_front), later = v + a t.
+    room = gap_m + front_mps * front_mps / (2 * front_braking_mps2) + acceleration_mps2 * response_s * response_s / 2
+    if room <= 0:
+        return 0.0
+    reach = response_s * braking_mps2
+    later = math.sqrt(reach * reach + 2 * braking_mps2 * room) - reach
+    return max(0.0, later - response_s * acceleration_mps2)
+
+
+def time_to_drive(distance_m: float, speed_mps: float, acceleration_mps2: float, top_mps: float) -> float:
+    """Return the time in which a vehicle that accelerates to a top speed drives a distance, in s; infinite if never.
+
+    Args:
+        distance_m: in m; 0 or less takes no time.
+        speed_mps: at the beginning, in m/s.
+        acceleration_mps2: until the top speed, in m/s²; at least 0.
+        top_mps: in m/s; a vehicle that is faster keeps its speed.
+    """
+    if distance_m <= 0:
+        return 0.0
+    top = max(speed_mps, top_mps)
+    if acceleration_mps2 <= 0 or top == speed_mps:
+        return distance_m / speed_mps if speed_mps > 0 else math.inf
+    spent_s = (top - speed_mps) / acceleration_mps2
+    covered = (speed_mps + top) / 2 * spent_s
+    if covered < distance_m:
+        return spent_s + (distance_m - covered) / top
+    return (math.sqrt(speed_mps * speed_mps + 2 * acceleration_mps2 * distance_m) - speed_mps) / acceleration_mps2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Neighbor:
+    """An actor or a stop line ahead or behind, on one lane.
+
+    Args:
+        actor: its identifier; empty for a red light.
+        gap_m: between the bumpers, in m; negative where the vehicles are alongside each other.
+        speed_mps: its speed along the lane, in m/s.
+        braking_mps2: its greatest deceleration, in m/s²; the usual one of its type.
+        acceleration_mps2: its greatest acceleration, in m/s².
+        kind: ``vehicle``, ``red light`` or ``crossing`` (an actor that crosses, at whose path the agent must stop).
+    """
+
+    actor: str
+    gap_m: float
+    speed_mps: float
+    braking_mps2: float
+    acceleration_mps2: float = 0.0
+    kind: NeighborKind = "vehicle"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Crossing:
+    """An actor whose path crosses or joins that of the agent in a junction.
+
+    Args:
+        actor: its identifier.
+        distance_m: of the agent to the conflict area, in m; negative inside and after it.
+        exit_m: of the agent until its rear has left the area, in m.
+        actor_distance_m: of the actor to the area, in m.
+        actor_exit_m: of the actor until its rear has left the area, in m.
+        speed_mps: of the actor, in m/s.
+        braking_mps2: its greatest deceleration, in m/s².
+        has_right_of_way: whether the agent must yield to it.
+    """
+
+    actor: str
+    distance_m: float
+    exit_m: float
+    actor_distance_m: float
+    actor_exit_m: float
+    speed_mps: float
+    braking_mps2: float
+    has_right_of_way: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Side:
+    """The neighbouring lane of an agent on one side.
+
+    Args:
+        exists: whether there is a lane that the agent may use.
+        ahead: the nearest vehicle ahead on it.
+        behind: the nearest vehicle behind on it.
+    """
+
+    exists: bool
+    ahead: Neighbor | None = None
+    behind: Neighbor | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Surroundings:
+    """What a careful driver would consider in one step.
+
+    Args:
+        speed_mps: of the agent, in m/s.
+        acceleration_mps2: its greatest acceleration, in m/s².
+        braking_mps2: its deceleration at full braking, in m/s².
+        ahead: vehicles and red lights on its path.
+        crossing: actors whose paths cross its path.
+        sides: by lane change, 1 to the left and -1 to the right; a missing side is unknown, as inside a junction.
+    """
+
+    speed_mps: float
+    acceleration_mps2: float
+    braking_mps2: float
+    ahead: tuple[Neighbor, ...] = ()
+    crossing: tuple[Crossing, ...] = ()
+    sides: Mapping[int, Side] = field(default_factory=dict)

@@ -1,0 +1,117 @@
+"""Causes that can be counted, the crashes to judge, and how causes are spread to the others."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given, strategies as st
+
+from crashhunt.crashes import (
+    Cause,
+    Factor,
+    Judgement,
+    LeftOut,
+    Omission,
+    Reference,
+    ReferenceRun,
+    Why,
+    cause_of,
+    representatives,
+    spread,
+)
+from crashhunt.trial import Outcome
+from crashhunt.world import Actor
+
+
+def bundle(outcome=Outcome.COLLISION, length=5.0):
+    actors = (Actor("ego", "passenger", 5.0, 1.8), Actor("x", "truck", length, 2.4))
+    return SimpleNamespace(result=SimpleNamespace(outcome=outcome), recording=lambda: SimpleNamespace(actors=actors))
+
+
+def omission(**more):
+    named = {
+        "faculty": "longitudinal",
+        "kind": "vehicle",
+        "actor": "x",
+        "step": 7,
+        "instead": "sped up",
+        "speed_mps": 9.0,
+    }
+    return Omission(**named | more)
+
+
+def factor(kind, what, *endings, name="ego"):
+    return Factor(kind, name, what, 7, None, tuple(LeftOut(place, end) for place, end in enumerate(endings)))
+
+
+@pytest.mark.parametrize(("length", "actor", "words"), [(5.0, "", "a vehicle"), (16.5, "long", "a long vehicle")])
+def test_an_omission_wins_over_a_decision_and_names_long_vehicles(length, actor, words):
+    why = Why((factor("agent", "sped up", "none", "none"),))
+    found = cause_of(bundle(length=length), Judgement(why=why, reference=Reference(omission=omission())))
+    assert found == Cause("omission", "vehicle", "sped up", actor)
+    assert str(found) == f"omission: does not brake for {words}, sped up"
+
+
+@pytest.mark.parametrize("relation", ["ahead", "behind", "alongside"])
+def test_of_a_lane_change_only_the_side_counts(relation):
+    change = omission(kind=f"{relation} left", instead="changed lanes", faculty="lateral")
+    found = cause_of(bundle(length=16.5), Judgement(reference=Reference(omission=change)))
+    assert found == Cause("omission", "gap left", "changed lanes")
+    missing = omission(kind="no lane left", instead="changed lanes", faculty="lateral", actor="")
+    words = str(cause_of(bundle(), Judgement(reference=Reference(omission=missing))))
+    assert words == "omission: changes to the left, where it has no lane"
+
+
+@pytest.mark.parametrize(
+    ("factors", "cause"),
+    [
+        ([factor("other", "braked", "none", "none"), factor("agent", "sped up", "none", "none")], "decision"),
+        ([factor("agent", "sped up", "same", "none"), factor("disturbance", "brake", "none", "none")], "disturbance"),
+        ([factor("argument", "default", "none", name="ego.speed")], "argument"),
+        ([factor("other", "there", "none", "none", "none")], "traffic"),
+        ([factor("agent", "sped up", "same", "same")], "unknown"),
+        ([factor("agent", "sped up", "none", "unclear")], "unknown"),  # a single run is chance
+        ([], "unknown"),
+    ],
+)
+def test_only_factors_without_which_no_run_crashes_are_causes(factors, cause):
+    judgement = Judgement(why=Why(tuple(factors)), reference=Reference())
+    assert cause_of(bundle(), judgement).kind == cause
+    assert cause_of(bundle(Outcome.AGENT_ERROR), judgement).kind == "software fault"
+    assert cause_of(bundle(), None).kind == "unknown"
+
+
+def test_what_runs_have_shown_comes_back_from_json():
+    run = ReferenceRun(faculty="lateral", step=7, ending="none", changed=("ego does not change lanes",))
+    reference = Reference(omission=omission(gap_m=-2.0, safe=9.5), runs=(run,), why_not="x")
+    assert Reference.from_json(reference.to_json()) == reference
+    assert Reference.from_json(Reference().to_json()) == Reference()
+
+
+POINTS = st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=1, max_size=20)
+
+
+@given(POINTS, st.integers(1, 25))
+def test_representatives_are_distinct_and_begin_with_the_shortest(points, count):
+    steps = [(place * 7) % 11 for place in range(len(points))]
+    chosen = representatives(points, steps, count)
+    assert len(chosen) == len({*chosen}) == min(count, len(points))
+    assert steps[chosen[0]] == min(steps)
+
+
+@given(POINTS, st.data())
+def test_every_crash_has_the_cause_of_the_nearest_judged_one(points, data):
+    places = data.draw(st.sets(st.integers(0, len(points) - 1), min_size=1))
+    known = {place: Cause("argument", str(place)) for place in places}
+    for place, cause in enumerate(spread(points, known)):
+        away = [sum((a - b) ** 2 for a, b in zip(points[place], points[other], strict=True)) for other in known]
+        mine = int(cause.what)
+        nearest = sum((a - b) ** 2 for a, b in zip(points[place], points[mine], strict=True))
+        assert nearest <= min(away) + 1e-9
+        assert mine == place or place not in known
+
+
+def test_far_groups_are_all_represented():
+    points = [(0.0, 0.0)] * 30 + [(50.0, 0.0)] + [(0.0, 50.0)]
+    assert {30, 31} < {*representatives(points, [9] * 32, 3)}

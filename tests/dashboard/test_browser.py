@@ -1,0 +1,211 @@
+"""The dashboard in a real browser."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sqlite3
+from contextlib import closing, suppress
+
+import pytest
+from dashboard_hunts import hunted
+from dashboard_pages import browser, page
+from served import served
+
+from crashhunt.base.integrity import digest_of_row
+
+__all__ = ["browser", "page"]  # fixtures
+pytestmark = pytest.mark.long
+STRANGE = "<img src=x onerror='window.hacked=1'><script>window.hacked=1</script>&amp;"
+
+
+@pytest.fixture
+def hunts(shell, made_once):
+    return made_once(hunted, shell).folder / "runs"
+
+
+def ended(process) -> None:
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+    process.communicate(timeout=120)
+
+
+def test_a_hunt_that_is_started_while_the_page_is_open_appears_and_its_crash_plays(shell, page):
+    root = shell.folder / "empty"
+    root.mkdir()
+    with served(root) as dashboard:
+        page.open(dashboard.url)
+        assert "No hunt yet" in page.text("main")
+        assert "crashhunt run" in page.text("main")
+        page.run("window.same = true")
+        words = ("--arg", "speed=20:25", "--seed", "1", "--keep-going")
+        hunt = shell.start("run", "empty/new", "1", "3", "800", *words)
+        try:
+            page.wait("document.querySelector('tbody a')?.innerText === 'new'")
+            assert page.run("return document.getElementById('begin').hidden")
+            page.run("document.querySelector('tbody a').click()")
+            page.wait("location.pathname.startsWith('/hunts/') && document.querySelector('h1').innerText === 'new'")
+            page.run("window.same = true")
+            page.wait("document.querySelector('#crashes a')")  # the crash arrives
+            assert page.run("return window.same")  # without a reload
+            page.run("document.querySelector('#crashes a').click()")
+            page.wait("window.crashhuntView?.crash")
+            page.run("document.getElementById('rate').value = '20'; document.getElementById('play').click()")
+            page.wait("crashhuntView.step === crashhuntView.crash.steps - 1 && !crashhuntView.playing")
+            assert page.run("return crashhuntView.frames") > 2
+        finally:
+            ended(hunt)
+    assert page.faults() == []
+
+
+@pytest.mark.nightly
+def test_a_hunt_that_is_killed_shows_as_killed(shell, page):
+    root = shell.folder / "runs"
+    root.mkdir()
+    with served(root) as dashboard:
+        words = ("--arg", "speed=5", "--seed", "1", "--keep-going")
+        hunt = shell.start("run", "runs/one", "1", "3000", "800", *words, start_new_session=True)
+        try:
+            page.open(dashboard.url)
+            page.wait("document.querySelector('tbody .state')?.innerText === 'running'")
+            page.wait("!document.querySelector('tbody').innerText.includes('0 of 3,000')")
+            os.kill(hunt.pid, signal.SIGKILL)
+            hunt.wait(60)
+            page.wait("document.querySelector('tbody .state').innerText === 'killed'")
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(hunt.pid, signal.SIGKILL)
+            hunt.communicate(timeout=60)
+
+
+def test_texts_of_strangers_are_text_on_every_page(hunts, page):
+    one = hunts / STRANGE.replace("/", "\u2215")
+    shutil.move(hunts / "one", one)
+    settings = one / "hunt.toml"
+    text = settings.read_text().replace("crashhunt.agents:KeepLaneWithSpeed", STRANGE)
+    settings.write_text(text.replace('scenario = "loop"', f'scenario = "{STRANGE}"'))
+    (one / "run.log").write_text(STRANGE)
+    with closing(sqlite3.connect(one / "ledger.sqlite")) as database, database:
+        (kinds,) = database.execute("SELECT value FROM hunt WHERE key = 'kinds'").fetchone()
+        row = ("kinds", kinds.replace('"words": "', f'"words": "{STRANGE}'))
+        database.execute("UPDATE hunt SET value = ?, digest = ? WHERE key = ?", (row[1], digest_of_row(row), "kinds"))
+    with served(hunts) as dashboard:
+        (row,) = dashboard.hunts().values()
+        assert row["agents"]["ego"] == STRANGE
+        crash = dashboard.get(f"/api/hunts/{row['id']}/crashes")["crashes"][0]["id"]
+        address = f"{dashboard.url}/hunts/{row['id']}"
+        for url, expected in (
+            (dashboard.url, STRANGE),
+            (address, STRANGE),
+            (f"{address}/crashes/{crash}", "onerror"),
+            (f"{dashboard.url}/compare?hunts={row['id']}", "onerror"),
+        ):
+            page.open(url)
+            page.wait("document.body.dataset.complete === 'true' || Number(document.body.dataset.polls) > 0")
+            page.wait("document.body.innerText.includes(arguments[0])", expected)
+            assert page.run("return window.hacked") is None
+            assert page.run("return document.querySelectorAll('img, main script').length") == 0
+    assert [fault for fault in page.faults() if "404" not in fault] == []
+
+
+def test_everything_is_reached_by_keyboard(hunts, page):
+    shutil.copytree(hunts / "one", hunts / "two")
+    with served(hunts) as dashboard:
+        page.open(dashboard.url)
+        page.wait("document.querySelectorAll('tbody tr').length === 2")
+        page.tab_to("at.id === 'filter'")
+        page.keys("two")
+        assert page.run("return document.querySelectorAll('tbody tr').length") == 1
+        assert "q=two" in page.browser.current_url
+        page.browser.refresh()  # the link keeps what was chosen
+        page.wait("document.querySelectorAll('tbody tr').length === 1")
+        page.run("document.getElementById('filter').focus()")
+        page.keys("\ue003" * 3)
+        page.tab_to("at.closest('th') && at.innerText === 'Hunt'")
+        page.keys("\ue007")
+        assert page.run("return document.querySelector('th[aria-sort=ascending]').innerText").startswith("Hunt")
+        assert page.run("return [...document.querySelectorAll('tbody a')].map((a) => a.innerText)") == ["one", "two"]
+        page.tab_to("at.type === 'checkbox' && at.closest('tbody')")
+        page.keys(" ")
+        page.tab_to("at.tagName === 'A' && at.innerText === 'one'")
+        page.keys("\ue007")
+        page.wait("document.querySelector('h1').innerText === 'one' && document.body.dataset.complete")
+        page.tab_to("at.id === 'over'")
+        page.keys("s")  # of "simulated steps"
+        assert "over=1" in page.browser.current_url
+        page.tab_to("at.id === 'trial-number'")
+        number = page.run("return document.querySelector('#crashes a').innerText")
+        page.keys(str(int(number.partition("-")[0])), "\ue007")
+        page.wait("location.pathname.includes('/crashes/') && window.crashhuntView?.crash")
+        body = page.browser.find_element("tag name", "body")
+        body.send_keys("\ue011")  # home
+        assert page.run("return crashhuntView.step") == 0
+        body.send_keys("\ue014")
+        assert page.run("return crashhuntView.step") == 1
+        body.send_keys("f")
+        assert page.run("return document.getElementById('follow').getAttribute('aria-pressed')") == "false"
+
+
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.nightly)])
+def test_axe_finds_nothing_serious_and_nothing_is_cut_off(hunts, page, scheme):
+    shutil.copytree(hunts / "one", hunts / "two")
+    with served(hunts) as dashboard:
+        page.scheme(scheme)
+        rows = dashboard.hunts()
+        one = rows["one"]["id"]
+        crash = dashboard.get(f"/api/hunts/{one}/crashes")["crashes"][0]["id"]
+        both = ",".join(row["id"] for row in rows.values())
+        for path in ("/", f"/hunts/{one}", f"/hunts/{one}/crashes/{crash}", f"/compare?hunts={both}"):
+            page.open(dashboard.url + path)
+            page.wait("document.body.dataset.complete === 'true' || Number(document.body.dataset.polls) > 0")
+            assert page.serious() == [], path
+            for width in (360, 800, 2500):
+                page.size(width, 900)
+                assert page.run("return document.documentElement.scrollWidth") <= width, (path, width)
+            page.size(1280, 1000)
+    assert page.faults() == []
+
+
+@pytest.mark.nightly
+def test_the_page_of_a_deleted_hunt_reports_that_it_is_gone(hunts, page):
+    with served(hunts) as dashboard:
+        page.open(f"{dashboard.url}/hunts/{dashboard.hunts()['one']['id']}")
+        page.wait("document.body.dataset.complete === 'true'")
+        shutil.rmtree(hunts / "one")
+        page.wait("!document.getElementById('banner').hidden")
+        assert "not there (any more)" in page.text("#banner")
+        assert page.text("#state") == "gone"
+        page.open(dashboard.url)
+        page.wait("!document.getElementById('begin').hidden")
+
+
+def test_the_page_reports_that_the_dashboard_has_ended(hunts, page):
+    with served(hunts) as dashboard:
+        page.open(dashboard.url)
+    page.wait("!document.getElementById('banner').hidden")
+    assert "does not answer" in page.text("#banner")
+
+
+def test_charts_draw_what_the_api_returns(hunts, page):
+    with served(hunts) as dashboard:
+        identifier = dashboard.hunts()["one"]["id"]
+        page.open(f"{dashboard.url}/hunts/{identifier}?across=speed&up=vehicles")
+        page.wait("document.getElementById('scatter').data && document.getElementById('map').data")
+        points = dashboard.get(f"/api/hunts/{identifier}/trials")["points"]
+        drawn = page.run(
+            "const dots = (one) => one.customdata.map((number, i) => [number, one.x[i], one.y[i]]);"
+            "return document.getElementById('scatter').data.flatMap(dots)"
+        )
+        assert sorted(drawn) == sorted(
+            [point["number"], point["values"]["speed"], point["values"]["vehicles"]] for point in points
+        )
+        curve = page.run("const [c] = document.getElementById('discovery').data; return [c.x, c.y]")
+        detail = dashboard.get(f"/api/hunts/{identifier}")
+        assert curve == [[one[0] for one in detail["curve"]], [one[2] for one in detail["curve"]]]
+        where = dashboard.get(f"/api/hunts/{identifier}/map")
+        shown = page.run(
+            "return document.getElementById('map').data.filter((t) => t.customdata).flatMap((t) => t.customdata)"
+        )
+        assert sorted(shown) == sorted(point["id"] for point in where["points"])
+        assert where["lanes"]

@@ -1,0 +1,139 @@
+"""``crashhunt dashboard`` as a user runs it: its address, its end, and what it says of bad input."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+
+import pytest
+from dashboard_hunts import hunted
+
+
+def begun(shell, *words: str):
+    """Start the command; return its process and what it says of its address."""
+    process = shell.start("dashboard", *words, "--port", "0", "--json", "--no-browser")
+    assert process.stdout is not None
+    return process, json.loads(process.stdout.readline())
+
+
+def fetched(url: str) -> bytes:
+    with urllib.request.urlopen(url, timeout=60) as answer:
+        return answer.read()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_prints_its_address_and_runs_until_it_is_stopped(shell, number):
+    process, address = begun(shell)
+    try:
+        assert address["url"] == f"http://127.0.0.1:{address['port']}/"
+        assert address["token"] == ""
+        assert b"<title>Hunts" in fetched(address["url"])
+        assert json.loads(fetched(f"{address['url']}api/hunts"))["hunts"] == []
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == (0 if number == signal.SIGINT else -signal.SIGTERM)
+    assert out == ""
+    assert err.splitlines() == [address["url"], "Ctrl-C ends the dashboard."]
+
+
+def test_an_address_that_others_reach_has_a_random_token(shell):
+    tokens = set()
+    for _ in range(2):
+        process, address = begun(shell, "--host", "0.0.0.0")
+        try:
+            assert f"?token={address['token']}" in address["url"]
+            assert len(address["token"]) >= 24
+            with pytest.raises(urllib.error.HTTPError, match="401"):
+                fetched(f"http://127.0.0.1:{address['port']}/")
+            tokens.add(address["token"])
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=60)
+    assert len(tokens) == 2
+
+
+def test_a_taken_port_is_one_line_with_the_next_free_one(shell):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = shell.crashhunt("dashboard", "--port", str(port), "--no-browser", expect=2)
+    (line,) = done.err.splitlines()
+    assert f"port {port} of 127.0.0.1 is taken" in line
+    free = int(line.partition("--port ")[2].partition(",")[0])
+    assert free > port
+    socket.create_server(("127.0.0.1", free)).close()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["nothing-here"], "'nothing-here' does not exist"),
+        (["--port", "70000"], "--port is 70000"),
+        (["--port", "-1"], "--port is -1"),
+        (["--port", "x"], "'x' is not a whole number"),
+        (["--host", "no.such.host.invalid"], "--host 'no.such.host.invalid' is not known"),
+        (["--host", "192.0.2.1", "--port", "0"], "cannot listen on 192.0.2.1"),
+        (["--host", "a" * 300], "is not known"),
+        (["--token", "short"], "--token has 5 characters (allowed: at least 16"),
+        (["--token", "with spaces in the text"], "printable ASCII without spaces"),
+        (["faulty.py"], "faulty.py"),
+    ],
+)
+def test_bad_input_is_one_line(shell, words, said):
+    done = shell.crashhunt("dashboard", "--no-browser", *words, expect=2)
+    (line,) = done.err.splitlines()
+    assert said in line
+    assert done.out == ""
+
+
+def test_a_missing_extra_names_the_command_that_installs_it(shell):
+    script = (
+        "import importlib.util as util, sys; real = util.find_spec\n"
+        "util.find_spec = lambda name, *more: None if name == 'plotly' else real(name, *more)\n"
+        "sys.argv = ['crashhunt', 'dashboard', '--no-browser']\n"
+        "from crashhunt.__main__ import main; main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=shell.folder,
+        env=shell.environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 2
+    assert done.stderr == ("crashhunt: the dashboard needs plotly; run: pip install 'crashhunt[dashboard]'\n")
+
+
+def test_other_commands_import_nothing_of_it(shell):
+    script = (
+        "import sys, crashhunt\n"
+        "from crashhunt.cli import make_parser\n"
+        "make_parser().format_help()\n"
+        "print([name for name in sys.modules if name.split('.')[0] in ('starlette', 'uvicorn', 'plotly')"
+        " or name.startswith('crashhunt.dashboard')])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_an_exported_crash_is_shown(shell, made_once):
+    made_once(hunted, shell)
+    shell.crashhunt("export", "runs/one", "crash.zip")
+    process, address = begun(shell, "crash.zip")
+    try:
+        (row,) = json.loads(fetched(f"{address['url']}api/hunts"))["hunts"]
+        assert (row["name"], row["exported"], row["damaged"]) == ("crash.zip", True, False)
+        one = f"{address['url']}api/hunts/{row['id']}"
+        (crash,) = json.loads(fetched(f"{one}/crashes"))["crashes"]
+        assert json.loads(fetched(f"{one}/crashes/{crash['id']}"))["steps"] > 0
+        for what in ("", "/trials", "/map", "/importance"):
+            fetched(one + what)
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)

@@ -1,0 +1,89 @@
+"""With ``--allow-control``, the page stops hunts and runs commands; without it, and for other sites, it does not."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import pytest
+from dashboard_hunts import hunted
+from served import served
+
+OURS = {"Host": "localhost", "X-Crashhunt": "1"}
+
+
+@pytest.fixture
+def hunt(shell, made_once):
+    return made_once(hunted, shell).folder / "runs"
+
+
+def wait_until(condition, seconds: float = 240.0):
+    deadline = time.monotonic() + seconds
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "it did not come to that"
+        time.sleep(0.1)
+    return found
+
+
+def test_nothing_is_controlled_unless_it_is_allowed(hunt):
+    with served(hunt) as dashboard:
+        one = f"/api/hunts/{dashboard.hunts()['one']['id']}"
+        crash = dashboard.get(f"{one}/crashes")["crashes"][0]["id"]
+        assert dashboard.get("/api")["control"] is False
+        for target in (f"{one}/stop", f"{one}/crashes/{crash}/jobs/replay"):
+            assert dashboard.ask(target, OURS, method="POST").status == 405
+        assert dashboard.ask(f"{one}/crashes/{crash}/jobs").status == 404
+
+
+def test_other_sites_control_nothing(hunt):
+    with served(hunt, control=True) as dashboard:
+        one = f"/api/hunts/{dashboard.hunts()['one']['id']}"
+        crash = dashboard.get(f"{one}/crashes")["crashes"][0]["id"]
+        target = f"{one}/crashes/{crash}/jobs/replay"
+        for headers in (
+            {"Host": "localhost"},  # as a form of another site sends it
+            {**OURS, "Host": "evil.example"},
+            {**OURS, "Origin": "http://evil.example"},
+            {**OURS, "Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"},
+            {**OURS, "X-Crashhunt": "2"},
+        ):
+            assert dashboard.ask(target, headers, method="POST").status in (403, 421)
+        assert dashboard.get(f"{one}/crashes/{crash}/jobs")["jobs"] == []
+        assert dashboard.ask(f"{one}/stop", OURS, method="GET").status == 405
+
+
+def test_a_crash_is_replayed_and_unknown_jobs_are_refused(hunt):
+    with served(hunt, control=True) as dashboard:
+        one = f"/api/hunts/{dashboard.hunts()['one']['id']}"
+        crash = min(dashboard.get(f"{one}/crashes")["crashes"], key=lambda row: row["steps"])["id"]
+        jobs = f"{one}/crashes/{crash}/jobs"
+        for name in ("rm", "export", "..%2freplay", "--version"):
+            assert dashboard.ask(f"{jobs}/{name}", OURS, method="POST").status in (404, 409)
+        assert dashboard.ask(f"{one}/crashes/nothing/jobs/replay", OURS, method="POST").status == 404
+        assert dashboard.ask(f"{one}/stop", OURS, method="POST").status == 409
+        assert dashboard.ask(f"{jobs}/replay", OURS, method="POST").status == 200
+        (job,) = wait_until(lambda: [one for one in dashboard.get(jobs)["jobs"] if one["state"] == "ended"])
+        assert (job["name"], job["exit_code"]) == ("replay", 0), job["output"]
+        assert "reproduced" in job["output"]
+
+
+def test_a_running_hunt_is_stopped_as_by_ctrl_c(shell):
+    root = shell.folder / "runs"
+    root.mkdir()
+    words = ("--arg", "speed=5", "--seed", "1", "--keep-going")
+    process = shell.start("run", "runs/one", "1", "3000", "800", *words)
+    try:
+        with served(root, control=True) as dashboard:
+            wait_until(lambda: any(row["trials_run"] for row in dashboard.hunts().values()))
+            row = dashboard.hunts()["one"]
+            assert row["state"] == "running"
+            workers = wait_until(lambda: dashboard.get(f"/api/hunts/{row['id']}")["workers"])
+            assert 0 <= workers[0]["since_s"] < 3600
+            assert dashboard.ask(f"/api/hunts/{row['id']}/stop", OURS, method="POST").status == 200
+            process.communicate(timeout=240)
+            assert process.returncode == 130
+            assert dashboard.hunts()["one"]["state"] == "interrupted"
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGKILL)
+            process.communicate(timeout=60)

@@ -1,0 +1,288 @@
+"""Attacks on the dashboard: each must be refused, and the page must go on."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+import threading
+from contextlib import ExitStack, closing, suppress
+
+import pytest
+from dashboard_hunts import hunted, written
+from served import served
+
+TOKEN = "a-token-of-a-test-1234"
+
+
+@pytest.fixture
+def hunt(shell, made_once):
+    """A real hunt of the toy simulator with crashes, in ``runs/one``."""
+    return made_once(hunted, shell).folder / "runs"
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:8642", "127.0.0.1.evil.example", "localhost.evil.example", "", "a b", "[::1"]
+)
+def test_a_name_that_is_not_ours_is_refused(hunt, host):
+    with served(hunt) as dashboard:
+        for target in ("/", "/api/hunts", "/static/common.js"):
+            reply = dashboard.ask(target, {"Host": host})
+            assert reply.status in (400, 421), reply.body
+            assert b"one" not in reply.body
+        assert dashboard.ask("/", {"Host": "localhost:9999"}).status == 200  # through a tunnel
+
+
+def test_two_host_headers_or_none_are_refused(hunt):
+    with served(hunt) as dashboard:
+        for lines in (b"Host: 127.0.0.1\r\nHost: evil.example\r\n", b""):
+            reply = dashboard.raw(b"GET /api/hunts HTTP/1.1\r\n" + lines + b"Connection: close\r\n\r\n")
+            assert reply.split()[1] in (b"400", b"421")
+        assert dashboard.raw(b"GET /api/hunts HTTP/1.0\r\n\r\n").split()[1] == b"421"
+
+
+def test_every_answer_forbids_what_is_not_ours(hunt):
+    with served(hunt) as dashboard:
+        for target, host in (("/", "localhost"), ("/nothing", "localhost"), ("/api/hunts", "localhost"), ("/", "evil")):
+            headers = dashboard.ask(target, {"Host": host}).headers
+            policy = dict(part.strip().partition(" ")[::2] for part in headers["content-security-policy"].split(";"))
+            assert policy["default-src"] == "'none'"
+            assert policy["script-src"] == "'self'"
+            assert policy["frame-ancestors"] == "'none'"
+            assert headers["x-content-type-options"] == "nosniff"
+            assert headers["x-frame-options"] == "DENY"
+            assert "access-control-allow-origin" not in headers
+
+
+def test_pages_have_no_inline_script_and_no_foreign_address(hunt):
+    with served(hunt) as dashboard:
+        for page in ("/", "/hunts/x", "/hunts/x/crashes/y", "/compare"):
+            text = dashboard.ask(page).body.decode()
+            assert text.count("<script") == text.count(' src="/static/')
+            assert "http://" not in text
+            assert "https://" not in text
+            assert " onclick=" not in text
+
+
+def test_requests_of_other_sites_are_refused(hunt):
+    with served(hunt) as dashboard:
+        host = {"Host": "localhost"}
+        assert dashboard.ask("/api/hunts", {**host, "Sec-Fetch-Site": "same-origin"}).status == 200
+        assert dashboard.ask("/api/hunts", {**host, "Sec-Fetch-Site": "cross-site"}).status == 403
+        assert dashboard.ask("/static/common.js", {**host, "Sec-Fetch-Site": "same-site"}).status == 403
+        assert dashboard.ask("/api/hunts", {**host, "Origin": "http://evil.example"}).status == 403
+        assert dashboard.ask("/api/hunts", {**host, "Origin": "null"}).status == 403
+        assert dashboard.ask("/api/hunts", {**host, "Origin": "http://localhost"}).status == 200
+        link = {**host, "Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}
+        assert dashboard.ask("/", link).status == 200
+
+
+def test_the_dashboard_only_reads(hunt):
+    with served(hunt) as dashboard:
+        for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE"):
+            assert dashboard.ask("/api/hunts", method=method).status == 405
+
+
+def test_without_the_token_nothing_is_shown(hunt):
+    with served(hunt, host="0.0.0.0", token=TOKEN) as dashboard:
+        for target in ("/", "/api", "/api/hunts", "/static/common.js", "/nothing"):
+            for headers in ({}, {"Cookie": "crashhunt-token=wrong"}, {"Authorization": "Bearer " + TOKEN[:-1]}):
+                reply = dashboard.ask(target, headers)
+                assert reply.status == 401
+                assert TOKEN not in reply.body.decode()
+            assert dashboard.ask(f"{target}?token=wrong").status == 401
+        assert dashboard.ask("/api/hunts", {"Authorization": f"Bearer {TOKEN}"}).status == 200
+        assert dashboard.ask("/api/hunts", {"Cookie": "crashhunt-token=\xff\xfe"}).status == 401
+
+
+def test_the_token_moves_from_the_link_to_a_cookie_that_scripts_cannot_read(hunt):
+    with served(hunt, host="0.0.0.0", token=TOKEN) as dashboard:
+        reply = dashboard.ask(f"/?q=x&token={TOKEN}")
+        assert (reply.status, reply.headers["location"]) == (303, "/?q=x")
+        cookie = reply.headers["set-cookie"]
+        assert "HttpOnly" in cookie
+        assert "samesite=strict" in cookie.lower()
+        assert dashboard.ask("/api/hunts", {"Cookie": cookie.partition(";")[0]}).status == 200
+        # Two slashes would lead to another machine.
+        assert dashboard.ask(f"//evil.example/?token={TOKEN}").headers["location"] == "/evil.example/"
+
+
+def test_no_path_leads_out_of_the_folders(hunt, tmp_path):
+    (tmp_path / "secret.txt").write_text("a secret")
+    with served(hunt) as dashboard:
+        one = f"/api/hunts/{dashboard.hunts()['one']['id']}"
+        paths = [
+            "/../secret.txt", "/static/../../secret.txt", "/static/..%2f..%2fsecret.txt", "/static/%2e%2e/secret.txt",
+            f"{one}/crashes/../../secret.txt", f"{one}/crashes/..%2f..%2fsecret/log", f"{one}/crashes/%2e%2e/log",
+            f"{one}/crashes/%00/log", "/api/hunts/..%2fone", f"/api/hunts/{hunt}/one", "/static//etc/passwd",
+            "/api/hunts/..\\..\\x",
+        ]  # fmt: skip
+        for path in paths:
+            reply = dashboard.ask(path)
+            assert reply.status == 404, path
+            assert b"a secret" not in reply.body
+
+
+def test_links_out_of_the_folders_are_not_followed(hunt, tmp_path):
+    outside = tmp_path / "outside"
+    shutil.copytree(hunt / "one", outside)
+    (hunt / "linked").symlink_to(outside)
+    shutil.copytree(hunt / "one", hunt / "ledger")
+    (hunt / "ledger" / "ledger.sqlite").unlink()
+    (hunt / "ledger" / "ledger.sqlite").symlink_to(outside / "ledger.sqlite")
+    crash = sorted((hunt / "one" / "crashes").iterdir())[0]
+    secret = tmp_path / "secret.txt"
+    secret.write_text("a secret")
+    (crash / "log.mcap").unlink()
+    (crash / "log.mcap").symlink_to(secret)
+    (crash / "run.log").unlink(missing_ok=True)
+    (crash / "run.log").symlink_to(secret)
+    (hunt / "one" / "crashes" / "999999-collision").symlink_to(outside / "crashes" / crash.name)
+    with served(hunt) as dashboard:
+        rows = dashboard.hunts()
+        assert "linked" not in rows
+        assert rows["ledger"]["state"] == "error"
+        assert "ledger.sqlite is a link to a place outside" in rows["ledger"]["detail"]
+        assert rows["one"]["state"] == "crashed"  # the others are as they were
+        one = f"/api/hunts/{rows['one']['id']}"
+        listed = {row["id"]: row for row in dashboard.get(f"{one}/crashes")["crashes"]}
+        for name in (crash.name, "999999-collision"):
+            assert "is a link to a place outside" in listed[name]["damaged"]
+            for what in ("", "/log", "/export"):
+                reply = dashboard.ask(f"{one}/crashes/{name}{what}")
+                assert reply.status in (404, 422)
+                assert b"a secret" not in reply.body
+
+
+def test_requests_that_are_too_large_are_refused(hunt):
+    with served(hunt) as dashboard:
+        assert dashboard.ask("/api/hunts?since=" + "9" * 5_000).status == 414
+        assert dashboard.ask("/api/hunts?since=" + "9" * 3_000).status == 200
+        assert dashboard.ask("/api/hunts", {"Content-Length": "99999999"}).status in (413, 400)
+        assert dashboard.ask("/api/hunts", {"X-Long": "a" * 15_000}).status == 200
+        # The server closes a connection on which it did not read everything: the client may see a reset before the
+        # answer.
+        with suppress(ConnectionError):
+            assert dashboard.ask("/api/hunts", {"X-Long": "a" * 100_000}).status in (400, 431)
+        body = b"GET /api/hunts HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+        body += b"8000\r\n" + b"a" * 0x8000 + b"\r\n0\r\n\r\n"
+        with suppress(ConnectionError):
+            assert not (reply := dashboard.raw(body)) or reply.split()[1] in (b"200", b"413", b"400")
+        assert dashboard.get("/api/hunts")["hunts"]
+
+
+def test_requests_at_a_time_are_bounded(hunt, monkeypatch):
+    from crashhunt.dashboard import _application, _security
+
+    monkeypatch.setattr(_security, "MAX_REQUESTS", 4)
+    goes, inside = threading.Event(), threading.Semaphore(0)
+
+    def waits(view):
+        inside.release()
+        assert goes.wait(60)
+        return {}
+
+    monkeypatch.setattr(_application, "detail_of", waits)
+    with served(hunt) as dashboard, ExitStack() as waiting:
+        identifier = dashboard.hunts()["one"]["id"]
+        replies = []
+        for _ in range(4):
+            thread = threading.Thread(target=lambda: replies.append(dashboard.ask(f"/api/hunts/{identifier}").status))
+            thread.start()
+            waiting.callback(thread.join, 60)
+        for _ in range(4):
+            assert inside.acquire(timeout=60)
+        busy = dashboard.ask("/api")
+        goes.set()
+        assert busy.status == 503
+        assert "requests at a time" in busy.json["error"]["message"]
+    assert replies == [200] * 4
+
+
+@pytest.mark.parametrize("damage", ["garbage", "truncated", "a fact", "a row", "no table"])
+def test_a_damaged_ledger_costs_its_own_row(hunt, shell, damage):
+    shutil.copytree(hunt / "one", hunt / "two")
+    ledger = hunt / "two" / "ledger.sqlite"
+    if damage == "garbage":
+        ledger.write_bytes(os.urandom(20_000))
+    elif damage == "truncated":
+        ledger.write_bytes(ledger.read_bytes()[: ledger.stat().st_size // 2])
+    else:
+        with closing(sqlite3.connect(ledger)) as database, database:
+            if damage == "a fact":
+                database.execute("UPDATE hunt SET value = '[1' WHERE key = 'state'")
+            elif damage == "a row":
+                database.execute("UPDATE trials SET result = '<img src=x onerror=alert(1)>' WHERE number = 1")
+            else:
+                database.execute("DROP TABLE trials")
+    with served(hunt) as dashboard:
+        rows = dashboard.hunts()
+        assert rows["one"]["state"] == "crashed"
+        two = f"/api/hunts/{rows['two']['id']}"
+        for target in ("", "/trials", "/importance", "/crashes", "/map"):
+            assert dashboard.ask(two + target).status == 200
+        said = [rows["two"]["detail"], *dashboard.get(two)["problems"]]
+        assert any("crashhunt check" in line or "not a ledger" in line for line in said), said
+        if damage in ("a fact", "a row"):
+            checked = shell.crashhunt("check", str(hunt / "two"), expect=None)
+            told = "a fact is not as it was written" if damage == "a fact" else "trial 1 is not as it was written"
+            assert told in " ".join(said)
+            assert told in checked.out + checked.err or damage == "a row"
+
+
+def test_a_damaged_bundle_costs_its_own_row(hunt):
+    folders = sorted((hunt / "one" / "crashes").iterdir())
+    (folders[0] / "crash.json").write_text("{")
+    (folders[1] / "log.mcap").write_bytes(b"garbage")
+    with served(hunt) as dashboard:
+        one = f"/api/hunts/{dashboard.hunts()['one']['id']}"
+        listed = {row["id"]: row for row in dashboard.get(f"{one}/crashes")["crashes"]}
+        assert listed[folders[0].name]["damaged"]
+        assert not listed[folders[2].name]["damaged"]
+        assert dashboard.ask(f"{one}/crashes/{folders[0].name}").status == 422
+        assert "error" in dashboard.ask(f"{one}/crashes/{folders[1].name}").json
+        assert dashboard.ask(f"{one}/crashes/{folders[2].name}").status == 200
+
+
+def test_nothing_is_written_into_the_folder_of_a_hunt(hunt):
+    before = {path: written(path) for path in sorted(hunt.rglob("*"))}
+    hunt.joinpath("one").chmod(0o555)
+    try:
+        with served(hunt) as dashboard:
+            one = f"/api/hunts/{dashboard.hunts()['one']['id']}"
+            crash = dashboard.get(f"{one}/crashes")["crashes"][0]["id"]
+            for target in ("", "/trials", "/importance", "/map", f"/crashes/{crash}", f"/crashes/{crash}/log"):
+                assert dashboard.ask(one + target).status == 200
+            assert dashboard.ask(f"{one}/crashes/{crash}/export").body[:2] == b"PK"
+            names = ",".join(row["id"] for row in dashboard.hunts().values())
+            assert dashboard.ask(f"/api/compare?hunts={names}").status == 200
+    finally:
+        hunt.joinpath("one").chmod(0o755)
+    assert {path: written(path) for path in sorted(hunt.rglob("*"))} == before
+
+
+def test_json_of_a_strange_hunt_is_json(hunt):
+    settings = hunt / "one" / "hunt.toml"
+    settings.write_text(
+        settings.read_text().replace("# crashhunt", "# \u2028<script>alert(1)</script>\x7f crashhunt", 1)
+    )
+    with served(hunt) as dashboard:
+        row = dashboard.get(f"/api/hunts/{dashboard.hunts()['one']['id']}")
+        assert "<script>" in row["command"]  # as text, which the page shows as text
+        reply = dashboard.ask("/api/hunts")
+        assert reply.headers["content-type"] == "application/json"
+        json.loads(reply.body)
+
+
+def test_a_folder_that_only_looks_like_a_hunt_costs_its_own_row(hunt):
+    for name, text in (("empty", ""), ("not-toml", "= ="), ("other", "a = 1")):
+        folder = hunt / name
+        folder.mkdir()
+        (folder / "hunt.toml").write_text(text)
+    (hunt / "folder" / "ledger.sqlite").mkdir(parents=True)
+    with served(hunt) as dashboard:
+        rows = dashboard.hunts()
+        assert rows["one"]["state"] == "crashed"
+        for name in ("empty", "not-toml", "other", "folder"):
+            assert rows[name]["state"] in ("error", "queued"), rows[name]

@@ -1,0 +1,211 @@
+"""What the dashboard counts and samples must be what the ledger says, whatever the order in which trials come."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+from dashboard_hunts import hunted
+from hypothesis import given, settings, strategies as st
+
+from crashhunt.dashboard import _trials
+from crashhunt.dashboard._catalog import Catalog
+from crashhunt.dashboard._hunt import HuntView
+from crashhunt.dashboard._trials import Sample, TrialCounts
+from crashhunt.estimation import counts_suffice, measure_rates, rate_of_counts
+from crashhunt.ledger import Ledger
+from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
+
+CRASH_ON = (Outcome.COLLISION, Outcome.HANG)
+OUTCOMES = (Outcome.SURVIVED, Outcome.SURVIVED, Outcome.COLLISION, Outcome.INVALID, Outcome.FINISHED)
+
+
+def trial(number: int, outcome: Outcome, *, killed: bool = False) -> TrialResult:
+    spec = TrialSpec(
+        number=number,
+        seed=number,
+        arguments={"ego": {"speed": number / 7}},
+        scenario_arguments={"cars": 3},
+        max_steps=9,
+    )
+    failure = Failure(KILLED, "was killed") if killed else None
+    return TrialResult(spec, outcome, steps=number % 9 + 1, failure=failure, danger=number * 0.37 % 1.0)
+
+
+def record(ledger: Ledger, trials) -> None:
+    for result in trials:
+        ledger.record(result, snapshot="s")
+
+
+def expected_prefix(trials: dict[int, TrialResult]):
+    """Counts of the trials up to the first that has not ended, or was killed from outside."""
+    found, number = [], 0
+    while number in trials and not trials[number].was_killed_from_outside:
+        found.append(trials[number])
+        number += 1
+    valid = [one for one in found if one.outcome is not Outcome.INVALID]
+    after = [one for one in trials.values() if one.spec.number >= number and not one.was_killed_from_outside]
+    return (
+        len(valid),
+        len(found) - len(valid),
+        sum(one.outcome in CRASH_ON for one in valid),
+        sum(one.steps for one in valid),
+        len(after),
+    )
+
+
+@settings(max_examples=50)
+@given(
+    st.integers(1, 90), st.randoms(use_true_random=False), st.lists(st.integers(0, 89), max_size=3, unique=True),
+    st.sampled_from([4, 16, 256]), st.booleans(), st.sampled_from([3, 4_000]),
+)  # fmt: skip
+def test_counts_are_those_of_the_ledger_in_any_order(tmp_path_factory, count, rng, killed, parts, same, tail):
+    trials = {
+        number: trial(number, Outcome.INVALID if number in killed else rng.choice(OUTCOMES), killed=number in killed)
+        for number in range(count)
+    }
+    if same:  # as trials that run all their steps
+        trials = {n: replace(one, steps=9) if one.outcome is Outcome.SURVIVED else one for n, one in trials.items()}
+    order = list(trials)
+    window = rng.randint(1, 12)  # workers end a little out of order
+    order.sort(key=lambda number: number + rng.uniform(0, window))
+    path = tmp_path_factory.mktemp("ledger") / "ledger.sqlite"
+    before = _trials.PARTS, _trials._TAIL
+    _trials.PARTS, _trials._TAIL = parts, tail
+    try:
+        counts, there = TrialCounts(CRASH_ON), {}
+        with closing(Ledger(path, writable=True)) as writer:
+            while order:
+                some, order = order[: (size := rng.randint(1, 30))], order[size:]
+                record(writer, (trials[number] for number in some))
+                there |= {number: trials[number] for number in some}
+                with closing(Ledger(path, read_only=True)) as reader, reader.one_moment():
+                    began = counts.last >= 0
+                    new = counts.refresh(reader)
+                if began:
+                    assert sorted(new) == sorted((number, str(trials[number].outcome)) for number in some)
+                assert counts.outcomes == Counter(str(one.outcome) for one in there.values())
+                assert tuple(counts.prefix) == expected_prefix(there)
+                curve = counts.curve(1000)
+                assert curve[-1] == [len(there), sum(one.steps for one in there.values()), counts.crashes]
+                assert len(counts.parts()) <= parts + 1
+                for part in counts.parts():
+                    inside = [one for n, one in there.items() if part["first"] <= n <= part["last"]]
+                    assert part["outcomes"] == Counter(str(one.outcome) for one in inside)
+                    assert part["steps"] == sum(one.steps for one in inside)
+    finally:
+        _trials.PARTS, _trials._TAIL = before
+
+
+def test_a_curve_has_no_more_points_than_asked_and_both_ends(tmp_path):
+    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
+        record(ledger, (trial(number, Outcome.SURVIVED) for number in range(300)))
+        counts = TrialCounts(CRASH_ON)
+        counts.refresh(ledger)
+    for most in (2, 7, 48):
+        curve = counts.curve(most)
+        assert len(curve) == most
+        assert (curve[0], curve[-1][0]) == ([0, 0, 0], 300)
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_the_sample_keeps_all_crashes_and_an_even_share(tmp_path, monkeypatch, at_once):
+    monkeypatch.setattr(_trials, "MAX_POINTS", 100)
+    crashed = set(random.Random(1).sample(range(3_000), 60))
+    path = tmp_path / "ledger.sqlite"
+    sample, counts = Sample(CRASH_ON), TrialCounts(CRASH_ON)
+    with closing(Ledger(path, writable=True)) as ledger, ledger.together():
+        for begin in range(0, 3_000, 3_000 if at_once else 250):
+            numbers = range(begin, begin + (3_000 if at_once else 250))
+            record(ledger, (trial(n, Outcome.COLLISION if n in crashed else Outcome.SURVIVED) for n in numbers))
+            first = counts.last < 0
+            new = counts.refresh(ledger)
+            if first:
+                sample.begin(ledger, counts.last, counts.crashes)
+            else:
+                sample.add(ledger, new)
+            assert {point["number"] for point in sample.points if point["crash"]} == {
+                n for n in crashed if n <= counts.last
+            }
+    others = sorted(point["number"] for point in sample.points if not point["crash"])
+    assert 40 <= len(others) <= 100
+    assert len(others) == len(set(others))
+    tenths = Counter(number // 300 for number in others)  # evenly over the hunt
+    assert all(abs(tenths[tenth] - len(others) / 10) <= 3 for tenth in range(10))
+    assert sample.points[0]["values"].keys() == {"speed", "cars"}
+
+
+def test_the_sample_of_a_hunt_that_grows_is_that_of_one_read_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(_trials, "MAX_POINTS", 64)
+    monkeypatch.setattr(_trials, "MAX_CRASHES", 32)
+    found = []
+    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
+        grown, counts = Sample(CRASH_ON), TrialCounts(CRASH_ON)
+        for number in range(1_000):
+            record(ledger, [trial(number, Outcome.COLLISION if number % 5 == 0 else Outcome.SURVIVED)])
+            if number % 50 == 49:
+                first = counts.last < 0
+                new = counts.refresh(ledger)
+                if first:
+                    grown.begin(ledger, counts.last, counts.crashes)
+                else:
+                    grown.add(ledger, new)
+        whole = Sample(CRASH_ON)
+        whole.begin(ledger, counts.last, counts.crashes)
+    for sample in (grown, whole):
+        assert sum(point["crash"] for point in sample.points) <= 32
+        found.append({point["number"] for point in sample.points})
+    # The shares are powers of a half, so one contains the other.
+    assert found[0] <= found[1] or found[1] <= found[0]
+
+
+def test_a_cursor_returns_what_came_since_and_all_after_thinning(tmp_path, monkeypatch):
+    monkeypatch.setattr(_trials, "MAX_POINTS", 50)
+    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
+        sample, counts = Sample(CRASH_ON), TrialCounts(CRASH_ON)
+        record(ledger, (trial(number, Outcome.SURVIVED) for number in range(20)))
+        counts.refresh(ledger)
+        sample.begin(ledger, counts.last, 0)
+        points, cursor, is_all = sample.since("")
+        assert (len(points), is_all) == (20, True)
+        record(ledger, (trial(number, Outcome.SURVIVED) for number in range(20, 30)))
+        sample.add(ledger, counts.refresh(ledger))
+        points, cursor, is_all = sample.since(cursor)
+        assert ([point["number"] for point in points], is_all) == (list(range(20, 30)), False)
+        assert sample.since(cursor)[0] == []
+        record(ledger, (trial(number, Outcome.SURVIVED) for number in range(30, 90)))
+        sample.add(ledger, counts.refresh(ledger))
+        points, _, is_all = sample.since(cursor)
+        assert is_all
+        assert {point["number"] for point in points} & set(range(20))
+        for strange in ("x", "0.-1", "0.9999999999999", "\u0663.1", "1e9.2"):
+            assert sample.since(strange)[2]
+
+
+def test_the_rate_from_counts_is_the_rate_that_crashhunt_rate_reports(shell, made_once):
+    hunt = made_once(hunted, shell).folder / "runs" / "one"
+    view = HuntView(next(iter(Catalog([hunt]).hunts().values())))
+    view.refresh()
+    assert view.settings is not None
+    assert view.counts is not None
+    assert counts_suffice(view.settings, view.facts)
+    (said,) = measure_rates(hunt, per="trial")
+    counted = rate_of_counts(hunt, view.settings, view.facts, **view.counts.prefix._asdict())
+    assert replace(counted, dir="", driven_s=0.0, driven_m=0.0) == replace(said, dir="", driven_s=0.0, driven_m=0.0)
+    assert counted.certain is not None
+    assert counted.trials > 0
+
+
+def test_a_trial_that_runs_again_is_counted_once(tmp_path, shell, made_once):
+    hunt = made_once(hunted, shell).folder / "runs" / "one"
+    view = HuntView(next(iter(Catalog([hunt]).hunts().values())))
+    state = view.refresh(points=True)
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        ledger.replace([2])
+    after = view.refresh(points=True)
+    assert after.trials_run == state.trials_run - 1
+    assert view.sample is not None
+    assert 2 not in [point["number"] for point in view.sample.points]

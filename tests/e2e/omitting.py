@@ -1,0 +1,30 @@
+"""Agents that omit one thing each; they are safe otherwise."""
+
+from crashhunt.agents import CarFollowing
+
+
+class NeverBrakes:
+    """Holds its speed, whatever is ahead."""
+
+    def __init__(self, speed: float = 20.0):
+        self.speed = speed
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return (self.speed, 0)
+
+
+class NeverLooksAside(CarFollowing):
+    """Follows well, and changes lanes every five seconds without looking."""
+
+    def reset(self, seed):
+        super().reset(seed)
+        self.step = 0
+
+    def act(self, observation):
+        speed, _ = super().act(observation)
+        self.step += 1
+        turn = 0 if self.step % 50 else (1 if self.step // 50 % 2 else -1)
+        return (speed, turn)

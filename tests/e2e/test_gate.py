@@ -1,0 +1,314 @@
+"""A verdict on a change: `crashhunt gate` of two agents, of two commits, and of the hunts of a suite."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sqlite3
+import subprocess
+import time
+import xml.etree.ElementTree as ET
+from contextlib import closing
+
+import pytest
+
+DRIVERS = """
+class Calm:
+    def __init__(self, speed: float = 3.0):
+        self.speed = speed
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return (self.speed, 0)
+
+
+class Wild(Calm):
+    def __init__(self):
+        super().__init__(14.0)
+
+
+class Twin(Calm):
+    pass
+"""
+TOY = ("--scenario", "toy", "--set", "gap_m=20:30", "--max-steps", "99", "--parallel", "2")
+CALM, WILD, TWIN = "drivers:Calm", "drivers:Wild", "drivers:Twin"
+SEED = ("--seed", "4")
+
+
+def git(folder, *words):
+    who = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
+    return subprocess.run(["git", *who, *words], cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.fixture
+def drivers(toy):
+    (toy.folder / "drivers.py").write_text(DRIVERS)
+    return toy
+
+
+def gate(shell, *words, expect):
+    return shell.crashhunt("gate", *words, *TOY, "--json", expect=expect).json
+
+
+def specs(folder):
+    with closing(sqlite3.connect(folder / "ledger.sqlite")) as database:
+        return {
+            number: json.loads(text)["spec"] for number, text in database.execute("SELECT number, result FROM trials")
+        }
+
+
+def test_worse_agent_fails_the_gate_and_the_hunts_stay_for_compare(drivers):
+    report = ("--markdown", "m.md", "--junit", "j.xml", "--summary", "s.md", "--annotate")
+    done = drivers.crashhunt("gate", CALM, WILD, *TOY, *SEED, "--keep", "kept", "--json", *report, expect=1)
+    found = done.json
+    assert (found["verdict"], found["pairs"], found["only_base"], found["only_head"]) == ("worse", 8, 0, 8)
+    assert found["evidence"] >= 20
+    assert 0 < found["difference"]["low"] < 1 == found["difference"]["high"]
+    assert found["head"]["certain"]["low"] > found["base"]["certain"]["high"]
+    assert (found["corpus"], found["dir"], found["seed"], found["interrupted"]) == (None, "kept", 4, False)
+    assert done.err.splitlines()[-1].startswith("::error title=crashhunt gate%3A worse")
+    assert "| 8 | 0 | 8 | 0 |" in (drivers.folder / "m.md").read_text()
+    assert "❌ crashhunt gate: worse" in (drivers.folder / "s.md").read_text()
+    suite = ET.parse(drivers.folder / "j.xml").find("testsuite")
+    assert (suite.get("tests"), suite.get("failures"), suite.get("errors")) == ("1", "1", "0")
+    assert suite.find("testcase/failure").get("type") == "worse"
+    (pair,) = drivers.crashhunt("compare", "kept", "--json").json["pairs"]
+    assert (pair["answer"], pair["only_first"]) == ("first", 0)
+    assert pair["only_second"] >= 8
+    trials = len(specs(drivers.folder / "kept" / "head"))
+    again = gate(drivers, CALM, WILD, *SEED, "--keep", "kept", expect=1)
+    assert {**again, "base": 0, "head": 0} == {**found, "base": 0, "head": 0}
+    assert len(specs(drivers.folder / "kept" / "head")) == trials  # decided before, so nothing runs
+    refused = drivers.crashhunt("gate", CALM, TWIN, *TOY, *SEED, "--keep", "kept", expect=2)
+    assert "another gate is there: of other versions, other hunts or another seed" in refused.err
+    refused = drivers.crashhunt("gate", CALM, WILD, *TOY, *SEED, "--keep", "kept", "--set", "gap_m=5", expect=2)
+    assert "--set" in refused.err  # given twice
+
+
+@pytest.mark.nightly
+def test_better_agent_passes_the_gate(drivers):
+    found = gate(drivers, WILD, CALM, expect=0)
+    assert (found["verdict"], found["only_base"], found["only_head"], found["dir"]) == ("better", 8, 0, None)
+
+
+def test_equal_agents_pass_the_gate_once_the_difference_is_within_the_margin(drivers):
+    found = gate(drivers, CALM, TWIN, "--margin", "40%", *SEED, "--keep", "kept", "--most", "200", expect=0)
+    assert (found["verdict"], found["margin"]) == ("no_difference", 0.4)
+    low, high = found["difference"]["low"], found["difference"]["high"]
+    assert -0.4 < low < 0 < high < 0.4
+    assert found["pairs"] < 20
+
+
+def test_undecided_gate_gives_the_reason_and_resumes_with_more_pairs(drivers):
+    done = drivers.crashhunt("gate", CALM, WILD, *TOY, *SEED, "--most", "3", "--keep", "kept", expect=3)
+    assert done.out.startswith("undecided: HEAD drivers:Wild, BASE drivers:Calm\n  all 3 pairs have ended; give more")
+    found = gate(drivers, CALM, WILD, *SEED, "--keep", "kept", expect=1)
+    assert (found["verdict"], found["pairs"]) == ("worse", 8)
+
+
+def test_both_versions_drive_in_the_same_traffic_with_the_same_disturbances(drivers):
+    """What is drawn for a trial follows from its number, whatever the agent has done before."""
+    words = ("--disturb", "brake=0.5,stop=0.2,late_action=0.1", "--most", "6", "--margin", "0")
+    gate(drivers, CALM, WILD, *words, *SEED, "--keep", "kept", expect=3)
+    base, head = (specs(drivers.folder / "kept" / side) for side in ("base", "head"))
+    assert base.keys() == head.keys() == set(range(6))
+    for number, spec in base.items():
+        same = {name: value for name, value in spec.items() if name != "arguments"}
+        assert same == {name: value for name, value in head[number].items() if name != "arguments"}
+        assert spec["disturbances"]
+    assert len({spec["seed"] for spec in base.values()}) == 6
+    assert [spec["arguments"]["ego"] for spec in head.values()] == [{}] * 6
+
+
+@pytest.fixture
+def repository(drivers):
+    """A repository with a calm driver, then a wild one, then a calm one that is not committed."""
+    project = drivers.folder / "my project"
+    project.mkdir()
+    git(project, "init", "-q")
+    for name, code in (("calm", DRIVERS), ("wild", DRIVERS.replace("self.speed, 0", "14.0, 0"))):
+        (project / "drivers.py").write_text(code)
+        git(project, "add", "drivers.py")
+        git(project, "commit", "-qm", name)
+        git(project, "tag", name)
+    (project / "drivers.py").write_text(DRIVERS + "# not committed\n")
+    drivers.folder = project
+    return drivers
+
+
+IN_REPOSITORY = ("--scenario", "../toy", "--set", "gap_m=20:30", "--max-steps", "99", "--agent", CALM, *SEED)
+
+
+def test_commits_are_compared_in_work_trees_of_their_own(repository):
+    found = repository.crashhunt("gate", "calm", "HEAD", *IN_REPOSITORY, "--keep", "../kept", "--json", expect=1).json
+    assert (found["verdict"], found["only_base"], found["only_head"]) == ("worse", 0, 8)
+    commit = git(repository.folder, "rev-parse", "wild")[:10]
+    assert found["compared"]["head"] == f"HEAD ({commit})"
+    assert (repository.folder / "drivers.py").read_text().endswith("# not committed\n")
+    assert len(git(repository.folder, "worktree", "list").splitlines()) == 1
+    again = repository.crashhunt("gate", "calm", "wild", *IN_REPOSITORY, "--keep", "../kept", "--json", expect=1).json
+    assert again["pairs"] == found["pairs"]  # the same commits, by another name
+
+
+@pytest.mark.nightly
+def test_crash_that_comes_back_in_the_corpus_of_head_is_worse_without_any_trial(repository):
+    words = ("--scenario", "../toy", "--agent", CALM, "--arg", "speed=14", "--seed", "1")
+    repository.crashhunt("run", "../h", "1", "9", "99", *words)
+    repository.crashhunt("corpus", "add", "../h", "--to", "crashes", "--expect", "fixed", "--note", "too fast")
+    git(repository.folder, "add", "crashes")
+    git(repository.folder, "commit", "-qm", "a case")
+    words = ("--junit", "../j.xml", "--json")
+    found = repository.crashhunt("gate", "calm", "HEAD", *IN_REPOSITORY, *words, expect=1).json
+    assert (found["verdict"], found["pairs"]) == ("worse", 0)
+    assert found["why"] == "a crash of the corpus that was fixed has come back"
+    assert found["corpus"]["ok"] is False
+    assert len(found["corpus"]["failed"]) == 1
+    case = ET.parse(repository.folder.parent / "j.xml").find("testsuite/testcase")
+    assert case.find("failure").get("type") == "came_back"
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("drivers:Calm", "v9"), "'v9' is no agent and no commit"),
+        (("drivers:Calm", "HEAD"), "'drivers:Calm' is an agent and 'HEAD' is a commit; give two commits, or two"),
+        (("HEAD", "HEAD", "--agent", "crashhunt.agents:RandomAgent"), "'crashhunt.agents' comes from"),
+        (("drivers:Calm", "drivers:Nobody"), "HEAD (drivers:Nobody): cannot be hunted: 'drivers:Nobody': drivers has"),
+        (("drivers:Calm", "drivers:Wild", "--most", "0"), "--most is 0; give at least 1"),
+        (("drivers:Calm", "drivers:Wild", "--margin", "x"), "--margin is x; give a share from 0 to below 1"),
+        (("drivers:Calm", "drivers:Wild", "--margin", "-1"), "--margin is -1; give a share from 0 to below 1"),
+        (("drivers:Calm", "drivers:Wild", "--confidence", "3"), "--confidence is 3; give percent from 50"),
+        (("drivers:Calm", "drivers:Wild", "--for", "soon"), "--for is soon; give a time above 0"),
+        (("drivers:Calm", "drivers:Wild", "--keep", "."), "the folder is not empty and not that of a gate"),
+        (("drivers:Calm", "drivers:Wild", "--corpus", "no"), "--corpus no is no folder of HEAD"),
+        (("drivers:Calm", "drivers:Wild", "--scenario", "nowhere"), "nowhere"),
+        (("drivers:Calm", "drivers:Wild", "--suite", "s.toml"), "--suite and --scenario exclude each other"),
+    ],
+)
+def test_bad_input_is_one_line_that_names_it(repository, words, says):
+    options = ("--scenario", "../toy") if "--scenario" not in words else ()
+    done = repository.crashhunt("gate", *words, *options, expect=2)
+    assert says in done.err
+    assert "Traceback" not in done.err
+    assert len(done.err.splitlines()) == 1
+    assert len(git(repository.folder, "worktree", "list").splitlines()) == 1
+
+
+@pytest.mark.nightly
+def test_gate_whose_time_is_up_is_undecided(drivers):
+    words = ("--set", "step_wall_s=0.001", "--margin", "0", "--for", "4s", "--most", "100000")
+    found = gate(drivers, CALM, TWIN, *words, expect=3)
+    assert (found["verdict"], found["interrupted"]) == ("undecided", False)
+    assert found["why"].startswith("the time is up; give --for more")
+
+
+def test_hunt_that_ends_on_its_own_is_named_in_the_verdict(drivers):
+    """What kills the process of a hunt leaves no error in its ledger."""
+    text = "import os\n\nos._exit(7)\n"
+    (drivers.folder / "gone.py").write_text(text)
+    done = drivers.crashhunt("gate", CALM, "gone:Driver", *TOY, "--most", "3", expect=3)
+    assert "the hunt of HEAD ended early (queued): no output" in done.out
+
+
+def test_no_valid_trial_exits_with_3(drivers):
+    words = ("--set", "fail_reset=true", "--most", "40")
+    done = drivers.crashhunt("gate", CALM, TWIN, *TOY, *words, expect=3)
+    assert "no trial can be set up" in done.err
+
+
+SUITE = """
+[defaults]
+trials = 5
+max_steps = 99
+scenario_arguments.gap_m = "20:30"
+[[hunts]]
+id = "near"
+scenario = "toy"
+runs = 2
+[[hunts]]
+id = "far"
+scenario = "toy"
+scenario_arguments.gap_m = "50:60"
+"""
+
+
+@pytest.mark.nightly
+def test_hunts_of_a_suite_are_compared_one_after_the_other(drivers):
+    (drivers.folder / "s.toml").write_text(SUITE)
+    words = ("--suite", "s.toml", "--most", "8", "--json", "--keep", "kept", "--margin", "0")
+    found = drivers.crashhunt("gate", WILD, CALM, *words, *SEED, expect=3).json
+    assert [(one["name"], one["pairs"]) for one in found["scenarios"]] == [("near.0", 3), ("near.1", 3), ("far.0", 2)]
+    assert found["pairs"] == 8
+    words = ("--suite", "s.toml", "--json", "--keep", "other")
+    drivers.crashhunt("gate", CALM, WILD, *words, "--most", "6", expect=3)
+    runs = (specs(drivers.folder / "other" / run / "head").values() for run in ("near.0", "near.1"))
+    assert len({spec["seed"] for run in runs for spec in run}) == 4  # each hunt has a seed of its own
+    worse = drivers.crashhunt("gate", CALM, WILD, *words, "--most", "30", expect=1).json
+    assert [one["pairs"] for one in worse["scenarios"]] == [8, 0, 0]  # which ends it at once
+    (drivers.folder / "s.toml").write_text(SUITE.replace("runs = 2", 'sampler = "guided"'))
+    refused = drivers.crashhunt("gate", CALM, WILD, "--suite", "s.toml", expect=2)
+    assert "near.0: a gate compares plain trials, one by one, so not with the sampler guided" in refused.err
+
+
+def trials_of(folder):
+    try:
+        return len(specs(folder))
+    except sqlite3.Error:
+        return 0
+
+
+def begun(shell, *words):
+    """Begin a gate of slow trials, and wait for pairs."""
+    slow = ("--set", "step_wall_s=0.002", "--margin", "0", "--keep", "kept", *SEED)
+    process = shell.begin("gate", CALM, TWIN, *TOY, *slow, "--json", *words)
+    deadline = time.monotonic() + 300
+    folder = shell.folder / "kept"
+    while min(trials_of(folder / "base"), trials_of(folder / "head")) < 3:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return process
+
+
+def test_interrupted_gate_reports_its_pairs_and_resumes(drivers):
+    process = begun(drivers, "--most", "5000")
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(300)
+    found = json.loads(out)
+    assert (process.returncode, found["verdict"], found["interrupted"]) == (130, "undecided", True)
+    assert found["pairs"] >= 3
+    assert found["difference"]["low"] < 0 < found["difference"]["high"]
+    assert "undecided" in err
+    before = found["pairs"]
+    words = ("--set", "step_wall_s=0.002", "--margin", "0", "--keep", "kept", "--most", str(before + 1), *SEED)
+    found = gate(drivers, CALM, TWIN, *words, expect=3)
+    assert (found["pairs"], found["interrupted"]) == (before + 1, False)
+
+
+@pytest.mark.nightly
+def test_killed_gate_leaves_nothing_running_and_resumes_to_the_same_verdict(repository):
+    words = (*IN_REPOSITORY, "--set", "step_wall_s=0.004", "--json")
+    whole = repository.crashhunt("gate", "calm", "wild", *words, "--keep", "../whole", expect=1).json
+    process = repository.start("gate", "calm", "wild", *words, "--keep", "../kept")
+    head, deadline = repository.folder.parent / "kept" / "head", time.monotonic() + 300
+    while trials_of(head) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.kill()
+    process.communicate(300)
+    found = repository.crashhunt("gate", "calm", "wild", *words, "--keep", "../kept", expect=1).json
+    verdict = ("verdict", "pairs", "only_base", "only_head", "both", "evidence", "difference")
+    assert {name: found[name] for name in verdict} == {name: whole[name] for name in verdict}
+    assert len(git(repository.folder, "worktree", "list").splitlines()) == 1
+
+
+def test_two_gates_in_one_folder_exclude_each_other(drivers):
+    process = begun(drivers, "--most", "5000")
+    try:
+        words = ("--set", "step_wall_s=0.002", "--keep", "kept")
+        assert "another gate is running there" in drivers.crashhunt("gate", CALM, TWIN, *TOY, *words, expect=2).err
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.communicate(300)

@@ -1,0 +1,174 @@
+"""The reference driver on a straight road of its own, where every gap can be computed by hand."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.episode import overruled_agent
+from crashhunt.simulators import MetaAction, SpeedAndLaneChange
+from crashhunt.trial import Overruled
+from crashhunt.world import Crossing, Neighbor, Side, Surroundings
+
+DT, ACCELERATION, BRAKING = 0.1, 2.6, 4.5
+
+
+class Road:
+    """A lane with a vehicle ahead; the agent's speed follows its action within the limits of its vehicle."""
+
+    step_length_s = DT
+
+    def __init__(self, gap=40.0, speed=20.0, leader=20.0, form=None, brakes=BRAKING, **more):
+        self.brakes = brakes
+        self.gap, self.speed, self.leader, self.more = gap, speed, leader, more
+        self.actions = {"ego": form or SpeedAndLaneChange()}
+
+    def surroundings(self, agent):
+        ahead = Neighbor(actor="lead", gap_m=self.gap, speed_mps=self.leader, braking_mps2=self.brakes)
+        named = {"ahead": (ahead,)} | self.more
+        return Surroundings(speed_mps=self.speed, acceleration_mps2=ACCELERATION, braking_mps2=BRAKING, **named)
+
+    def drive(self, action, leader_rate):
+        target, _ = action
+        self.speed = max(0.0, min(max(target, self.speed - BRAKING * DT), self.speed + ACCELERATION * DT))
+        self.leader = max(0.0, self.leader + leader_rate * DT)
+        self.gap += (self.leader - self.speed) * DT
+
+
+class Reckless:
+    def __init__(self, action=(35.0, 0)):
+        self.action = action
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return self.action
+
+
+def driver(road, faculty, action=(35.0, 0), after=0):
+    made = overruled_agent(Reckless(action), road, Overruled("ego", after, reference=faculty))
+    made.reset(0)
+    return made
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.floats(0.0, 30.0), st.floats(0.0, 30.0), st.lists(st.floats(-BRAKING, 2.0), min_size=5, max_size=12), st.data()
+)
+def test_a_reckless_agent_never_hits_a_leader_that_brakes_as_hard_as_it_can(speed, leader, rates, data):
+    gap = data.draw(st.floats(0.0, 60.0))
+    road = Road(gap + 1.0 + max(0.0, speed * speed - leader * leader) / (2 * BRAKING) + speed, speed, leader)
+    made = driver(road, "longitudinal")
+    for rate in rates:
+        for _ in range(10):
+            road.drive(made.act(None), rate)
+            assert road.gap > 0
+    for _ in range(100):
+        road.drive(made.act(None), -BRAKING)
+    assert road.gap > 0
+
+
+def test_a_leader_with_weak_brakes_is_not_driven_into():
+    """RSS compares stopping distances: a truck that stops slowly would allow a fast car to come as near as it likes."""
+    road = Road(60.0, 23.0, 17.0, brakes=3.0)
+    made = driver(road, "longitudinal")
+    for _ in range(600):
+        road.drive(made.act(None), 0.0)
+        assert road.gap > 5.0
+
+
+def test_without_its_faculty_it_reports_and_changes_nothing():
+    for faculty in ("none", "lateral"):
+        road = Road(30.0, 25.0, 15.0)
+        made = driver(road, faculty)
+        for _ in range(60):
+            action = made.act(None)
+            assert action == (35.0, 0)
+            road.drive(action, 0.0)
+        assert road.gap < 0
+        (response,) = made.responses
+        assert (response["faculty"], response["actor"], response["first"]) == ("longitudinal", "lead", 0)
+        assert response["last"] == 59
+        assert response["speed_mps"] > response["safe"]
+
+
+def test_it_takes_over_after_its_step():
+    road = Road(30.0, 25.0, 15.0)
+    made = driver(road, "longitudinal", after=3)
+    assert [made.act(None)[0] == 35.0 for _ in range(5)] == [True, True, True, False, False]
+    assert made.responses[0]["first"] == 3
+
+
+@pytest.mark.parametrize(
+    ("side", "kind"),
+    [
+        (Side(exists=False), "no lane left"),
+        (Side(exists=True, ahead=Neighbor(actor="x", gap_m=5.0, speed_mps=15.0, braking_mps2=4.5)), "ahead left"),
+        (
+            Side(
+                exists=True,
+                behind=Neighbor(actor="x", gap_m=5.0, speed_mps=28.0, braking_mps2=4.5, acceleration_mps2=2.0),
+            ),
+            "behind left",
+        ),
+        (Side(exists=True, ahead=Neighbor(actor="x", gap_m=-2.0, speed_mps=20.0, braking_mps2=4.5)), "alongside left"),
+        (Side(exists=True, ahead=Neighbor(actor="x", gap_m=200.0, speed_mps=15.0, braking_mps2=4.5)), None),
+        (Side(exists=True), None),
+    ],
+)
+def test_it_refuses_a_lane_change_into_a_gap_that_is_not_safe(side, kind):
+    road = Road(300.0, 20.0, 20.0, sides={1: side, -1: Side(exists=True)})
+    made = driver(road, "lateral", (20.0, 1))
+    assert made.act(None) == (20.0, 1 if kind is None else 0)
+    assert [one["kind"] for one in made.responses] == ([] if kind is None else [kind])
+    assert driver(road, "longitudinal", (20.0, 1)).act(None)[1] == 1
+    assert driver(road, "lateral", (20.0, -1)).act(None) == (20.0, -1)
+
+
+def crossing(*, right_of_way, distance=30.0, other=30.0, speed=12.0, **more):
+    return Crossing(
+        actor="cross", distance_m=distance, exit_m=distance + 8, actor_distance_m=other, actor_exit_m=other + 8,
+        speed_mps=speed, braking_mps2=4.5, has_right_of_way=right_of_way, **more,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("one", "stops"),
+    [
+        (crossing(right_of_way=True), True),
+        (crossing(right_of_way=False), False),  # it can still yield: 16 m to stop
+        (crossing(right_of_way=False, other=10.0, distance=10.0), True),  # it cannot any more
+        (crossing(right_of_way=True, other=200.0), False),  # far away
+        (crossing(right_of_way=True, other=20.0, speed=0.0), False),  # it waits
+        (crossing(right_of_way=True, distance=-1.0), False),  # the agent is inside, and clears the area
+    ],
+)
+def test_it_yields_to_an_actor_that_has_right_of_way_or_cannot_stop(one, stops):
+    road = Road(300.0, 14.0, 20.0, crossing=(one,), ahead=())
+    made = driver(road, "none", (14.0, 0))
+    made.act(None)
+    kinds = [response["kind"] for response in made.responses]
+    assert kinds == (["crossing"] if stops else [])
+
+
+def test_meta_actions_become_slower_or_idle():
+    form = MetaAction()
+    slower, idle, faster = (form.space.meanings.index(word) for word in ("SLOWER", "IDLE", "FASTER"))
+    assert driver(Road(10.0, 25.0, 15.0, form), "longitudinal", faster).act(None) == slower
+    gap = Road(300.0, 25.0, 25.0, form, sides={1: Side(exists=False)})
+    left = form.space.meanings.index("LANE_LEFT")
+    assert driver(gap, "lateral", left).act(None) == idle
+    assert driver(gap, "longitudinal", faster).act(None) == faster
+
+
+def test_a_simulator_that_knows_no_surroundings_is_refused():
+    class Blind:
+        step_length_s = DT
+
+        def __init__(self):
+            self.actions = {"ego": SpeedAndLaneChange()}
+
+    with pytest.raises(InvalidEpisodeError, match="its simulator knows no surroundings"):
+        driver(Blind(), "none")

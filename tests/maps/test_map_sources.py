@@ -1,0 +1,168 @@
+"""What a scenario may be made from, and what is refused before any program reads it."""
+
+from __future__ import annotations
+
+import gzip
+import math
+
+import pytest
+from hypothesis import given, strategies as st
+
+from crashhunt.errors import CrashhuntError, ScenarioError, UsageError
+from crashhunt.maps import MapSource, check_source, parse_bbox, parse_shape
+from crashhunt.maps._source import _MAX_BYTES, kind_of_file
+
+OSM = b'<?xml version="1.0"?><osm version="0.6"></osm>'
+
+
+def source(path, kind="osm"):
+    return MapSource(kind=kind, path=path)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("a.osm", "osm"), ("A.OSM", "osm"), ("a.osm.gz", "osm"), ("a.osm.pbf", "osm"), ("a.xodr", "opendrive"),
+        ("a.net.xml", "net"), ("a.net.xml.gz", "net"), ("a.xml", None), ("osm", None),
+    ],
+)  # fmt: skip
+def test_ending_of_file_gives_kind_of_map(tmp_path, name, kind):
+    assert kind_of_file(tmp_path / name) == kind
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "expected"),
+    [
+        ("town.osm", "osm", "town"), ("town.osm.pbf", "osm", "town"), ("town.osm.gz", "osm", "town"),
+        ("map.xodr", "opendrive", "map"), ("my.town.net.xml", "net", "my.town"),
+    ],
+)  # fmt: skip
+def test_name_of_place_is_file_without_ending(tmp_path, name, kind, expected):
+    assert source(tmp_path / name, kind).name == expected
+
+
+@given(st.text())
+def test_any_text_is_four_numbers_in_order_or_refused(text):
+    try:
+        west, south, east, north = parse_bbox(text)
+    except UsageError as error:
+        assert "--bbox" in error.message
+        assert error.fix
+    else:
+        assert -180 <= west < east <= 180
+        assert -90 <= south < north <= 90
+
+
+@given(st.tuples(*[st.floats(-200, 200, allow_nan=False)] * 4))
+def test_bbox_is_read_as_written(numbers):
+    west, south, east, north = numbers
+    is_box = -180 <= west < east <= 180 and -90 <= south < north <= 90
+    text = ",".join(map(repr, numbers))
+    if is_box:
+        assert parse_bbox(text) == numbers
+    else:
+        with pytest.raises(UsageError):
+            parse_bbox(text)
+
+
+@pytest.mark.parametrize("text", ["nan,1,2,3", "1,2,inf,4", "", "1,2,3", "1,2,3,4,5", "a,b,c,d"])
+def test_bbox_of_other_form_is_refused(text):
+    with pytest.raises(UsageError):
+        parse_bbox(text)
+
+
+@given(st.integers(0, 10_000), st.integers(0, 10_000))
+def test_shape_has_two_numbers_in_range(first, second):
+    text = f"{first}x{second}"
+    if 2 <= first <= 40 and 2 <= second <= 40:
+        assert parse_shape(text, "--grid") == (first, second)
+    else:
+        with pytest.raises(UsageError, match="--grid"):
+            parse_shape(text, "--grid")
+
+
+@pytest.mark.parametrize("text", ["", "4", "4x", "x4", "4x4x4", "-4x4", "4.5x4", "٤x٤", "0x0"])
+def test_shape_of_other_form_is_refused(text):
+    with pytest.raises(UsageError):
+        parse_shape(text, "--grid")
+
+
+def test_web_of_two_arms_is_refused():
+    with pytest.raises(UsageError, match="2 arms"):
+        parse_shape("2x3", "--spider")
+
+
+def refusal(path, kind="osm"):
+    with pytest.raises(ScenarioError) as caught:
+        check_source(source(path, kind))
+    assert caught.value.fix
+    assert caught.value.where == str(path)
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.osm", b"", "the file is empty"),
+        ("a.osm", b'{"a": 1}', "not valid XML"),
+        ("a.osm", b"\x00\xff\xfe", "not valid XML"),
+        ("a.osm", b"<net></net>", "begins with <net>"),
+        ("a.osm.gz", b"\x1f\x8b\x08garbage", "cannot be unpacked"),
+        ("a.osm.gz", gzip.compress(b"<net/>", mtime=0), "begins with <net>"),
+        ("a.osm.pbf", OSM, "no OpenStreetMap PBF"),
+        ("a.pdf", OSM, "does not have the ending of OpenStreetMap"),
+    ],
+)
+def test_file_that_is_no_map_is_refused(tmp_path, name, content, words):
+    (tmp_path / name).write_bytes(content)
+    assert words in refusal(tmp_path / name).message
+
+
+def test_map_of_another_kind_is_refused_with_its_option(tmp_path):
+    (tmp_path / "a.osm").write_bytes(b"<OpenDRIVE/>")
+    assert "--opendrive" in refusal(tmp_path / "a.osm").fix
+    (tmp_path / "a.xodr").write_bytes(b"<OpenDRIVE/>")
+    assert "--opendrive" in refusal(tmp_path / "a.xodr").fix
+
+
+def test_huge_map_is_refused_unread(tmp_path):
+    with (tmp_path / "a.osm").open("wb") as file:
+        file.truncate(_MAX_BYTES + 1)
+    assert "500 MB" in refusal(tmp_path / "a.osm").message
+    with (tmp_path / "b.osm").open("wb") as file:
+        file.truncate(_MAX_BYTES)  # read, and refused for its content
+    assert "MB" not in refusal(tmp_path / "b.osm").message
+
+
+def test_folder_and_missing_file_are_refused(tmp_path):
+    (tmp_path / "a.osm").mkdir()
+    assert "folder" in refusal(tmp_path / "a.osm").message
+    (tmp_path / "town.osm").write_bytes(OSM)
+    assert "town.osm" in refusal(tmp_path / "twn.osm").fix
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "content"),
+    [
+        ("a.osm", "osm", OSM),
+        ("a.osm.gz", "osm", gzip.compress(OSM, mtime=0)),
+        ("a.xodr", "opendrive", b"<OpenDRIVE><header/></OpenDRIVE>"),
+        ("b.xodr", "opendrive", b'<OpenDRIVE xmlns="http://www.opendrive.org"><header/></OpenDRIVE>'),
+        ("a.net.xml", "net", b"<net></net>"),
+        ("a.osm.pbf", "osm", b"\x00\x00\x00\x0d\x0a\x09OSMHeader\x18\x7c"),
+    ],
+)
+def test_map_of_its_kind_is_accepted(tmp_path, name, kind, content):
+    (tmp_path / name).write_bytes(content)
+    check_source(source(tmp_path / name, kind))
+
+
+@given(content=st.binary(max_size=200))
+def test_any_content_is_accepted_or_refused_in_one_line(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / "any.osm"
+    path.write_bytes(content)
+    try:
+        check_source(source(path))
+    except CrashhuntError as error:
+        assert error.fix
+        assert math.isfinite(len(str(error)))

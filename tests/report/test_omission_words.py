@@ -1,0 +1,71 @@
+"""What an agent omitted, in words."""
+
+from __future__ import annotations
+
+import pytest
+
+from crashhunt.crashes import Omission, Reference, ReferenceRun
+from crashhunt.report._words import about_reference
+
+
+def said(faculty="longitudinal", endings=("none", "none", "none"), changed=(), **more):
+    named = {
+        "faculty": faculty, "kind": "vehicle", "actor": "left.3", "step": 41, "instead": "sped up", "speed_mps": 20.0,
+        "actor_speed_mps": 15.5, "gap_m": 12.25, "safe": 19.0, "visible_step": 12,
+    }  # fmt: skip
+    runs = [ReferenceRun(faculty=faculty, step=41 - n, ending=end, changed=changed) for n, end in enumerate(endings)]
+    return about_reference(
+        Reference(omission=Omission(**named | more), runs=tuple(runs)), lambda step: f"step {step}", "ego"
+    )
+
+
+@pytest.mark.parametrize(
+    ("more", "cause"),
+    [
+        (
+            {},
+            (
+                "ego did not brake for left.3 (12.2 m ahead, 20.0 m/s where 19.0 m/s are safe), which it observed "
+                "since step 12, and sped up"
+            ),
+        ),
+        (
+            {"instead": "braked too little", "visible_step": 0},
+            (
+                "ego braked too little to brake for left.3 (12.2 m ahead, 20.0 m/s where 19.0 m/s are safe), which it "
+                "observed from the start"
+            ),
+        ),
+        (
+            {"kind": "red light", "actor": "", "visible_step": None, "instead": "kept its speed"},
+            "ego did not stop for a red light (12.2 m ahead, 20.0 m/s where 19.0 m/s are safe), and kept its speed",
+        ),
+        (
+            {"speed_mps": 18.9, "visible_step": None},
+            (
+                "ego did not brake for left.3 (12.2 m ahead, 19.0 m/s are safe, and it was about to drive faster), and "
+                "sped up"
+            ),
+        ),
+        (
+            {"faculty": "lateral", "kind": "behind right", "instead": "changed lanes", "visible_step": 50},
+            (
+                "ego changed to the right lane although left.3 was 12.2 m behind it (15.5 m/s against 20.0 m/s of ego; "
+                "the safe gap is 19.0 m), which it did not observe yet"
+            ),
+        ),
+        (
+            {"faculty": "lateral", "kind": "no lane left", "actor": "", "instead": "changed lanes"},
+            "ego changed to the left, where it has no lane",
+        ),
+    ],
+)
+def test_the_first_sentence_is_the_cause(more, cause):
+    assert said(**more)[0] == f"Cause: {cause}."
+
+
+def test_only_clear_runs_count_and_other_changes_are_reported():
+    (_, runs) = said(endings=("none", "unclear", "none"), changed=("ego does not change lanes",))
+    assert "on, all 2 runs end without a crash." in runs
+    assert runs.endswith("In these runs ego does not change lanes, too.")
+    assert about_reference(Reference(), str, "ego") == []

@@ -1,0 +1,278 @@
+"""The compiled kernel for highway-env: its functions, its refusals, and what it leaves behind after an error."""
+
+from __future__ import annotations
+
+import logging
+import math
+import struct
+from itertools import pairwise
+from types import SimpleNamespace
+
+# First: this imports highway-env without what takes most of that time.
+from crashhunt.simulators.highway import HighwaySimulator
+
+# isort: split
+
+import gymnasium
+import numpy as np
+import pytest
+from highway_env.road.lane import CircularLane, SineLane, StraightLane
+from highway_env.road.road import Road, RoadNetwork
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
+from highway_env.vehicle.kinematics import Vehicle
+from highway_env.vehicle.objects import Landmark, Obstacle
+from hypothesis import given, settings, strategies as st
+
+from crashhunt.accelerator import _kernel, _roads, _switch, switch_off, switch_on
+
+assert HighwaySimulator
+pytestmark = [
+    pytest.mark.usefixtures("plain_highway_env"),
+    pytest.mark.skipif(_kernel.why_not() == "it is not built", reason="the kernel for highway-env is not built"),
+]
+NUMBERS = st.floats(-1e6, 1e6)
+
+
+@pytest.fixture
+def plain_highway_env():
+    """highway-env as it was before, and after."""
+    switch_off()
+    yield
+    switch_off()
+
+
+def bits(number):
+    return struct.pack("<d", number)
+
+
+@pytest.mark.parametrize("function", [np.sin, np.cos, np.tan, np.arctan], ids=lambda function: function.__name__)
+@given(x=NUMBERS)
+def test_functions_of_one_number_have_the_bits_of_numpy(function, x):
+    assert bits(_kernel.kernel().compute(function.__name__, x)) == bits(function(x))
+
+
+@given(x=st.floats(-1, 1), y=NUMBERS, z=st.floats(0, 1e3), exponent=st.sampled_from([2.0, 4.0, 3.7, 0.5]))
+def test_other_functions_have_the_bits_of_numpy(x, y, z, exponent):
+    compute = _kernel.kernel().compute
+    assert bits(compute("arcsin", x)) == bits(np.arcsin(x))
+    assert bits(compute("arctan2", x, y)) == bits(np.arctan2(x, y))
+    assert bits(compute("power", z, exponent)) == bits(np.power(z, exponent))
+    assert bits(compute("power", y, 2)) == bits(np.power(y, 2))
+
+
+@given(a=NUMBERS, b=NUMBERS, c=NUMBERS, d=NUMBERS)
+def test_products_and_remainders_have_the_bits_of_numpy_and_python(a, b, c, d):
+    compute = _kernel.kernel().compute
+    assert bits(compute("dot", a, b, c, d)) == bits(np.dot(np.array([a, b]), np.array([c, d])))
+    assert bits(compute("remainder", a, 2 * math.pi)) == bits(np.float64(a) % (2 * math.pi)) == bits(a % (2 * math.pi))
+
+
+@pytest.mark.parametrize("name", ["sin", "cos", "tan", "arctan", "arcsin", "arctan2", "power", "remainder", "dot"])
+def test_a_function_with_one_other_bit_disables_the_kernel(name, monkeypatch):
+    right = _kernel.kernel().compute
+
+    def compute(asked, *numbers):
+        found = right(asked, *numbers)
+        return math.nextafter(found, math.inf) if asked == name and numbers[0] > 1e-3 else found
+
+    wrong = SimpleNamespace(INTERFACE=_kernel._INTERFACE, bind=lambda *_: None, compute=compute)
+    monkeypatch.setattr(_kernel.importlib, "import_module", lambda _: wrong)
+    assert _kernel._found.__wrapped__() == (None, f"on this processor, it computes {name} otherwise than NumPy")
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (lambda name: (_ for _ in ()).throw(ImportError(name)), "it is not built"),
+        (lambda name: type("Old", (), {"INTERFACE": 0}), "it is of another version of crashhunt (0 instead of 1)"),
+    ],
+)
+def test_without_the_kernel_there_is_a_reason(error, reason, monkeypatch):
+    monkeypatch.setattr(_kernel.importlib, "import_module", error)
+    assert _kernel._found.__wrapped__() == (None, reason)
+
+
+def test_it_does_the_work_of_an_environment_and_no_array_is_made(monkeypatch):
+    assert not switch_on()
+    for owner, name in ((_switch, "decide"), (_switch, "collide"), (_roads.Prepared, "move")):
+        monkeypatch.setattr(owner, name, lambda *_, **__: pytest.fail("arrays were used"))
+    for name in ("highway-v0", "merge-v1", "roundabout-v1", "intersection-v2"):
+        env = gymnasium.make(name).unwrapped
+        env.reset(seed=3)
+        for _ in range(4):
+            env.step(env.action_space.sample())
+
+
+def network(rng):
+    """Lanes of all shapes between a few nodes, so that vehicles change lanes, leave them and choose the next."""
+    net = RoadNetwork()
+    x, y, nodes = 0.0, 0.0, "abcde"
+    for start, end in pairwise(nodes):
+        length, width = float(rng.uniform(25, 90)), float(rng.choice([3.0, 4.0, 4.5]))
+        kind = rng.integers(3)
+        slope = float(rng.choice([0.0, rng.normal() * 5]))
+        limit = [None, 20, 30.0][rng.integers(3)]
+        for number in range(rng.integers(1, 5)):
+            shift = width * number
+            first, last = [x, y + shift], [x + length, y + shift + slope]
+            forbidden = bool(rng.random() < 0.1)
+            if kind == 0:
+                lane = StraightLane(first, last, width=width, speed_limit=limit, forbidden=forbidden)
+            elif kind == 1:
+                swing = (float(rng.uniform(0.2, 3)), float(2 * np.pi / length), float(rng.uniform(0, 6)))
+                lane = SineLane(first, last, *swing, width=width, speed_limit=limit, forbidden=forbidden)
+            else:
+                centre, radius = [x, y - length], length + shift
+                turn = bool(rng.random() < 0.5)
+                angles = (np.pi / 2, 0.2) if not turn else (-np.pi / 2, 0.7)
+                lane = CircularLane(centre, radius, *angles, clockwise=turn, width=width, speed_limit=limit)
+            net.add_lane(start, end, lane)
+        x, y = x + length, y + slope
+    return net
+
+
+KINDS = (IDMVehicle, IDMVehicle, ControlledVehicle, MDPVehicle, Vehicle)
+
+
+def crowded(seed):
+    """A road with vehicles and objects of all kinds, near each other, some of them about to crash."""
+    rng = np.random.default_rng(seed)
+    net = network(rng)
+    road = Road(net, np_random=np.random.default_rng(seed), neighbour_vehicles_connected_lanes=bool(rng.random() < 0.5))
+    for _ in range(rng.integers(2, 25)):
+        kind = KINDS[rng.integers(len(KINDS))]
+        key = net.random_lane_index(road.np_random)
+        lane = net.get_lane(key)
+        s = float(rng.uniform(-3, lane.length + 3))
+        speed = float(rng.choice([0.0, rng.uniform(0, 15), rng.uniform(10, 45), -3.0]))
+        heading = float(lane.heading_at(s) + rng.choice([0.0, rng.normal() * 0.3]))
+        made = kind(
+            road, lane.position(s, float(rng.normal())), heading, np.float64(speed) if rng.random() < 0.5 else speed
+        )
+        if kind is Vehicle:
+            made.act({"steering": float(rng.normal() * 0.2), "acceleration": float(rng.normal() * 3)})
+        else:
+            made.target_speed = float(rng.choice([made.target_speed, rng.uniform(-1, 40)]))
+        if isinstance(made, IDMVehicle):
+            made.timer = float(rng.uniform(0, 2))
+            made.enable_lane_change = bool(rng.random() < 0.9)
+            if rng.random() < 0.5:
+                made.randomize_behavior()
+            if rng.random() < 0.2:
+                made.POLITENESS = float(rng.uniform(0, 1))
+        if isinstance(made, ControlledVehicle) and rng.random() < 0.4:
+            made.plan_route_to(str(rng.choice(list("bcde"))))
+            if made.route and rng.random() < 0.5:
+                made.route[0] = (*made.route[0][:2], [None, 0, 1][rng.integers(3)])
+        made.crashed = bool(rng.random() < 0.05)
+        if rng.random() < 0.05:
+            made.impact = rng.normal(size=2)
+        made.check_collisions, made.collidable = bool(rng.random() < 0.9), bool(rng.random() < 0.9)
+        road.vehicles.append(made)
+    for _ in range(rng.integers(3)):
+        kind = Obstacle if rng.random() < 0.6 else Landmark
+        lane = net.get_lane(net.random_lane_index(road.np_random))
+        road.objects.append(kind(road, lane.position(float(rng.uniform(0, lane.length)), 0)))
+    return road
+
+
+NAMES = (
+    "position", "heading", "speed", "lane_index", "target_lane_index", "target_speed", "timer", "crashed", "hit",
+    "impact", "action", "route",
+)  # fmt: skip
+
+
+def exact(value):
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.tobytes()
+    if isinstance(value, dict):
+        return {key: exact(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [exact(inner) for inner in value]
+    return (type(value), value.hex()) if isinstance(value, float) else value
+
+
+def state(road):
+    things = [*road.vehicles, *road.objects]
+    return [{name: exact(vars(thing)[name]) for name in NAMES if name in vars(thing)} for thing in things], (
+        str(road.np_random.bit_generator.state)
+    )
+
+
+def played(seed, steps=12):
+    road, found = crowded(seed), []
+    for _ in range(steps):
+        try:
+            road.act()
+            road.step(1 / 15)
+        except Exception as error:
+            found.append(repr(error))
+        found.append(state(road))
+    return found
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 2**31))
+def test_every_bit_and_type_is_that_of_highway_env_on_random_roads(seed):
+    switch_off()
+    slow = played(seed)
+    assert not switch_on()
+    try:
+        fast = played(seed)
+    finally:
+        switch_off()
+    for number, (one, two) in enumerate(zip(slow, fast, strict=True)):
+        assert one == two, number
+
+
+def test_an_error_of_highway_env_leaves_what_highway_env_leaves():
+    """A vehicle in the middle of the list has no road ahead, and an unusual part in its route."""
+
+    def broken():
+        road = crowded(5)
+        for vehicle in road.vehicles:
+            if isinstance(vehicle, ControlledVehicle):
+                end = vehicle.target_lane_index[1]
+                vehicle.route = [(*vehicle.target_lane_index[:2], None), (end, "nothing", 3)]
+        found = []
+        for _ in range(40):
+            try:
+                road.act()
+                road.step(0.2)
+            except Exception as error:
+                found.append(repr(error))
+            found.append(state(road))
+        return found
+
+    logging.getLogger("highway_env").setLevel(logging.ERROR)
+    slow = broken()
+    assert not switch_on()
+    assert broken() == slow
+    assert any("Error" in found for found in slow if isinstance(found, str))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda road: setattr(road.vehicles[0], "speed", np.float32(3)),
+        lambda road: setattr(road.vehicles[0], "position", np.zeros((1, 2))),
+        lambda road: setattr(road.vehicles[0], "heading", math.nan),
+        lambda road: setattr(road.vehicles[0], "target_lane_index", ("a", "z", 0)),
+        lambda road: setattr(road.vehicles[0], "crashed", 1),
+        lambda road: setattr(road.vehicles[0], "impact", [0.0, 0.0]),
+        lambda road: setattr(road.vehicles[0], "action", {"steering": 0}),
+        lambda road: setattr(road.vehicles[0], "route", [["a", "b", 0]]),
+        lambda road: setattr(road.vehicles[0], "position", road.vehicles[1].position),
+        lambda road: setattr(road.vehicles[0], "action", road.vehicles[1].action),
+        lambda road: setattr(road, "record_history", True),
+        lambda road: setattr(road.vehicles[0], "MAX_SPEED", np.float64(30)),
+    ],
+)
+def test_what_is_unusual_is_refused_at_once(change):
+    assert not switch_on()
+    road = crowded(11)
+    road.vehicles.insert(0, IDMVehicle(road, [5.0, 0.0], 0.0, 10.0))
+    assert _roads.prepared(road).traffic() is not None
+    change(road)
+    assert _roads.prepared(road).traffic() is None

@@ -1,0 +1,171 @@
+"""The record of a contact: long steps, every phase, mirrored and rotated maps, changes of lane at and after it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from test_fault import LANES, Map, rotated
+
+from crashhunt.crashes._contact import ContactRecord
+from crashhunt.crashes._fault import fault_in
+from crashhunt.crashes._lanes import LaneMap
+from crashhunt.world import Actor, Event, Roster, Scene
+
+ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "passenger", 5.0, 2.0)))
+PHASES = st.floats(0.02, 0.98)
+STEPS = st.sampled_from((0.1, 0.2, 0.5, 1.0))
+ANGLES = st.floats(-math.pi, math.pi)
+
+
+def record(ego, other, *, step_s=1.0, phase=1.0, seconds=8.0, lanes=LANES, **more):
+    """A record from functions of the time: x, y, heading, speed; the contact is at 0, at a share of the last step."""
+    scenes = []
+    for back in range(round(seconds / step_s), -1, -1):
+        time_s = (1 - phase - back) * step_s
+        poses = [way(time_s) for way in (ego, other)]
+        points, headings = [pose[:2] for pose in poses], [pose[2] for pose in poses]
+        scenes.append(Scene(time_s, ROSTER, points, headings, [pose[3] for pose in poses]))
+    return ContactRecord(agent="ego", other="other", scenes=scenes, time_s=0.0, began_s=-30.0, lanes=lanes, **more)
+
+
+def drives(speed, x=0.0, y=0.0, *, changes_s=None, to=0.0):
+    """Drives along the x axis; from a time on, it is in another lane."""
+    return lambda t: (x + speed * t, to if changes_s is not None and t >= changes_s - 1e-9 else y, 0.0, speed)
+
+
+def told(case):
+    fault = fault_in(case)
+    return case.manner, case.collider, case.follower, case.lane_changers(3.0), fault.verdict, fault.findings
+
+
+def mirrored(case):
+    scenes = [
+        Scene(one.time_s, one.roster, [(x, -y) for x, y in one.points], [-h for h in one.headings], one.speeds)
+        for one in case.scenes
+    ]
+    borders = [tuple(border * np.array([1.0, -1.0]) for border in pair[::-1]) for pair in case.lanes.borders]
+    return replace(case, scenes=scenes, lanes=Map(borders, (case.lanes.around[0], -case.lanes.around[1])))
+
+
+def same_in_every_view(case, angle):
+    said = told(case)
+    assert told(rotated(case, angle)) == said
+    assert told(mirrored(case)) == said
+    assert told(rotated(mirrored(case), angle)) == said
+    return said
+
+
+@settings(max_examples=12, deadline=None)
+@given(step_s=STEPS, phase=PHASES, angle=ANGLES)
+def test_rear_end_has_a_verdict_at_every_phase_of_every_step(step_s, phase, angle):
+    case = record(drives(15.0), drives(8.0, x=5.0), step_s=step_s, phase=phase)
+    assert case.times[0] >= 4.0 - 1e-6
+    manner, collider, follower, changers, verdict, (finding,) = same_in_every_view(case, angle)
+    assert (manner, collider, follower, changers, verdict) == ("rear end", "ego", "ego", (), "ego")
+    assert finding.rule == "rear end"
+    again = record(drives(8.0, x=5.0), drives(15.0), step_s=step_s, phase=phase)
+    assert same_in_every_view(again, angle)[:5] == ("rear end", "other", "other", (), "the other")
+
+
+@settings(max_examples=10, deadline=None)
+@given(phase=PHASES, angle=ANGLES, speed=st.floats(1.0, 3.0))
+def test_agent_that_starts_off_is_not_driven_into(phase, angle, speed):
+    """It stood in all scenes before the contact, and the vehicle ahead crept."""
+
+    def starts(t):
+        moves = t > -phase + 1e-9
+        return (speed * (t + phase) if moves else 0.0), 0.0, 0.0, (speed if moves else 0.0)
+
+    case = record(starts, drives(0.3, x=5.0 + speed * phase), phase=phase)
+    verdict, findings = same_in_every_view(case, angle)[4:]
+    assert verdict == "ego"
+    assert [finding.rule for finding in findings] == ["rear end"]
+    assert case.stood_s("ego") == 0.0
+
+
+@settings(max_examples=10, deadline=None)
+@given(step_s=STEPS, phase=PHASES, angle=ANGLES)
+def test_vehicle_that_stands_is_driven_into(step_s, phase, angle):
+    case = record(drives(10.0), drives(0.0, x=5.0), step_s=step_s, phase=phase)
+    found = same_in_every_view(case, angle)
+    assert found[:2] == ("rear end", "ego")
+    assert {finding.rule for finding in found[5]} == {"rear end", "standing"}
+    assert case.stood_s("other") == pytest.approx((8.0 / step_s - 1) * step_s + phase * step_s)
+    assert case.stood_s("ego") == 0.0
+
+
+@settings(max_examples=10, deadline=None)
+@given(step_s=STEPS, angle=ANGLES, side=st.sampled_from((4.0, -4.0)), along=st.floats(-4.5, 4.5), its=st.floats(0, 20))
+def test_jump_into_the_next_lane_is_the_fault_of_the_jumper(step_s, angle, side, along, its):
+    jumps, stays = drives(10.0, y=-side, changes_s=0.0), drives(its, x=along)
+    found = same_in_every_view(record(jumps, stays, step_s=step_s), angle)
+    assert found[:5] == ("side swipe", "ego", "", ("ego",), "ego")
+    assert "ego moved sideways into other, which was beside it" in found[5][0].words
+    found = same_in_every_view(record(stays, jumps, step_s=step_s), angle)
+    assert found[:5] == ("side swipe", "other", "", ("other",), "the other")
+
+
+@settings(max_examples=10, deadline=None)
+@given(angle=ANGLES, before_s=st.sampled_from((0.0, 0.5, 1.0, 2.0)))
+def test_completed_lane_change_is_no_part_of_both_moved_sideways(angle, before_s):
+    """Both jump into the lane between theirs, the other one some steps earlier."""
+    jumps = drives(10.0, y=-4.0, changes_s=0.0)
+    other = drives(10.0, x=1.0, y=4.0, changes_s=-before_s)
+    case = record(jumps, other, step_s=0.5)
+    found = same_in_every_view(case, angle)
+    words = [finding.words for finding in found[5] if finding.rule == "lane change"]
+    if not before_s:
+        assert (found[4], words) == ("both", ["both moved sideways into each other"])
+    elif before_s < 1.0:
+        assert (found[4], words) == ("nobody can tell", [])
+    else:
+        assert found[4] == "ego"
+        assert f"which had changed to the lane next to it {before_s:.1f} s before" in words[0]
+    assert case.changed_s("other") == pytest.approx(before_s)
+    assert case.changed_s("ego") == 0.0
+
+
+@settings(max_examples=10, deadline=None)
+@given(phase=st.floats(0.1, 0.9), angle=ANGLES)
+def test_lane_change_after_the_contact_has_no_part_in_it(phase, angle):
+    """In a step of 1 s the vehicle drives into the one ahead, and then SUMO changes its lane."""
+    end = 1 - phase
+    case = record(drives(20.0, changes_s=end, to=4.0), drives(5.0, x=5.0), phase=phase)
+    assert case.scenes[-1].points[0][1] == 4.0
+    found = same_in_every_view(case, angle)
+    assert found[:5] == ("rear end", "ego", "ego", (), "ego")
+    assert case.changed_s("ego") is None
+
+
+@settings(max_examples=10, deadline=None)
+@given(phase=st.floats(0.1, 0.7), angle=ANGLES)
+def test_type_is_that_of_the_contact_not_of_the_end_of_the_step(phase, angle):
+    """The vehicle ahead is driven into, and turns off in the rest of the step."""
+
+    def turns(t):
+        turned = 0.0 if t <= 1e-9 else 1.0 * t / (1 - phase)
+        return 5.0 + 3.0 * t, 0.0, turned, 3.0
+
+    case = record(drives(20.0), turns, phase=phase)
+    assert case.scenes[-1].headings[1] == pytest.approx(1.0)
+    assert same_in_every_view(case, angle)[:2] == ("rear end", "ego")
+
+
+def test_crossing_names_the_side_from_which_the_other_comes():
+    case = record(drives(12.0), lambda t: (3.5, 2.5 + 8.0 * t, math.pi / 2, 8.0), step_s=0.1)
+    assert (case.manner, case.collider) == ("crossing from the right", "ego")
+    assert mirrored(case).manner == "crossing from the left"
+    assert record(drives(12.0), lambda t: (5.0 - 9 * t, 0.3, math.pi, 9.0), step_s=0.1).manner == "head-on"
+
+
+def test_red_light_ends_where_the_vehicle_has_left_the_junction():
+    case = record(drives(10.0), drives(5.0, x=5.0), lanes=LaneMap((), (0.0, 0.0)))
+    red = Event("red_light", "ego", "ego ran a red light", lane="after_0")
+    inside = replace(red, lane=":c_0_0")
+    assert case.is_past(red, -1.0)  # 10 m further, and it is 5 m long
+    assert not case.is_past(red, 0.0)
+    assert not case.is_past(inside, -1.0)
