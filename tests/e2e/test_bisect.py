@@ -68,6 +68,7 @@ def test_what_is_no_revision_is_reported(toy, made_once):
     assert "'v1' is no commit" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err
 
 
+@pytest.mark.nightly
 def test_a_revision_on_another_branch_that_mended_it_is_reported(tmp_path, monkeypatch):
     """Git says so again and again, and goes on to no other revision."""
     git(tmp_path, "init", "-q", "-b", "main")

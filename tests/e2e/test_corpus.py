@@ -75,6 +75,7 @@ def test_a_case_is_small_has_no_code_and_is_looked_at_like_a_hunt(kept):
         assert str(kept.folder) not in file.read_text()
 
 
+@pytest.mark.nightly
 def test_crashes_that_a_corpus_has_are_reported_from_new_ones(kept):
     words = ("crashes", "h", "--json", "--annotate", "--summary", "s.md", "--sarif", "x.sarif", "--known")
     done = kept.crashhunt(*words, "kept crashes")

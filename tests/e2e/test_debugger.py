@@ -63,10 +63,12 @@ def test_backwards_and_on_from_there_to_the_same_bits(crash):
     assert "reproduced: 29 of 29 steps" in out
 
 
+@pytest.mark.nightly
 def test_quitting_the_debugger_is_no_crash_of_ours(crash):
     assert "reproduced" not in typed(crash, "q\n", "--pdb", fork=True, expect=130)
 
 
+@pytest.mark.nightly
 def test_a_breakpoint_in_the_users_code_works(crash):
     faulty = crash.folder / "faulty.py"
     faulty.write_text(
@@ -87,6 +89,7 @@ def test_a_stop_compares_what_was_run(crash):
     assert (other["verdict"], other["divergence"]["step"]) == ("diverged", 1)  # whether it is fixed is not known
 
 
+@pytest.mark.nightly
 def test_fields_are_printed_as_a_table(crash):
     fields = "x, speed,action,gap_m,reward,observation[0,vx]"
     done = crash.crashhunt("replay", "h", "--until", "5", "--print", fields, "--json")

@@ -223,6 +223,7 @@ def test_disturb_is_edited_in_the_hunts_file(after, left, says, ignored):
     assert with_other_words(planned, before, before, ["ego"]) == (planned, [], [])
 
 
+@pytest.mark.nightly
 def test_what_every_trial_has_in_the_hunt_the_scenario_and_the_replay(toy):
     words = "stop@30=ahead:6:8"
     done = hunt(toy, "--disturb", words, "--set", "gap_m=5", trials="1")

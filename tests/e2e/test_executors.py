@@ -135,6 +135,7 @@ def test_it_may_know_better_than_this_machine_what_0_represents(mine):
     assert calls(mine)[0] == f"made {min(4, len(os.sched_getaffinity(0)))} 1000 "
 
 
+@pytest.mark.nightly
 def test_suites_rerun_and_python_choose_it_too(mine, monkeypatch):
     entry = 'id = "a"\nscenario = "toy"\ntrials = 2\nmax_steps = 20\nseed = 1\narguments.speed = 5\n'
     (mine.folder / "s.toml").write_text(f"[[hunts]]\n{entry}")

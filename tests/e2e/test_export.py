@@ -76,6 +76,7 @@ def with_index(change):
     return apply
 
 
+@pytest.mark.nightly
 def test_a_forged_signature_is_a_strangers(exported):
     def forge(name, data):
         if name == "hunt.toml":

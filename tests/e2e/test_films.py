@@ -99,6 +99,7 @@ def test_panels_that_fail_are_reported_in_the_film_and_do_not_change_the_verdict
     assert (good != bad).any()
 
 
+@pytest.mark.nightly
 def test_no_panels_and_the_last_seconds(crash):
     words = ("--no-panels", "--last-seconds", "1", "--size", "200x100", "--last-step-repeats", "0")
     done = crash.crashhunt("replay", "h", "--frames", "f", *words, "--json").json
@@ -108,6 +109,7 @@ def test_no_panels_and_the_last_seconds(crash):
     assert size(crash.folder / "g/000000.png") > (200, 100)
 
 
+@pytest.mark.nightly
 def test_several_crashes_in_one_film(toy):
     words = ("--agent", "faulty:Raises", "--arg", "at=12", "--scenario", "toy", "--seed", "1", "--keep-going")
     found = toy.crashhunt("run", "h", "2", "2", "40", *words, "--json").json
@@ -120,6 +122,7 @@ def test_several_crashes_in_one_film(toy):
     assert "names several" in done.err
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("agent", "where"),
     [

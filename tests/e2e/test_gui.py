@@ -48,6 +48,7 @@ def read_until(stream, text: str) -> str:
     return found
 
 
+@pytest.mark.nightly
 @pytest.mark.long
 def test_the_window_follows_the_ego_and_pauses_before_the_crash(crash, screen):
     crash.environment["DISPLAY"] = screen

@@ -163,6 +163,7 @@ def test_branches_that_are_killed_are_counted_and_asked_again(shell, folder, gap
     assert table(shell, "h") == table(shell, "u")
 
 
+@pytest.mark.nightly
 def test_trial_that_is_killed_at_different_steps_is_invalid_until_it_is_run_again(shell, folder):
     words = ("run", "h", *HUNT, "--agent", "faulty:Waits")
     steps, waits = ["3", "12", "21", ""], folder / "waits"

@@ -130,6 +130,7 @@ def damaged(toy, made_once, monkeypatch):
     return toy
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("most", [6, pytest.param(NEVER, marks=pytest.mark.nightly)])
 def test_salvage_that_was_killed_at_a_step_is_done_when_it_is_run_again(damaged, most):
     folder, to = damaged.folder, damaged.folder / "saved here"
@@ -326,6 +327,7 @@ def described(path: Path) -> dict[str, int]:
     return {path.name: path.stat().st_size // 1000}
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("every", [6, pytest.param(1, marks=pytest.mark.nightly)])
 def test_bisect_that_was_killed_leaves_no_work_tree(tmp_path, monkeypatch, every):
     git(tmp_path, "init", "-q", "-b", "main")

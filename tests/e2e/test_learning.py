@@ -92,6 +92,7 @@ def test_where_trials_come_from_is_in_the_table(own):
     assert (table.schema["parent"], table.schema["origin"]) == (pl.Int64, pl.String)
 
 
+@pytest.mark.nightly
 def test_a_damaged_proposal_is_found_and_the_others_are_saved(own):
     words = (*HUNT, "--sampler", "climber:Climber", "--deterministic")
     own.crashhunt("run", "h", *words)

@@ -107,6 +107,7 @@ def test_watching_ends_with_the_hunt(toy):
     assert "interrupted" in out
 
 
+@pytest.mark.nightly
 def test_logs_are_found_wherever_they_are(shell):
     words = ("--agent", "faulty:Raises", "--arg", "at=12", "--set", "vehicles=10", "--seed", "1", "--keep-going")
     shell.crashhunt("run", "h", "1", "2", "40", *words)
@@ -180,6 +181,7 @@ def test_another_version_of_a_hunt_runs_elsewhere(toy):
     assert not (toy.folder / "x").exists()
 
 
+@pytest.mark.nightly
 def test_a_hunt_whose_scenario_is_gone_runs_again_from_its_snapshot(toy):
     toy.crashhunt("run", "h", "1", "5", "50", *KEEP, "--arg", "speed=4")
     (toy.folder / "toy/scenario.toml").unlink()
@@ -188,6 +190,7 @@ def test_a_hunt_whose_scenario_is_gone_runs_again_from_its_snapshot(toy):
     assert [row["digest"] for row in rows(toy, "again")] == [row["digest"] for row in rows(toy, "h")]
 
 
+@pytest.mark.nightly
 def test_a_hunt_of_ones_own_scenario_begins_again(toy):
     toy.crashhunt("run", "h", "1", "4", "99", *KEEP)
     before = [row["digest"] for row in rows(toy, "h")]

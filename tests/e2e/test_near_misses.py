@@ -112,6 +112,7 @@ def test_a_hunt_that_continues_keeps_those_of_all_its_trials(hunt):
     assert left.exists()
 
 
+@pytest.mark.nightly
 def test_one_that_is_damaged_is_found_and_made_again(hunt):
     log = next((hunt.folder / "h" / "near-misses").iterdir()) / "log.mcap"
     log.write_bytes(log.read_bytes()[:-100])

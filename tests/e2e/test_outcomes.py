@@ -74,6 +74,7 @@ def test_a_software_fault_is_found_saved_and_replayed(toy, agent, outcome, kind,
     assert verdict["divergence"] is None
 
 
+@pytest.mark.nightly
 def test_an_agent_that_goes_elsewhere_takes_no_one_along(toy):
     (toy.folder / "needed.txt").write_text("8")
     words = ("run", "h", "1", "3", "60", "--agent", "faulty:Wanders", *TOY, "--keep-going", "--json")

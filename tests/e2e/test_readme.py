@@ -19,7 +19,8 @@ WITH_MORE = [root for root in BY_DAY if any(page.topic in AT_NIGHT for page in t
 # Times, rates, digests and the numbers of what is drawn differ, and so do lines that come now and then.
 # How many trials have ended beside the one that crashed depends on time; which one crashed does not.
 VARIES = re.compile(
-    r"(collision|finished|survived) \d+(, [a-z_]+ \d+)*|[\da-f]{16,}|/(tmp|dev/shm)/\S+|\d+(\.\d+)?|[─ ]+"
+    r"(collision|finished|survived) \d+(, [a-z_]+ \d+)*|[\da-f]{16,}|/(tmp|dev/shm)/\S+|[─ ]+"
+    r"|\d+(\.\d+)?(/s\b| s/trial\b)?"  # a loaded machine runs less than one trial per second
 )
 NOW_AND_THEN = re.compile(
     r"running:|done:|saving:|confirming:|.*: (running|finished|crashed)$|\.+ +\[|(.* )?\d+ passed"

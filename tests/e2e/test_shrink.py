@@ -80,6 +80,7 @@ def test_a_crash_that_does_not_come_again_is_reported(hunt, monkeypatch):
         shrink(bundle)
 
 
+@pytest.mark.nightly
 def test_a_full_disk_is_reported_and_what_came_of_the_trials_is_remembered(hunt, monkeypatch):
     bundle = find_bundle(hunt.folder / "h")
     folder = bundle.path.parent

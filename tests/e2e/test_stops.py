@@ -68,6 +68,7 @@ STOPS = [(number, whom) for number in (signal.SIGTERM, signal.SIGHUP) for whom i
 BY_DAY = [(signal.SIGHUP, "every process")]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("number", "whom"), mostly_nightly(STOPS, BY_DAY))
 def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, whom):
     words = ("run", "h", "2", "8", "30", *FINE, *SLOW, "--json")

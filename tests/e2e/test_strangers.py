@@ -162,10 +162,12 @@ EVIL = 'from pathlib import Path\nPath("evil was here").touch()\n'
     ("file", "before", "after"),
     [
         ("hunt.toml", 'agent = "crashhunt.agents:KeepLaneWithSpeed"', 'agent = "evil:Agent"'),
-        ("hunt.toml", 'sampler = "random"', 'sampler = "evil:Sampler"'),
-        ("hunt.toml", '"overlap"', '"evil:Oracle"'),
+        pytest.param("hunt.toml", 'sampler = "random"', 'sampler = "evil:Sampler"', marks=pytest.mark.nightly),
+        pytest.param("hunt.toml", '"overlap"', '"evil:Oracle"', marks=pytest.mark.nightly),
         (OPTIONS, 'simulator = "sumo"', 'simulator = "evil:Simulator"'),
-        (OPTIONS, 'agent = "crashhunt.agents:KeepLaneWithSpeed"', 'agent = "evil:Agent"'),
+        pytest.param(
+            OPTIONS, 'agent = "crashhunt.agents:KeepLaneWithSpeed"', 'agent = "evil:Agent"', marks=pytest.mark.nightly
+        ),
     ],
 )
 def test_no_code_is_imported(with_code, tmp_path, monkeypatch, capsys, file, before, after):

@@ -163,6 +163,7 @@ def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
     assert log.count("running") == (1 if killed["a/0"] == "finished" else 2)  # as on a machine that is busy
 
 
+@pytest.mark.nightly
 def test_a_damaged_plan_leaves_the_others_untouched(toy):
     from crashhunt.suites import Suite, run_all
 

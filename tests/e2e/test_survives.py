@@ -41,6 +41,7 @@ def test_what_is_printed_of_a_crash_in_traffic_is_small_and_can_be_pasted(tmp_pa
     assert str(again.value).splitlines()[1] == str(raised.value).splitlines()[1]
 
 
+@pytest.mark.nightly
 def test_an_example_may_have_disturbances(toy, monkeypatch):
     monkeypatch.chdir(toy.folder)
     (toy.folder / "erring").mkdir()

@@ -140,6 +140,7 @@ def test_futures_on_sumo_are_real_and_agents_take_over(shell, made_once, make):
     assert "--leave-out 'unicorn': no such actor enters" in err
 
 
+@pytest.mark.nightly
 def test_futures_on_highway_env_exist_where_it_draws_random_numbers(shell, made_once):
     made_once(hunted_on_highway, shell)
     err = shell.crashhunt("whatif", "h", "--from-step", "2", "--futures", expect=2).err

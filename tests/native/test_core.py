@@ -270,6 +270,7 @@ def repr_of(seen):
     return seen and [[column.tolist() for column in part] for part in seen[:2]] + [seen[2]]
 
 
+@pytest.mark.nightly
 @settings(deadline=None, max_examples=60)
 @given(some.lists(two_scenes(), min_size=2, max_size=4))
 def test_the_closest_until_then_leaves_out_nothing(episodes):

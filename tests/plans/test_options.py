@@ -66,6 +66,7 @@ print(json.dumps({
 """
 
 
+@pytest.mark.nightly
 def test_an_option_that_is_added_to_the_list_is_everywhere(toy):
     copy = toy.folder / "elsewhere" / "crashhunt"
     shutil.copytree(PACKAGE, copy)  # with what Python has compiled, which holds for files of the same age and size

@@ -214,6 +214,7 @@ def outcome_of_stepping_out(person, vehicle, seconds=6.0):
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("every", [45, pytest.param(2, marks=pytest.mark.nightly)])
 def test_near_junctions_persons_step_out_only_where_sumo_keeps_them_on_their_sidewalk(junction, every):
     """Elsewhere SUMO may map them to a crossing or a walking area, and on large networks the process may die then."""

@@ -3,6 +3,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 from crashhunt.snapshots._take import find_sources, git
 
 
@@ -20,6 +22,7 @@ def test_in_a_hook_of_another_repository_a_folder_is_still_of_its_own(tmp_path, 
     assert git(tmp_path / "here", "rev-parse", "--absolute-git-dir") == f"{tmp_path}/here/.git\n".encode()
 
 
+@pytest.mark.nightly
 def test_a_name_that_would_be_folders_elsewhere_is_excluded_and_reported(tmp_path):
     """A snapshot is refused that has one, as it might be unpacked anywhere; a hunt is not, as its project has one."""
     for name in ("unit-x2d\\x2d1.service", "kept.txt"):
