@@ -31,7 +31,8 @@ _ORDER = [
     "kinds-of-crashes", "fault", "omissions", "judge", "causes", "what-if", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "cluster", "dashboard", "rate", "rare", "compare", "gate", "train",
     "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "determinism", "security",
-    "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
+    "disturbance-kinds", "forks", "fault-rules", "minimization", "export", "clusters",
+    "gallery", "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
 """Topics in reading order; all other topics follow them."""
 
