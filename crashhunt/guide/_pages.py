@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["SECTIONS", "Page", "completed", "find_page", "for_terminal", "list_pages", "pages_folder"]
 
 SECTIONS = {
+    "start": "Start",
     "tutorials": "Tutorials",
     "howto": "How to",
     "reference": "Reference",
@@ -26,7 +27,8 @@ SECTIONS = {
 """The folders of the guide with their titles, in reading order."""
 
 _ORDER = [
-    "first-hunt", "your-town", "from-a-map", "highway-env", "gymnasium", "ci",
+    "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed",
+    "your-town", "from-a-map", "highway-env", "gymnasium", "ci",
     "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
     "kinds-of-crashes", "fault", "omissions", "judge", "causes", "what-if", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "cluster", "dashboard", "rate", "rare", "compare", "gate", "train",
@@ -35,6 +37,9 @@ _ORDER = [
     "gallery", "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
 """Topics in reading order; all other topics follow them."""
+
+_FORMER = {"first-hunt": "find-a-crash"}
+"""Topics that were renamed, and their present names: `crashhunt guide` still takes them."""
 
 _MADE = re.compile(r"^<!-- made from the code: (\w+) -->\n", re.MULTILINE)
 _COMMENT = re.compile(r"<!--.*?-->\n*", re.DOTALL)
@@ -85,12 +90,13 @@ def list_pages() -> list[Page]:
 
 
 def find_page(topic: str) -> Page:
-    """Return the page of a topic.
+    """Return the page of a topic, also by a former name.
 
     Raises:
         UsageError: there is none.
     """
     pages = {page.topic: page for page in list_pages()}
+    topic = _FORMER.get(topic, topic)
     if topic not in pages:
         raise UsageError(f"the guide has no topic {topic!r}", fix=one_of(topic, pages))
     return pages[topic]

@@ -13,13 +13,16 @@ from pages import PAGES, ROOT, Page, prepare, tree
 
 ROOTS = [topic for topic in PAGES if not Page(topic).before and Page(topic).commands]
 # The dearest pages; what they show is asked by day elsewhere, without their words.
-AT_NIGHT = ("api", "ci", "compare", "disturbances", "executor", "film", "highway-env", "sampler", "suites")
+AT_NIGHT = (
+    "api", "ci", "compare", "disturbances", "executor", "film", "highway-env", "sampler", "suites", "watch-and-see-why",
+)  # fmt: skip
 BY_DAY = [root for root in ROOTS if root not in AT_NIGHT]
 WITH_MORE = [root for root in BY_DAY if any(page.topic in AT_NIGHT for page in tree(root))]
 # Times, rates, digests and the numbers of what is drawn differ, and so do lines that come now and then.
 # How many trials have ended beside the one that crashed depends on time; which one crashed does not.
 VARIES = re.compile(
-    r"(collision|finished|survived) \d+(, [a-z_]+ \d+)*|[\da-f]{16,}|/(tmp|dev/shm)/\S+|\d+(\.\d+)?|[─ ]+"
+    r"(collision|finished|survived) \d+(, [a-z_]+ \d+)*|[\da-f]{16,}|\d+(\.\d+)?( s/trial|/s)|/(tmp|dev/shm)/\S+"
+    r"|\d+(\.\d+)?|[─ ]+"
 )
 NOW_AND_THEN = re.compile(
     r"running:|done:|saving:|confirming:|.*: (running|finished|crashed)$|\.+ +\[|(.* )?\d+ passed"
