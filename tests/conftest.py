@@ -158,7 +158,7 @@ def _ended(words: tuple[str, ...], done: Done, expect: int | None) -> Done:
     if expect is not None:
         assert done.code == expect, f"{words}: {done.code}\n{done.out}\n{done.err}"
     assert "Traceback" not in done.err, done.err
-    json_schemas.check_output(words, done.code, done.out)
+    json_schemas.check_output(words, done.out)
     return done
 
 

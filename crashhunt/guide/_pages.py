@@ -27,11 +27,11 @@ SECTIONS = {
 """The folders of the guide with their titles, in reading order."""
 
 _ORDER = [
-    "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed",
-    "your-town", "from-a-map", "highway-env", "gymnasium", "ci",
+    "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed", "how-often-does-it-crash",
+    "which-version-is-better", "cluster", "your-town", "from-a-map", "highway-env", "gymnasium", "ci",
     "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
     "kinds-of-crashes", "fault", "omissions", "judge", "causes", "what-if", "shrink", "film", "near-misses",
-    "hand-over", "corpus", "suites", "warm-up", "cluster", "dashboard", "rate", "rare", "compare", "gate", "train",
+    "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
     "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "determinism", "security",
     "disturbance-kinds", "forks", "fault-rules", "minimization", "export", "clusters",
     "gallery", "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",

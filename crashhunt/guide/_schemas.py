@@ -117,6 +117,19 @@ class RunData(TypedDict):
     rate: NotRequired[RateEntry]
 
 
+class OneReplay(ReplayData):
+    """``crashhunt replay`` of one crash; ``written`` has the pictures of each film."""
+
+    written: NotRequired[dict[str, int]]
+
+
+class SeveralReplays(TypedDict):
+    """``crashhunt replay`` that films several crashes, or one from its log: then nothing is replayed."""
+
+    crashes: list[ReplayData]
+    written: dict[str, int]
+
+
 class StatusData(TypedDict):
     """``crashhunt status``."""
 
@@ -267,7 +280,7 @@ class CrashesData(TypedDict):
 
 SCHEMAS: dict[str, Any] = {
     "run": RunData,
-    "replay": ReplayData,
+    "replay": OneReplay | SeveralReplays,
     "status": StatusData,
     "rate": RatesData,
     "crashes": CrashesData,

@@ -118,7 +118,7 @@ def test_reference_links_every_schema():
 
 def test_output_that_its_schema_refuses_fails():
     with pytest.raises(AssertionError, match="'hunts' is a required property"):
-        json_schemas.check_output(("status", "x", "--json"), 0, "{}")
-    json_schemas.check_output(("status", "x"), 0, "{}")
+        json_schemas.check_output(("status", "x", "--json"), "{}")
+    json_schemas.check_output(("status", "x"), "{}")
     with pytest.raises(AssertionError, match="'fix' is a required property"):
-        json_schemas.check_output(("run", "--json"), 2, '{"error": {"message": "a"}}')
+        json_schemas.check_output(("run", "--json"), '{"error": {"message": "a"}}')
