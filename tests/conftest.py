@@ -22,6 +22,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import hypothesis
+import json_schemas
 import pytest
 from commands import CRASHHUNT, Begun, Commands
 
@@ -157,6 +158,7 @@ def _ended(words: tuple[str, ...], done: Done, expect: int | None) -> Done:
     if expect is not None:
         assert done.code == expect, f"{words}: {done.code}\n{done.out}\n{done.err}"
     assert "Traceback" not in done.err, done.err
+    json_schemas.check_output(words, done.out)
     return done
 
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["SECTIONS", "Page", "completed", "find_page", "for_terminal", "list_pages", "pages_folder"]
 
 SECTIONS = {
+    "start": "Start",
     "tutorials": "Tutorials",
     "howto": "How to",
     "reference": "Reference",
@@ -26,14 +27,19 @@ SECTIONS = {
 """The folders of the guide with their titles, in reading order."""
 
 _ORDER = [
-    "first-hunt", "your-town", "from-a-map", "highway-env", "gymnasium", "ci",
+    "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed", "how-often-does-it-crash",
+    "which-version-is-better", "cluster", "your-town", "from-a-map", "highway-env", "gymnasium", "ci",
     "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
     "kinds-of-crashes", "fault", "omissions", "judge", "causes", "what-if", "shrink", "film", "near-misses",
-    "hand-over", "corpus", "suites", "warm-up", "cluster", "dashboard", "rate", "rare", "compare", "gate", "train",
+    "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
     "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "determinism", "security",
-    "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
+    "disturbance-kinds", "forks", "fault-rules", "minimization", "export", "clusters",
+    "gallery", "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
 """Topics in reading order; all other topics follow them."""
+
+_FORMER = {"first-hunt": "find-a-crash"}
+"""Topics that were renamed, and their present names: `crashhunt guide` still takes them."""
 
 _MADE = re.compile(r"^<!-- made from the code: (\w+) -->\n", re.MULTILINE)
 _COMMENT = re.compile(r"<!--.*?-->\n*", re.DOTALL)
@@ -84,12 +90,13 @@ def list_pages() -> list[Page]:
 
 
 def find_page(topic: str) -> Page:
-    """Return the page of a topic.
+    """Return the page of a topic, also by a former name.
 
     Raises:
         UsageError: there is none.
     """
     pages = {page.topic: page for page in list_pages()}
+    topic = _FORMER.get(topic, topic)
     if topic not in pages:
         raise UsageError(f"the guide has no topic {topic!r}", fix=one_of(topic, pages))
     return pages[topic]

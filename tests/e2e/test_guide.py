@@ -32,10 +32,10 @@ TOPICS = [page.topic for page in list_pages()]
 def test_topics_are_listed(shell):
     out = shell.crashhunt("guide").out
     assert all(re.search(rf"^  {topic} +\S", out, re.MULTILINE) for topic in TOPICS)
-    assert out.index("first-hunt") < out.index("your-town") < out.index("troubleshooting")
+    assert out.index("find-a-crash") < out.index("your-town") < out.index("troubleshooting")
     found = shell.crashhunt("guide", "--json").json["topics"]
     assert [entry["topic"] for entry in found] == TOPICS
-    assert found[0] == {"topic": "first-hunt", "section": "tutorials", "title": "Your first hunt"}
+    assert found[0] == {"topic": "find-a-crash", "section": "start", "title": "Find a crash in your agent in 5 minutes"}
 
 
 def test_every_page_has_a_topic_of_its_own():
@@ -82,6 +82,10 @@ def test_an_unknown_topic_is_one_line(shell):
     assert done.err.startswith("crashhunt: the guide has no topic 'determinsm'; did you mean 'determinism'?")
     assert len(done.err.splitlines()) == 1
     assert shell.crashhunt("guide", "nothing", "--json", expect=2).json["error"]["fix"]
+
+
+def test_former_topic_shows_the_page_that_replaced_it():
+    assert find_page("first-hunt").topic == "find-a-crash"
 
 
 @pytest.mark.parametrize(

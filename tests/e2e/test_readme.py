@@ -13,7 +13,10 @@ from pages import PAGES, ROOT, Page, prepare, tree
 
 ROOTS = [topic for topic in PAGES if not Page(topic).before and Page(topic).commands]
 # The dearest pages; what they show is asked by day elsewhere, without their words.
-AT_NIGHT = ("api", "ci", "compare", "disturbances", "executor", "film", "highway-env", "sampler", "suites")
+AT_NIGHT = (
+    "api", "ci", "compare", "disturbances", "executor", "film", "highway-env", "how-often-does-it-crash", "sampler",
+    "suites", "watch-and-see-why", "which-version-is-better",
+)  # fmt: skip
 BY_DAY = [root for root in ROOTS if root not in AT_NIGHT]
 WITH_MORE = [root for root in BY_DAY if any(page.topic in AT_NIGHT for page in tree(root))]
 # Times, rates, digests and the numbers of what is drawn differ, and so do lines that come now and then.
