@@ -286,10 +286,10 @@ class ContactRecord:
         # The leader is the last point: where the road bends, the follower would not have gone straight on.
         ends = [self._at_contact(actor)[0] for actor in (follow.id, leader)]
         path = np.vstack((follow.centers, *ends))
-        beside = _BESIDE_M + min(_BEND_M, self._bend_m / 2)
+        limit_m = _BESIDE_M + min(_BEND_M, self._bend_m / 2)
         found = 0.0
         for back in range(len(self.times) - 1, -1, -1):
-            if _distance(path[back:], lead.centers[back]) > beside:
+            if _distance(path[back:], lead.centers[back]) > limit_m:
                 break
             found = float(self.times[back])
         return found

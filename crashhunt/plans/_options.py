@@ -216,7 +216,6 @@ class RunOptions(_Options):
         0, "with ``distinct`` or ``keep``, how many crashes of each type to judge, so that each cause counts; 0: none",
         help="with --distinct or --keep: count each cause of a crash type on its own. Runs up to N crashes of each "
         "type again, as crashhunt crashes --by-cause does; 0: count types",
-        brief="with --distinct or --keep: count each cause of a crash type",
         flag="--by-cause", group="search", metavar="N", check=at_least(0, zero="count types"),
     )  # fmt: skip
     only_at_fault: bool = option(
