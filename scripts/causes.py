@@ -1,8 +1,9 @@
 """How well crash types agree with planted bugs: by signature, and divided by cause. Run it as ``scripts/causes``.
 
-Agents with two or three planted bugs are hunted. The label of a crash is the bug without which the same trial does not
-crash within 5 s after it; of several such bugs, the one that acted last. A crash without such a bug is not labelled,
-and does not count. The adjusted Rand index (Hubert and Arabie 1985) compares labels with types: 1 is equal, 0 chance.
+Agents with two or three planted bugs are hunted. The label of a crash is the bug without which the same trial has no
+crash with the same two actors until 5 s after it; of several such bugs, the one that acted last. A crash without such a
+bug is not labelled, and does not count. Crashes that need a single bug are also compared on their own. The
+adjusted Rand index (Hubert and Arabie 1985) compares labels with types: 1 is equal, 0 chance.
 
     scripts/causes --folder DIR [--trials N] [--judge N] [SCENARIO:BUGS…]     goes on where it was
 """
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from crashhunt.crashes import Bundle
+    from crashhunt.trial import TrialResult
 
 AGENTS = (
     ("loop", "sign+frozen"), ("loop", "wrong_side+frozen"), ("loop", "sign+blind_behind"), ("loop", "sign+off_edge"),
@@ -66,8 +68,9 @@ def main() -> int:
     given.folder = given.folder.resolve()
     given.folder.mkdir(parents=True, exist_ok=True)
     shutil.copy(Path(__file__).with_name("planted_bugs.py"), given.folder)
-    print("| scenario | bugs | crashes | labels | types | by cause | ARI types | ARI by cause | hidden by --keep 3 |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |", flush=True)
+    print("| scenario | bugs | crashes | labels | types | by cause | ARI types | ARI by cause | ARI causes alone | "
+          "of crashes that need one bug | hidden by --keep 3 |")  # fmt: skip
+    print(f"{'| --- ' * 11}|", flush=True)
     chosen = [tuple(one.split(":", 1)) for one in given.only] or AGENTS
     for scenario, bugs in chosen:
         store = given.folder / f"{scenario}-{bugs}.json"
@@ -92,7 +95,8 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
             rows += [
                 {
                     "crash": bundle.id,
-                    "label": labels[bundle.id],
+                    "label": labels[bundle.id][0],
+                    "needs": labels[bundle.id][1],
                     "type": str(group.signature),
                     "cause": str(part.cause),
                     "judged": bundle in part.judged,
@@ -103,9 +107,9 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
     return {"scenario": scenario, "bugs": bugs, "rows": rows}
 
 
-def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, str]:
-    """Return the bug behind each crash, by runs of its trial without one bug at a time; empty where none is."""
-    found: dict[str, str] = {bundle.id: "" for bundle in bundles}
+def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, tuple[str, int]]:
+    """Return the bug behind each crash and how many bugs it needs, by runs of its trial without one bug at a time."""
+    found: dict[str, tuple[str, int]] = {bundle.id: ("", 0) for bundle in bundles}
     if not bundles:
         return found
     reruns = [prepare(bundle, ReplayOptions(trusted=True)) for bundle in bundles]
@@ -121,14 +125,27 @@ def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, str]:
         runs = Reruns(reruns[0], Path(scratch), parallel=2, stopped=lambda: False)
         for ended in runs.run(specs, recorded=False):
             bundle, bug = asked[ended.place]
-            if ended.result.outcome in (Outcome.SURVIVED, Outcome.FINISHED):
+            if not _is_same(ended.result, bundle.result):
                 needed.setdefault(bundle.id, []).append(bug)
         runs.close()
     for bundle in bundles:
         acted = {name: int(step) for name, step in _PLANTED.findall((bundle.path / "run.log").read_text())}
         those = needed.get(bundle.id, [])
-        found[bundle.id] = max(those, key=lambda name: acted.get(name, 0), default="")
+        found[bundle.id] = max(those, key=lambda name: acted.get(name, 0), default=""), len(those)
     return found
+
+
+def _is_same(rerun: TrialResult, result: TrialResult) -> bool:
+    """Whether a run ends in the same crash: with the same actors, or without a partner in the same way.
+
+    Another crash that follows later, by another bug, is not the same one.
+    """
+    if rerun.outcome in (Outcome.SURVIVED, Outcome.FINISHED):
+        return False
+    was, now = result.collision, rerun.collision
+    if was is None or now is None:
+        return rerun.outcome is result.outcome
+    return {was.collider, was.victim} == {now.collider, now.victim}
 
 
 def _line(study: dict[str, Any]) -> str:
@@ -136,12 +153,13 @@ def _line(study: dict[str, Any]) -> str:
     labels = [row["label"] for row in rows]
     types, causes = [row["type"] for row in rows], [(row["type"], row["cause"]) for row in rows]
     merged = [row["cause"] for row in rows]
+    single = [row for row in rows if row["needs"] == 1]
+    alone = adjusted_rand_index([row["label"] for row in single], [row["cause"] for row in single])
     hidden = [", ".join(sorted({*labels} - _kept(rows, key))) or "none" for key in ("type", "cause")]
-    return (
-        f"| {study['scenario']} | {study['bugs']} | {len(study['rows'])} | {len({*labels})} | {len({*types})} | "
-        f"{len({*causes})} | {adjusted_rand_index(labels, types):.2f} | {adjusted_rand_index(labels, causes):.2f} "
-        f"({adjusted_rand_index(labels, merged):.2f} cause alone) | {hidden[0]}; by cause {hidden[1]} |"
-    )
+    indices = [f"{adjusted_rand_index(labels, found):.2f}" for found in (types, causes, merged)]
+    counts = [len(study["rows"]), *(len({*found}) for found in (labels, types, causes))]
+    cells = [study["scenario"], study["bugs"], *counts, *indices, f"{alone:.2f} ({len(single)})"]
+    return f"| {' | '.join(map(str, cells))} | {hidden[0]}; by cause {hidden[1]} |"
 
 
 def _kept(rows: list[dict[str, Any]], key: str) -> set[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,8 +17,7 @@ from crashhunt.crashes._fault import fault_in
 from crashhunt.crashes._lanes import LaneMap
 from crashhunt.recording import read_lanes
 from crashhunt.trial import Outcome
-from crashhunt.world import Scene, is_person
-from crashhunt.world._contact import _Way
+from crashhunt.world import Scene, is_person, lane_jump, poses_between
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 _JUMP_M, _STANDS_MPS, _SPEED_MPS, _ANGLE = 1.5, 0.1, 0.05, math.radians(2)
 _NEAR_M, _LATELY_S = 70.0, 25.0
 _SHIFTS = (0.25, 0.5, 0.75)
+_LOOKS_BACK_S = 5.0
 _LEFT_RIGHT = {"left": "right", "right": "left"}
 
 
@@ -215,15 +216,21 @@ def variants(record: ContactRecord, bundle: Bundle) -> Iterator[tuple[str, tuple
         ]
         lanes = LaneMap(pairs, moved(around))  # type: ignore[arg-type]
         yield name, told(replace(record, scenes=scenes, lanes=lanes)), flip < 0
-    if any(scene.spines for scene in record.scenes[-2:]) or not record.swept:
-        return
+    if any(scene.spines for scene in record.scenes[-2:]) or not record.swept or _jumped(record):
+        return  # an instantaneous lane change takes place at the end of a step, so in a shifted step at another time
     for shift in _SHIFTS:
         yield "shifted", told(replace(record, scenes=_shifted(record, shift))), False
 
 
+def _jumped(record: ContactRecord) -> bool:
+    """Whether one of the actors has changed lanes in an instant, in the seconds that the rules look back."""
+    since = [scene for scene in record.scenes if scene.time_s >= record.time_s - _LOOKS_BACK_S]
+    return any(lane_jump(*pair, actor) for pair in pairwise(since) for actor in (record.agent, record.other))
+
+
 def _shifted(record: ContactRecord, shift: float) -> list[Scene]:
-    """Return scenes as if every step had begun a share of a step later; the last one may be shorter."""
-    found = []
+    """Return scenes as if every step but the first had begun a share of a step later; the last one may be shorter."""
+    found = list(record.scenes[:1])
     for before, after in zip(record.scenes, record.scenes[1:], strict=False):
         index = before.roster.index
         both = [actor for actor in after.roster.actors if actor.id in index]
@@ -231,9 +238,9 @@ def _shifted(record: ContactRecord, shift: float) -> list[Scene]:
         for actor in both:
             was, row = index[actor.id], after.roster.index[actor.id]
             size = actor.length, actor.width
-            way = _Way((*before.points[was], before.headings[was], *size),
-                       (*after.points[row], after.headings[row], *size), bends=not is_person(actor.id))  # fmt: skip
-            poses.append(way.at(shift))
+            start = (*before.points[was], before.headings[was], *size)
+            end = (*after.points[row], after.headings[row], *size)
+            poses += poses_between(start, end, (shift,), bends=not is_person(actor.id))
             speeds.append((1 - shift) * before.speeds[was] + shift * after.speeds[row])
         roster = type(before.roster)(tuple(both))
         time_s = before.time_s + shift * (after.time_s - before.time_s)

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import add_ci_options, add_json, add_trust, check_trust, integer, say, tell
+from crashhunt.cli._common import (
+    DONE,
+    INTERRUPTED,
+    add_ci_options,
+    add_json,
+    add_trust,
+    check_trust,
+    integer,
+    say,
+    tell,
+)
 
 if TYPE_CHECKING:
     import argparse
@@ -20,6 +30,8 @@ if TYPE_CHECKING:
     from crashhunt.crashes import CauseGroup, Group, Signature
 
 __all__ = ["add_crashes"]
+
+_DEFAULT_RUNS = 8  # `crashhunt.whatif.REPRESENTATIVES`, which takes longer to import than a parser to build
 
 
 def add_crashes(commands: Commands) -> None:
@@ -39,7 +51,7 @@ def add_crashes(commands: Commands) -> None:
         "--sarif", metavar="FILE", type=Path, help="write the crash types as SARIF 2.1.0, for code scanning and editors"
     )
     crashes.add_argument(
-        "--by-cause", metavar="N", type=integer, nargs="?", const=-1, default=0,
+        "--by-cause", metavar="N", type=integer, nargs="?", const=_DEFAULT_RUNS, default=None,
         help="divide each type by cause: run up to N of its crashes again, as judge does; the others have the cause of "
         "the nearest one; default: 8",
     )  # fmt: skip
@@ -54,12 +66,14 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.hunts import dropped_crashes, find_hunts
     from crashhunt.report import describe_causes, describe_groups
 
+    if options.by_cause is not None and options.by_cause < 1:
+        raise UsageError(f"--by-cause is {options.by_cause}", fix="give at least 1")
     cases = _cases(options.known)
     hunts = list(dict.fromkeys(hunt for directory in options.directories for hunt in find_hunts(directory)))
     bundles = (bundle for hunt in hunts for bundle in list_bundles(hunt))
     found = group_crashes(bundles, dropped_crashes(hunts))
     known = _known(found.groups, cases)
-    causes = _divided(options, found.groups) if options.by_cause else None
+    causes, interrupted = (None, False) if options.by_cause is None else _divided(options, found.groups)
     say(describe_groups(found.groups, known), as_json=options.json)
     if causes is not None:
         say(describe_causes(found.groups, causes), as_json=options.json)
@@ -74,31 +88,31 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
         if known is not None:
             groups = [{**one, "known": known.get(of.signature)} for one, of in zip(groups, found.groups, strict=True)]
         print(json.dumps({"groups": groups, "left_out": list(found.left_out)}))
-    return 0
+    if interrupted:
+        say("Interrupted: some causes are not known yet. Run the same command to resume.", as_json=options.json)
+    return INTERRUPTED if interrupted else DONE
 
 
-def _divided(options: argparse.Namespace, groups: Sequence[Group]) -> list[tuple[CauseGroup, ...]]:
-    """Return the crashes of each type, divided by cause."""
+def _divided(options: argparse.Namespace, groups: Sequence[Group]) -> tuple[list[tuple[CauseGroup, ...]], bool]:
+    """Return the crashes of each type, divided by cause, and whether the user has stopped that."""
     from crashhunt.base.signals import stop_requests
     from crashhunt.replays import ReplayOptions
-    from crashhunt.whatif import REPRESENTATIVES, divide_by_cause
+    from crashhunt.whatif import divide_by_cause
 
-    if options.by_cause < -1:
-        raise UsageError(f"--by-cause is {options.by_cause}", fix="give at least 1")
-    most = REPRESENTATIVES if options.by_cause == -1 else options.by_cause
     for first in {group.first.hunt: group.first for group in groups}.values():  # before the first one runs
         check_trust(first, options.trust or None)
     with stop_requests() as stops:
-        return [
+        divided = [
             divide_by_cause(
                 group,
                 ReplayOptions(force=True, trusted=True),
-                most=most,
+                most=options.by_cause,
                 parallel=len(os.sched_getaffinity(0)),
                 stopped=lambda: bool(stops),
             )
             for group in groups
         ]
+        return divided, bool(stops)
 
 
 def _cases(corpus: Path | None) -> list[Case] | None:

@@ -34,11 +34,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.cli._common import Commands
     from crashhunt.crashes import Bundle
     from crashhunt.recording import Recording
     from crashhunt.render import FilmOptions, Shot
-    from crashhunt.replays import Look, ReplayData, ReplayOptions, ReplayReport
+    from crashhunt.replays import Look, ReplayOptions, ReplayReport
     from crashhunt.trial import TrialResult
 
 
@@ -349,7 +350,7 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
             raise UsageError(f"--times {options.times}: {name} looks at one run", fix="leave one of the two out")
 
 
-def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions) -> tuple[ReplayReport, ReplayData]:
+def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions) -> tuple[ReplayReport, JsonObject]:
     from crashhunt.crashes import most_dangerous, partner
     from crashhunt.replays import replay
     from crashhunt.report import check_fields, describe_replay, format_table, steps_table

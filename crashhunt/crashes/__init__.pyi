@@ -19,10 +19,9 @@ from ._bundle import (
 from ._causes import (
     Cause as Cause,
     CauseGroup as CauseGroup,
+    Division as Division,
     cause_of as cause_of,
     features_of as features_of,
-    representatives as representatives,
-    spread as spread,
 )
 from ._contact import ContactRecord as ContactRecord, contact_record as contact_record
 from ._encounter import (

@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.integrity import FileEntry
     from crashhunt.base.json_types import Plain
-    from crashhunt.recording import DivergenceData
     from crashhunt.trial import Value
     from crashhunt.world import Lane
 
@@ -114,7 +113,7 @@ class CrashData(Protected):
     snapshot: str
     versions: dict[str, str]
     confirmed: bool | None
-    divergence: DivergenceData | None
+    divergence: JsonObject | None
     disturbed: NotRequired[bool]
     log_likelihood: NotRequired[float | None]
     danger: NotRequired[float | None]
@@ -272,7 +271,7 @@ class Bundle:
     hunt_seed: int
     snapshot: str
     confirmed: bool | None = None
-    divergence: DivergenceData | None = None
+    divergence: JsonObject | None = None
     files: Mapping[str, FileEntry] = field(default_factory=dict)
     added: Plain = field(default_factory=dict)
     why_unconfirmed: str = ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.codec import Serializable
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, Judgement, Omission, Why
     from crashhunt.recording import Recording
 
-__all__ = ["Cause", "CauseGroup", "cause_of", "features_of", "representatives", "spread"]
+__all__ = ["Cause", "CauseGroup", "Division", "cause_of", "features_of"]
 
 _LONG_M = 7.0  # a longer actor is a truck, a bus or a trailer, which agents that assume a car's length hit
 _LOOKS_S = (0.2, 1.0, 2.0)  # before the crash
-_SCALES = {"speed": 5.0, "gap": 5.0, "length": 4.0, "side": 1.0}  # m/s, m, m, 1: a difference that matters
+_SCALES = {"speed": 5.0, "gap": 5.0, "length": 4.0}  # m/s, m, m: a difference that matters
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -125,19 +125,22 @@ def _length(recording: Recording, actor: str) -> float:
     return next((one.length for one in recording.actors if one.id == actor), 0.0)
 
 
-def features_of(bundle: Bundle) -> tuple[float, ...]:
+def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[float, ...]:
     """Return what distinguishes crashes of one type without runs, in units of a difference that matters.
 
-    Speeds and gap 0.2 s, 1 s and 2 s before the crash, the length of the collision partner, and the lateral offset of
-    the partner one second before.
+    Speeds and gap 0.2 s, 1 s and 2 s before the crash, and the length of the collision partner.
 
     Args:
-        bundle: the crash; its log is read.
+        bundle: the crash.
+        recording: of it, where it has been read already.
+
+    Raises:
+        BundleError: its log is missing or damaged.
     """
     hit = bundle.result.collision
     if hit is None or not hit.other:
         return ()
-    recording = bundle.recording()
+    recording = recording or bundle.recording()
     encounter = Encounter(recording, hit.agent, hit.other)
     moments = encounter.moments
     found = []
@@ -152,36 +155,101 @@ def features_of(bundle: Bundle) -> tuple[float, ...]:
     return tuple(found)
 
 
-def representatives(features: Sequence[tuple[float, ...]], steps: Sequence[int], count: int) -> list[int]:
-    """Return the places of the crashes to judge: the shortest, then each time the one furthest from those chosen.
+class Division:
+    """The crashes of one type, some of which are judged; the others have the cause of the nearest judged one.
+
+    The crashes to judge differ as much as possible: the shortest comes first, then always the crash that is furthest
+    from all those chosen (farthest-first traversal: T. F. Gonzalez, Clustering to minimize the maximum intercluster
+    distance, Theoretical Computer Science 38, 1985). Crashes may be added in between.
 
     Args:
-        features: of each crash, as `features_of` returns them.
-        steps: of each crash.
-        count: how many at most.
+        most: how many crashes to judge at most.
     """
-    if not features:
-        return []
-    chosen = [min(range(len(steps)), key=lambda place: (steps[place], place))]
-    while len(chosen) < min(count, len(features)):
-        away = [min(_distance(one, features[place]) for place in chosen) for one in features]
-        left = [place for place in range(len(features)) if place not in chosen]
-        chosen.append(max(left, key=lambda place: (away[place], -place)))
-    return chosen
 
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._steps: dict[int, int] = {}
+        self._features: dict[int, tuple[float, ...]] = {}
+        self._chosen: list[int] = []
+        self._open: set[int] = set()  # chosen, without an answer yet
+        self._known: dict[int, Cause] = {}
 
-def spread(features: Sequence[tuple[float, ...]], known: dict[int, Cause]) -> list[Cause]:
-    """Return the cause of each crash: its own where it was judged, else that of the nearest judged one.
+    def add(self, number: int, steps: int, features: tuple[float, ...]) -> None:
+        """Add a crash.
 
-    Args:
-        features: of each crash.
-        known: place to cause; at least one.
-    """
-    places = sorted(known)
-    return [
-        known[place] if place in known else known[min(places, key=lambda other: _distance(features[other], one))]
-        for place, one in enumerate(features)
-    ]
+        Args:
+            number: identifies it.
+            steps: of its trial.
+            features: as `features_of` returns them.
+        """
+        self._steps[number], self._features[number] = steps, features
+
+    def choose(self) -> int | None:
+        """Return the number of the next crash to judge; None where enough are chosen, or all."""
+        left = [number for number in self._features if number not in self._chosen]
+        if not left or len(self._chosen) >= self._most:
+            return None
+        if self._chosen:
+            found = max(left, key=lambda number: (self._away(number, self._chosen), -number))
+        else:
+            found = min(left, key=lambda number: (self._steps[number], number))
+        self._chosen.append(found)
+        self._open.add(found)
+        return found
+
+    def settle(self, number: int, cause: Cause | None) -> None:
+        """Note the cause of a crash.
+
+        Args:
+            number: of the crash.
+            cause: according to its runs; None where it cannot be run again. Then the nearest judged crash decides.
+        """
+        self._open.discard(number)
+        if number not in self._chosen:
+            self._chosen.append(number)
+        if cause is not None:
+            self._known[number] = cause
+
+    def postpone(self, number: int) -> None:
+        """Take a crash back that was chosen and has not been judged; it may be chosen again."""
+        self._open.remove(number)
+        self._chosen.remove(number)
+
+    @property
+    def left(self) -> int:
+        """How many crashes `choose` would still return."""
+        return max(0, min(self._most, len(self._features)) - len(self._chosen))
+
+    @property
+    def judged(self) -> frozenset[int]:
+        """The numbers of the crashes that have been judged."""
+        return frozenset(self._known)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether as many crashes have been judged as should be."""
+        return not self._open and len(self._chosen) >= self._most
+
+    def causes(self) -> dict[int, Cause]:
+        """Return number to cause, for all crashes."""
+        if not self._known:
+            return dict.fromkeys(self._features, Cause("unknown"))
+        # That an actor was long counts only where all of them were: where cars were hit as well, length is no cause.
+        cars = {cause for cause in self._known.values() if not cause.actor}
+        known = {
+            number: replace(cause, actor="") if replace(cause, actor="") in cars else cause
+            for number, cause in self._known.items()
+        }
+        return {number: known[self._nearest(number)] for number in self._features}
+
+    def _nearest(self, number: int) -> int:
+        if number in self._known:
+            return number
+        own = self._features[number]
+        return min(sorted(self._known), key=lambda other: _distance(own, self._features[other]))
+
+    def _away(self, number: int, others: Sequence[int]) -> float:
+        return min(_distance(self._features[number], self._features[other]) for other in others)
 
 
 def _distance(one: tuple[float, ...], other: tuple[float, ...]) -> float:

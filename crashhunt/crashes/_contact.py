@@ -16,7 +16,7 @@ import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.crashes._lanes import LaneMap
-from crashhunt.world import STANDS_MPS, contact_at, is_person, lane_jump
+from crashhunt.world import STANDS_MPS, contact_at, is_person, lane_jump, poses_between
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,6 +33,7 @@ __all__ = ["SAME_WAY", "ContactRecord", "Way", "contact_record", "record_in"]
 
 
 _WINDOW_S = 4.0  # earlier movements have not led to the contact
+_SAMPLE_S = 0.1  # as short as the usual steps of simulators
 _EVENTS_S = 10.0  # before the contact
 SAME_WAY = math.radians(45)
 _OPPOSITE = math.radians(135)
@@ -43,12 +44,13 @@ _SIDEWAYS_M = 0.3  # less is drifting
 _STRAIGHT = math.radians(10)
 _DRIFTS_M = 0.1
 _ACROSS_M = 50.0  # from the line of a junction to where it ends; there are larger ones
+_BEND_M = 0.4  # with it, an actor on the neighbouring lane is still not in the way: its centre is more than 2 m away
 _BESIDE_M = 1.2  # of the path that another one drives; less is in its way
 
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """How an actor moved: before the crash, a row a scene.
+    """How an actor moved before the contact, a row for each of the times of a `ContactRecord`.
 
     Args:
         id: of the actor.
@@ -130,8 +132,15 @@ class ContactRecord:
 
     @cached_property
     def times(self) -> NDArray[np.float64]:
-        """Of the scenes before, in s before the contact; the first one is the longest ago."""
-        return np.array([self.time_s - scene.time_s for scene in self.before])
+        """When the movement before the contact is sampled, in s before the contact; the first one is the longest ago.
+
+        The samples are relative to the contact, and not those of the scenes. Otherwise the answers of the rules would
+        depend on the part of a long step in which the actors touch.
+        """
+        first, last = (self.time_s - self.before[place].time_s for place in (0, -1))
+        first = min(first, max(_WINDOW_S, last))
+        samples = first - _SAMPLE_S * np.arange(math.ceil((first - last) / _SAMPLE_S - 1e-6))
+        return np.append(samples, last)
 
     def way(self, actor: str) -> Way:
         """Return how one of them moved before the contact."""
@@ -145,14 +154,51 @@ class ContactRecord:
         rows = [(scene, scene.roster.index[actor]) for scene in self.before]
         scene, row = rows[-1]
         known = scene.roster.actors[row]
+        poses = [(*scene.points[row], scene.headings[row], known.length, known.width) for scene, row in rows]
+        at = np.array([self.time_s - scene.time_s for scene, _ in rows])
+        bends = self.swept and not is_person(actor)
+        found = []
+        for time_s in self.times:
+            place = max(0, min(len(rows) - 2, int(np.searchsorted(-at, -time_s, side="right")) - 1))
+            after = min(place + 1, len(rows) - 1)
+            share = (at[place] - time_s) / (at[place] - at[after]) if after > place else 1.0
+            (pose,) = poses_between(poses[place], poses[after], (share,), bends=bends)
+            found.append(pose)
         return Way(
             id=actor,
-            points=np.array([scene.points[row] for scene, row in rows]),
-            headings=np.unwrap(np.array([scene.headings[row] for scene, row in rows])),
-            speeds=np.array([scene.speeds[row] for scene, row in rows]),
+            points=np.array([pose[:2] for pose in found]),
+            headings=np.unwrap(np.array([pose[2] for pose in found])),
+            speeds=np.interp(-self.times, -at, [scene.speeds[row] for scene, row in rows]),
             length=known.length,
             width=known.width,
         )
+
+    def _at_contact(self, actor: str) -> tuple[NDArray[np.float64], float]:
+        """Return the centre of an actor at the contact, in m, and its heading, in rad."""
+        known = self.way(actor)
+        scenes = self.through[-2:]
+        rows = [scene.roster.index[actor] for scene in scenes]
+        start, end = (
+            (*scenes[place].points[rows[place]], scenes[place].headings[rows[place]], known.length, known.width)
+            for place in (0, -1)
+        )
+        bends = self.swept and not is_person(actor)
+        ((x, y, heading, length, _),) = poses_between(start, end, (self.touch.share,), bends=bends)
+        return np.array([x - length / 2 * math.cos(heading), y - length / 2 * math.sin(heading)]), heading
+
+    @cached_property
+    def _bend_m(self) -> float:
+        """The greatest height of a bend above its chord between two scenes, in m.
+
+        Between the scenes, the way in a bend is an estimate, whose error is a part of this height.
+        """
+        found = 0.0
+        for before, after in pairwise(self.through):
+            for actor in (self.agent, self.other):
+                was, row = before.roster.index[actor], after.roster.index[actor]
+                turn = abs(math.remainder(after.headings[row] - before.headings[was], math.tau))
+                found = max(found, math.dist(before.points[was], after.points[row]) * turn / 8)
+        return found
 
     def partner(self, actor: str) -> str:
         """Return the other one of the two."""
@@ -237,11 +283,13 @@ class ContactRecord:
     def in_its_way_s(self, leader: str) -> float:
         """For how long a leader had been in the follower's way, in s: the follower drove over where it had been."""
         lead, follow = self.way(leader), self.way(self.partner(leader))
-        straight = np.array([math.cos(follow.headings[-1]), math.sin(follow.headings[-1])])
-        path = np.vstack((follow.centers, follow.centers[-1] + straight * np.array([[5.0], [60.0]])))
+        # The leader is the last point: where the road bends, the follower would not have gone straight on.
+        ends = [self._at_contact(actor)[0] for actor in (follow.id, leader)]
+        path = np.vstack((follow.centers, *ends))
+        limit_m = _BESIDE_M + min(_BEND_M, self._bend_m / 2)
         found = 0.0
-        for back in range(len(self.before) - 1, -1, -1):
-            if _distance(path[back:], lead.centers[back]) > _BESIDE_M:
+        for back in range(len(self.times) - 1, -1, -1):
+            if _distance(path[back:], lead.centers[back]) > limit_m:
                 break
             found = float(self.times[back])
         return found
@@ -252,11 +300,12 @@ class ContactRecord:
         It had been in its way before, as long as is known.
         """
         lead, follow = self.way(leader), self.way(self.partner(leader))
-        straight = bool(np.ptp(follow.headings) < _STRAIGHT) and self.ahead_m(leader) > 0
+        headings = np.unwrap(np.append(follow.headings, self._at_contact(follow.id)[1]))
+        straight = bool(np.ptp(headings) < _STRAIGHT) and self.ahead_m(leader) > 0
         before = abs(math.remainder(lead.headings[0] - follow.headings[0], math.tau))
         if not straight or before >= _STRAIGHT or self.turn < _STRAIGHT:
             return None
-        asides = [abs(self.aside_m(leader, back)) for back in range(len(self.before))]
+        asides = [abs(self.aside_m(leader, back)) for back in range(len(self.times))]
         left = next((back for back, aside in enumerate(asides) if aside > _BESIDE_M), len(asides))
         parting = all(after > before - _DRIFTS_M for before, after in pairwise(asides[max(0, left - 1) :]))
         return float(self.times[left - 1]) if left > 0 and parting else None
@@ -279,7 +328,7 @@ class ContactRecord:
             self.lanes.reaches_over(scenes[since:], actor) for scenes in (through, self.before)
         ):
             return float(self.times[-1])
-        return None if left is None else float(self.times[left])
+        return None if left is None else self.time_s - self.before[left].time_s
 
     def until_contact(self, actor: str) -> list[Scene]:
         """Return the scenes before the contact and the one after it, without a lane change after the contact."""
@@ -376,14 +425,17 @@ class ContactRecord:
         """For how long an actor had stood until the contact, in s; 0 where it moved when they touched."""
         if self.speed_at_contact(actor) >= STANDS_MPS:
             return 0.0
-        found = 0.0
+        found, slowest = 0.0, self.speed_at_contact(actor)
         for scene in reversed(self.scenes):
             row = scene.roster.index.get(actor)
             if scene.time_s >= self.time_s - 1e-6:
                 continue
-            if row is None or scene.speeds[row] >= STANDS_MPS:
+            if row is None:
                 break
-            found = self.time_s - scene.time_s
+            speed, ago = scene.speeds[row], self.time_s - scene.time_s
+            if speed >= STANDS_MPS:  # it stopped between two scenes
+                return found + (ago - found) * (STANDS_MPS - slowest) / (speed - slowest)
+            found, slowest = ago, speed
         return found
 
     def slowed(self, actor: str, since_s: float) -> float:

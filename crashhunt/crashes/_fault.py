@@ -194,7 +194,7 @@ def _rear_end(case: ContactRecord) -> Finding | None:
     if ahead_s < _FOLLOWS_S or case.hardest_braking(leader) > _IMPOSSIBLE:
         return None
     lead, follow = case.way(leader), case.way(follower)
-    if lead.speeds[-1] < -STANDS_MPS:
+    if min(lead.speeds[-1], case.speed_at_contact(leader)) < -STANDS_MPS:
         return None  # it reversed
     back = int(np.argmin(np.abs(case.times - min(ahead_s, _FOLLOWS_S))))
     gap, safe = max(0.0, case.gap_m(leader, back)), safe_gap_m(float(follow.speeds[back]), float(lead.speeds[back]))
@@ -235,7 +235,7 @@ def _steps_out(case: ContactRecord) -> Finding | None:
     person, driver = (case.agent, case.other) if is_person(case.agent) else (case.other, case.agent)
     if not is_person(person) or is_person(driver) or not case.is_between_junctions(person, driver):
         return None
-    asides = [abs(case.aside_m(person, back)) for back in range(len(case.before))]
+    asides = [abs(case.aside_m(person, back)) for back in range(len(case.times))]
     way, reach = case.way(driver), case.way(driver).width / 2 + _STEP_M
     inside = next((back for back in range(len(asides) - 1, -1, -1) if asides[back] > reach), -1) + 1
     if not 0 < inside < len(asides) or max(asides[:inside]) < _OFF_M or case.times[inside] > _AT_ONCE_S:

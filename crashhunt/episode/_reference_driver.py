@@ -208,28 +208,24 @@ class ReferenceDriver:
         """Return why a lane change is not safe: the word, the vehicle, and the gap that it would need, in m."""
         if not side.exists:
             return "no lane", None, 0.0
-        found = []
-        ahead, behind = side.ahead, side.behind
-        if ahead is not None:
-            needed = safe_distance(
-                around.speed_mps,
-                ahead.speed_mps,
-                response_s=self._response_s,
-                acceleration_mps2=around.acceleration_mps2,
-                **_brakings(around.braking_mps2, ahead.braking_mps2),
-            )
-            found.append(("alongside" if ahead.gap_m < 0 else "ahead", ahead, needed))
-        if behind is not None:
-            needed = safe_distance(
-                behind.speed_mps,
-                around.speed_mps,
-                response_s=self._response_s,
-                acceleration_mps2=behind.acceleration_mps2,
-                **_brakings(behind.braking_mps2, around.braking_mps2),
-            )
-            found.append(("alongside" if behind.gap_m < 0 else "behind", behind, needed))
+        found = [
+            ("alongside" if neighbor.gap_m < 0 else word, neighbor, self._needed_m(neighbor, around, is_ahead=is_ahead))
+            for word, neighbor, is_ahead in (("ahead", side.ahead, True), ("behind", side.behind, False))
+            if neighbor is not None
+        ]
         short = [one for one in found if one[1].gap_m < max(one[2], 0.0)]
         return min(short, key=lambda one: one[1].gap_m - one[2], default=None)
+
+    def _needed_m(self, neighbor: Neighbor, around: Surroundings, *, is_ahead: bool) -> float:
+        """Return the gap that is safe between the vehicle and a neighbor of the target lane, in m."""
+        rear, front = (around, neighbor) if is_ahead else (neighbor, around)
+        return safe_distance(
+            rear.speed_mps,
+            front.speed_mps,
+            response_s=self._response_s,
+            acceleration_mps2=rear.acceleration_mps2,
+            **_brakings(rear.braking_mps2, front.braking_mps2),
+        )
 
     def _note(self, step: int, faculty: str, kind: str, actor: str, values: dict[str, float]) -> None:
         pause = max(1, round(_PAUSE_S / self._step_s))

@@ -231,7 +231,10 @@ class Hunt:
         stopped: StoppedBecause = progress.why_stopped(keep_going=settings.run.keep_going)
         if not progress.is_done:
             stopped = self._hunt(runs_again, ledger, trials, snapshot, progress, finished, watch)
-        prune_bundles(ledger, progress, settings.run)
+        runs_again.judge(progress)
+        if stopped in ("all_trials", "time") and progress.last_wanted is not None:
+            stopped = progress.why_stopped(keep_going=settings.run.keep_going)
+        prune_bundles(ledger, progress, settings.run, final=not self._stops)
         progress.replace(runs_again.confirm(progress.crashes))
         if self._audits_left.numbers:
             self._audits_left.finish(runs_again, progress)
@@ -263,6 +266,7 @@ class Hunt:
             events=ledger.traffic_events(),
             audit=progress.audit,
             kinds=progress.about_kinds()[0],
+            types_by_cause=progress.kinds.types_by_cause if progress.kinds is not None else None,
             near_misses=near,
             probes=probes,
             at_fault=progress.kinds.at_fault if progress.kinds is not None else None,

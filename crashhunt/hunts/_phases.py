@@ -27,7 +27,7 @@ __all__ = ["PhaseClock", "PhaseName", "PhaseStatus", "RemainingTime"]
 T = TypeVar("T")
 R = TypeVar("R")
 
-PhaseName = Literal["confirming", "auditing", "near misses", "probes", "branches", "rare crashes"]
+PhaseName = Literal["causes", "confirming", "auditing", "near misses", "probes", "branches", "rare crashes"]
 """What a hunt does after its last trial."""
 
 _TICK_S = 0.1  # how late the screen may be

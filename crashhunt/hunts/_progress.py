@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import BundleError
-from crashhunt.crashes import SIGNATURE_VERSION, Group, fault_of, groups_of, signature_of
+from crashhunt.crashes import (
+    SIGNATURE_VERSION,
+    Division,
+    Group,
+    cause_of,
+    fault_of,
+    features_of,
+    groups_of,
+    judgement_of,
+    signature_of,
+)
 from crashhunt.executors import HasNodes
 from crashhunt.hunts._phases import PhaseStatus, RemainingTime
 from crashhunt.hunts._reports import kind_data
@@ -19,7 +29,7 @@ from crashhunt.hunts._tally import CrashTally
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from crashhunt.crashes import Bundle, Signature
+    from crashhunt.crashes import Bundle, Cause, Signature
     from crashhunt.executors import Executor, NodeFigures
     from crashhunt.hunts._rare import RareWatch
     from crashhunt.hunts._reports import AuditReport, StoppedBecause
@@ -32,6 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "HuntStatus",
+    "Judged",
     "Kinds",
     "Progress",
     "SearchStatus",
@@ -44,6 +55,21 @@ _SHARE_OF_TIME = 0.05  # that grouping crashes for a screen may take
 # Which kinds of crashes a hunt has found, while it runs.
 
 
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A crash whose cause was searched for.
+
+    Args:
+        bundle: the crash, with its judgement.
+        cause: the cause; None where the crash cannot be run again.
+        is_stopped: whether the search was interrupted, so that nothing is known.
+    """
+
+    bundle: Bundle
+    cause: Cause | None = None
+    is_stopped: bool = False
+
+
 class Kinds:
     """The kinds of the crashes that a hunt has saved.
 
@@ -54,6 +80,7 @@ class Kinds:
         only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
         dropped: of each kind, in words, the trials whose bundles were given up before.
         dropped_at_fault: of these, the trials whose crashes are the agent's own fault.
+        by_cause: how many crashes of each type to judge, so that each cause of a type counts; 0: types count.
     """
 
     def __init__(
@@ -65,13 +92,16 @@ class Kinds:
         only_at_fault: bool = False,
         dropped: Mapping[str, Sequence[int]] | None = None,
         dropped_at_fault: Sequence[int] = (),
+        by_cause: int = 0,
     ) -> None:
+        self._by_cause = by_cause
+        self._divisions: dict[Signature, Division] = {}
         self._only_at_fault = only_at_fault
         self._at_fault: set[int] = set()
         self._wanted = wanted
         self._signed: dict[int, tuple[Signature, Bundle]] = {}  # by the number of the trial
         self._seen: set[Signature] = set()
-        self._first: dict[Signature, int] = {}  # of each kind that counts, its trial of the least number
+        self._first: dict[tuple[Signature, Cause | None], int] = {}  # of what counts, its trial of the least number
         self._groups: tuple[Group, ...] | None = None
         self._shown: tuple[Group, ...] = ()
         self._due = 0.0
@@ -112,24 +142,89 @@ class Kinds:
             self._shown, self._due = self._groups, ended + (ended - began) / _SHARE_OF_TIME
         return self._groups
 
-    def surplus(self, keep: int) -> list[Bundle]:
-        """Return the crashes beyond the `keep` shortest of each crash type, and forget them.
+    def surplus(self, keep: int, *, final: bool = False) -> list[Bundle]:
+        """Return the crashes beyond the `keep` shortest of each crash type, or of each cause, and forget them.
 
-        They count on, and are no members any more.
+        They still count, but are no members any more. A type whose crashes are still being judged keeps all of them.
+
+        Args:
+            keep: how many stay.
+            final: whether no more crashes are judged.
         """
         found = []
         for group in groups_of(self._signed.values()):
-            for bundle in sorted(group.bundles, key=self._worth)[keep:]:
-                number = bundle.result.spec.number
-                del self._signed[number]
-                if number in self._at_fault:
-                    self._at_fault.discard(number)
-                    self._dropped_at_fault.add(number)
-                self.dropped.setdefault(str(group.signature), []).append(number)
-                found.append(bundle)
+            for bundles in self._parts(group, final=final):
+                ordered = sorted(bundles, key=self._worth)
+                judged = self._divisions[group.signature].judged if group.signature in self._divisions else frozenset()
+                # The runs that show the cause are in the bundle of a judged crash, so one of them stays.
+                shown = next((place for place, one in enumerate(ordered) if one.result.spec.number in judged), 0)
+                if keep <= shown:
+                    ordered.insert(keep - 1, ordered.pop(shown))
+                for bundle in ordered[keep:]:
+                    number = bundle.result.spec.number
+                    del self._signed[number]
+                    if number in self._at_fault:
+                        self._at_fault.discard(number)
+                        self._dropped_at_fault.add(number)
+                    self.dropped.setdefault(str(group.signature), []).append(number)
+                    found.append(bundle)
         if found:
             self._groups = None
         return found
+
+    def _parts(self, group: Group, *, final: bool) -> list[list[Bundle]]:
+        """Return the crashes of a type by cause; none where that is not known yet."""
+        division = self._divisions.get(group.signature)
+        if division is None:
+            return [list(group.bundles)]
+        if not division.is_complete and not final:
+            return []
+        causes = division.causes()
+        parts: dict[Cause, list[Bundle]] = {}
+        for bundle in group.bundles:
+            parts.setdefault(causes[bundle.result.spec.number], []).append(bundle)
+        return list(parts.values())
+
+    def next_to_judge(self) -> Bundle | None:
+        """Return the next crash whose cause is wanted; None where there is none for now."""
+        for division in self._divisions.values():
+            if (number := division.choose()) is not None:
+                return self._signed[number][1]
+        return None
+
+    def count_to_judge(self) -> int:
+        """Return how many crashes are to be judged."""
+        return sum(division.left for division in self._divisions.values())
+
+    def settle(self, judged: Judged) -> None:
+        """Take in the cause of a crash."""
+        number = judged.bundle.result.spec.number
+        if judged.is_stopped:
+            self._divisions[self._signed[number][0]].postpone(number)
+        else:
+            self._settle(number, judged.cause)
+
+    def _settle(self, number: int, cause: Cause | None) -> None:
+        signature = self._signed[number][0]
+        self._divisions[signature].settle(number, cause)
+        self._count(number, signature, cause)
+
+    @property
+    def types_by_cause(self) -> int | None:
+        """How many causes there are, each type on its own; None where types count."""
+        return len(self._counted()) if self._by_cause else None
+
+    def _count(self, number: int, signature: Signature, cause: Cause | None) -> None:
+        if number in self._at_fault or not self._only_at_fault:
+            known = None if cause is None or cause.kind == "unknown" else cause
+            self._first[signature, known] = min(number, self._first.get((signature, known), number))
+
+    def _counted(self) -> list[int]:
+        """Return the first trials of what counts: a type without a known cause counts once."""
+        caused = {signature for signature, cause in self._first if cause is not None}
+        return sorted(
+            number for (signature, cause), number in self._first.items() if cause is not None or signature not in caused
+        )
 
     def _worth(self, bundle: Bundle) -> tuple[bool, int, int]:
         """What is kept first: what was hunted for, and of that the shortest."""
@@ -139,7 +234,7 @@ class Kinds:
     @property
     def until(self) -> int | None:
         """The least number of a trial up to which there are enough kinds; None where there are not."""
-        firsts = sorted(self._first.values())
+        firsts = self._counted()
         return firsts[self._wanted - 1] if 0 < self._wanted <= len(firsts) else None
 
     @property
@@ -163,20 +258,28 @@ class Kinds:
     def _sign(self, bundle: Bundle) -> bool:
         """Take in a crash; return whether it is of a kind that has not been there."""
         number = bundle.result.spec.number
+        collided = bundle.result.collision is not None
         try:
-            # Both look at it, and reading a log takes longer than looking.
-            recording = bundle.recording() if self._only_at_fault and bundle.result.collision is not None else None
+            # All look at it, and reading a log takes longer than looking.
+            recording = bundle.recording() if collided and (self._only_at_fault or self._by_cause) else None
             signature = signature_of(bundle, recording)
             if self._only_at_fault and fault_of(bundle, recording).is_egos:
                 self._at_fault.add(number)
+            if self._by_cause and not bundle.result.outcome.is_software_fault:
+                division = self._divisions.setdefault(signature, Division(self._by_cause))
+                division.add(number, bundle.result.steps, features_of(bundle, recording))
         except BundleError:
             return False  # it has no crash type, and crashhunt check reports it
         is_new = signature not in self._seen
         self._seen.add(signature)
         self._signed[number] = signature, bundle
         self._groups = None
-        if number in self._at_fault or not self._only_at_fault:
-            self._first[signature] = min(number, self._first.get(signature, number))
+        self._count(number, signature, None)
+        judgement = judgement_of(bundle) if signature in self._divisions else None
+        if judgement is not None and not judgement.is_interrupted:
+            cause = cause_of(bundle, judgement)
+            if cause.kind != "unknown":
+                self._settle(number, cause)
         return is_new
 
 
@@ -396,6 +499,7 @@ class Progress:
                 only_at_fault=run.only_at_fault,
                 dropped=before.get("dropped"),
                 dropped_at_fault=before.get("dropped_at_fault") or (),
+                by_cause=run.by_cause,
             )
 
     def count(self, result: TrialResult, *, crashed: bool) -> None:

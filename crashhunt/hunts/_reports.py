@@ -277,6 +277,7 @@ class HuntReport:
         events: traffic events of all trials: kind to their number, and the number of trials that had one.
         audit: the result of the audit; None without ``--audit``.
         kinds: crash types, the most frequent first; None where the first crash ended the hunt.
+        types_by_cause: how many causes the crash types have, each type on its own; None without ``--by-cause``.
         near_misses: the near misses that were kept, the most critical first.
         probes: the result of the probes; None without ``--probe``.
         at_fault: numbers of the trials whose crash is the agent's fault; None without ``--at-fault``.
@@ -302,6 +303,7 @@ class HuntReport:
     events: dict[str, tuple[int, int]] = field(default_factory=dict)
     audit: AuditReport | None = None
     kinds: tuple[Group, ...] | None = None
+    types_by_cause: int | None = None
     near_misses: tuple[Bundle, ...] = ()
     probes: ProbeReport | None = None
     at_fault: tuple[int, ...] | None = None
@@ -338,6 +340,8 @@ class HuntReport:
             found["branches"] = self.branches.to_json()
         if self.kinds is not None:
             found["kinds"] = list(map(kind_data, self.kinds))
+        if self.types_by_cause is not None:
+            found["types_by_cause"] = self.types_by_cause
         if self.settings.run.near_misses:
             found["near_misses"] = [bundle.summary() for bundle in self.near_misses]
         if self.at_fault is not None:

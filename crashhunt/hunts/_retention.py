@@ -28,13 +28,19 @@ if TYPE_CHECKING:
 __all__ = ["dropped_crashes", "keep_near_misses", "prune_bundles"]
 
 
-def prune_bundles(ledger: Ledger, progress: Progress, run: RunSettings) -> None:
+def prune_bundles(ledger: Ledger, progress: Progress, run: RunSettings, *, final: bool = False) -> None:
     """Remove the bundles of crashes of which there are enough that are shorter.
+
+    Args:
+        ledger: of the hunt.
+        progress: of the hunt, which forgets them.
+        run: says how many stay.
+        final: whether no more crashes are judged.
 
     Raises:
         HuntDirectoryError: the ledger cannot be written.
     """
-    surplus = progress.kinds.surplus(run.keep) if progress.kinds is not None and run.keep else []
+    surplus = progress.kinds.surplus(run.keep, final=final) if progress.kinds is not None and run.keep else []
     if not surplus or progress.kinds is None:
         return
     ledger.note(dropped=progress.kinds.dropped, dropped_at_fault=progress.kinds.dropped_at_fault)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import queue
 import shutil
 import threading
@@ -23,10 +24,12 @@ from crashhunt.executors import (
     snapshot_executor,
 )
 from crashhunt.hunts._next_trials import settings_again
+from crashhunt.hunts._progress import Judged
 from crashhunt.hunts._reports import AuditReport, Difference
 from crashhunt.recording import Recording, first_divergence, read_black_box
-from crashhunt.replays import confirm
+from crashhunt.replays import ReplayOptions, confirm
 from crashhunt.snapshots import Snapshot
+from crashhunt.whatif import find_cause
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
@@ -58,7 +61,9 @@ __all__ = [
 class Confirmation:
     """Confirms crashes one at a time, in a thread of its own. Meanwhile, the hunt has one slot less.
 
-    Crashes that are not confirmed at the end of the hunt are confirmed then.
+    With ``--by-cause``, the same thread judges crashes, which come before those to confirm. One thread does both, so
+    that neither overwrites in a bundle what the other has found. Crashes that are not confirmed or judged at the end of
+    the hunt are confirmed and judged then.
 
     Args:
         again: runs them.
@@ -68,44 +73,66 @@ class Confirmation:
     def __init__(self, again: TrialReruns, executor: Executor) -> None:
         self._again = again
         self._executor = executor
-        self._asked: queue.SimpleQueue[Bundle | None] = queue.SimpleQueue()
+        self._asked: queue.PriorityQueue[tuple[int, int, Bundle | None]] = queue.PriorityQueue()
+        self._order = itertools.count()
         self._confirmed: queue.SimpleQueue[Bundle] = queue.SimpleQueue()
+        self._judged: queue.SimpleQueue[Judged] = queue.SimpleQueue()
         self._over = threading.Event()
         self._thread: threading.Thread | None = None
         self._known: set[str] = set()
+        self._is_judging = False
 
     def look(self, progress: Progress) -> None:
-        """Ask for crashes that are new, and take in those that have been confirmed."""
+        """Ask for crashes that are new, and take in those that have been confirmed or judged."""
         if progress.kinds is None:
             return  # the first crash ends the hunt, and is confirmed then
         for bundle in progress.crashes:
             if bundle.confirmed is None and bundle.id not in self._known:
                 self._known.add(bundle.id)
-                self._asked.put(bundle)
-                if self._thread is None:
-                    self._thread = threading.Thread(target=self._confirm, name="crashhunt-confirmation", daemon=True)
-                    self._thread.start()
+                self._ask(_CONFIRM, bundle)
         with suppress(queue.Empty):
             while True:
                 found = self._confirmed.get_nowait()
                 progress.replace([found if found.id == crash.id else crash for crash in progress.crashes])
+        with suppress(queue.Empty):
+            judged = self._judged.get_nowait()
+            self._is_judging = False
+            progress.kinds.settle(judged)
+        if not self._is_judging and not self._over.is_set() and (wanted := progress.kinds.next_to_judge()) is not None:
+            self._is_judging = True
+            self._ask(_JUDGE, wanted)
 
     def close(self, progress: Progress) -> None:
         """Cancel the running confirmation, so that no stop waits for it."""
         self._over.set()
         if self._thread is not None:
-            self._asked.put(None)
+            self._ask(_END, None)
             self._thread.join()
         self.look(progress)
 
-    def _confirm(self) -> None:
-        while (bundle := self._asked.get()) is not None and not self._over.is_set():
+    def _ask(self, what: int, bundle: Bundle | None) -> None:
+        self._asked.put((what, next(self._order), bundle))
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._work, name="crashhunt-confirmation", daemon=True)
+            self._thread.start()
+
+    def _work(self) -> None:
+        latest: dict[str, Bundle] = {}  # with what this thread has found
+        while True:
+            what, _, bundle = self._asked.get()
+            if bundle is None:
+                break
+            bundle = latest.get(bundle.id, bundle)
             self._hold_back(1)
             try:
-                found = self._again.confirm_one(bundle, self._over.is_set)
+                judged = self._again.judge_one(bundle, self._over.is_set) if what == _JUDGE else None
+                found = self._again.confirm_one(bundle, self._over.is_set) if judged is None else judged.bundle
                 if found is not bundle:
+                    latest[found.id] = found
                     self._confirmed.put(found)
-            except Exception:  # the confirmation at the end of the hunt reports it
+                if judged is not None:
+                    self._judged.put(judged)
+            except Exception:  # the end of the hunt does the same, and reports it
                 return
             finally:
                 self._hold_back(0)
@@ -113,6 +140,9 @@ class Confirmation:
     def _hold_back(self, slots: int) -> None:
         if isinstance(self._executor, PoolExecutor):
             self._executor.held_back = slots
+
+
+_END, _JUDGE, _CONFIRM = range(3)  # what the thread does first
 
 
 # Trials of a hunt that are run again in fresh processes, by the code that they ran with, for their recordings.
@@ -220,6 +250,41 @@ class TrialReruns:
             return bundle
         found.write()
         return found
+
+    def judge_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Judged:
+        """Find the cause of a crash by runs, and write them into its bundle.
+
+        Args:
+            bundle: the crash.
+            stopped: called regularly; true to cancel.
+        """
+
+        def is_stopped() -> bool:
+            return bool(len(self.stops)) or stopped()
+
+        options = ReplayOptions(force=True, trusted=self._is_made_now(bundle))
+        try:
+            cause, found = find_cause(bundle, options, stopped=is_stopped)
+        except CrashhuntError as error:
+            note = f"{bundle.id} was not judged: {error.message}"
+            if note not in self.notes:
+                self.notes.append(note)
+            return Judged(bundle)
+        if is_stopped():
+            return Judged(bundle, is_stopped=True)
+        if found is not bundle and bundle.path.is_dir():
+            found.write()
+        return Judged(found, cause)
+
+    def judge(self, progress: Progress) -> None:
+        """Find the causes of the crashes that are still to be judged, one after the other."""
+        if progress.kinds is None or (total := progress.kinds.count_to_judge()) == 0:
+            return
+        self.phases.begin("causes", total)
+        while not len(self.stops) and (bundle := progress.kinds.next_to_judge()) is not None:
+            (judged,) = self.phases.run(self.judge_one, [bundle], counts=lambda one: not one.is_stopped)
+            progress.kinds.settle(judged)
+            progress.replace([judged.bundle if judged.bundle.id == one.id else one for one in progress.crashes])
 
     def _is_made_now(self, bundle: Bundle) -> bool | None:
         """Whether a bundle ran what this process has just taken a snapshot of, whose files need no second look."""

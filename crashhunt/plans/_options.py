@@ -212,6 +212,12 @@ class RunOptions(_Options):
         brief="keep only the N shortest crashes of each type",
         flag="--keep", group="kept", metavar="N", check=at_least(0, zero="keep all"),
     )  # fmt: skip
+    by_cause: int = option(
+        0, "with ``distinct`` or ``keep``, how many crashes of each type to judge, so that each cause counts; 0: none",
+        help="with --distinct or --keep: count each cause of a crash type on its own. Runs up to N crashes of each "
+        "type again, as crashhunt crashes --by-cause does; 0: count types",
+        flag="--by-cause", group="search", metavar="N", check=at_least(0, zero="count types"),
+    )  # fmt: skip
     only_at_fault: bool = option(
         False, "stop only at crashes that are the agent's own fault; the others are kept, and the hunt continues",
         help="hunt for crashes that are the agent's own fault, according to the rules; other and undecided crashes "
@@ -288,6 +294,11 @@ class RunOptions(_Options):
         if found.keep and not (found.keep_going or found.distinct or found.only_at_fault or found.until_rate):
             message = f"--keep {found.keep} requires a hunt that continues after a crash"
             raise UsageError(message, fix="give --keep-going or --distinct as well")
+        if found.by_cause and not (found.distinct or found.keep):
+            raise UsageError(f"--by-cause {found.by_cause} counts nothing", fix="give --distinct or --keep as well")
+        if found.by_cause and found.distinct and found.deterministic:
+            message = "--deterministic and --by-cause contradict each other with --distinct"
+            raise UsageError(f"{message}: which crashes are judged depends on which end first", fix="leave one out")
         return replace(found, keep_going=True) if found.distinct or found.until_rate else found
 
 

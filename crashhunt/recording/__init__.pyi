@@ -14,7 +14,7 @@ from ._compare import (
     has_same_scenes as has_same_scenes,
     values_around as values_around,
 )
-from ._divergence import Divergence as Divergence, DivergenceData as DivergenceData
+from ._divergence import Divergence as Divergence
 from ._foxglove import foxglove_layout as foxglove_layout, lane_borders as lane_borders, read_lanes as read_lanes
 from ._log import read_log as read_log, write_log as write_log
 from ._reading import AgentChannel as AgentChannel, Prologue as Prologue, StepRecord as StepRecord

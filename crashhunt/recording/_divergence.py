@@ -4,26 +4,16 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from crashhunt.base.json_types import Json
+    from crashhunt.base.codec import JsonObject
 
-__all__ = ["Divergence", "DivergenceData", "first_difference"]
-
-
-class DivergenceData(TypedDict):
-    """The plain data of a `Divergence`."""
-
-    step: int
-    agent: str
-    field: str
-    recorded: Json
-    replayed: Json
+__all__ = ["Divergence", "first_difference"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +36,11 @@ class Divergence:
     replayed: object
     place: tuple[str, tuple[int, ...]] | None = None
 
-    def to_json(self) -> DivergenceData:
+    def to_json(self) -> JsonObject:
         """Return the shape that ``replay --json`` prints."""
         facts = asdict(self)
         del facts["place"]
-        data: DivergenceData = json.loads(json.dumps(facts, default=float))
+        data: JsonObject = json.loads(json.dumps(facts, default=float))
         return data
 
     def __str__(self) -> str:

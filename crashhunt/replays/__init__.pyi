@@ -8,7 +8,6 @@ from ._prepare import (
     prepare as prepare,
 )
 from ._replay import (
-    ReplayData as ReplayData,
     ReplayReport as ReplayReport,
     confirm as confirm,
     replay as replay,

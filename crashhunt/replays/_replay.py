@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError, UsageError
@@ -19,17 +19,17 @@ from crashhunt.snapshots import environment_changes
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Mapping
 
-    from crashhunt.base.json_types import Plain
+    from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle
     from crashhunt.executors import SharedExecutors
-    from crashhunt.recording import AgentChannel, DivergenceData, Prologue
+    from crashhunt.recording import AgentChannel, Prologue
     from crashhunt.replays._prepare import Code, Look, Rerun
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["ReplayData", "ReplayReport", "Verdict", "confirm", "judged", "replay", "up_to"]
+__all__ = ["ReplayReport", "Verdict", "confirm", "judged", "replay", "up_to"]
 
 
 # Whether a replay is the same as what was recorded, and where it first is not.
@@ -37,28 +37,6 @@ __all__ = ["ReplayData", "ReplayReport", "Verdict", "confirm", "judged", "replay
 _AROUND = 2  # steps to report before and after the first difference
 
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]
-
-
-class ReplayData(TypedDict):
-    """What ``replay --json`` prints of a crash; ``table`` has the fields that were asked for, a row a step."""
-
-    crash: str
-    verdict: Verdict
-    code: Code
-    steps_recorded: int
-    steps_replayed: int
-    digest_recorded: str
-    digest_replayed: str
-    divergence: DivergenceData | None
-    outcome_recorded: str
-    outcome_replayed: str
-    reason: str
-    edits: list[str]
-    warnings: list[str]
-    times: int
-    agreed: int
-    verdicts: dict[Verdict, int]
-    table: NotRequired[Sequence[Plain]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +73,7 @@ class ReplayReport:
         """How many steps it completed."""
         return self.recording.steps
 
-    def to_json(self) -> ReplayData:
+    def to_json(self) -> JsonObject:
         """Return the shape that ``replay --json`` prints."""
         return {
             "crash": self.bundle.id,
@@ -283,7 +261,7 @@ def confirm(
     except UntrustedError:  # which says nothing about the crash
         raise
     except _NotSetUpError as error:
-        failure: DivergenceData = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": str(error)}
+        failure: JsonObject = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": str(error)}
         return replace(bundle, confirmed=False, divergence=failure, why_unconfirmed="")
     except CrashhuntError as error:  # it did not take place, or not to its end
         return replace(bundle, confirmed=None, divergence=None, why_unconfirmed=error.message)

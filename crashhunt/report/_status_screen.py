@@ -225,6 +225,7 @@ def format_pace(rate_per_s: float) -> str:
 _PHASES = {
     "confirming": "confirming",
     "auditing": "auditing",
+    "causes": "finding causes",
     "near misses": "confirming near misses",
     "probes": "confirming crashes of probes",
     "branches": "confirming crashes of branches",

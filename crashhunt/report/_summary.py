@@ -120,8 +120,9 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     lines += [f"Note: {note}" for note in report.notes]
     lines += _describe_audit(report)
     if report.stopped_because == "distinct":
-        found, wanted = len(report.kinds or ()), report.settings.run.distinct
-        lines.append(f"Found {found} crash types (--distinct {wanted}).")
+        by_cause = report.types_by_cause
+        found = f"{len(report.kinds or ())} crash types" if by_cause is None else f"{by_cause} crash types by cause"
+        lines.append(f"Found {found} (--distinct {report.settings.run.distinct}).")
     if report.rate is not None:
         lines += describe_rates([report.rate]).splitlines()
     if report.copied is not None:

@@ -205,8 +205,9 @@ def _replace_invalid(hunt: Path, state: HuntState) -> int:
     if not state.outcomes.get(Outcome.INVALID):
         return 0
     with closing(Ledger(hunt / layout.LEDGER, writable=True)) as ledger:
-        # With --only-at-fault, crashes of others' and their kinds are not what it was after.
-        if ledger.facts().get("state") in ("crash", "distinct", "rate") or (done and not run.only_at_fault):
+        # With --only-at-fault or --by-cause, the crash types do not show whether it has found what it was after.
+        is_counted = not run.only_at_fault and not run.by_cause
+        if ledger.facts().get("state") in ("crash", "distinct", "rate") or (done and is_counted):
             return 0
         return ledger.replace([result.spec.number for result in ledger.results(outcomes=(str(Outcome.INVALID),))])
 

@@ -3,8 +3,10 @@
 First the reference driver only watches. That run must be bit-identical to the recording, and reports where the agent
 was not safe. Then the reference driver takes over from the beginning of such a period, and from 0.5 s and 1 s before.
 The period is the cause if no such run ends in a crash. The run from its beginning is made twice, with the same digest.
+Where all crashes of such runs are other ones, the agent may have brought them about with its other faculty. Then the
+reference driver takes both faculties over, from the same steps, and no run may end in a crash.
 
-Cost: one run that watches, three for each candidate, and one repetition; at most `_CANDIDATES` candidates.
+Cost: one run that watches, three or six for each candidate, and one repetition; at most `_CANDIDATES` candidates.
 """
 
 from __future__ import annotations
@@ -129,8 +131,17 @@ class _Search:
         if watched.result.digest != self._result.digest or watched.responses is None:
             return Reference(why_not=differs)
         candidates = self._candidates(watched.responses)
+        replaced = []  # by another crash, which the agent brings about with its other faculty
         for candidate in candidates:
+            began = len(self.runs)
             found = self._try(candidate, str(candidate["faculty"]))
+            if found is not None:
+                return found
+            endings = {run.ending for run in self.runs[began:]}
+            if "other" in endings and endings <= {"none", "other"}:
+                replaced.append(candidate)
+        for candidate in replaced:
+            found = self._try(candidate, "both")
             if found is not None:
                 return found
         if len({str(one["faculty"]) for one in candidates}) > 1:

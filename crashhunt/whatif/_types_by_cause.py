@@ -10,12 +10,11 @@ from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes import (
     Cause,
     CauseGroup,
+    Division,
     Judgement,
     cause_of,
     features_of,
     judgement_of,
-    representatives,
-    spread,
     with_judgement,
 )
 from crashhunt.replays import ReplayOptions, prepare
@@ -60,7 +59,8 @@ def find_cause(
     if result.outcome.is_software_fault or result.outcome is Outcome.HANG or bundle.is_near_miss:
         return cause_of(bundle, None), bundle
     found = judgement_of(bundle)
-    found = Judgement() if found is None else found
+    if found is None or found.is_interrupted:  # an interrupted search says nothing about the cause
+        found = Judgement()
     if found.reference is None and result.outcome in (Outcome.COLLISION, Outcome.OFF_ROAD):
         rerun = prepare(bundle, options or ReplayOptions())
         with temporary_folder("causes") as scratch:
@@ -93,38 +93,29 @@ def divide_by_cause(
         write: whether to write what the runs have shown into the bundles, so that the next call needs no run.
         stopped: returns whether to stop; the rest then has the cause of the nearest crash that was judged.
     """
-    bundles = group.bundles
-    features = [features_of(bundle) for bundle in bundles]
-    known: dict[int, Cause] = {}
-    for place in representatives(features, [bundle.result.steps for bundle in bundles], most):
-        if stopped():
-            break
+    bundles, division = group.bundles, Division(most)
+    for number, bundle in enumerate(bundles):
+        division.add(number, bundle.result.steps, features_of(bundle))
+    while not stopped() and (place := division.choose()) is not None:
         try:
-            known[place], judged = find_cause(bundles[place], options, parallel=parallel, stopped=stopped)
-        except CrashhuntError:
-            continue  # one crash that cannot be run again does not keep the others from being divided
-        if write and not stopped() and judged is not bundles[place]:
+            cause, judged = find_cause(bundles[place], options, parallel=parallel, stopped=stopped)
+        except CrashhuntError:  # the other crashes are divided nevertheless
+            division.settle(place, None)
+            continue
+        if stopped():
+            break  # what was interrupted says nothing
+        division.settle(place, cause)
+        if write and judged is not bundles[place]:
             judged.write()
-    known = _without_chance_lengths(known)
-    causes = spread(features, known or {0: Cause("unknown")})
     members: dict[Cause, list[int]] = {}
-    for place, cause in enumerate(causes):
+    for place, cause in division.causes().items():
         members.setdefault(cause, []).append(place)
     found = [
         CauseGroup(
             cause=cause,
             members=tuple(bundles[place] for place in places),
-            judged=tuple(bundles[place] for place in places if place in known),
+            judged=tuple(bundles[place] for place in places if place in division.judged),
         )
         for cause, places in members.items()
     ]
     return tuple(sorted(found, key=lambda one: (-len(one.members), one.cause)))
-
-
-def _without_chance_lengths(known: dict[int, Cause]) -> dict[int, Cause]:
-    """Keep that an actor was long only where all of them were: where cars were hit as well, length is no cause."""
-    mixed = {replace(cause, actor="") for cause in known.values() if not cause.actor}
-    return {
-        place: replace(cause, actor="") if replace(cause, actor="") in mixed else cause
-        for place, cause in known.items()
-    }

@@ -11,6 +11,7 @@ from ._contact import (
     contact_at as contact_at,
     first_contact as first_contact,
     lane_jump as lane_jump,
+    poses_between as poses_between,
     reachable_m as reachable_m,
 )
 from ._danger import (

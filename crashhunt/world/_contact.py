@@ -20,10 +20,12 @@ from crashhunt.world._geometry import levels, outlines, same_level, separation
 from crashhunt.world._scene import is_person
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from crashhunt.world._geometry import Level, Rectangle
     from crashhunt.world._scene import Scene
 
-__all__ = ["STANDS_MPS", "Face", "Touch", "contact_at", "first_contact", "lane_jump"]
+__all__ = ["STANDS_MPS", "Face", "Touch", "contact_at", "first_contact", "lane_jump", "poses_between"]
 
 STANDS_MPS = 0.1
 """An actor that moves more slowly than this stands, in m/s."""
@@ -169,6 +171,19 @@ class _Way:
         a, b, c = 3 * rest * rest, 6 * rest * share, 3 * share * share
         (x0, y0), (x1, y1), (x2, y2) = self.legs
         return a * x0 + b * x1 + c * x2, a * y0 + b * y1 + c * y2
+
+
+def poses_between(start: Rectangle, end: Rectangle, shares: Sequence[float], *, bends: bool = True) -> list[Rectangle]:
+    """Return the rectangles of an actor at some shares of a step, on the way that contacts are computed with.
+
+    Args:
+        start: at the beginning of the step: x and y of the front in m, heading in rad, length and width in m.
+        end: at the end of the step, likewise.
+        shares: of the step, 0 to 1; an instantaneous lane change takes place at 1.
+        bends: whether the actor drives along a curve; persons do not.
+    """
+    way = _Way(start, end, bends=bends)
+    return [way.at(share) for share in shares]
 
 
 def first_contact(previous: Scene | None, present: Scene, row: int, other: int) -> Touch | None:

@@ -9,6 +9,7 @@ from hypothesis import given, strategies as st
 
 from crashhunt.crashes import (
     Cause,
+    Division,
     Factor,
     Judgement,
     LeftOut,
@@ -17,8 +18,6 @@ from crashhunt.crashes import (
     ReferenceRun,
     Why,
     cause_of,
-    representatives,
-    spread,
 )
 from crashhunt.trial import Outcome
 from crashhunt.world import Actor
@@ -92,26 +91,66 @@ def test_what_runs_have_shown_comes_back_from_json():
 POINTS = st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=1, max_size=20)
 
 
+def division(points, most, steps=None):
+    found = Division(most)
+    for number, point in enumerate(points):
+        found.add(number, steps[number] if steps else 9, point)
+    return found
+
+
+def chosen_of(found):
+    return list(iter(found.choose, None))
+
+
 @given(POINTS, st.integers(1, 25))
-def test_representatives_are_distinct_and_begin_with_the_shortest(points, count):
+def test_chosen_crashes_are_distinct_and_begin_with_the_shortest(points, most):
     steps = [(place * 7) % 11 for place in range(len(points))]
-    chosen = representatives(points, steps, count)
-    assert len(chosen) == len({*chosen}) == min(count, len(points))
+    found = division(points, most, steps)
+    assert found.left == min(most, len(points))
+    chosen = chosen_of(found)
+    assert len(chosen) == len({*chosen}) == min(most, len(points))
     assert steps[chosen[0]] == min(steps)
+    assert found.left == 0
 
 
 @given(POINTS, st.data())
 def test_every_crash_has_the_cause_of_the_nearest_judged_one(points, data):
     places = data.draw(st.sets(st.integers(0, len(points) - 1), min_size=1))
-    known = {place: Cause("argument", str(place)) for place in places}
-    for place, cause in enumerate(spread(points, known)):
-        away = [sum((a - b) ** 2 for a, b in zip(points[place], points[other], strict=True)) for other in known]
+    found = division(points, 30)
+    for place in places:
+        found.settle(place, Cause("argument", str(place)))
+    assert found.judged == places
+    for place, cause in found.causes().items():
+        away = [sum((a - b) ** 2 for a, b in zip(points[place], points[other], strict=True)) for other in places]
         mine = int(cause.what)
         nearest = sum((a - b) ** 2 for a, b in zip(points[place], points[mine], strict=True))
         assert nearest <= min(away) + 1e-9
-        assert mine == place or place not in known
+        assert mine == place or place not in places
 
 
-def test_far_groups_are_all_represented():
+def test_far_groups_are_all_chosen():
     points = [(0.0, 0.0)] * 30 + [(50.0, 0.0)] + [(0.0, 50.0)]
-    assert {30, 31} < {*representatives(points, [9] * 32, 3)}
+    assert {30, 31} < {*chosen_of(division(points, 3))}
+
+
+def test_division_is_complete_once_all_chosen_crashes_have_an_answer():
+    found = division([(0.0,), (5.0,), (9.0,)], 2)
+    first, second = chosen_of(found)
+    found.settle(first, Cause("traffic"))
+    assert not found.is_complete
+    found.postpone(second)  # interrupted: it is chosen again
+    assert (found.left, found.choose()) == (1, second)
+    found.settle(second, None)  # cannot be run: the nearest judged crash decides
+    assert found.is_complete
+    assert found.judged == {first}
+    assert {*found.causes().values()} == {Cause("traffic")}
+    assert {*division([(0.0,)], 2).causes().values()} == {Cause("unknown")}
+
+
+def test_length_is_no_cause_where_cars_were_hit_as_well():
+    found = division([(0.0,), (5.0,), (9.0,)], 3)
+    long, car = Cause("omission", "vehicle", "sped up", "long"), Cause("omission", "vehicle", "sped up")
+    found.settle(0, long)
+    assert found.causes()[1] == long
+    found.settle(2, car)
+    assert found.causes() == {0: car, 1: car, 2: car}

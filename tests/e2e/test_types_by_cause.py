@@ -18,4 +18,20 @@ def test_types_are_divided_by_cause_and_the_runs_are_kept(toy):
     said = toy.crashhunt("crashes", "h", "--by-cause", "1").out
     assert "argument: ego.speed" in said
     assert "causes" not in toy.crashhunt("crashes", "h", "--json").json["groups"][0]
+    assert "--by-cause is 0" in toy.crashhunt("crashes", "h", "--by-cause", "0", expect=2).err
     assert "--by-cause is -5" in toy.crashhunt("crashes", "h", "--by-cause", "-5", expect=2).err
+
+
+@pytest.mark.nightly
+def test_hunt_ends_and_keeps_by_cause(toy):
+    trials = ("200", "--scenario", "toy", "--arg", "speed=12:16", "--seed", "1")
+    report = toy.crashhunt(
+        "run", "h", "2", "12", *trials, "--keep-going", "--keep", "1", "--by-cause", "2", "--json"
+    ).json
+    assert report["types_by_cause"] == 1
+    assert sum(kind["count"] for kind in report["kinds"]) > len(report["crashes"]) == 1
+    (group,) = toy.crashhunt("crashes", "h", "--by-cause", "--json").json["groups"]
+    assert [part["cause"]["what"] for part in group["causes"]] == ["ego.speed"]
+    assert len(group["causes"][0]["judged"]) == 1  # the bundle that stayed is one with the runs
+    said = toy.crashhunt("run", "d", "2", "60", *trials, "--distinct", "1", "--by-cause", "2").out
+    assert "Found 1 crash types by cause (--distinct 1)." in said

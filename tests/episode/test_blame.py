@@ -187,6 +187,9 @@ class Oracle:
     def see_map(self, lanes):
         fail("see_map")
 
+    def close(self):
+        fail("close")
+
 
 class Form:
     def __init__(self, form):
@@ -211,6 +214,10 @@ class Simulator(ToySimulator):
         shown, rewards, *rest = found
         wrong = {"garbage": None, "list": ({"ego": [1.0]}, rewards, *rest), "reward": (shown, {"ego": "x"}, *rest)}
         return wrong.get(fails, found)
+
+    def close(self):
+        super().close()
+        fail("close")
 
     def scene(self):
         fail("scene")
@@ -325,12 +332,19 @@ def test_environment_that_cannot_be_made_is_a_mistake_in_the_scenario_or_an_inva
 
 
 @pytest.mark.parametrize(
-    ("fails", "place"), [("check", "check"), ("garbage", "check"), ("number", "check"), ("see_map", "see_map")]
+    ("fails", "expected"),
+    [
+        ("check", ("simulator_error", O, "check", "")),
+        ("garbage", ("simulator_error", O, "check", "")),
+        ("number", ("simulator_error", O, "check", "")),
+        ("see_map", ("simulator_error", O, "see_map", "")),
+        ("close", ("survived", "", "", "")),  # an oracle has no such method, so an episode does not call it
+    ],
 )
-def test_failure_of_a_users_oracle_is_the_oracles(modules, tmp_path, fails, place):
+def test_failure_of_a_users_oracle_is_the_oracles(modules, tmp_path, fails, expected):
     modules["other"].fails = fails
-    result = run(tmp_path, toy(tmp_path), [modules["other"].Oracle()])
-    assert label(result) == ("simulator_error", O, place, "")
+    oracle = modules["other"].Oracle()
+    assert label(run(tmp_path, toy(tmp_path), [oracle])) == expected
 
 
 @pytest.mark.parametrize(
@@ -346,6 +360,7 @@ def test_failure_of_a_users_oracle_is_the_oracles(modules, tmp_path, fails, plac
         ("no scene", ("invalid", S, "scene", "")),
         ("encode", ("simulator_error", S, "action conversion", "")),
         ("first encode", ("invalid", S, "reset", "")),
+        ("close", ("survived", "", "", "")),  # the trial has ended before
     ],
 )
 def test_failure_of_a_users_simulator_is_the_simulators(modules, tmp_path, fails, expected):

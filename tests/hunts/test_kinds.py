@@ -8,11 +8,12 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.errors import UsageError
+from crashhunt.crashes import Cause, Factor, Judgement, LeftOut, Why
 from crashhunt.hunts import _progress
-from crashhunt.hunts._progress import Kinds
+from crashhunt.hunts._progress import Judged, Kinds
 from crashhunt.hunts._reports import kind_data
 from crashhunt.plans import RunSettings
-from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import Collision, Failure, Outcome, TrialResult, TrialSpec
 
 
 def crash(number, kind, steps=5):
@@ -129,3 +130,92 @@ def test_only_the_agents_own_crashes_count_where_that_was_asked(monkeypatch):
     assert (kinds.until, kinds.at_fault) == (4, (4, 6))
     assert len(kinds.groups()) == 2  # all are shown
     assert Kinds(2, [crash(3, "KeyError")]).at_fault is None
+
+
+def collision(number, steps=5, judgement=None):
+    spec = TrialSpec(number, 1, {"ego": {}}, {}, max_steps=10)
+    hit = Collision("ego", "", "alone", "", "", 0.0, 0.0, "", 0.0, 0.0, 0.0)
+    result = TrialResult(spec, Outcome.COLLISION, steps=steps, collision=hit)
+    added = {} if judgement is None else {"judged": judgement.to_json()}
+    return SimpleNamespace(result=result, path=f"c{number}", id=f"c{number}", added=added, recording=lambda: None)
+
+
+@pytest.fixture
+def one_type(monkeypatch):
+    """All collisions have one signature, and features that nothing distinguishes."""
+    monkeypatch.setattr(_progress, "signature_of", lambda bundle, _: bundle.result.outcome)
+    monkeypatch.setattr(_progress, "features_of", lambda bundle, _: (float(bundle.result.spec.number),))
+
+
+def settle(kinds, bundle, what, **more):
+    kinds.settle(Judged(bundle, Cause("omission", what) if what else None, **more))
+
+
+def test_each_cause_of_a_type_counts_where_causes_count(one_type):
+    kinds = Kinds(2, by_cause=3)
+    crashes = [collision(number) for number in (3, 5, 9)]
+    for bundle in crashes:
+        kinds.add(bundle, 1)
+    assert (kinds.until, kinds.types_by_cause, kinds.count_to_judge()) == (None, 1, 3)
+    first = kinds.next_to_judge()
+    assert first is crashes[0]
+    settle(kinds, first, "vehicle")
+    assert (kinds.until, kinds.types_by_cause) == (None, 1)  # not one without a cause, and one with it
+    second = kinds.next_to_judge()
+    assert second is crashes[2]  # the furthest
+    settle(kinds, second, "red light")
+    assert (kinds.until, kinds.types_by_cause) == (9, 2)
+    assert Kinds(2, crashes).types_by_cause is None
+
+
+def test_keep_retains_each_cause_once_it_is_known(one_type):
+    kinds = Kinds(0, by_cause=2)
+    for number, steps in enumerate([9, 8, 7, 6, 5, 4]):
+        kinds.add(collision(number, steps), 1)
+    assert kinds.surplus(1) == []  # nothing is known yet
+    settle(kinds, kinds.next_to_judge(), "vehicle")
+    rare = kinds.next_to_judge()
+    assert rare.id == "c0"  # the longest, furthest from the shortest
+    settle(kinds, rare, None, is_stopped=True)
+    assert kinds.next_to_judge() is rare
+    assert kinds.surplus(1) == []
+    settle(kinds, rare, "red light")
+    # Of each cause, the crash that was judged stays, and the shortest of the others.
+    assert {bundle.id for bundle in kinds.surplus(1)} == {"c1", "c2", "c3", "c4"}
+    assert {bundle.id for group in kinds.groups() for bundle in group.bundles} == {"c5", "c0"}
+    assert kinds.groups()[0].count == 6
+
+
+def test_crashes_that_were_never_judged_are_pruned_at_the_end(one_type):
+    kinds = Kinds(0, by_cause=8)
+    for number, steps in ((1, 9), (2, 4)):
+        kinds.add(collision(number, steps), 1)
+        settle(kinds, kinds.next_to_judge(), "vehicle")
+    assert kinds.surplus(1) == []  # more crashes may come, to be judged
+    assert [bundle.id for bundle in kinds.surplus(1, final=True)] == ["c1"]
+
+
+def test_resumed_hunt_counts_causes_that_bundles_contain(one_type):
+    factor = Factor("agent", "ego", "sped up", 7, None, (LeftOut(0, "none"), LeftOut(1, "none")))
+    kinds = Kinds(1, [collision(4, judgement=Judgement(why=Why((factor,)))), collision(6)], by_cause=8)
+    assert (kinds.until, kinds.types_by_cause, kinds.count_to_judge()) == (4, 1, 1)
+    assert kinds.next_to_judge().id == "c6"
+
+
+def test_software_faults_need_no_runs_for_their_cause():
+    kinds = Kinds(2, [crash(1, "KeyError"), crash(2, "IndexError")], by_cause=8)
+    assert (kinds.until, kinds.next_to_judge(), kinds.types_by_cause) == (2, None, 2)
+    assert [bundle.id for bundle in Kinds(0, [crash(1, "A"), crash(2, "A")], by_cause=8).surplus(1)] == ["c2"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"by_cause": 8}, "--by-cause 8 counts nothing"),
+        ({"by_cause": 8, "distinct": 2, "deterministic": True}, "--deterministic and --by-cause"),
+        ({"by_cause": -1}, "--by-cause is -1"),
+    ],
+)
+def test_impossible_options_are_refused(options, words):
+    with pytest.raises(UsageError, match=words):
+        RunSettings(**options).checked()
