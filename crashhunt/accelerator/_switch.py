@@ -19,24 +19,19 @@ from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
 from crashhunt.accelerator import _kernel
-from crashhunt.accelerator._drive import decide
-from crashhunt.accelerator._move import collide, collide_one_by_one, enforce, finish
-from crashhunt.accelerator._observe import close_objects, fill_lanes, observe, observe_exit, observe_goal
+from crashhunt.accelerator._observe import close_objects, fill_lanes, observe, observe_exit, observe_goal, observe_grid
 from crashhunt.accelerator._roads import (
     forget,
     frame_of,
-    is_known,
     look,
-    look_traffic,
     methods_of,
     network_of,
     prepared,
     take,
-    take_traffic,
     watches,
 )
+from crashhunt.accelerator._rules import collide_one_by_one, enforce, finish
 from crashhunt.accelerator._substep_loop import can_run_alone, simulate
-from crashhunt.accelerator._vehicle_arrays import Crowd
 from crashhunt.accelerator._versions import Watch, left_alone, originals, reason_against
 
 if TYPE_CHECKING:
@@ -105,19 +100,16 @@ def _act(self: Road) -> None:
         for vehicle in self.vehicles:
             vehicle.act()
         return
-    compiled = take_traffic(self) or look_traffic(self)
-    if compiled is not None:
-        found, traffic = compiled
-        traffic.act()
-        found.keep_traffic(traffic)
-        return
-    state = take(self) or look(self)
-    if state is not None:
-        found, crowd, frame = state
-        if decide(self, frame, crowd):
-            found.keep(crowd, frame)
+    kept = take(self)
+    if kept is None:
+        found = look(self)
+        if found is None or not found[1].decides or found[1].traffic is None:
+            originals["Road.act"](self)
             return
-    originals["Road.act"](self)
+        kept = found[0], found[1].traffic
+    owner, traffic = kept
+    traffic.act()
+    owner.keep(traffic)
 
 
 def _step(self: Road, dt: float) -> None:
@@ -127,30 +119,31 @@ def _step(self: Road, dt: float) -> None:
         if len(self.vehicles) + len(self.objects) > 1:
             collide_one_by_one(self, dt)
         return
-    compiled = take_traffic(self)
-    state = take(self)
-    if compiled is None and state is None:
-        if not is_known(self):
-            originals["Road.step"](self, dt)
+    kept = take(self)
+    if kept is None:
+        found = look(self)
+        if found is None or not found[1].moves or found[1].traffic is None:
+            _step_one_by_one(self, dt)
             return
-        compiled = look_traffic(self, known=True)
-    if compiled is not None and type(dt) is float:
-        owner, traffic = compiled
-        if traffic.step(dt):
-            owner.keep_traffic(traffic)
-        else:
-            finish(self, dt)
-        return
-    found, crowd, before = state or (prepared(self, known=True), Crowd(self), None)
-    frame = None
-    if found is not None and crowd.moves and not self.record_history:
-        frame = found.move(crowd, dt, before)
-    if frame is None:
-        for vehicle in self.vehicles:
-            vehicle.step(dt)
-        crowd = Crowd(self)
-    if collide(self, dt, crowd) and found is not None and frame is not None:
-        found.keep(crowd, frame)
+        kept = found[0], found[1].traffic
+    owner, traffic = kept
+    if type(dt) is not float:
+        _step_one_by_one(self, dt)
+    elif traffic.step(dt):
+        owner.keep(traffic)
+    else:
+        finish(self, dt)
+
+
+def _step_one_by_one(road: Road, dt: float) -> None:
+    """Do what `Road.step` does; the kernel checks the pairs if it knows the vehicles then."""
+    for vehicle in road.vehicles:
+        vehicle.step(dt)
+    found = look(road) if type(dt) is float else None
+    if found is not None and found[1].traffic is not None:
+        found[1].traffic.collide(dt)
+    else:
+        collide_one_by_one(road, dt)
 
 
 def _simulate(self: AbstractEnv, action: object = None) -> None:
@@ -191,15 +184,11 @@ def _close_objects_to(
 
 
 def _enforce_road_rules(self: RegulatedRoad) -> None:
-    compiled, state = take_traffic(self), take(self)
-    if (compiled is not None or state is not None or prepared(self) is not None) and enforce(self):
-        if compiled is not None and compiled[1].read():
-            compiled[0].keep_traffic(compiled[1])
-        elif state is not None:
-            found, crowd, frame = state
-            found.keep(crowd, frame)
-    else:
+    kept = take(self)
+    if (kept is None and prepared(self) is None) or not enforce(self):
         originals["RegulatedRoad.enforce_road_rules"](self)
+    elif kept is not None and kept[1].read():
+        kept[0].keep(kept[1])
 
 
 def _observe(self: KinematicObservation) -> object:
@@ -221,6 +210,14 @@ def _observe_exit(self: ExitObservation) -> object:
 def _observe_goal(self: KinematicsGoalObservation) -> object:
     found = observe_goal(self) if _is_plain(self, KinematicsGoalObservation) else None
     return found if found is not None else originals["KinematicsGoalObservation.observe"](self)
+
+
+def _observe_grid(self: OccupancyGridObservation) -> object:
+    if _is_plain(self, OccupancyGridObservation):
+        found = observe_grid(self, frame_of(self.env.road))
+        if found is not None:
+            return found
+    return originals["OccupancyGridObservation.observe"](self)
 
 
 def _fill_road_layer_by_lanes(
@@ -256,6 +253,7 @@ _REPLACED: tuple[tuple[type, str, Callable[..., object]], ...] = (
     (KinematicObservation, "observe", _observe),
     (ExitObservation, "observe", _observe_exit),
     (KinematicsGoalObservation, "observe", _observe_goal),
+    (OccupancyGridObservation, "observe", _observe_grid),
     (OccupancyGridObservation, "fill_road_layer_by_lanes", _fill_road_layer_by_lanes),
 )
 _OF_ROADS = [replaced for replaced in _REPLACED if issubclass(replaced[0], Road)]

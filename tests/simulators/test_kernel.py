@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import struct
+import sys
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -16,20 +17,22 @@ from crashhunt.simulators.highway import HighwaySimulator
 import gymnasium
 import numpy as np
 import pytest
+from compiled import needs_kernel
 from highway_env.road.lane import CircularLane, SineLane, StraightLane
 from highway_env.road.road import Road, RoadNetwork
-from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.behavior import AggressiveVehicle, DefensiveVehicle, IDMVehicle, LinearVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
+from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle
 from hypothesis import given, settings, strategies as st
 
-from crashhunt.accelerator import _kernel, _roads, _switch, switch_off, switch_on
+from crashhunt.accelerator import _kernel, _roads, switch_off, switch_on
 
 assert HighwaySimulator
 pytestmark = [
     pytest.mark.usefixtures("plain_highway_env"),
-    pytest.mark.skipif(_kernel.why_not() == "it is not built", reason="the kernel for highway-env is not built"),
+    needs_kernel,
 ]
 NUMBERS = st.floats(-1e6, 1e6)
 
@@ -68,7 +71,9 @@ def test_products_and_remainders_have_the_bits_of_numpy_and_python(a, b, c, d):
     assert bits(compute("remainder", a, 2 * math.pi)) == bits(np.float64(a) % (2 * math.pi)) == bits(a % (2 * math.pi))
 
 
-@pytest.mark.parametrize("name", ["sin", "cos", "tan", "arctan", "arcsin", "arctan2", "power", "remainder", "dot"])
+@pytest.mark.parametrize(
+    "name", ["sin", "cos", "tan", "arctan", "arcsin", "arctan2", "power", "remainder", "dot", "dot3", "square"]
+)
 def test_a_function_with_one_other_bit_disables_the_kernel(name, monkeypatch):
     right = _kernel.kernel().compute
 
@@ -85,7 +90,7 @@ def test_a_function_with_one_other_bit_disables_the_kernel(name, monkeypatch):
     ("error", "reason"),
     [
         (lambda name: (_ for _ in ()).throw(ImportError(name)), "it is not built"),
-        (lambda name: type("Old", (), {"INTERFACE": 0}), "it is of another version of crashhunt (0 instead of 1)"),
+        (lambda name: type("Old", (), {"INTERFACE": 0}), "it is of another version of crashhunt (0 instead of 2)"),
     ],
 )
 def test_without_the_kernel_there_is_a_reason(error, reason, monkeypatch):
@@ -93,15 +98,25 @@ def test_without_the_kernel_there_is_a_reason(error, reason, monkeypatch):
     assert _kernel._found.__wrapped__() == (None, reason)
 
 
-def test_it_does_the_work_of_an_environment_and_no_array_is_made(monkeypatch):
+def test_kernel_runs_all_substeps_of_an_environment():
     assert not switch_on()
-    for owner, name in ((_switch, "decide"), (_switch, "collide"), (_roads.Prepared, "move")):
-        monkeypatch.setattr(owner, name, lambda *_, **__: pytest.fail("arrays were used"))
+    codes = {IDMVehicle.act.__code__, Vehicle.step.__code__, ControlledVehicle.steering_control.__code__}
+    called = []
+
+    def see(frame, event, _):
+        if event == "call" and frame.f_code in codes:
+            called.append(frame.f_code.co_qualname)
+
     for name in ("highway-v0", "merge-v1", "roundabout-v1", "intersection-v2"):
-        env = gymnasium.make(name).unwrapped
+        config = {"other_vehicles_type": "highway_env.vehicle.behavior.DefensiveVehicle"} if "high" in name else {}
+        env = gymnasium.make(name, config=config).unwrapped
         env.reset(seed=3)
-        for _ in range(4):
-            env.step(env.action_space.sample())
+        for action in (0, 1, 2, 1):
+            sys.setprofile(see)
+            env.step(action)
+            sys.setprofile(None)
+        # Only the agent decides for itself, once per step.
+        assert called.count("IDMVehicle.act") == called.count("Vehicle.step") == 0, name
 
 
 def network(rng):
@@ -132,7 +147,8 @@ def network(rng):
     return net
 
 
-KINDS = (IDMVehicle, IDMVehicle, ControlledVehicle, MDPVehicle, Vehicle)
+LINEAR = (LinearVehicle, AggressiveVehicle, DefensiveVehicle)
+KINDS = (IDMVehicle, IDMVehicle, ControlledVehicle, MDPVehicle, Vehicle, BicycleVehicle, *LINEAR)
 
 
 def crowded(seed):
@@ -150,7 +166,7 @@ def crowded(seed):
         made = kind(
             road, lane.position(s, float(rng.normal())), heading, np.float64(speed) if rng.random() < 0.5 else speed
         )
-        if kind is Vehicle:
+        if kind in (Vehicle, BicycleVehicle):
             made.act({"steering": float(rng.normal() * 0.2), "acceleration": float(rng.normal() * 3)})
         else:
             made.target_speed = float(rng.choice([made.target_speed, rng.uniform(-1, 40)]))
@@ -179,7 +195,7 @@ def crowded(seed):
 
 NAMES = (
     "position", "heading", "speed", "lane_index", "target_lane_index", "target_speed", "timer", "crashed", "hit",
-    "impact", "action", "route",
+    "impact", "action", "route", "data", "lateral_speed", "yaw_rate",
 )  # fmt: skip
 
 
@@ -273,6 +289,6 @@ def test_what_is_unusual_is_refused_at_once(change):
     assert not switch_on()
     road = crowded(11)
     road.vehicles.insert(0, IDMVehicle(road, [5.0, 0.0], 0.0, 10.0))
-    assert _roads.prepared(road).traffic() is not None
+    assert _roads.prepared(road).roster() is not None
     change(road)
-    assert _roads.prepared(road).traffic() is None
+    assert _roads.prepared(road).roster() is None
