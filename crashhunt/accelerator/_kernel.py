@@ -55,6 +55,9 @@ class CompiledNetwork(Protocol):
     def coordinates(self, lane: int, positions: bytes, /) -> tuple[list[float], list[float]]:
         """Return longitudinal and lateral coordinates on a lane, in m, of positions ``x, y`` of float64."""
 
+    def mark_cells(self, *grid: object) -> tuple[bytearray, list[tuple[int, float]]]:
+        """Return a byte for each cell with a point of a lane, and lanes with points near the border of a cell."""
+
 
 class Snapshot(Protocol):
     """The members that namespaces had at one time."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from highway_env import utils
-from highway_env.road.lane import AbstractLane, CircularLane, SineLane
+from highway_env.road.lane import AbstractLane
 from highway_env.vehicle.kinematics import Vehicle
 
 from crashhunt.accelerator._frames import are_plain
@@ -213,42 +213,46 @@ def observe_grid(grid: OccupancyGridObservation, frame: Frame | None) -> NDArray
     return seen
 
 
-def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, reach: float) -> None:
-    """Do what `OccupancyGridObservation.fill_road_layer_by_lanes` does, for all points of a lane together.
+def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, reach: float) -> bool:
+    """Do what `OccupancyGridObservation.fill_road_layer_by_lanes` does, for all lanes together.
 
     highway-env's own code decides about points so near to the border of a cell that rounding matters.
+
+    Args:
+        grid: The observation.
+        network: The lanes of the road.
+        layer: The number of the layer to fill.
+        reach: How far lanes are followed in both directions, in m.
+
+    Returns:
+        False, with nothing changed, if the grid is too large or not finite.
     """
-    observer = grid.observer_vehicle
-    spacing, low, cells = np.amin(grid.grid_step), grid.grid_size[:, 0], grid.grid.shape[-2:]
-    c, s = math.cos(observer.heading), math.sin(observer.heading)
-    for lane in network.lanes:
-        origin, _ = lane.local_coordinates(observer.position)
-        points = np.unique(np.arange(origin - reach, origin + reach, spacing).clip(0, lane.length))
-        offset = _along(lane, points) - observer.position
-        if grid.align_to_vehicle_axes:
-            offset = np.stack((offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s), axis=1)
-        place = (offset - low) / grid.grid_step
-        near = ((place > -1) & (place < np.array(cells) + 1)).all(axis=1)
-        sure = (np.abs(place - np.rint(place)) > 1e-6).all(axis=1)
-        found = np.floor(place[near & sure]).astype(int).tolist()
-        found += [grid.pos_to_index(lane.position(point, 0)) for point in points[near & ~sure]]
-        for first, second in found:
-            if 0 <= first < cells[0] and 0 <= second < cells[1]:
-                grid.grid[layer, first, second] = 1
+    observer, cells = grid.observer_vehicle, grid.grid.shape[-2:]
+    spacing = float(np.amin(grid.grid_step))
+    given = (
+        observer.position.tolist(),
+        (math.cos(observer.heading), math.sin(observer.heading)),
+        float(reach),
+        spacing,
+        grid.grid_size[:, 0].tolist(),
+        grid.grid_step.tolist(),
+        cells,
+        grid.align_to_vehicle_axes,
+    )
+    try:
+        marks, unsure = network.in_kernel(looks_further=False).mark_cells(*map(_as_tuple, given))
+    except (OverflowError, TypeError, ValueError):
+        return False
+    grid.grid[layer][np.frombuffer(marks, bool).reshape(cells)] = 1
+    for number, point in unsure:
+        first, second = grid.pos_to_index(network.lanes[number].position(point, 0))
+        if 0 <= first < cells[0] and 0 <= second < cells[1]:
+            grid.grid[layer, first, second] = 1
+    return True
 
 
-def _along(lane: AbstractLane, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return positions on the centre line, of shape (points, 2); the last bits may differ from highway-env's."""
-    if isinstance(lane, CircularLane):
-        phi = lane.direction * points / lane.radius + lane.start_phase
-        found = lane.center + lane.radius * np.stack((np.cos(phi), np.sin(phi)), axis=1)
-    else:
-        found = lane.start + points[:, None] * lane.direction
-        if isinstance(lane, SineLane):
-            swing = lane.amplitude * np.sin(lane.pulsation * points + lane.phase)
-            found = found + swing[:, None] * lane.direction_lateral
-    places: NDArray[np.float64] = found
-    return places
+def _as_tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _are_known(features: object) -> bool:

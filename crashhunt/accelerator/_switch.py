@@ -224,9 +224,7 @@ def _fill_road_layer_by_lanes(
     self: OccupancyGridObservation, layer_index: int, lane_perception_distance: float = 100
 ) -> None:
     network = network_of(self.env.road) if _is_plain(self, OccupancyGridObservation) else None
-    if network is not None:
-        fill_lanes(self, network, layer_index, lane_perception_distance)
-    else:
+    if network is None or not fill_lanes(self, network, layer_index, lane_perception_distance):
         originals["OccupancyGridObservation.fill_road_layer_by_lanes"](self, layer_index, lane_perception_distance)
 
 

@@ -275,7 +275,95 @@ PyObject *network_coordinates(Network *self, PyObject *args) {
     return both;
 }
 
+// The grid of an occupancy grid observation, in m: its axes are those of the observer, or those of the world.
+struct Grid {
+    double x, y, cosine, sine; // the position and the direction of the observer
+    double reach, spacing;     // how far lanes are followed, and the distance of points on them
+    double low[2], step[2];
+    Py_ssize_t cells[2];
+    int is_aligned;
+
+    // Marks the cell of a position. False: the position is so near to the border of a cell that rounding matters.
+    bool mark(double px, double py, char *marks) const {
+        double dx = px - x, dy = py - y;
+        double offset[2] = {is_aligned ? dx * cosine + dy * sine : dx, is_aligned ? dy * cosine - dx * sine : dy};
+        Py_ssize_t cell[2];
+        bool is_sure = true, is_inside = true;
+        for (int axis : {0, 1}) {
+            double place = (offset[axis] - low[axis]) / step[axis];
+            if (!(place > -1 && place < static_cast<double>(cells[axis]) + 1)) {
+                return true;
+            }
+            is_sure = is_sure && std::fabs(place - std::rint(place)) > 1e-6;
+            cell[axis] = static_cast<Py_ssize_t>(std::floor(place));
+            is_inside = is_inside && 0 <= cell[axis] && cell[axis] < cells[axis];
+        }
+        if (is_sure && is_inside) {
+            marks[cell[0] * cells[1] + cell[1]] = 1;
+        }
+        return is_sure;
+    }
+};
+
+// Marks the cells of the points on one lane, and lists the points about which highway-env must decide. False: an error.
+bool mark_lane(const Lane &lane, Py_ssize_t number, const Grid &grid, char *marks, PyObject *unsure) {
+    double origin, lateral, last = NAN;
+    lane.local_coordinates(grid.x, grid.y, origin, lateral);
+    // The points are those of np.arange, which adds multiples of the first difference.
+    double start = origin - grid.reach, stop = origin + grid.reach;
+    double difference = start + grid.spacing - start, count = std::ceil((stop - start) / grid.spacing);
+    for (double at = 0; at < count; at++) {
+        double point = clip(start + at * difference, 0, lane.length), px, py;
+        if (point == last) {
+            continue;
+        }
+        last = point;
+        lane.position(point, px, py);
+        if (!grid.mark(px, py, marks)) {
+            PyObject *pair = Py_BuildValue("nd", number, point);
+            bool listed = pair && PyList_Append(unsure, pair) == 0;
+            Py_XDECREF(pair);
+            if (!listed) {
+                return false;
+            }
+        }
+    }
+    return true;
+}
+
+// mark_cells(...): a byte for each cell that is 1 if a point of a lane is in it, and a list of lanes with points about
+// which highway-env must decide.
+PyObject *network_mark_cells(Network *self, PyObject *args) {
+    Grid grid;
+    if (!PyArg_ParseTuple(args, "(dd)(dd)dd(dd)(dd)(nn)p", &grid.x, &grid.y, &grid.cosine, &grid.sine, &grid.reach,
+                          &grid.spacing, &grid.low[0], &grid.low[1], &grid.step[0], &grid.step[1], &grid.cells[0],
+                          &grid.cells[1], &grid.is_aligned)) {
+        return nullptr;
+    }
+    const Py_ssize_t most = 1000000;
+    if (!(grid.spacing > 0 && grid.reach / grid.spacing < 1e6) || grid.cells[0] < 0 || grid.cells[1] < 0 ||
+        grid.cells[0] > most || grid.cells[1] > most) {
+        PyErr_SetString(PyExc_ValueError, "the grid is too large");
+        return nullptr;
+    }
+    PyObject *marks = PyByteArray_FromStringAndSize(nullptr, grid.cells[0] * grid.cells[1]);
+    PyObject *unsure = PyList_New(0), *both = nullptr;
+    if (marks && unsure) {
+        char *first = PyByteArray_AS_STRING(marks);
+        std::memset(first, 0, static_cast<size_t>(PyByteArray_GET_SIZE(marks)));
+        bool done = true;
+        for (size_t number = 0; done && number < self->lanes->size(); number++) {
+            done = mark_lane((*self->lanes)[number], static_cast<Py_ssize_t>(number), grid, first, unsure);
+        }
+        both = done ? PyTuple_Pack(2, marks, unsure) : nullptr;
+    }
+    Py_XDECREF(marks);
+    Py_XDECREF(unsure);
+    return both;
+}
+
 PyMethodDef network_methods[] = {
+    {"mark_cells", reinterpret_cast<PyCFunction>(network_mark_cells), METH_VARARGS, nullptr},
     {"coordinates", reinterpret_cast<PyCFunction>(network_coordinates), METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };

@@ -55,6 +55,19 @@ struct Lane {
         }
     }
 
+    // The position of a point on the centre line; the last bits may differ from highway-env's.
+    void position(double s, double &px, double &py) const {
+        if (kind == CIRCULAR) {
+            double phi = direction * s / radius + start_phase;
+            px = x + radius * call(COS, phi);
+            py = y + radius * call(SIN, phi);
+            return;
+        }
+        double swing = kind == SINE ? amplitude * call(SIN, pulsation * s + phase) : 0;
+        px = x + s * along_x + swing * across_x;
+        py = y + s * along_y + swing * across_y;
+    }
+
     double heading_at(double s) const {
         if (kind == STRAIGHT) {
             return heading;
