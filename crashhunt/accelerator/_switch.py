@@ -18,7 +18,6 @@ from highway_env.envs.common.observation import (
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from crashhunt.accelerator import _kernel
 from crashhunt.accelerator._observe import close_objects, fill_lanes, observe, observe_exit, observe_goal, observe_grid
 from crashhunt.accelerator._roads import (
     forget,
@@ -272,15 +271,10 @@ class Acceleration:
 
     @property
     def reason(self) -> str:
-        """Why highway-env is not accelerated, such as a replaced function; empty if it is accelerated."""
+        """Why highway-env is not accelerated, such as a missing kernel; empty if it is accelerated."""
         if self._reason:
             return self._reason
         return why_not() if is_on() else "it has been undone"
-
-    @property
-    def why_not_compiled(self) -> str:
-        """Why the compiled kernel is not used, and Python code on arrays is slower; empty if the kernel is used."""
-        return _kernel.why_not()
 
     @property
     def left_alone(self) -> dict[str, tuple[str, ...]]:
@@ -317,13 +311,14 @@ def accelerate() -> Acceleration:
     for everything that the accelerator does not know, and the accelerator checks that in every step:
 
     - another version of highway-env
+    - an installation of crashhunt without the compiled kernel, which needs a C++ compiler
     - your classes that override an accelerated method
     - functions and methods that other code has replaced, on a class, a module or an object
 
     Returns:
         The state of the acceleration. Its truth value says whether highway-env is accelerated. ``reason`` says why not.
         ``left_alone`` lists classes that are not accelerated. ``undo()``, or the end of a ``with`` block, switches the
-        accelerator off. ``why_not_compiled`` says why the compiled kernel is not used.
+        accelerator off.
 
     Example:
         >>> import crashhunt

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
+import os
 import struct
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -268,6 +271,56 @@ def test_an_error_of_highway_env_leaves_what_highway_env_leaves():
     assert any("Error" in found for found in slow if isinstance(found, str))
 
 
+def test_threads_do_not_disturb_each_other():
+    slow = [played(seed, 5) for seed in range(8)]
+    assert not switch_on()
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(lambda seed: played(seed, 5), range(8))) == slow
+
+
+def test_a_fork_goes_on_with_the_same_bits():
+    assert not switch_on()
+    road = crowded(4)
+
+    def digest():
+        found = []
+        for _ in range(4):
+            road.act()
+            road.step(1 / 15)
+            found.append(state(road))
+        return hashlib.sha256(repr(found).encode()).digest()
+
+    digest()
+    outlet, inlet = os.pipe()
+    child = os.fork()
+    if not child:
+        os.write(inlet, digest())
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert os.read(outlet, 100) == digest()
+    os.close(outlet)
+    os.close(inlet)
+
+
+def test_linear_vehicle_collects_the_same_data():
+    def collected():
+        road = Road(RoadNetwork.straight_road_network(2), np_random=np.random.default_rng(1))
+        for number, kind in enumerate((*LINEAR, IDMVehicle)):
+            road.vehicles.append(kind(road, [20.0 * number, 4.0 * (number % 2)], 0.0, 20.0 + number))
+        road.vehicles[0].randomize_behavior()
+        road.vehicles[1].collecting_data = False
+        for _ in range(20):
+            road.act()
+            road.step(0.1)
+        return [exact(vehicle.data) for vehicle in road.vehicles[:3]], state(road)
+
+    slow = collected()
+    assert not switch_on()
+    assert collected() == slow
+    assert len(slow[0][0]["lateral"]["outputs"]) == 20
+    assert slow[0][1] == {}
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -277,6 +330,9 @@ def test_an_error_of_highway_env_leaves_what_highway_env_leaves():
         lambda road: setattr(road.vehicles[0], "target_lane_index", ("a", "z", 0)),
         lambda road: setattr(road.vehicles[0], "crashed", 1),
         lambda road: setattr(road.vehicles[0], "impact", [0.0, 0.0]),
+        lambda road: setattr(road.vehicles[0], "impact", np.zeros((1, 2))),
+        lambda road: setattr(road.vehicles[0], "impact", np.zeros(2, np.float32)),
+        lambda road: delattr(road.vehicles[0], "action"),
         lambda road: setattr(road.vehicles[0], "action", {"steering": 0}),
         lambda road: setattr(road.vehicles[0], "route", [["a", "b", 0]]),
         lambda road: setattr(road.vehicles[0], "position", road.vehicles[1].position),
