@@ -84,15 +84,15 @@ class Roster:
             self._kinds == kinds
             and self._ids == list(map(id, things))
             and self._looks_further == road.neighbour_vehicles_connected_lanes
-            and self._is_shared
-            and all(map(_is_disjoint, self._fixed, map(vars, things)))
-            and (self.traffic is None or self._is_current(road))
+            and (self.traffic is None or self._is_current(road, things))
         )
 
-    def _is_current(self, road: Road) -> bool:
-        return all(vehicle.road is road for vehicle in road.vehicles) and self._read() == (
-            self._parameters,
-            self._deltas,
+    def _is_current(self, road: Road, things: list[RoadObject]) -> bool:
+        return (
+            self._is_shared
+            and all(map(_is_disjoint, self._fixed, map(vars, things)))
+            and all(vehicle.road is road for vehicle in road.vehicles)
+            and self._read() == (self._parameters, self._deltas)
         )
 
     def _read(self) -> tuple[list[Row], list[object]]:
@@ -107,15 +107,15 @@ class Roster:
         module, kinds = kernel(), self._kinds
         if module is None or not all(kind.collides for kind in kinds) or not are_plain(things, kinds):
             return None
-        if not all(vehicle.road is road for vehicle in road.vehicles):
+        count = len(road.vehicles)
+        # Drivers evaluate a vehicle among the objects like a vehicle, which the kernel does not know.
+        if not all(vehicle.road is road for vehicle in road.vehicles) or any(kind.base for kind in kinds[count:]):
             return None
         parameters = _read_parameters(things, kinds)
         if parameters is None:
             return None
-        models = [
-            _MODELS[kind.drives] if row >= len(road.vehicles) or kind.drives else _FOREIGN
-            for row, kind in enumerate(kinds)
-        ]
+        models = [_MODELS[kind.drives] if kind.drives else _FOREIGN for kind in kinds[:count]]
+        models += [_MODELS[""]] * (len(kinds) - count)
         flags = bytes(map(_flags_of, things, kinds))
         lanes = network.in_kernel(looks_further=bool(self._looks_further))
         return module.Traffic(lanes, things, bytes(models), flags, parameters)

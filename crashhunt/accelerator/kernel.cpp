@@ -5,8 +5,9 @@
 // - It is compiled without contraction, because a fused multiply-add rounds once instead of twice.
 // - Sine, cosine and their like are the inner loops of NumPy's own functions, because NumPy has several versions of them
 //   for different processors. crashhunt/accelerator/_kernel.py compares all of them with NumPy when a process starts.
-// - What the kernel does not know, it refuses: `read` returns False, and Python code does the work. For two events it
-//   calls highway-env's own methods: the end of a lane, and a pair of vehicles that may touch.
+// - What the kernel does not know, it refuses: `read` returns False, and highway-env does the work. For three events it
+//   calls highway-env's own methods: the end of a lane, a pair of vehicles that may touch, and a movement by the dynamic
+//   bicycle model.
 //
 // Its parts are kernel_numbers.hpp (arithmetic), kernel_lanes.hpp, kernel_actors.hpp (state), kernel_policies.hpp
 // (decisions) and kernel_movement.hpp. This file has what Python calls.
@@ -143,14 +144,15 @@ PyObject *traffic_new(PyTypeObject *type, PyObject *args, PyObject *) {
             actor = Actor();
             actor.object = PyList_GET_ITEM(actors, static_cast<Py_ssize_t>(row));
             Py_INCREF(actor.object);
-            const int flag = static_cast<const char *>(flags.buf)[row]; // see `_kernel._flags_of`
+            const int flag = static_cast<const char *>(flags.buf)[row]; // see `_roster._flags_of`
             actor.model = static_cast<const char *>(models.buf)[row];
             actor.moves = actor.model != OBJECT;
             actor.has_target = actor.model == CONTROLLED || actor.model == IDM || actor.model == LINEAR;
             actor.is_landmark = flag & 1;
             actor.slides = flag & 2;
             actor.changes_lanes = flag & 4;
-            std::memcpy(&actor.parameters, static_cast<const char *>(parameters.buf) + row * sizeof(Parameters), sizeof(Parameters));
+            const char *numbers = static_cast<const char *>(parameters.buf) + row * sizeof(Parameters);
+            std::memcpy(&actor.parameters, numbers, sizeof(Parameters));
             actor.gap_root = 2 * std::sqrt(-actor.parameters.comfort_acc_max * actor.parameters.comfort_acc_min);
             self->vehicles += actor.moves;
         }

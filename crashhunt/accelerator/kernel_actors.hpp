@@ -10,10 +10,10 @@
 
 namespace {
 
-// Models of decision, see `_kernel._MODELS`. FOREIGN vehicles decide by code that is not highway-env's.
+// Models of decision, see `_roster._MODELS`. FOREIGN vehicles decide by code that is not highway-env's.
 enum { OBJECT, PASSIVE, CONTROLLED, IDM, LINEAR, FOREIGN };
 
-// The order of the parameters of a vehicle, see `_kernel._PARAMETERS`.
+// The order of the parameters of a vehicle, see `_roster._PARAMETERS`.
 struct Parameters {
     double length, width, max_speed, min_speed;
     double tau_pursuit, kp_lateral, kp_heading, max_steering_angle, kp_a;
@@ -73,7 +73,7 @@ PyObject *slide;       // the function that moves a vehicle with the dynamic bic
 
 const size_t NO_ROW = static_cast<size_t>(-1);
 
-// The actors on a lane and on lanes connected to it, from the last to the first.
+// The actors on a lane and on lanes connected to it, in their order along the lane.
 struct Queue {
     uint64_t instant = 0; // at which it is valid
     std::vector<std::pair<double, size_t>> places; // longitudinal coordinates with rows

@@ -11,7 +11,7 @@ namespace {
 
 enum { STRAIGHT, SINE, CIRCULAR };
 
-// A row of the table that `_kernel._table` makes, in its order.
+// A row of the table that `_network._table` makes, in its order.
 struct LaneRow {
     double kind, x, y, along_x, along_y, across_x, across_y, length, width, heading, limit, forbidden;
     double amplitude, pulsation, phase, radius, start_phase, direction, left, right, road;

@@ -278,7 +278,7 @@ def test_threads_do_not_disturb_each_other():
         assert list(pool.map(lambda seed: played(seed, 5), range(8))) == slow
 
 
-def test_a_fork_goes_on_with_the_same_bits():
+def test_fork_computes_the_same_bits():
     assert not switch_on()
     road = crowded(4)
 
@@ -337,6 +337,7 @@ def test_linear_vehicle_collects_the_same_data():
         lambda road: setattr(road.vehicles[0], "route", [["a", "b", 0]]),
         lambda road: setattr(road.vehicles[0], "position", road.vehicles[1].position),
         lambda road: setattr(road.vehicles[0], "action", road.vehicles[1].action),
+        lambda road: road.objects.append(IDMVehicle(road, [15.0, 0.0], 0.0, 10.0)),
         lambda road: setattr(road, "record_history", True),
         lambda road: setattr(road.vehicles[0], "MAX_SPEED", np.float64(30)),
     ],
