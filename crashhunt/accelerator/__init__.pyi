@@ -1,3 +1,4 @@
+from ._frames import Frame as Frame
 from ._network import Network as Network
 from ._substep_loop import Onlooker as Onlooker, SkippedObservation as SkippedObservation
 from ._switch import (
@@ -7,5 +8,4 @@ from ._switch import (
     switch_on as switch_on,
     why_not as why_not,
 )
-from ._vehicle_arrays import Frame as Frame
 from ._versions import kind_of as kind_of, reason_against as reason_against

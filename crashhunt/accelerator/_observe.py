@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from highway_env import utils
-from highway_env.road.lane import AbstractLane, CircularLane, SineLane
+from highway_env.road.lane import AbstractLane
 from highway_env.vehicle.kinematics import Vehicle
 
-from crashhunt.accelerator._vehicle_arrays import are_plain
+from crashhunt.accelerator._frames import are_plain
 from crashhunt.accelerator._versions import are_numbers, kind_of
 
 if TYPE_CHECKING:
@@ -25,14 +25,16 @@ if TYPE_CHECKING:
     from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
 
+    from crashhunt.accelerator._frames import Frame
     from crashhunt.accelerator._network import Network
-    from crashhunt.accelerator._vehicle_arrays import Frame
 
 
-__all__ = ["close_objects", "fill_lanes", "observe", "observe_exit", "observe_goal"]
+__all__ = ["close_objects", "fill_lanes", "observe", "observe_exit", "observe_goal", "observe_grid"]
 
 
 _KNOWN = frozenset(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))
+_ALL = sorted(_KNOWN)
+_ALL_OF_FRAMES = frozenset(("cos_d", "sin_d", "long_off", "lat_off", "ang_off"))  # columns that are not computed here
 _OF_OBJECTS = _KNOWN - {"heading"}
 
 
@@ -157,42 +159,100 @@ def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.f
     return OrderedDict(observation=here / scales, achieved_goal=here / scales, desired_goal=there / scales)
 
 
-def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, reach: float) -> None:
-    """Do what `OccupancyGridObservation.fill_road_layer_by_lanes` does, for all points of a lane together.
+def observe_grid(grid: OccupancyGridObservation, frame: Frame | None) -> NDArray[np.generic] | None:
+    """Return the result of `OccupancyGridObservation.observe`; None if highway-env's own code must run.
+
+    The features of all vehicles are normalized in one array, without a data frame. highway-env writes the vehicles in
+    reverse order, so that the first one in a cell remains.
+    """
+    observer, features = grid.observer_vehicle, grid.features
+    shown = [name for name in features if name != "on_road"] if type(features) is list else None
+    if frame is None or grid.absolute or shown is None or not _KNOWN.issuperset(shown):
+        return None
+    vehicles = grid.env.road.vehicles
+    if observer is None or not vehicles or type(observer.position) is not np.ndarray:
+        return None
+    if not all(_is_plain(thing, _ALL) and _arrives(thing, frame.network) for thing in (observer, *vehicles)):
+        return None
+    own = _values(observer)
+    columns = {name: np.array([values[name] for values in map(_values, vehicles)]) for name in _ALL}
+    for name in ("x", "y", "vx", "vy"):
+        columns[name] = columns[name] - own[name]
+    ranges = grid.features_range or {
+        "vx": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
+        "vy": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
+    }
+    if type(ranges) is not dict or not _ALL_OF_FRAMES.isdisjoint(ranges):
+        return None
+    for name, limits in ranges.items():
+        if name in columns:
+            columns[name] = utils.lmap(columns[name], [limits[0], limits[1]], [-1, 1])
+    places = [
+        utils.lmap(columns[name], [-1, 1], [ranges[name][0], ranges[name][1]]) if name in ranges else columns[name]
+        for name in ("x", "y")
+    ]
+    if not np.isfinite(places).all():
+        return None
+    grid.features_range = ranges
+    grid.grid.fill(np.nan)
+    width, height = grid.grid.shape[-2:]
+    cells = [grid.pos_to_index(place, relative=True) for place in zip(*places, strict=True)] if shown else []
+    for layer, name in enumerate(features):
+        if name == "on_road":
+            grid.fill_road_layer_by_lanes(layer)
+            continue
+        for (first, second), value in zip(reversed(cells), reversed(columns[name].tolist()), strict=True):
+            if 0 <= first < width and 0 <= second < height:
+                grid.grid[layer, first, second] = value
+    found = grid.grid
+    if grid.clip:
+        found = np.clip(found, -1, 1)
+    if grid.as_image:
+        found = ((np.clip(found, -1, 1) + 1) / 2 * 255).astype(np.uint8)
+    seen: NDArray[np.generic] = np.nan_to_num(found).astype(np.uint8 if grid.as_image else np.float32)
+    return seen
+
+
+def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, reach: float) -> bool:
+    """Do what `OccupancyGridObservation.fill_road_layer_by_lanes` does, for all lanes together.
 
     highway-env's own code decides about points so near to the border of a cell that rounding matters.
+
+    Args:
+        grid: The observation.
+        network: The lanes of the road.
+        layer: The number of the layer to fill.
+        reach: How far lanes are followed in both directions, in m.
+
+    Returns:
+        False, with nothing changed, if the grid is too large or not finite.
     """
-    observer = grid.observer_vehicle
-    spacing, low, cells = np.amin(grid.grid_step), grid.grid_size[:, 0], grid.grid.shape[-2:]
-    c, s = math.cos(observer.heading), math.sin(observer.heading)
-    for lane in network.lanes:
-        origin, _ = lane.local_coordinates(observer.position)
-        points = np.unique(np.arange(origin - reach, origin + reach, spacing).clip(0, lane.length))
-        offset = _along(lane, points) - observer.position
-        if grid.align_to_vehicle_axes:
-            offset = np.stack((offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s), axis=1)
-        place = (offset - low) / grid.grid_step
-        near = ((place > -1) & (place < np.array(cells) + 1)).all(axis=1)
-        sure = (np.abs(place - np.rint(place)) > 1e-6).all(axis=1)
-        found = np.floor(place[near & sure]).astype(int).tolist()
-        found += [grid.pos_to_index(lane.position(point, 0)) for point in points[near & ~sure]]
-        for first, second in found:
-            if 0 <= first < cells[0] and 0 <= second < cells[1]:
-                grid.grid[layer, first, second] = 1
+    observer, cells = grid.observer_vehicle, grid.grid.shape[-2:]
+    spacing = float(np.amin(grid.grid_step))
+    given = (
+        observer.position.tolist(),
+        (math.cos(observer.heading), math.sin(observer.heading)),
+        float(reach),
+        spacing,
+        grid.grid_size[:, 0].tolist(),
+        grid.grid_step.tolist(),
+        cells,
+        grid.align_to_vehicle_axes,
+    )
+    try:
+        marks, unsure = network.in_kernel(looks_further=False).mark_cells(*map(_as_tuple, given))
+    except (OverflowError, TypeError, ValueError):
+        return False
+    grid.grid[layer][np.frombuffer(marks, bool).reshape(cells)] = 1
+    for number, point in unsure:
+        first, second = grid.pos_to_index(network.lanes[number].position(point, 0))
+        if 0 <= first < cells[0] and 0 <= second < cells[1]:
+            grid.grid[layer, first, second] = 1
+    return True
 
 
-def _along(lane: AbstractLane, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return positions on the centre line, of shape (points, 2); the last bits may differ from highway-env's."""
-    if isinstance(lane, CircularLane):
-        phi = lane.direction * points / lane.radius + lane.start_phase
-        found = lane.center + lane.radius * np.stack((np.cos(phi), np.sin(phi)), axis=1)
-    else:
-        found = lane.start + points[:, None] * lane.direction
-        if isinstance(lane, SineLane):
-            swing = lane.amplitude * np.sin(lane.pulsation * points + lane.phase)
-            found = found + swing[:, None] * lane.direction_lateral
-    places: NDArray[np.float64] = found
-    return places
+def _as_tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _are_known(features: object) -> bool:

@@ -8,18 +8,13 @@ from typing import TYPE_CHECKING
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from crashhunt.accelerator._kernel import Roster, kernel
-from crashhunt.accelerator._move import as_numpy, move
+from crashhunt.accelerator._frames import Frame
 from crashhunt.accelerator._network import Network
-from crashhunt.accelerator._vehicle_arrays import Crowd, Frame
+from crashhunt.accelerator._roster import Roster
 from crashhunt.accelerator._versions import Own, Watch, is_plain, kinds_of
 
 if TYPE_CHECKING:
-    from highway_env.vehicle.kinematics import Vehicle
-
     from crashhunt.accelerator._kernel import Traffic
-
-    Everybody = tuple["Prepared", Crowd, Frame]
 
 
 __all__ = [
@@ -28,12 +23,10 @@ __all__ = [
     "frame_of",
     "is_known",
     "look",
-    "look_traffic",
     "methods_of",
     "network_of",
     "prepared",
     "take",
-    "take_traffic",
     "watches",
 ]
 
@@ -58,90 +51,47 @@ class Prepared:
         self.network = Network(road.network)
         self.frame: Frame | None = None
         self.alone = False
-        self._crowd: Crowd | None = None
         self._roster: Roster | None = None
         self._traffic: Traffic | None = None
-        self._moved: list[Vehicle] = []
 
-    def move(self, crowd: Crowd, dt: float, before: Frame | None) -> Frame | None:
-        """Move all vehicles with `move`, and remember which vehicles need `as_numpy` afterwards."""
-        frame = move(crowd, self.network, dt, before, alone=self.alone)
-        if self.alone and frame is not None:
-            self._moved = crowd.vehicles
-        return frame
-
-    def traffic(self) -> Traffic | None:
+    def roster(self) -> Roster | None:
         """Return all vehicles in the kernel, with their current state; None if the kernel does not know them."""
         road = self.road
-        if road.record_history or kernel() is None:
+        if road.record_history:
             return None
         things = road.vehicles + road.objects
         kinds = kinds_of(things)
         if self._roster is None or not self._roster.is_of(road, things, kinds):
-            if not all(kind.drives for kind in kinds[: len(road.vehicles)]):
-                return None
-            self._roster = Roster(Crowd(road), self.network)
+            self._roster = Roster(road, things, kinds, self.network)
         traffic = self._roster.traffic
-        return traffic if traffic is not None and traffic.read() else None
+        return self._roster if traffic is not None and traffic.read() else None
 
-    def keep_traffic(self, traffic: Traffic) -> None:
+    def keep(self, traffic: Traffic) -> None:
         """Keep the state of all vehicles in the kernel until foreign code runs."""
-        self._crowd = None
         self._traffic = traffic if self.alone else None
 
-    def trusted_traffic(self) -> Traffic | None:
-        """Return the kept state in the kernel and discard it; None if none has been kept since the last call."""
+    def trusted(self) -> Traffic | None:
+        """Return the kept state and discard it; None if no state has been kept since the last call."""
         traffic, self._traffic = self._traffic, None
         return traffic
 
-    def keep(self, crowd: Crowd, frame: Frame) -> None:
-        """Keep the state of all vehicles until foreign code runs."""
-        self.frame = frame
-        self._crowd = crowd if self.alone and crowd.drives and crowd.moves else None
-
-    def trusted(self) -> Everybody | None:
-        """Return the kept state and discard it; None if no state has been kept since the last call."""
-        crowd, self._crowd = self._crowd, None
-        return (self, crowd, self.frame) if crowd is not None and self.frame is not None else None
-
     def distrust(self) -> None:
-        """Prepare for foreign code: restore highway-env's types, and discard the kept state."""
-        self._crowd = self._traffic = None
-        as_numpy(self._moved)
-        self._moved = []
+        """Prepare for foreign code: discard the kept state."""
+        self._traffic = None
 
 
-def look(road: Road) -> Everybody | None:
-    """Return the current state of a road; None if the road or the decisions of a vehicle are unknown."""
-    found = prepared(road) if all(kind.drives for kind in kinds_of(road.vehicles)) else None
-    if found is None:
-        return None
-    crowd = Crowd(road)
-    if not crowd.drives:
-        return None
-    if found.frame is None or not found.frame.has(crowd.things, crowd.places):
-        found.frame = Frame(found.network, road, crowd.places)
-    return found, crowd, found.frame
-
-
-def take(road: Road) -> Everybody | None:
+def take(road: Road) -> tuple[Prepared, Traffic] | None:
     """Return the kept state of a road; None if foreign code may have run since."""
     found = _roads.get(id(road))
-    return found.trusted() if found is not None and found.road is road else None
-
-
-def take_traffic(road: Road) -> tuple[Prepared, Traffic] | None:
-    """Return the kept state of a road in the kernel; None if foreign code may have run since."""
-    found = _roads.get(id(road))
-    traffic = found.trusted_traffic() if found is not None and found.road is road else None
+    traffic = found.trusted() if found is not None and found.road is road else None
     return (found, traffic) if found is not None and traffic is not None else None
 
 
-def look_traffic(road: Road, *, known: bool = False) -> tuple[Prepared, Traffic] | None:
-    """Return the current state of a road in the kernel; None if the kernel cannot be used for the road."""
-    found = prepared(road, known=known) if kernel() is not None else None
-    traffic = found.traffic() if found is not None else None
-    return (found, traffic) if found is not None and traffic is not None else None
+def look(road: Road) -> tuple[Prepared, Roster] | None:
+    """Return the current state of a road; None if the kernel cannot be used for the road."""
+    found = prepared(road)
+    roster = found.roster() if found is not None else None
+    return (found, roster) if found is not None and roster is not None else None
 
 
 def forget() -> None:
@@ -150,14 +100,9 @@ def forget() -> None:
     watches.clear()
 
 
-def prepared(road: Road, *, known: bool = False) -> Prepared | None:
-    """Return the cached data of a road; None if the road, its lanes or highway-env itself are unknown.
-
-    Args:
-        road: The road.
-        known: Whether `is_known` has just returned true for the road.
-    """
-    if not known and not is_known(road):
+def prepared(road: Road) -> Prepared | None:
+    """Return the cached data of a road; None if the road, its lanes or highway-env itself are unknown."""
+    if not is_known(road):
         return None
     found = _roads.get(id(road))
     if found is None or not found.network.is_of(road.network):

@@ -1,4 +1,4 @@
-"""The loop over an environment's sub-steps, which keeps the vehicles' state in arrays while no foreign code runs.
+"""The loop over an environment's sub-steps, which keeps the vehicles' state in the kernel while no foreign code runs.
 
 Foreign code is code of the user or of a library other than highway-env. It may change a vehicle at any time, so the
 state is read again after it has run.
@@ -23,8 +23,8 @@ from highway_env.envs.parking_env import ParkingEnv
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from crashhunt.accelerator._move import finish
-from crashhunt.accelerator._roads import look_traffic, methods_of, prepared, watches
+from crashhunt.accelerator._roads import look, methods_of, prepared, watches
+from crashhunt.accelerator._rules import finish
 from crashhunt.accelerator._versions import Own, is_genuine, kinds_of, originals
 
 if TYPE_CHECKING:
@@ -43,8 +43,7 @@ __all__ = ["Onlooker", "SkippedObservation", "can_run_alone", "simulate"]
 class Onlooker:
     """Replaces the ``step`` of a road object, and calls observers before and after it.
 
-    The kept state of the road stays valid while the observers do not interfere. Until the end of the environment's
-    step, headings may then be Python floats in place of NumPy floats.
+    The kept state of the road stays valid while the observers do not interfere.
 
     Args:
         advance: The road's own ``step``.
@@ -139,8 +138,9 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[type, st
 def _run(env: AbstractEnv, found: Prepared, count: int) -> int:
     """Let the kernel do several sub-steps; return how many it has done."""
     road = env.road
-    compiled = look_traffic(road)
-    traffic = compiled[1] if compiled is not None and compiled[0] is found else None
+    state = look(road)
+    roster = state[1] if state is not None and state[0] is found else None
+    traffic = roster.traffic if roster is not None and roster.decides and roster.moves else None
     dt = 1 / env.config["simulation_frequency"]
     if traffic is None or type(dt) is not float:
         return 0

@@ -18,25 +18,19 @@ from highway_env.envs.common.observation import (
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from crashhunt.accelerator import _kernel
-from crashhunt.accelerator._drive import decide
-from crashhunt.accelerator._move import collide, collide_one_by_one, enforce, finish
-from crashhunt.accelerator._observe import close_objects, fill_lanes, observe, observe_exit, observe_goal
+from crashhunt.accelerator._observe import close_objects, fill_lanes, observe, observe_exit, observe_goal, observe_grid
 from crashhunt.accelerator._roads import (
     forget,
     frame_of,
-    is_known,
     look,
-    look_traffic,
     methods_of,
     network_of,
     prepared,
     take,
-    take_traffic,
     watches,
 )
+from crashhunt.accelerator._rules import collide_one_by_one, enforce, finish
 from crashhunt.accelerator._substep_loop import can_run_alone, simulate
-from crashhunt.accelerator._vehicle_arrays import Crowd
 from crashhunt.accelerator._versions import Watch, left_alone, originals, reason_against
 
 if TYPE_CHECKING:
@@ -105,19 +99,16 @@ def _act(self: Road) -> None:
         for vehicle in self.vehicles:
             vehicle.act()
         return
-    compiled = take_traffic(self) or look_traffic(self)
-    if compiled is not None:
-        found, traffic = compiled
-        traffic.act()
-        found.keep_traffic(traffic)
-        return
-    state = take(self) or look(self)
-    if state is not None:
-        found, crowd, frame = state
-        if decide(self, frame, crowd):
-            found.keep(crowd, frame)
+    kept = take(self)
+    if kept is None:
+        found = look(self)
+        if found is None or not found[1].decides or found[1].traffic is None:
+            originals["Road.act"](self)
             return
-    originals["Road.act"](self)
+        kept = found[0], found[1].traffic
+    owner, traffic = kept
+    traffic.act()
+    owner.keep(traffic)
 
 
 def _step(self: Road, dt: float) -> None:
@@ -127,30 +118,31 @@ def _step(self: Road, dt: float) -> None:
         if len(self.vehicles) + len(self.objects) > 1:
             collide_one_by_one(self, dt)
         return
-    compiled = take_traffic(self)
-    state = take(self)
-    if compiled is None and state is None:
-        if not is_known(self):
-            originals["Road.step"](self, dt)
+    kept = take(self)
+    if kept is None:
+        found = look(self)
+        if found is None or not found[1].moves or found[1].traffic is None:
+            _step_one_by_one(self, dt)
             return
-        compiled = look_traffic(self, known=True)
-    if compiled is not None and type(dt) is float:
-        owner, traffic = compiled
-        if traffic.step(dt):
-            owner.keep_traffic(traffic)
-        else:
-            finish(self, dt)
-        return
-    found, crowd, before = state or (prepared(self, known=True), Crowd(self), None)
-    frame = None
-    if found is not None and crowd.moves and not self.record_history:
-        frame = found.move(crowd, dt, before)
-    if frame is None:
-        for vehicle in self.vehicles:
-            vehicle.step(dt)
-        crowd = Crowd(self)
-    if collide(self, dt, crowd) and found is not None and frame is not None:
-        found.keep(crowd, frame)
+        kept = found[0], found[1].traffic
+    owner, traffic = kept
+    if type(dt) is not float:
+        _step_one_by_one(self, dt)
+    elif traffic.step(dt):
+        owner.keep(traffic)
+    else:
+        finish(self, dt)
+
+
+def _step_one_by_one(road: Road, dt: float) -> None:
+    """Do what `Road.step` does; the kernel checks the pairs if it knows the vehicles then."""
+    for vehicle in road.vehicles:
+        vehicle.step(dt)
+    found = look(road) if type(dt) is float else None
+    if found is not None and found[1].traffic is not None:
+        found[1].traffic.collide(dt)
+    else:
+        collide_one_by_one(road, dt)
 
 
 def _simulate(self: AbstractEnv, action: object = None) -> None:
@@ -191,15 +183,11 @@ def _close_objects_to(
 
 
 def _enforce_road_rules(self: RegulatedRoad) -> None:
-    compiled, state = take_traffic(self), take(self)
-    if (compiled is not None or state is not None or prepared(self) is not None) and enforce(self):
-        if compiled is not None and compiled[1].read():
-            compiled[0].keep_traffic(compiled[1])
-        elif state is not None:
-            found, crowd, frame = state
-            found.keep(crowd, frame)
-    else:
+    kept = take(self)
+    if (kept is None and prepared(self) is None) or not enforce(self):
         originals["RegulatedRoad.enforce_road_rules"](self)
+    elif kept is not None and kept[1].read():
+        kept[0].keep(kept[1])
 
 
 def _observe(self: KinematicObservation) -> object:
@@ -223,13 +211,19 @@ def _observe_goal(self: KinematicsGoalObservation) -> object:
     return found if found is not None else originals["KinematicsGoalObservation.observe"](self)
 
 
+def _observe_grid(self: OccupancyGridObservation) -> object:
+    if _is_plain(self, OccupancyGridObservation):
+        found = observe_grid(self, frame_of(self.env.road))
+        if found is not None:
+            return found
+    return originals["OccupancyGridObservation.observe"](self)
+
+
 def _fill_road_layer_by_lanes(
     self: OccupancyGridObservation, layer_index: int, lane_perception_distance: float = 100
 ) -> None:
     network = network_of(self.env.road) if _is_plain(self, OccupancyGridObservation) else None
-    if network is not None:
-        fill_lanes(self, network, layer_index, lane_perception_distance)
-    else:
+    if network is None or not fill_lanes(self, network, layer_index, lane_perception_distance):
         originals["OccupancyGridObservation.fill_road_layer_by_lanes"](self, layer_index, lane_perception_distance)
 
 
@@ -256,6 +250,7 @@ _REPLACED: tuple[tuple[type, str, Callable[..., object]], ...] = (
     (KinematicObservation, "observe", _observe),
     (ExitObservation, "observe", _observe_exit),
     (KinematicsGoalObservation, "observe", _observe_goal),
+    (OccupancyGridObservation, "observe", _observe_grid),
     (OccupancyGridObservation, "fill_road_layer_by_lanes", _fill_road_layer_by_lanes),
 )
 _OF_ROADS = [replaced for replaced in _REPLACED if issubclass(replaced[0], Road)]
@@ -276,15 +271,10 @@ class Acceleration:
 
     @property
     def reason(self) -> str:
-        """Why highway-env is not accelerated, such as a replaced function; empty if it is accelerated."""
+        """Why highway-env is not accelerated, such as a missing kernel; empty if it is accelerated."""
         if self._reason:
             return self._reason
         return why_not() if is_on() else "it has been undone"
-
-    @property
-    def why_not_compiled(self) -> str:
-        """Why the compiled kernel is not used, and Python code on arrays is slower; empty if the kernel is used."""
-        return _kernel.why_not()
 
     @property
     def left_alone(self) -> dict[str, tuple[str, ...]]:
@@ -321,13 +311,14 @@ def accelerate() -> Acceleration:
     for everything that the accelerator does not know, and the accelerator checks that in every step:
 
     - another version of highway-env
+    - an installation of crashhunt without the compiled kernel, which needs a C++ compiler
     - your classes that override an accelerated method
     - functions and methods that other code has replaced, on a class, a module or an object
 
     Returns:
         The state of the acceleration. Its truth value says whether highway-env is accelerated. ``reason`` says why not.
         ``left_alone`` lists classes that are not accelerated. ``undo()``, or the end of a ``with`` block, switches the
-        accelerator off. ``why_not_compiled`` says why the compiled kernel is not used.
+        accelerator off.
 
     Example:
         >>> import crashhunt

@@ -7,7 +7,6 @@ import hashlib
 import inspect
 import logging
 import re
-from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,11 +17,16 @@ from highway_env.envs.common import abstract, observation
 from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, dynamics, kinematics, objects
 
+from crashhunt.accelerator._kernel import kernel, why_not
 from crashhunt.scenario.backends.highway import ACCELERATED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
     from types import ModuleType
+
+    from crashhunt.accelerator._kernel import Snapshot
+
+    Space = dict[str, Any] | type  # the dictionary of a module, or a class
 
 
 __all__ = [
@@ -57,22 +61,23 @@ _NUMPY = (
 class Watch:
     """Detects replaced, added and removed members of namespaces, except numbers, which are read where they are used.
 
-    A check costs about ten microseconds, so it can run in every sub-step.
+    A check costs a few microseconds, so it can run in every sub-step.
 
     Args:
-        places: Namespaces with their names in messages.
+        places: Namespaces, which are dictionaries of modules or classes, with their names in messages.
         but: Members that do not matter, as ``Class.name``.
     """
 
-    def __init__(self, places: Iterable[tuple[str, Mapping[str, object]]], but: Iterable[str] = ()) -> None:
+    def __init__(self, places: Iterable[tuple[str, Space]], but: Iterable[str] = ()) -> None:
         skipped = frozenset(but)
-        self._places: list[_Place] = [_Place(name, space, skipped) for name, space in places]
+        self._places: list[_Place] = [_Place(name, owner, skipped) for name, owner in places]
         self._reported = ""
+        self._snapshot: Snapshot | None = None
 
     @classmethod
     def of_roads(cls, but: Iterable[str]) -> Watch:
         """Watch roads, lanes and vehicles, and the functions of NumPy that they use."""
-        places = [(module.__name__, vars(module)) for module in MODULES]
+        places: list[tuple[str, Space]] = [(module.__name__, vars(module)) for module in MODULES]
         for module in MODULES:
             places += _classes(module)
         numpy = {name: getattr(np, name) for name in _NUMPY}
@@ -86,21 +91,25 @@ class Watch:
         """Watch the classes of the accelerated observations."""
         kinds = ("", "Kinematic", "KinematicsGoal", "OccupancyGrid", "Exit", "MultiAgent")
         wanted = ("ObservationType", *[f"{kind}Observation" for kind in kinds])
-        places = [(name, space) for name, space in _classes(observation) if name in wanted]
-        return cls([(observation.__name__, vars(observation)), *places], but)
+        places: list[tuple[str, Space]] = [(observation.__name__, vars(observation))]
+        return cls([*places, *(place for place in _classes(observation) if place[0] in wanted)], but)
 
     @property
     def intact(self) -> bool:
         """Whether no member has changed; logs each changed member once."""
-        for place in self._places:
-            if len(place.space) != place.size or not place.same():
-                changed = place.changed()
-                if changed:
-                    if changed != self._reported:
-                        self._reported = changed
-                        message = "the accelerator is disabled: %s has been replaced"
-                        logging.getLogger("crashhunt").warning(message, changed)
-                    return False
+        if self._snapshot is None:
+            self._snapshot = snapshot_of([(place.owner, place.members) for place in self._places])
+            self._sizes = [place.size for place in self._places]
+        while (number := self._snapshot.first_changed(self._sizes)) >= 0:
+            place = self._places[number]
+            changed = place.changed()
+            if changed:
+                if changed != self._reported:
+                    self._reported = changed
+                    message = "the accelerator is disabled: %s has been replaced"
+                    logging.getLogger("crashhunt").warning(message, changed)
+                return False
+            self._sizes[number] = len(place.space)  # a new member that does not matter
         return True
 
     @property
@@ -112,11 +121,11 @@ class Watch:
 class _Place:
     """A namespace with the members that it had at the start."""
 
-    def __init__(
-        self, name: str, space: Mapping[str, object], but: frozenset[str], names: tuple[str, ...] | None = None
-    ) -> None:
+    def __init__(self, name: str, owner: Space, but: frozenset[str], names: tuple[str, ...] | None = None) -> None:
         self.name = name
-        self.space = space
+        self.owner = owner
+        self.space: Mapping[str, object] = vars(owner) if isinstance(owner, type) else owner
+        space = self.space
         self.size = len(space)
         if names is None:
             names = tuple(
@@ -128,21 +137,13 @@ class _Place:
             self._but = frozenset(key for key in space if f"{name}.{key}" in but)
         else:  # of a large foreign namespace such as NumPy's, watch only these names
             self._seen = self._but = frozenset(space)
-        self._names = names
-        self._get: Callable[[Mapping[str, object]], tuple[object, ...]] = _getter(names)
-        self._values = self._get(space)
-
-    def same(self) -> bool:
-        try:
-            # Tuples compare identities first, and different functions are never equal.
-            return self._get(self.space) == self._values
-        except Exception:
-            return False
+        #: the watched members
+        self.members = {key: space[key] for key in names}
 
     def changed(self) -> str:
         """Return the first changed name that matters; empty if there is none."""
         missing = object()
-        for name, value in zip(self._names, self._values, strict=True):
+        for name, value in self.members.items():
             if self.space.get(name, missing) is not value:
                 return f"{self.name}.{name}"
         if self._but is not self._seen:
@@ -150,7 +151,6 @@ class _Place:
                 # A new name may hide a method of a base class or a built-in function.
                 if not is_plain(self.space[name]) or hasattr(builtins, name) or _is_method(self.name, name):
                     return f"{self.name}.{name}"
-        self.size = len(self.space)
         return ""
 
 
@@ -163,15 +163,18 @@ def _special(name: str) -> bool:
     return name in ("__doc__", "__builtins__", "__dict__", "__weakref__", "_abc_impl", "__warningregistry__")
 
 
-def _getter(names: tuple[str, ...]) -> Callable[[Mapping[str, object]], tuple[object, ...]]:
-    if len(names) > 1:
-        return itemgetter(*names)
-    return lambda space: tuple([space[name] for name in names])
+def snapshot_of(spaces: Iterable[tuple[Space, Mapping[str, object]]]) -> Snapshot:
+    """Return the members of namespaces in the kernel, to find out in a few microseconds whether one has changed."""
+    module = kernel()
+    assert module is not None
+    owners, members = zip(*spaces, strict=True)
+    names = tuple(tuple(part) for part in members)
+    return module.Snapshot(tuple(owners), names, tuple(tuple(part.values()) for part in members))
 
 
-def _classes(module: ModuleType) -> list[tuple[str, Mapping[str, object]]]:
+def _classes(module: ModuleType) -> list[tuple[str, type]]:
     found = [value for value in vars(module).values() if isinstance(value, type)]
-    return [(kind.__qualname__, vars(kind)) for kind in found if kind.__module__ == module.__name__]
+    return [(kind.__qualname__, kind) for kind in found if kind.__module__ == module.__name__]
 
 
 def _is_method(owner: str, name: str) -> bool:
@@ -186,7 +189,7 @@ _MODULES = (*MODULES, observation)
 _COLLIDES = ("handle_collisions", "_is_colliding", "polygon", "direction", "velocity", "lane_distance_to", "on_road")
 _MOVES = ("step", "clip_actions", "on_state_update")
 _DRIVES: tuple[str, ...] = ("act", "follow_road", "steering_control", "speed_control", "acceleration", "desired_gap")
-_DRIVES += ("change_lane_policy", "mobil")
+_DRIVES += ("change_lane_policy", "mobil", "collect_data", "add_features", "acceleration_features", "steering_features")
 _SLIDES = ("state", "derivative_func")
 _PREDICTS = ("predict_trajectory_constant_speed",)
 _DESCRIBES = ("to_dict", "destination", "destination_direction", "lane_offset")
@@ -199,10 +202,12 @@ _SPECIAL = (
 _VALUES = (
     "road", "position", "heading", "speed", "lane_index", "lane", "collidable", "solid", "check_collisions", "diagonal",
     "crashed", "hit", "impact", "prediction_type", "action", "history", "target_lane_index", "target_speed", "route",
-    "timer", "enable_lane_change", "speed_index", "target_speeds", "is_yielding", "yield_timer", "color", "log",
+    "timer", "enable_lane_change", "speed_index", "target_speeds", "is_yielding", "yield_timer", "color", "log", "data",
+    "collecting_data", "ACCELERATION_PARAMETERS", "STEERING_PARAMETERS",
 )  # fmt: skip
 """Attributes of vehicles that must be plain values, so that the accelerator may read them any number of times."""
 _BASES = {
+    behavior.LinearVehicle: "linear",
     behavior.IDMVehicle: "idm",
     controller.MDPVehicle: "controlled",
     controller.ControlledVehicle: "controlled",
@@ -217,7 +222,7 @@ _LIMITED = (*_OUTLINE, "MAX_SPEED", "MIN_SPEED")
 _STEERED = (*_LIMITED, "TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "MAX_STEERING_ANGLE", "KP_A")
 _THINKING = (*_STEERED, "COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DISTANCE_WANTED", "TIME_WANTED", "ACC_MAX", "POLITENESS")
 _THINKING += ("LANE_CHANGE_DELAY", "LANE_CHANGE_MIN_ACC_GAIN", "LANE_CHANGE_MAX_BRAKING_IMPOSED")
-NUMBERS_OF = {"": _OUTLINE, "nothing": _LIMITED, "controlled": _STEERED, "idm": _THINKING}
+NUMBERS_OF = {"": _OUTLINE, "nothing": _LIMITED, "controlled": _STEERED, "idm": _THINKING, "linear": _THINKING}
 """Class attributes with the parameters of vehicles, by model of decision; a vehicle may override them."""
 _METHODS = frozenset((*_COLLIDES, *_MOVES, *_SLIDES, *_DRIVES, *_PREDICTS, *_DESCRIBES))
 _ORIGINALS = {
@@ -242,7 +247,9 @@ class Own:
         self._kind, self._base = kind, base
         self._mro = kind.__mro__
         # The members that a user can change later; `Watch` covers highway-env's own classes.
-        self._members = [(vars(part), tuple(vars(part).items())) for part in self._mro if part.__module__ not in _OWN]
+        parts = [part for part in self._mro if part.__module__ not in _OWN]
+        self._sizes = [len(vars(part)) for part in parts]
+        self._snapshot = snapshot_of([(part, vars(part)) for part in parts]) if parts else None
         values = {*values, *(name for name in dir(base) if is_plain(inspect.getattr_static(base, name)))}
         self.names = [name for name in _SPECIAL if self.has(name)]
         self.names += [name for name in sorted(values) if name[:2] != "__" and not is_plain(self._of(name))]
@@ -258,10 +265,8 @@ class Own:
     @property
     def current(self) -> bool:
         """Whether the class has not changed since."""
-        return self._kind.__mro__ is self._mro and all(
-            len(space) == len(seen)
-            and all(a is b and v is w for (a, v), (b, w) in zip(space.items(), seen, strict=True))
-            for space, seen in self._members
+        return self._kind.__mro__ is self._mro and (
+            self._snapshot is None or self._snapshot.first_changed(self._sizes) < 0
         )
 
 
@@ -275,9 +280,9 @@ class Kind:
         plain: Whether all attributes that the accelerator reads are plain values.
         collides: Whether the collision check is inherited.
         moves: Whether the movement is inherited.
-        slides: Whether the class has the dynamic bicycle model, which the accelerator runs one vehicle at a time.
+        slides: Whether the class has the dynamic bicycle model, which highway-env's own code computes.
         times: Whether its vehicles count the time since their last decision about a lane change.
-        drives: The model of decision, if inherited: ``idm``, ``controlled`` or ``nothing``; otherwise empty.
+        drives: The model of decision, ``idm``, ``linear``, ``controlled`` or ``nothing``; empty if not inherited.
         predicts: Whether the prediction of trajectories is inherited.
         describes: Whether ``to_dict`` and its parts are inherited.
         base: The model of decision of the base class.
@@ -299,7 +304,7 @@ class Kind:
         self.collides = leaves(_COLLIDES)
         self.slides = base is dynamics.BicycleVehicle
         self.moves = moving and self.collides and leaves((*_MOVES, *(_SLIDES if self.slides else ())))
-        self.times = base is behavior.IDMVehicle
+        self.times = base in (behavior.IDMVehicle, behavior.LinearVehicle)
         self.drives = _BASES[base] if base is not None and self.collides and leaves(_DRIVES) else ""
         self.predicts = self.moves and leaves((*_PREDICTS, *_DRIVES))
         self.describes = self.collides and leaves(_DESCRIBES)
@@ -367,11 +372,7 @@ def reason_against() -> str:
             return f"{name} has been replaced by {place}"
         if function.__qualname__ != name:  # such as another method of highway-env
             return f"{name} has been replaced by {function.__qualname__}"
-    if not hasattr(np, "vecdot"):
-        return f"NumPy {np.__version__} is installed; the accelerator needs NumPy 2.0 or later"
-    if not _arrays_equal_scalars():
-        return "on this processor, NumPy's functions return different results for arrays than for single numbers"
-    return ""
+    return f"the compiled kernel is not used: {why_not()}" if kernel() is None else ""
 
 
 _FILES = {str(module.__file__) for module in (*_MODULES, abstract)}
@@ -394,26 +395,3 @@ def _functions() -> Iterator[tuple[str, Callable[..., object]]]:
                 function = getattr(found, "fget", None) or getattr(found, "__func__", found)
                 if callable(function) and hasattr(function, "__module__") and not isinstance(function, type):
                     yield f"{name}.{member}".rstrip("."), inspect.unwrap(function)
-
-
-def _arrays_equal_scalars() -> bool:
-    """Whether the functions return the same bits for arrays as for single numbers, on 203 random values."""
-    rng = np.random.default_rng(0)
-    values, others = rng.normal(size=203) * 10.0 ** rng.integers(-6, 3, 203).astype(float), rng.uniform(3.5, 4.5, 203)
-    inside = np.clip(values, -1.0, 1.0)
-    for function in (np.cos, np.sin, np.tan, np.arctan, np.arcsin):
-        if function(inside).tolist() != [function(value) for value in inside.tolist()]:
-            return False
-        if function is not np.arcsin and function(values).tolist() != [function(value) for value in values.tolist()]:
-            return False
-    if ((values + np.pi) % (2 * np.pi)).tolist() != [float((value + np.pi) % (2 * np.pi)) for value in values.tolist()]:
-        return False
-    bases = np.abs(values)
-    powers = [np.power(base, exponent) for base, exponent in zip(bases.tolist(), others.tolist(), strict=True)]
-    if np.power(bases, others).tolist() != powers:
-        return False
-    if np.power(values, 2).tolist() != [np.power(value, 2) for value in values.tolist()]:
-        return False
-    pairs, against = rng.normal(size=(203, 2)), rng.normal(size=(203, 2))
-    products = [float(np.dot(one, two)) for one, two in zip(pairs, against, strict=True)]
-    return bool(np.vecdot(pairs, against).tolist() == products)

@@ -19,8 +19,8 @@ import gymnasium
 import highway_env
 import numpy as np
 import pytest
+from compiled import needs_kernel
 from conftest import mostly_nightly
-from engines import engine
 from highway_env.envs.common import observation
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.road.lane import CircularLane, SineLane, StraightLane
@@ -35,6 +35,7 @@ from crashhunt.accelerator import (
     Frame,
     Network,
     Onlooker,
+    _kernel,
     _switch as accelerator,
     _versions,
     kind_of,
@@ -44,7 +45,6 @@ from crashhunt.accelerator import (
 )
 
 assert HighwaySimulator
-assert engine  # a fixture
 IDS = sorted(name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("highway_env"))
 BEHAVIOR = "highway_env.vehicle.behavior"
 FEATURES = ["presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"]
@@ -81,7 +81,7 @@ CASES += [
 ]
 
 
-pytestmark = pytest.mark.usefixtures("plain_highway_env", "engine")
+pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
 
 
 def plain(value):
@@ -256,7 +256,7 @@ def test_a_subclass_is_as_its_author_wrote_it(kind):
 
 
 @pytest.mark.parametrize(("speeds", "known"), [([8, 16, 24], True), ([0, 2**60], False)])
-def test_whole_speeds_out_of_a_list_are_known(speeds, known, monkeypatch, engine):
+def test_whole_speeds_out_of_a_list_are_known(speeds, known, monkeypatch):
     """NumPy's whole numbers, which floats hold: the target speeds of u-turns, roundabouts and exits."""
 
     def played():
@@ -272,11 +272,10 @@ def test_whole_speeds_out_of_a_list_are_known(speeds, known, monkeypatch, engine
 
     slow = played()
     assert switch_on() == ""
-    decided = []
-    decide = accelerator.decide
-    monkeypatch.setattr(accelerator, "decide", lambda *given: decided.append(decide(*given)) or decided[-1])
+    asked, act = [], accelerator.originals["Road.act"]
+    monkeypatch.setitem(accelerator.originals, "Road.act", lambda road: asked.append(road) or act(road))
     assert played() == slow
-    assert decided == [known] * 20 if engine == "arrays" or not known else not decided
+    assert len(asked) == (0 if known else 20)
 
 
 class Elsewhere(Landmark):
@@ -381,14 +380,10 @@ def test_it_steps_aside_for_a_changed_installation(monkeypatch):
     assert "not the published one" in reason_against()
 
 
-def test_it_steps_aside_for_an_older_numpy(monkeypatch):
-    monkeypatch.delattr(np, "vecdot")
-    assert "needs NumPy 2.0" in switch_on()
-
-
-def test_it_steps_aside_where_arrays_give_other_bits(monkeypatch):
-    monkeypatch.setattr(_versions, "_arrays_equal_scalars", lambda: False)
-    assert "on this processor" in switch_on()
+def test_it_steps_aside_without_a_usable_kernel(monkeypatch):
+    monkeypatch.setattr(_kernel, "_found", lambda: (None, "it is not built"))
+    assert switch_on() == "the compiled kernel is not used: it is not built"
+    assert Road.act.__module__ == "highway_env.road.road"
 
 
 # Each in a process of its own that has imported highway-env, which takes a second, but nothing of ours: in forks.

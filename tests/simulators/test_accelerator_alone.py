@@ -7,7 +7,7 @@ import copy
 import highway_env
 import numpy as np
 import pytest
-from engines import engine
+from compiled import needs_kernel
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.envs.intersection_env import ContinuousIntersectionEnv
@@ -19,15 +19,12 @@ from highway_env.vehicle.controller import ControlledVehicle
 from crashhunt.accelerator import Onlooker, _roads, kind_of, switch_off, switch_on
 from crashhunt.simulators.highway import restore_classes
 
-assert engine  # a fixture
-
-
 assert highway_env
 NAMES = "position heading speed action crashed impact lane_index target_lane_index target_speed timer route"
 NAMES += " lateral_speed yaw_rate is_yielding"
 
 
-pytestmark = pytest.mark.usefixtures("plain_highway_env", "engine")
+pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
 
 
 def state(place):
@@ -78,15 +75,11 @@ def driven(change=lambda env: None, steps=3):
     return drive
 
 
-def looked(monkeypatch, engine):
+def looked(monkeypatch):
     """How often everybody is looked at."""
     times = []
-    if engine == "kernel":
-        traffic = _roads.Prepared.traffic
-        monkeypatch.setattr(_roads.Prepared, "traffic", lambda self: times.append(1) or traffic(self))
-    else:
-        crowd = _roads.Crowd
-        monkeypatch.setattr(_roads, "Crowd", lambda place: times.append(1) or crowd(place))
+    roster = _roads.Prepared.roster
+    monkeypatch.setattr(_roads.Prepared, "roster", lambda self: times.append(1) or roster(self))
     return times
 
 
@@ -99,17 +92,15 @@ def passer_by(env):
     env.road.step = lambda dt: advance(dt)
 
 
-@pytest.mark.parametrize(("change", "times"), [(lambda env: None, 2), (onlooker, 2), (passer_by, 16)])
-def test_everybody_is_looked_at_once_in_a_step_unless_an_actor_might_do_anything(change, times, monkeypatch, engine):
+@pytest.mark.parametrize(("change", "times"), [(lambda env: None, 2), (onlooker, 2), (passer_by, 32)])
+def test_everybody_is_looked_at_once_in_a_step_unless_an_actor_might_do_anything(change, times, monkeypatch):
     slow, fast = both(made, driven(change, steps=2))
     assert slow == fast
     env = made()
     change(env)
-    found = looked(monkeypatch, engine)
+    found = looked(monkeypatch)
     env.step(1)
     env.step(1)
-    if engine == "kernel" and change is passer_by:
-        times *= 2  # the kernel's `step` looks at them by the same function as its `act`
     assert len(found) == times
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
-from engines import engine
 
 # First: this imports highway-env without what takes most of that time.
 from crashhunt.simulators.highway import HighwaySimulator
 
 # isort: split
 
+from compiled import needs_kernel
 from highway_env.envs.common.observation import KinematicObservation, MultiAgentObservation
 from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.vehicle.behavior import IDMVehicle
@@ -21,11 +21,8 @@ from test_highway import drive, simulator_of
 from crashhunt.accelerator import SkippedObservation, switch_off, switch_on
 from crashhunt.scenario import ObservationSetup
 
-assert engine  # a fixture
-pytestmark = pytest.mark.usefixtures("engine")
-
-
 assert HighwaySimulator
+pytestmark = needs_kernel
 SMALL = {"vehicles_count": 6, "simulation_frequency": 4, "duration": 9}
 
 

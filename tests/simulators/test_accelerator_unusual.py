@@ -7,7 +7,7 @@ import pickle
 import highway_env
 import numpy as np
 import pytest
-from engines import both_engines
+from compiled import needs_kernel
 from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.road import road
 from highway_env.road.lane import StraightLane
@@ -16,14 +16,11 @@ from highway_env.vehicle.kinematics import Vehicle
 
 from crashhunt.accelerator import _roads, switch_off, switch_on
 
-assert both_engines  # a fixture
-
-
 assert highway_env
 NAMES = ["position", "heading", "speed", "crashed", "impact", "lane_index", "target_lane_index", "timer", "route"]
 
 
-pytestmark = pytest.mark.usefixtures("plain_highway_env", "both_engines")
+pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
 
 
 def plain(value):
@@ -220,11 +217,11 @@ def test_an_environment_that_has_been_pickled_is_fast_too(monkeypatch):
     assert switch_on() == ""
     env = pickle.loads(pickle.dumps(environment()))
     decided = []
-    crowd = _roads.Crowd
-    monkeypatch.setattr(_roads, "Crowd", lambda place: decided.append(crowd(place)) or decided[-1])
+    roster = _roads.Prepared.roster
+    monkeypatch.setattr(_roads.Prepared, "roster", lambda self: decided.append(roster(self)) or decided[-1])
     env.step(1)
     assert len(decided) == 1
-    assert decided[0].drives
+    assert decided[0].decides
 
 
 def one_action(place, patch):

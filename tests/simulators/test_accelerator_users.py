@@ -17,8 +17,8 @@ import gymnasium
 import highway_env
 import numpy as np
 import pytest
+from compiled import needs_kernel
 from conftest import mostly_nightly
-from engines import engine
 from highway_env import utils
 from highway_env.envs.common import observation
 from highway_env.road import lane, regulation, road
@@ -27,9 +27,6 @@ from highway_env.vehicle import behavior, controller, kinematics, objects
 import crashhunt
 from crashhunt.accelerator import Onlooker, switch_off, switch_on, why_not
 from crashhunt.simulators.highway import restore_classes
-
-assert engine  # a fixture
-
 
 assert highway_env
 MODULES = (utils, lane, regulation, road, behavior, controller, kinematics, objects, observation)
@@ -55,7 +52,7 @@ def _slower(name, value):
     return value * 0.999 if name == "speed" else value
 
 
-pytestmark = pytest.mark.usefixtures("plain_highway_env", "engine")
+pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
 
 
 def plain(value):

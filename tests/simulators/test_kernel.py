@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
+import os
 import struct
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -16,20 +20,22 @@ from crashhunt.simulators.highway import HighwaySimulator
 import gymnasium
 import numpy as np
 import pytest
+from compiled import needs_kernel
 from highway_env.road.lane import CircularLane, SineLane, StraightLane
 from highway_env.road.road import Road, RoadNetwork
-from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.behavior import AggressiveVehicle, DefensiveVehicle, IDMVehicle, LinearVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
+from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle
 from hypothesis import given, settings, strategies as st
 
-from crashhunt.accelerator import _kernel, _roads, _switch, switch_off, switch_on
+from crashhunt.accelerator import _kernel, _roads, switch_off, switch_on
 
 assert HighwaySimulator
 pytestmark = [
     pytest.mark.usefixtures("plain_highway_env"),
-    pytest.mark.skipif(_kernel.why_not() == "it is not built", reason="the kernel for highway-env is not built"),
+    needs_kernel,
 ]
 NUMBERS = st.floats(-1e6, 1e6)
 
@@ -68,7 +74,9 @@ def test_products_and_remainders_have_the_bits_of_numpy_and_python(a, b, c, d):
     assert bits(compute("remainder", a, 2 * math.pi)) == bits(np.float64(a) % (2 * math.pi)) == bits(a % (2 * math.pi))
 
 
-@pytest.mark.parametrize("name", ["sin", "cos", "tan", "arctan", "arcsin", "arctan2", "power", "remainder", "dot"])
+@pytest.mark.parametrize(
+    "name", ["sin", "cos", "tan", "arctan", "arcsin", "arctan2", "power", "remainder", "dot", "dot3", "square"]
+)
 def test_a_function_with_one_other_bit_disables_the_kernel(name, monkeypatch):
     right = _kernel.kernel().compute
 
@@ -85,7 +93,7 @@ def test_a_function_with_one_other_bit_disables_the_kernel(name, monkeypatch):
     ("error", "reason"),
     [
         (lambda name: (_ for _ in ()).throw(ImportError(name)), "it is not built"),
-        (lambda name: type("Old", (), {"INTERFACE": 0}), "it is of another version of crashhunt (0 instead of 1)"),
+        (lambda name: type("Old", (), {"INTERFACE": 0}), "it is of another version of crashhunt (0 instead of 2)"),
     ],
 )
 def test_without_the_kernel_there_is_a_reason(error, reason, monkeypatch):
@@ -93,15 +101,25 @@ def test_without_the_kernel_there_is_a_reason(error, reason, monkeypatch):
     assert _kernel._found.__wrapped__() == (None, reason)
 
 
-def test_it_does_the_work_of_an_environment_and_no_array_is_made(monkeypatch):
+def test_kernel_runs_all_substeps_of_an_environment():
     assert not switch_on()
-    for owner, name in ((_switch, "decide"), (_switch, "collide"), (_roads.Prepared, "move")):
-        monkeypatch.setattr(owner, name, lambda *_, **__: pytest.fail("arrays were used"))
+    codes = {IDMVehicle.act.__code__, Vehicle.step.__code__, ControlledVehicle.steering_control.__code__}
+    called = []
+
+    def see(frame, event, _):
+        if event == "call" and frame.f_code in codes:
+            called.append(frame.f_code.co_qualname)
+
     for name in ("highway-v0", "merge-v1", "roundabout-v1", "intersection-v2"):
-        env = gymnasium.make(name).unwrapped
+        config = {"other_vehicles_type": "highway_env.vehicle.behavior.DefensiveVehicle"} if "high" in name else {}
+        env = gymnasium.make(name, config=config).unwrapped
         env.reset(seed=3)
-        for _ in range(4):
-            env.step(env.action_space.sample())
+        for action in (0, 1, 2, 1):
+            sys.setprofile(see)
+            env.step(action)
+            sys.setprofile(None)
+        # Only the agent decides for itself, once per step.
+        assert called.count("IDMVehicle.act") == called.count("Vehicle.step") == 0, name
 
 
 def network(rng):
@@ -132,7 +150,8 @@ def network(rng):
     return net
 
 
-KINDS = (IDMVehicle, IDMVehicle, ControlledVehicle, MDPVehicle, Vehicle)
+LINEAR = (LinearVehicle, AggressiveVehicle, DefensiveVehicle)
+KINDS = (IDMVehicle, IDMVehicle, ControlledVehicle, MDPVehicle, Vehicle, BicycleVehicle, *LINEAR)
 
 
 def crowded(seed):
@@ -150,7 +169,7 @@ def crowded(seed):
         made = kind(
             road, lane.position(s, float(rng.normal())), heading, np.float64(speed) if rng.random() < 0.5 else speed
         )
-        if kind is Vehicle:
+        if kind in (Vehicle, BicycleVehicle):
             made.act({"steering": float(rng.normal() * 0.2), "acceleration": float(rng.normal() * 3)})
         else:
             made.target_speed = float(rng.choice([made.target_speed, rng.uniform(-1, 40)]))
@@ -179,7 +198,7 @@ def crowded(seed):
 
 NAMES = (
     "position", "heading", "speed", "lane_index", "target_lane_index", "target_speed", "timer", "crashed", "hit",
-    "impact", "action", "route",
+    "impact", "action", "route", "data", "lateral_speed", "yaw_rate",
 )  # fmt: skip
 
 
@@ -252,6 +271,56 @@ def test_an_error_of_highway_env_leaves_what_highway_env_leaves():
     assert any("Error" in found for found in slow if isinstance(found, str))
 
 
+def test_threads_do_not_disturb_each_other():
+    slow = [played(seed, 5) for seed in range(8)]
+    assert not switch_on()
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(lambda seed: played(seed, 5), range(8))) == slow
+
+
+def test_fork_computes_the_same_bits():
+    assert not switch_on()
+    road = crowded(4)
+
+    def digest():
+        found = []
+        for _ in range(4):
+            road.act()
+            road.step(1 / 15)
+            found.append(state(road))
+        return hashlib.sha256(repr(found).encode()).digest()
+
+    digest()
+    outlet, inlet = os.pipe()
+    child = os.fork()
+    if not child:
+        os.write(inlet, digest())
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert os.read(outlet, 100) == digest()
+    os.close(outlet)
+    os.close(inlet)
+
+
+def test_linear_vehicle_collects_the_same_data():
+    def collected():
+        road = Road(RoadNetwork.straight_road_network(2), np_random=np.random.default_rng(1))
+        for number, kind in enumerate((*LINEAR, IDMVehicle)):
+            road.vehicles.append(kind(road, [20.0 * number, 4.0 * (number % 2)], 0.0, 20.0 + number))
+        road.vehicles[0].randomize_behavior()
+        road.vehicles[1].collecting_data = False
+        for _ in range(20):
+            road.act()
+            road.step(0.1)
+        return [exact(vehicle.data) for vehicle in road.vehicles[:3]], state(road)
+
+    slow = collected()
+    assert not switch_on()
+    assert collected() == slow
+    assert len(slow[0][0]["lateral"]["outputs"]) == 20
+    assert slow[0][1] == {}
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -261,10 +330,14 @@ def test_an_error_of_highway_env_leaves_what_highway_env_leaves():
         lambda road: setattr(road.vehicles[0], "target_lane_index", ("a", "z", 0)),
         lambda road: setattr(road.vehicles[0], "crashed", 1),
         lambda road: setattr(road.vehicles[0], "impact", [0.0, 0.0]),
+        lambda road: setattr(road.vehicles[0], "impact", np.zeros((1, 2))),
+        lambda road: setattr(road.vehicles[0], "impact", np.zeros(2, np.float32)),
+        lambda road: delattr(road.vehicles[0], "action"),
         lambda road: setattr(road.vehicles[0], "action", {"steering": 0}),
         lambda road: setattr(road.vehicles[0], "route", [["a", "b", 0]]),
         lambda road: setattr(road.vehicles[0], "position", road.vehicles[1].position),
         lambda road: setattr(road.vehicles[0], "action", road.vehicles[1].action),
+        lambda road: road.objects.append(IDMVehicle(road, [15.0, 0.0], 0.0, 10.0)),
         lambda road: setattr(road, "record_history", True),
         lambda road: setattr(road.vehicles[0], "MAX_SPEED", np.float64(30)),
     ],
@@ -273,6 +346,6 @@ def test_what_is_unusual_is_refused_at_once(change):
     assert not switch_on()
     road = crowded(11)
     road.vehicles.insert(0, IDMVehicle(road, [5.0, 0.0], 0.0, 10.0))
-    assert _roads.prepared(road).traffic() is not None
+    assert _roads.prepared(road).roster() is not None
     change(road)
-    assert _roads.prepared(road).traffic() is None
+    assert _roads.prepared(road).roster() is None

@@ -1,0 +1,167 @@
+"""The vehicles and objects of a road in the compiled kernel, with everything that must stay the same meanwhile."""
+
+from __future__ import annotations
+
+import math
+from operator import attrgetter
+from typing import TYPE_CHECKING
+
+import numpy as np
+from highway_env.vehicle.objects import Landmark
+
+from crashhunt.accelerator._frames import are_plain
+from crashhunt.accelerator._kernel import kernel
+from crashhunt.accelerator._versions import NUMBERS_OF, are_numbers
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from highway_env.road.road import Road
+    from highway_env.vehicle.objects import RoadObject
+    from numpy.typing import NDArray
+
+    from crashhunt.accelerator._kernel import Traffic
+    from crashhunt.accelerator._network import Network
+    from crashhunt.accelerator._versions import Kind
+
+    Row = tuple[object, ...]
+
+
+__all__ = ["Roster"]
+
+
+_MODELS = {"": 0, "nothing": 1, "controlled": 2, "idm": 3, "linear": 4}
+_FOREIGN = 5
+_PARAMETERS = (
+    "LENGTH", "WIDTH", "MAX_SPEED", "MIN_SPEED",
+    "TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "MAX_STEERING_ANGLE", "KP_A",
+    "COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DISTANCE_WANTED", "TIME_WANTED", "ACC_MAX", "POLITENESS",
+    "LANE_CHANGE_DELAY", "LANE_CHANGE_MIN_ACC_GAIN", "LANE_CHANGE_MAX_BRAKING_IMPOSED",
+)  # fmt: skip
+"""The parameters in the order of the kernel, which adds ``DELTA``."""
+_OF_GAPS = ("COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DISTANCE_WANTED", "TIME_WANTED")
+_MAX_EXPONENT = 20.0  # with a larger IDM exponent, an acceleration may overflow
+_PARAMETERS_OF: dict[str, Callable[[RoadObject], Row]] = {how: attrgetter(*names) for how, names in NUMBERS_OF.items()}
+_DELTA = attrgetter("DELTA")
+_is_disjoint = frozenset.isdisjoint
+assert all(_PARAMETERS[: len(names)] == names for names in NUMBERS_OF.values())
+
+
+class Roster:
+    """The vehicles and objects of a road in the kernel, with everything that must stay the same while they are there.
+
+    Args:
+        road: The road.
+        things: Its vehicles, then its objects.
+        kinds: The properties of the class of each.
+        network: The lanes of the road.
+
+    Attributes:
+        traffic: The vehicles in the kernel; None if it does not know them.
+        decides: Whether the kernel knows how all vehicles decide.
+        moves: Whether the kernel knows how all vehicles move.
+    """
+
+    def __init__(self, road: Road, things: list[RoadObject], kinds: list[Kind], network: Network) -> None:
+        vehicles = kinds[: len(road.vehicles)]
+        self._ids = list(map(id, things))
+        self._kinds = kinds
+        self._looks_further = road.neighbour_vehicles_connected_lanes
+        self.decides = all(kind.drives for kind in vehicles)
+        self.moves = all(kind.moves for kind in vehicles)
+        self._fixed = [kind.fixed for kind in kinds]
+        self._is_shared = all(map(_is_disjoint, self._fixed, map(vars, things)))
+        #: one thing of each class, for the parameters of the class
+        self._examples = [things[kinds.index(kind)] for kind in dict.fromkeys(kinds)]
+        self._thinking = [thing for thing, kind in zip(things, kinds, strict=True) if kind.times]
+        self.traffic = self._in_kernel(road, things, network)
+        if self.traffic is not None:
+            self._parameters, self._deltas = self._read()
+
+    def is_of(self, road: Road, things: list[RoadObject], kinds: list[Kind]) -> bool:
+        """Whether the kernel still knows the vehicles and objects of a road, apart from their state."""
+        return (
+            self._kinds == kinds
+            and self._ids == list(map(id, things))
+            and self._looks_further == road.neighbour_vehicles_connected_lanes
+            and (self.traffic is None or self._is_current(road, things))
+        )
+
+    def _is_current(self, road: Road, things: list[RoadObject]) -> bool:
+        return (
+            self._is_shared
+            and all(map(_is_disjoint, self._fixed, map(vars, things)))
+            and all(vehicle.road is road for vehicle in road.vehicles)
+            and self._read() == (self._parameters, self._deltas)
+        )
+
+    def _read(self) -> tuple[list[Row], list[object]]:
+        """Return the parameters of each class with their types, and the exponents of all drivers."""
+        found: list[Row] = []
+        for thing, kind in zip(self._examples, dict.fromkeys(self._kinds), strict=True):
+            numbers = _PARAMETERS_OF[kind.base](thing)
+            found += [numbers, tuple(map(type, numbers))]
+        return found, list(map(_DELTA, self._thinking))
+
+    def _in_kernel(self, road: Road, things: list[RoadObject], network: Network) -> Traffic | None:
+        module, kinds = kernel(), self._kinds
+        if module is None or not all(kind.collides for kind in kinds) or not are_plain(things, kinds):
+            return None
+        count = len(road.vehicles)
+        # Drivers evaluate a vehicle among the objects like a vehicle, which the kernel does not know.
+        if not all(vehicle.road is road for vehicle in road.vehicles) or any(kind.base for kind in kinds[count:]):
+            return None
+        parameters = _read_parameters(things, kinds)
+        if parameters is None:
+            return None
+        models = [_MODELS[kind.drives] if kind.drives else _FOREIGN for kind in kinds[:count]]
+        models += [_MODELS[""]] * (len(kinds) - count)
+        flags = bytes(map(_flags_of, things, kinds))
+        lanes = network.in_kernel(looks_further=bool(self._looks_further))
+        return module.Traffic(lanes, things, bytes(models), flags, parameters)
+
+
+def _flags_of(thing: RoadObject, kind: Kind) -> int:
+    return isinstance(thing, Landmark) | 2 * kind.slides | 4 * kind.times
+
+
+def _read_parameters(things: list[RoadObject], kinds: list[Kind]) -> bytes | None:
+    """Return the kernel's row of parameters for each object; None if one is missing or unusual."""
+    shared: dict[int, Row] = {}  # of objects without parameters of their own, by class
+    rows = []
+    try:
+        for thing, kind in zip(things, kinds, strict=True):
+            own = not kind.fixed.isdisjoint(vars(thing))
+            if own and not kind.is_of(thing):
+                return None
+            row = None if own else shared.get(id(kind))
+            if row is None:
+                row = _PARAMETERS_OF[kind.base](thing)
+                # A limit that is a NumPy float makes speeds NumPy floats.
+                if not are_numbers(row) or any(type(number) is np.float64 for number in row[2:4]):
+                    return None
+                if not own:
+                    shared[id(kind)] = row
+            delta = _DELTA(thing) if kind.times else math.nan
+            if not are_numbers((delta,)):
+                return None
+            rows.append((*row, *[math.nan] * (len(_PARAMETERS) - len(row)), delta))
+    except AttributeError:  # a user's vehicle may lack a parameter that highway-env never reads
+        return None
+    numbers = np.array(rows, float)
+    used = np.array([len(NUMBERS_OF[kind.base]) for kind in kinds])
+    times = np.array([kind.times for kind in kinds])
+    if not _is_tame(numbers[times]):
+        return None
+    missing = np.isnan(numbers[:, :-1]) & (np.arange(len(_PARAMETERS)) < used[:, None])
+    return None if missing.any() else numbers.tobytes()
+
+
+def _is_tame(rows: NDArray[np.float64]) -> bool:
+    """Whether the parameters of drivers guarantee finite accelerations for finite velocities."""
+    comfort, braking, wanted, time = (rows[:, _PARAMETERS.index(name)] for name in _OF_GAPS)
+    return bool(
+        np.isfinite([comfort, braking, wanted, time]).all()
+        and (comfort * braking < 0).all()
+        and (np.abs(rows[:, -1]) < _MAX_EXPONENT).all()
+    )

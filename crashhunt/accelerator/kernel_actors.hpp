@@ -1,0 +1,471 @@
+// The vehicles and objects of a road: their state, how it is read, and how it is written. A part of kernel.cpp.
+
+#pragma once
+
+#include "kernel_lanes.hpp"
+
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+
+namespace {
+
+// Models of decision, see `_roster._MODELS`. FOREIGN vehicles decide by code that is not highway-env's.
+enum { OBJECT, PASSIVE, CONTROLLED, IDM, LINEAR, FOREIGN };
+
+// The order of the parameters of a vehicle, see `_roster._PARAMETERS`.
+struct Parameters {
+    double length, width, max_speed, min_speed;
+    double tau_pursuit, kp_lateral, kp_heading, max_steering_angle, kp_a;
+    double comfort_acc_max, comfort_acc_min, distance_wanted, time_wanted, acc_max, politeness;
+    double lane_change_delay, lane_change_min_acc_gain, lane_change_max_braking_imposed, delta;
+};
+
+// A number of Python with its type, because later arithmetic depends on it.
+struct Number {
+    double value = 0;
+    bool is_numpy = false; // of NumPy's type
+    bool is_whole = false;
+};
+
+struct Actor {
+    PyObject *object;
+    Py_buffer position;
+    bool is_open;            // whether `position` is
+    int model;
+    bool moves;              // a vehicle
+    bool slides;             // moves by the dynamic bicycle model, which is highway-env's
+    bool is_landmark;        // not a neighbour
+    bool has_target;         // has a target lane
+    bool changes_lanes;      // has a timer, and the MOBIL model
+    Parameters parameters;
+    double gap_root;         // 2 * np.sqrt(-COMFORT_ACC_MAX * COMFORT_ACC_MIN)
+
+    double x, y, heading;
+    double cosine, sine;     // of the heading
+    Number speed, timer, target_speed;
+    bool has_target_speed, reset_timer;
+    int lane, target;        // numbers of lanes; -1 for none
+    bool changed_target;
+    bool crashed, new_crash;
+    bool has_impact;
+    double impact_x, impact_y;
+    Number steering, acceleration;
+    bool new_action, changed_action, moved; // since they were written
+    bool enable_lane_change;
+    bool has_prescribed_lane; // by the first part of the route
+    long prescribed_lane;
+    bool checks, collides;
+    double radius;           // half the diagonal
+    double acceleration_parameters[3], steering_parameters[2]; // of a linear vehicle
+    bool collects_data;
+};
+
+PyObject *s_position, *s_heading, *s_speed, *s_lane, *s_lane_index, *s_target_lane_index, *s_target_speed, *s_timer,
+    *s_crashed, *s_impact, *s_action, *s_steering, *s_acceleration, *s_route, *s_enable_lane_change, *s_check_collisions,
+    *s_collidable, *s_diagonal, *s_follow_road, *s_handle_collisions, *s_acceleration_parameters,
+    *s_steering_parameters, *s_collecting_data, *s_data;
+PyObject *numpy_float; // the type np.float64
+PyObject *numpy_int;   // the type np.int64
+PyObject *numpy_array; // the type np.ndarray
+PyObject *make_array;  // the function np.zeros
+PyObject *slide;       // the function that moves a vehicle with the dynamic bicycle model
+
+const size_t NO_ROW = static_cast<size_t>(-1);
+
+// The actors on a lane and on lanes connected to it, in their order along the lane.
+struct Queue {
+    uint64_t instant = 0; // at which it is valid
+    std::vector<std::pair<double, size_t>> places; // longitudinal coordinates with rows
+};
+
+struct Traffic {
+    PyObject_HEAD
+    Network *network;
+    std::vector<Actor> *actors;          // vehicles, then objects
+    std::vector<double> *along, *across; // coordinates of actors on lanes
+    std::vector<uint64_t> *stamps;       // the instant at which these are valid
+    std::vector<Queue> *queues;          // by lane
+    uint64_t now;
+    int completed; // sub-steps of the last `run`
+    size_t vehicles;
+    size_t lanes;
+};
+
+bool has_type(PyObject *value, PyObject *type) { return Py_TYPE(value) == reinterpret_cast<PyTypeObject *>(type); }
+
+// Reads a Python float or int, or a NumPy float or integer. Any other type makes the kernel refuse.
+bool read_value(PyObject *value, Number &number) {
+    number.is_numpy = has_type(value, numpy_float) || has_type(value, numpy_int);
+    number.is_whole = PyLong_CheckExact(value) || has_type(value, numpy_int);
+    if (PyFloat_CheckExact(value) || has_type(value, numpy_float)) {
+        number.value = PyFloat_AS_DOUBLE(value); // np.float64 is a subclass of float
+        return true;
+    }
+    if (!number.is_whole) {
+        return false;
+    }
+    number.value = PyFloat_AsDouble(value);
+    if (number.value == -1 && PyErr_Occurred()) {
+        PyErr_Clear();
+        return false;
+    }
+    return std::fabs(number.value) < 9007199254740992.0; // from 2**53 on, a float is not exact
+}
+
+// An attribute; a new reference, or null with no error set.
+PyObject *attribute(PyObject *object, PyObject *name) {
+    PyObject *found = PyObject_GetAttr(object, name);
+    if (!found) {
+        PyErr_Clear();
+    }
+    return found;
+}
+
+bool read_number(PyObject *object, PyObject *name, Number &number) {
+    PyObject *found = attribute(object, name);
+    bool read = found && read_value(found, number);
+    Py_XDECREF(found);
+    return read;
+}
+
+bool read_bool(PyObject *object, PyObject *name, bool &truth) {
+    PyObject *found = attribute(object, name);
+    bool read = found && PyBool_Check(found);
+    if (read) {
+        truth = found == Py_True;
+    }
+    Py_XDECREF(found);
+    return read;
+}
+
+// Opens an array of `count` floats; any other object makes the kernel refuse.
+bool open_floats(PyObject *array, Py_buffer &view, Py_ssize_t count, int flags) {
+    if (!has_type(array, numpy_array)) {
+        return false;
+    }
+    if (PyObject_GetBuffer(array, &view, PyBUF_FORMAT | PyBUF_ND | flags)) { // fails if the numbers are not adjacent
+        PyErr_Clear();
+        return false;
+    }
+    if (view.ndim == 1 && view.shape[0] == count && view.format && !std::strcmp(view.format, "d")) {
+        return true;
+    }
+    PyBuffer_Release(&view);
+    return false;
+}
+
+// Reads a list of numbers, or an array of floats.
+bool read_numbers(PyObject *object, PyObject *name, double *numbers, Py_ssize_t count) {
+    PyObject *found = attribute(object, name);
+    Py_buffer view;
+    bool read = found != nullptr;
+    if (read && PyList_CheckExact(found)) {
+        read = PyList_GET_SIZE(found) == count;
+        for (Py_ssize_t which = 0; read && which < count; which++) {
+            Number number;
+            read = read_value(PyList_GET_ITEM(found, which), number) && std::isfinite(number.value);
+            numbers[which] = number.value;
+        }
+    } else if (read && (read = open_floats(found, view, count, 0))) {
+        std::memcpy(numbers, view.buf, static_cast<size_t>(count) * sizeof(double));
+        read = std::all_of(numbers, numbers + count, [](double number) { return std::isfinite(number); });
+        PyBuffer_Release(&view);
+    }
+    Py_XDECREF(found);
+    return read;
+}
+
+// Reads the number of the lane with the key that an attribute holds.
+bool read_lane(const Network *network, PyObject *object, PyObject *name, int &lane) {
+    PyObject *key = attribute(object, name);
+    if (!key) {
+        return false;
+    }
+    PyObject *found = PyDict_GetItemWithError(network->index, key);
+    PyErr_Clear(); // such as a list, which is not hashable
+    if (found) {
+        lane = static_cast<int>(PyLong_AsLong(found));
+    }
+    Py_DECREF(key);
+    return found != nullptr;
+}
+
+// Reads the lane on which an actor is, which must be the lane with its key.
+bool read_own_lane(const Network *network, Actor &actor) {
+    PyObject *lane = attribute(actor.object, s_lane);
+    bool known = lane && read_lane(network, actor.object, s_lane_index, actor.lane) &&
+                 PyList_GET_ITEM(network->objects, actor.lane) == lane;
+    Py_XDECREF(lane);
+    return known;
+}
+
+// Reads whether the first part of the route prescribes a lane. All parts must be usual, as each may become the first.
+bool read_route(Actor &actor) {
+    actor.has_prescribed_lane = false;
+    PyObject *route = attribute(actor.object, s_route);
+    if (!route) {
+        return false;
+    }
+    bool read = route == Py_None || PyList_CheckExact(route);
+    for (Py_ssize_t part = 0; read && route != Py_None && part < PyList_GET_SIZE(route); part++) {
+        PyObject *key = PyList_GET_ITEM(route, part);
+        read = PyTuple_CheckExact(key) && PyTuple_GET_SIZE(key) == 3;
+        PyObject *lane = read ? PyTuple_GET_ITEM(key, 2) : Py_None;
+        if (lane != Py_None) {
+            long number = PyLong_CheckExact(lane) ? PyLong_AsLong(lane) : -1;
+            read = -1000000 < number && number < 1000000 && PyLong_CheckExact(lane);
+            PyErr_Clear();
+            if (part == 0) {
+                actor.has_prescribed_lane = read;
+                actor.prescribed_lane = number;
+            }
+        }
+    }
+    Py_DECREF(route);
+    return read;
+}
+
+bool read_impact(Actor &actor) {
+    PyObject *impact = attribute(actor.object, s_impact);
+    if (!impact) {
+        return false;
+    }
+    actor.has_impact = impact != Py_None;
+    Py_buffer view;
+    bool read = !actor.has_impact || open_floats(impact, view, 2, 0);
+    if (read && actor.has_impact) {
+        const double *values = static_cast<const double *>(view.buf);
+        actor.impact_x = values[0];
+        actor.impact_y = values[1];
+        PyBuffer_Release(&view);
+    }
+    Py_DECREF(impact);
+    return read;
+}
+
+// Reads an action, and adds the address of its dictionary to a list.
+bool read_action(Actor &actor, std::vector<const void *> &actions) {
+    PyObject *action = attribute(actor.object, s_action);
+    bool read = action && PyDict_CheckExact(action);
+    if (read) {
+        PyObject *steering = PyDict_GetItemWithError(action, s_steering);
+        PyObject *acceleration = PyDict_GetItemWithError(action, s_acceleration);
+        PyErr_Clear();
+        read = steering && acceleration && read_value(steering, actor.steering) &&
+               read_value(acceleration, actor.acceleration);
+        actions.push_back(action);
+    }
+    Py_XDECREF(action);
+    actor.new_action = actor.changed_action = false;
+    return read;
+}
+
+bool is_finite(const Actor &actor) {
+    return std::isfinite(actor.x) && std::isfinite(actor.y) && std::isfinite(actor.heading) &&
+           std::isfinite(actor.speed.value);
+}
+
+void turn(Actor &actor) {
+    actor.cosine = call(COS, actor.heading);
+    actor.sine = call(SIN, actor.heading);
+}
+
+// Opens the array with the position of an actor, unless it is open.
+bool open_position(Actor &actor) {
+    PyObject *position = attribute(actor.object, s_position);
+    if (!position) {
+        return false;
+    }
+    if (actor.is_open && actor.position.obj != position) {
+        PyBuffer_Release(&actor.position);
+        actor.is_open = false;
+    }
+    actor.is_open = actor.is_open || open_floats(position, actor.position, 2, PyBUF_WRITABLE);
+    Py_DECREF(position);
+    return actor.is_open;
+}
+
+bool read_pose(Actor &actor) {
+    Number heading, diagonal;
+    if (!open_position(actor) || !read_number(actor.object, s_heading, heading) ||
+        !read_number(actor.object, s_speed, actor.speed) || !read_number(actor.object, s_diagonal, diagonal)) {
+        return false;
+    }
+    const double *place = static_cast<const double *>(actor.position.buf);
+    actor.x = place[0];
+    actor.y = place[1];
+    actor.heading = heading.value;
+    actor.radius = diagonal.value / 2;
+    turn(actor);
+    return is_finite(actor);
+}
+
+bool read_target_speed(Actor &actor) {
+    PyObject *found = attribute(actor.object, s_target_speed);
+    actor.target_speed = Number();
+    actor.has_target_speed = found != nullptr;
+    bool read = found ? read_value(found, actor.target_speed) : !actor.has_target;
+    Py_XDECREF(found);
+    return read && std::isfinite(actor.target_speed.value);
+}
+
+// Reads the data that a linear vehicle has collected: a dictionary in which a part is missing or usual.
+bool read_data(Actor &actor) {
+    PyObject *data = attribute(actor.object, s_data);
+    bool read = data && PyDict_CheckExact(data);
+    for (const char *name : {"longitudinal", "lateral"}) {
+        PyObject *part = read ? PyDict_GetItemString(data, name) : nullptr;
+        for (const char *list : {"features", "outputs"}) {
+            PyObject *found = part && PyDict_CheckExact(part) ? PyDict_GetItemString(part, list) : nullptr;
+            read = read && (!part || (found && PyList_CheckExact(found)));
+        }
+    }
+    PyErr_Clear();
+    Py_XDECREF(data);
+    return read;
+}
+
+bool read_linear(Actor &actor) {
+    return !actor.speed.is_whole && // otherwise its features might be whole numbers
+           read_numbers(actor.object, s_acceleration_parameters, actor.acceleration_parameters, 3) &&
+           read_numbers(actor.object, s_steering_parameters, actor.steering_parameters, 2) &&
+           read_bool(actor.object, s_collecting_data, actor.collects_data) &&
+           (!actor.collects_data || read_data(actor));
+}
+
+bool read_vehicle(const Network *network, Actor &actor, std::vector<const void *> &actions) {
+    PyObject *object = actor.object;
+    actor.new_crash = actor.changed_target = actor.reset_timer = actor.moved = false;
+    actor.target = -1;
+    if (!read_own_lane(network, actor) || !read_bool(object, s_crashed, actor.crashed) || !read_impact(actor) ||
+        !read_action(actor, actions) || !read_target_speed(actor)) {
+        return false;
+    }
+    if (actor.has_target && !(read_lane(network, object, s_target_lane_index, actor.target) && read_route(actor))) {
+        return false;
+    }
+    if (actor.changes_lanes && !(read_number(object, s_timer, actor.timer) &&
+                                 read_bool(object, s_enable_lane_change, actor.enable_lane_change))) {
+        return false;
+    }
+    return actor.model != LINEAR || read_linear(actor);
+}
+
+bool are_different(std::vector<const void *> &pointers) {
+    std::sort(pointers.begin(), pointers.end());
+    return std::adjacent_find(pointers.begin(), pointers.end()) == pointers.end();
+}
+
+// Reads the state of all actors. False: something has an unusual type or value, and the kernel must not be used.
+bool read_all(Traffic *self) {
+    self->now++;
+    std::vector<const void *> positions, actions; // a change of one that two actors share would change both
+    for (Actor &actor : *self->actors) {
+        if (!read_pose(actor) || !read_bool(actor.object, s_check_collisions, actor.checks) ||
+            !read_bool(actor.object, s_collidable, actor.collides)) {
+            return false;
+        }
+        positions.push_back(actor.position.buf);
+        if (actor.moves && !read_vehicle(self->network, actor, actions)) {
+            return false;
+        }
+        // A linear vehicle evaluates an object behind it like a vehicle.
+        if (!actor.moves && !read_own_lane(self->network, actor)) {
+            actor.lane = -1;
+        }
+    }
+    return are_different(positions) && are_different(actions);
+}
+
+bool set(PyObject *object, PyObject *name, PyObject *value) { // takes the reference to the value
+    bool done = value && PyObject_SetAttr(object, name, value) == 0;
+    Py_XDECREF(value);
+    return done;
+}
+
+PyObject *as_python(double value, bool as_numpy) {
+    PyObject *number = PyFloat_FromDouble(value);
+    if (!number || !as_numpy) {
+        return number;
+    }
+    PyObject *found = PyObject_CallOneArg(numpy_float, number);
+    Py_DECREF(number);
+    return found;
+}
+
+PyObject *as_python(const Number &number) { return as_python(number.value, number.is_numpy); }
+
+// Writes the results of decisions.
+bool publish_decision(Traffic *self, Actor &actor) {
+    if (actor.changed_target) {
+        PyObject *key = PyList_GET_ITEM(self->network->keys, actor.target);
+        if (PyObject_SetAttr(actor.object, s_target_lane_index, key)) {
+            return false;
+        }
+        actor.changed_target = false;
+    }
+    if (actor.reset_timer) {
+        if (!set(actor.object, s_timer, PyLong_FromLong(0))) {
+            return false;
+        }
+        actor.reset_timer = false;
+    }
+    if (actor.new_action || actor.changed_action) {
+        PyObject *steering = as_python(actor.steering);
+        PyObject *acceleration = as_python(actor.acceleration);
+        PyObject *action = actor.new_action ? PyDict_New() : PyObject_GetAttr(actor.object, s_action);
+        bool done = steering && acceleration && action && PyDict_SetItem(action, s_steering, steering) == 0 &&
+                    PyDict_SetItem(action, s_acceleration, acceleration) == 0 &&
+                    (!actor.new_action || PyObject_SetAttr(actor.object, s_action, action) == 0);
+        Py_XDECREF(steering);
+        Py_XDECREF(acceleration);
+        Py_XDECREF(action);
+        actor.new_action = actor.changed_action = false;
+        return done;
+    }
+    return true;
+}
+
+// Writes the results of a movement.
+bool publish_movement(Traffic *self, Actor &actor) {
+    if (!actor.moved) {
+        return true;
+    }
+    actor.moved = false;
+    double *place = static_cast<double *>(actor.position.buf);
+    place[0] = actor.x;
+    place[1] = actor.y;
+    PyObject *object = actor.object;
+    if (!actor.slides &&
+        (!set(object, s_heading, as_python(actor.heading, true)) || !set(object, s_speed, as_python(actor.speed)))) {
+        return false;
+    }
+    if (PyObject_SetAttr(object, s_lane_index, PyList_GET_ITEM(self->network->keys, actor.lane)) ||
+        PyObject_SetAttr(object, s_lane, PyList_GET_ITEM(self->network->objects, actor.lane))) {
+        return false;
+    }
+    if (actor.changes_lanes && !set(object, s_timer, as_python(actor.timer))) {
+        return false;
+    }
+    if (actor.new_crash) {
+        actor.new_crash = false;
+        if (PyObject_SetAttr(object, s_crashed, Py_True) || PyObject_SetAttr(object, s_impact, Py_None)) {
+            return false;
+        }
+    }
+    return true;
+}
+
+bool publish_all(Traffic *self, bool moved) {
+    for (size_t row = 0; row < self->vehicles; row++) {
+        Actor &actor = (*self->actors)[row];
+        actor.reset_timer = actor.reset_timer && !moved; // a movement has increased the timer since
+        if (!publish_decision(self, actor) || (moved && !publish_movement(self, actor))) {
+            return false;
+        }
+    }
+    return true;
+}
+
+} // namespace
