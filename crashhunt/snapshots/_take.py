@@ -405,6 +405,10 @@ def _argument_files(settings: HuntSettings) -> dict[str, str]:
             for value in values:
                 if isinstance(value, str) and value not in found and os.path.isfile(value):  # noqa: PTH113
                     found[value] = f"{layout.FILES}/{len(found)}-{Path(value).name}"
+                    # A comparison must know which traffics a policy was trained on.
+                    record = str(Path(value).parent / layout.TRAINED_ON)
+                    if record not in found and os.path.isfile(record):  # noqa: PTH113
+                        found[record] = f"{layout.FILES}/{len(found)}-{layout.TRAINED_ON}"
     return found
 
 
