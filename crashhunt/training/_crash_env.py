@@ -12,9 +12,9 @@ import gymnasium
 from crashhunt.base import layout
 from crashhunt.base.errors import SimulatorError, UsageError
 from crashhunt.base.text import one_of
+from crashhunt.crashes import snapshot_of
 from crashhunt.envs import RemoteEpisodes
 from crashhunt.plans import read_settings
-from crashhunt.snapshots import Snapshot
 from crashhunt.training._episodes import CrashEpisodes
 from crashhunt.training._record import TrainedOn
 from crashhunt.training._replay import CrashReplay
@@ -105,7 +105,9 @@ class CrashEnv(gymnasium.Env[Any, Any]):
         paths = tuple(str(crash.bundle.path) for crash in self._training)
         words = (paths, agent, float(before_s), float(after_s), max_steps or 0)
         if process is None:
-            process = _has_one_simulation(self._training[0].bundle.hunt, self._training[0].bundle.snapshot)
+            snapshot = snapshot_of(self._training[0].bundle)
+            snapshot.verify()
+            process = snapshot.scenario().backend.one_per_process
         self._episodes: CrashEpisodes | _RemoteCrashEpisodes
         self._episodes = _RemoteCrashEpisodes(*words) if process else CrashEpisodes(*words)
         self.agent = self._episodes.agent
@@ -254,12 +256,6 @@ def _check(before_s: float, after_s: float, share: float, max_steps: int | None,
         raise UsageError(f"max_steps is {max_steps}", fix="give at least 1, or None for that of the hunt")
     if not math.isfinite(crash_reward):
         raise UsageError(f"crash_reward is {crash_reward:g}", fix="give a finite number, such as -10")
-
-
-def _has_one_simulation(hunt: Path, snapshot: str) -> bool:
-    """Return whether a process can have only one simulation of the scenario of a hunt."""
-    scenario = Snapshot(hunt / layout.SNAPSHOTS / snapshot).scenario()
-    return scenario.simulator == "sumo"
 
 
 def make_training_env(crashes: Sequence[str | Path] | str | Path, **options: Any) -> gymnasium.Env[Any, Any]:

@@ -151,15 +151,5 @@ def held_out_traffics(settings: HuntSettings, hunts: Iterable[Path]) -> HeldOutT
 
 
 def _records_of(snapshot: Snapshot) -> list[TrainedOn]:
-    """Return the records that a snapshot carries: next to files that arguments name, and next to agents' modules."""
-    manifest = snapshot.manifest
-    folders = [place for place in manifest["paths"] if place]
-    modules = [setup.agent.partition(":")[0] for setup in snapshot.scenario().agents.values()]
-    modules += [chosen.agent.partition(":")[0] for chosen in snapshot.settings().agents.values()]
-    names = {"/".join([folder, *module.split(".")[:-1], layout.TRAINED_ON]) for folder in folders for module in modules}
-    found = [name for name in manifest["files"] if name in names or _is_of_argument(name)]
-    return [read_trained_on(snapshot.path / name) for name in dict.fromkeys(found)]
-
-
-def _is_of_argument(name: str) -> bool:
-    return name.startswith(f"{layout.FILES}/") and name.endswith(f"-{layout.TRAINED_ON}")
+    names = snapshot.manifest["argument_files"].values()
+    return [read_trained_on(snapshot.path / name) for name in names if name.endswith(f"-{layout.TRAINED_ON}")]
