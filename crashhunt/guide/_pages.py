@@ -30,6 +30,7 @@ _ORDER = [
     "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
     "kinds-of-crashes", "fault", "omissions", "judge", "causes", "what-if", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "cluster", "dashboard", "rate", "rare", "compare", "gate", "train",
+    "train-on-crashes",
     "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "determinism", "security",
     "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
