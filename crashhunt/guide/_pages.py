@@ -26,7 +26,7 @@ SECTIONS = {
 """The folders of the guide with their titles, in reading order."""
 
 _ORDER = [
-    "first-hunt", "your-town", "from-a-map", "highway-env", "gymnasium", "ci",
+    "first-hunt", "your-town", "from-a-map", "highway-env", "gymnasium", "learn-from-crashes", "ci",
     "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
     "kinds-of-crashes", "fault", "omissions", "judge", "causes", "what-if", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "cluster", "dashboard", "rate", "rare", "compare", "gate", "train",

@@ -8,6 +8,7 @@ import shutil
 from contextlib import closing
 
 import pytest
+from conftest import Shell
 from hypothesis import given, strategies as st
 
 import crashhunt
@@ -49,7 +50,7 @@ class Driver:
     def act(self, observation):
         return self.speed, 0
 '''
-TRIALS = 24
+TRIALS = 16
 
 
 @pytest.fixture(scope="module")
@@ -64,17 +65,16 @@ def place(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.syspath_prepend(str(folder))
-        run("before", "policy/speed.txt")
+        run(folder, "before", "policy/speed.txt")
         CrashEnv("before", before_s=1.0, trained_on="trained").close()
-        run("after", "trained/speed.txt")
-        run("elsewhere", "trained/speed.txt", seed=5)
+        run(folder, "after", "trained/speed.txt")
+        run(folder, "elsewhere", "trained/speed.txt", seed=5)
         yield folder
 
 
-def run(name, policy, seed=4):
-    crashhunt.run(
-        name, 1, TRIALS, 60, scenario="held.toml", seed=seed, keep_going=True, arguments={"path": policy},
-    )  # fmt: skip
+def run(folder, name, policy, seed=4):
+    words = ("run", name, "2", str(TRIALS), "60", "--scenario", "held.toml", "--seed", str(seed), "--keep-going")
+    Shell(folder).crashhunt(*words, "--arg", f"path={policy}")
 
 
 def seeds_of(hunt):

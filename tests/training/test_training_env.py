@@ -12,12 +12,15 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from conftest import Shell
 from gymnasium.utils.env_checker import check_env
 
 import crashhunt
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import CrashhuntError, SimulatorError, UsageError
+from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.training import CrashEnv, is_test_traffic
+from crashhunt.training._episodes import _Start
 from crashhunt.training._replay import CrashReplay
 
 TOY = """
@@ -37,13 +40,10 @@ default = 12.0
 BEFORE_S = 1.0
 
 
-def hunt(folder, name, *, toy=TOY, action="meta", seed=4, trials=12, **options):
-    scenario = folder / f"{options.pop('scenario', 'toy')}.toml"
-    scenario.write_text(toy.replace("ACTION", action))
-    crashhunt.run(
-        folder / name, 1, trials, 60, scenario=scenario, seed=seed, keep_going=True,
-        **{"snapshot_code": False, **options},
-    )  # fmt: skip
+def hunt(folder, name, *, action="meta", trials=8, scenario="toy"):
+    (folder / f"{scenario}.toml").write_text(TOY.replace("ACTION", action))
+    words = ("run", name, "1", str(trials), "60", "--scenario", f"{scenario}.toml", "--seed", "4", "--keep-going")
+    Shell(folder).crashhunt(*words, "--no-snapshot")
     return folder / name
 
 
@@ -193,6 +193,28 @@ def test_a_recording_that_differs_is_not_used(crashes):
     assert names
 
 
+def test_a_compact_recording_is_compared_by_the_actors_that_it_has(crashes):
+    env = CrashEnv(crashes, before_s=BEFORE_S, share=1.0)
+    name = env.crashes[0]
+    rerun = prepare(bundle_of(crashes, name), ReplayOptions(code="current"))
+    compact = rerun.recorded.compacted((), radius_m=0.1, observations=False)
+    start = _Start.of(replace(rerun, recorded=compact), "ego", BEFORE_S)
+    assert start.scenes[0][0] == ("ego",)  # without the vehicle ahead
+    env._episodes._starts[0] = start
+    assert env.reset(options={"crash": name})[1]["step"] == len(start.actions)
+    env._episodes._starts[0] = replace(start, actions=tuple(np.asarray(4 - action) for action in start.actions))
+    with pytest.raises(SimulatorError, match="the scene of step"):
+        env.reset(options={"crash": name})
+
+
+def test_crashes_of_a_corpus(crashes, shell):
+    bundles = list_bundles(crashes)[:2]
+    shell.crashhunt("corpus", "add", *(str(bundle.path) for bundle in bundles), "--to", "corpus")
+    env = CrashEnv(shell.folder / "corpus", before_s=BEFORE_S, share=1.0, test=0.0)
+    assert [name.rpartition("/")[2] for name in env.crashes] == [bundle.id for bundle in bundles]
+    assert env.reset(seed=1)[1]["crash"] in env.crashes
+
+
 def refused(crashes, **options):
     with pytest.raises(CrashhuntError) as caught:
         CrashEnv(crashes, **{"before_s": BEFORE_S, **options})
@@ -215,9 +237,9 @@ def test_bad_input_is_one_line(crashes, tmp_path):
 
 
 def test_crashes_of_other_scenarios_and_spaces_are_refused(crashes, tmp_path):
-    other = hunt(tmp_path, "other", scenario="another", trials=4)
+    other = hunt(tmp_path, "other", scenario="another", trials=2)
     assert "the crashes are of two scenarios: 'toy.toml' and 'another.toml'" in refused([crashes, other], test=0.0)
-    continuous = hunt(tmp_path, "continuous", action="continuous", trials=4)
+    continuous = hunt(tmp_path, "continuous", action="continuous", trials=2)
     assert "the action spaces differ: Discrete(5) and " in refused([crashes, continuous], test=0.0)
 
 
