@@ -1,7 +1,8 @@
 """A parallel crash-hunting fuzzer for traffic agents.
 
 ``crashhunt.run``, ``prepare``, ``replay``, ``what_if``, ``load``, ``compare``, ``Hunt`` and ``Suite`` do what the
-command line does; ``accelerate`` speeds highway-env up in a process of your own.
+command line does. ``accelerate`` speeds highway-env up in a process of your own. ``make_training_env`` returns an
+environment to train an agent on crashes.
 
 >>> import crashhunt
 >>> report = crashhunt.run(
@@ -26,10 +27,14 @@ if TYPE_CHECKING:
     from crashhunt.estimation import compare
     from crashhunt.hunts import Hunt, load
     from crashhunt.suites import Suite
+    from crashhunt.training import make_training_env
 
 from crashhunt.base.version import __version__
 
-__all__ = ["Hunt", "Suite", "__version__", "accelerate", "compare", "load", "prepare", "replay", "run", "what_if"]
+__all__ = [
+    "Hunt", "Suite", "__version__", "accelerate", "compare", "load", "make_training_env", "prepare", "replay", "run",
+    "what_if",
+]  # fmt: skip
 
 _HOMES = {
     "Hunt": "crashhunt.hunts",
@@ -37,6 +42,7 @@ _HOMES = {
     "accelerate": "crashhunt.accelerator",
     "compare": "crashhunt.estimation",
     "load": "crashhunt.hunts",
+    "make_training_env": "crashhunt.training",
 }
 
 
@@ -51,16 +57,23 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def _register_environment() -> None:
-    """Register ``crashhunt/SUMO-v0`` with Gymnasium, without imports until the environment is made."""
+_ENVIRONMENTS = {
+    "crashhunt/SUMO-v0": "crashhunt.envs:SumoEnv",
+    "crashhunt/Crashes-v0": "crashhunt.training:CrashEnv",
+}
+
+
+def _register_environments() -> None:
+    """Register the environments with Gymnasium, without imports until one is made."""
     from gymnasium.envs.registration import register, registry
 
-    if "crashhunt/SUMO-v0" not in registry:
-        register(id="crashhunt/SUMO-v0", entry_point="crashhunt.envs:SumoEnv")
+    for name, entry_point in _ENVIRONMENTS.items():
+        if name not in registry:
+            register(id=name, entry_point=entry_point)
 
 
 class _GymnasiumFinder:
-    """Registers the environment once Gymnasium is imported after crashhunt; imports nothing itself.
+    """Registers the environments once Gymnasium is imported after crashhunt; imports nothing itself.
 
     ``gymnasium.make("crashhunt:…")`` imports this module, which does nothing if it was imported before.
     """
@@ -79,7 +92,7 @@ class _GymnasiumFinder:
 
             def execute_and_register(module: Any) -> None:
                 execute(module)
-                _register_environment()
+                _register_environments()
 
             loader.exec_module = execute_and_register
         return spec
@@ -90,6 +103,6 @@ _REGISTRY = "gymnasium.envs.registration"
 # gymnasium.make("crashhunt:crashhunt/SUMO-v0") imports this module. Other users must not wait for Gymnasium's import,
 # the command line least of all.
 if _REGISTRY in sys.modules:
-    _register_environment()
+    _register_environments()
 else:
     sys.meta_path.insert(0, _GymnasiumFinder())

@@ -1254,6 +1254,47 @@ def bench_dashboard() -> Iterator[Figure]:
     yield Figure(name="dashboard_frames", value=rate, unit="/s", better="higher", target=60.0, note=note)
 
 
+def bench_training() -> Iterator[Figure]:
+    """Environment steps a second in training: accelerated highway-env, episodes before crashes, and SUMO."""
+    import bench_training as training
+
+    def child(function: str, *words: str) -> dict[str, float]:
+        done = subprocess.run(
+            [sys.executable, training.__file__, function, *words], check=True, stdout=subprocess.PIPE,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        )  # fmt: skip
+        found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+        return found
+
+    load = f"load {os.getloadavg()[0]:.1f}"
+    for name, steps in (("highway-v0", "64"), ("highway-fast-v0", "256")) if training.has("stable_baselines3") else ():
+        found = child("child_ppo", name, steps, "3")
+        note = (
+            f"PPO, steps/s with gradient steps: {found['slow']:.1f} become {found['fast']:.0f}; 3 pairs in turns, "
+            f"{found['low']:.1f} to {found['high']:.1f}; {load}"
+        )
+        yield Figure(
+            name=f"training_ppo_{name}", value=found["ratio"], unit="x", better="higher", target=None, note=note
+        )
+    found = child("child_crashes", "5")
+    note = (
+        f"steps/s of Crashes-v0 with resets: {found['slow']:.0f} in plain episodes, {found['fast']:.0f} in those "
+        f"before crashes; 5 pairs in turns, {found['low']:.2f} to {found['high']:.2f}; {load}"
+    )
+    yield Figure(name="training_crashes", value=found["ratio"], unit="x", better="higher", target=None, note=note)
+    if training.has("sumo_rl", "sumo"):
+        pairs = [(child("child_sumo_rl", "1500")["rate"], child("child_sumo", "1500")["rate"]) for _ in range(3)]
+        ratios = [ours / theirs for theirs, ours in pairs]
+        note = (
+            f"steps/s of SUMO-v0 {statistics.median(ours for _, ours in pairs):.0f}, of sumo-rl through libsumo "
+            f"{statistics.median(theirs for theirs, _ in pairs):.0f}, without resets; same net, traffic and step of "
+            f"1 s; sumo-rl drives the lights; {min(ratios):.2f} to {max(ratios):.2f}; {load}"
+        )
+        yield Figure(
+            name="training_sumo", value=statistics.median(ratios), unit="x", better="higher", target=None, note=note
+        )
+
+
 BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "step": bench_step,
     "core": bench_core,
@@ -1277,6 +1318,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "dashboard": bench_dashboard,
     "ray": bench_ray,
     "accelerator": bench_accelerator,
+    "training": bench_training,
     "search": bench_search,
 }
 

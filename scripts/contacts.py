@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import argparse
 import os
-import random
 import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from xml.etree import ElementTree as ET
+
+from towns import AGENT_HEAD, write_traffic
 
 NETWORKS = {
     "grid-priority": "--grid --grid.number 4 --grid.length 110 -L 2 -j priority",
@@ -52,17 +52,8 @@ NETWORKS = {
 }  # fmt: skip
 """Name to the arguments of netgenerate."""
 STEPS_S = (0.1, 0.2, 0.5, 1.0)
-AGENT = """\
-from crashhunt.agents import CarFollowing
-
-
-class Erring(CarFollowing):
-    def __init__(self, defect: str = "none", observation_space=None, action_space=None, step_length_s: float = 0.1):
-        super().__init__(
-            desired_speed=12.0, observation_space=observation_space, action_space=action_space,
-            step_length_s=step_length_s,
-        )
-        self.defect, self.step_s = defect, step_length_s
+AGENT = f"""\
+{AGENT_HEAD}        self.defect, self.step_s = defect, step_length_s
 
     def reset(self, seed):
         super().reset(seed)
@@ -84,7 +75,7 @@ class Erring(CarFollowing):
                 return 14.0, 1 if right < 0 else -1
         return 14.0, 0
 """
-_SECONDS, _PERIOD_S, _TRIAL_S = 90, 0.35, 40.0
+_SECONDS, _TRIAL_S = 90, 40.0
 _HUNT = ("--ego", "any", "--agent", "erring:Erring", "--seed", "5",
          "--disturb", "ignore_priority=0.2,cut_in=0.1,stop=0.03", "--keep-going",
          "--crash-on", "collision")  # fmt: skip
@@ -145,25 +136,7 @@ def _hunt(network: Path, folder: Path, step_s: float, trials: int, defects: str)
         return
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(network, folder / "town.net.xml")
-    edges = [
-        edge.get("id", "")
-        for edge in ET.parse(network).getroot().findall("edge")
-        if not edge.get("function") and any(lane.get("allow") != "pedestrian" for lane in edge.findall("lane"))
-    ]
-    rng = random.Random(folder.name)
-    trips = ET.Element("routes")
-    for number in range(round(_SECONDS / _PERIOD_S)):
-        start, end = rng.sample(edges, 2)
-        trip = {"id": f"v{number}", "depart": f"{number * _PERIOD_S:g}", "from": start, "to": end}
-        ET.SubElement(trips, "trip", {**trip, "departLane": "best", "departSpeed": "max"})
-    ET.ElementTree(trips).write(folder / "town.rou.xml")
-    config = ET.Element("configuration")
-    files = ET.SubElement(config, "input")
-    ET.SubElement(files, "net-file", value="town.net.xml")
-    ET.SubElement(files, "route-files", value="town.rou.xml")
-    ET.SubElement(ET.SubElement(config, "time"), "step-length", value=f"{step_s:g}")
-    ET.SubElement(ET.SubElement(config, "processing"), "ignore-route-errors", value="true")
-    ET.ElementTree(config).write(folder / "town.sumocfg")
+    write_traffic(folder / "town.net.xml", folder, seed=folder.name, seconds=_SECONDS, step_s=step_s)
     (folder / "erring.py").write_text(AGENT, encoding="utf-8")
     command = [sys.executable, "-m", "crashhunt", "run", "hunt", str(len(os.sched_getaffinity(0))), str(trials)]
     command += [str(round(_TRIAL_S / step_s)), "--scenario", "town.sumocfg", *_HUNT, "--arg", f"defect={defects}"]

@@ -15,7 +15,7 @@ from xml.etree import ElementTree as ET
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["AGENT", "TOWNS", "make_town"]
+__all__ = ["AGENT", "AGENT_HEAD", "TOWNS", "make_town", "write_traffic"]
 
 TOWNS = {
     "priority": ("--grid", "--grid.number", "4", "--grid.length", "110", "-L", "2", "-j", "priority"),
@@ -27,7 +27,7 @@ TOWNS = {
     "random": ("--rand", "--rand.iterations", "80", "--rand.max-distance", "170", "-L", "2", "--seed", "7"),
 }  # fmt: skip
 """Name to the arguments of netgenerate."""
-AGENT = """\
+AGENT_HEAD = """\
 from crashhunt.agents import CarFollowing
 
 
@@ -37,7 +37,10 @@ class Erring(CarFollowing):
             desired_speed=12.0, observation_space=observation_space, action_space=action_space,
             step_length_s=step_length_s,
         )
-        self.defect = defect
+"""
+"""The beginning of an agent with a defect, up to the end of the base class's constructor."""
+AGENT = f"""\
+{AGENT_HEAD}        self.defect = defect
 
     def reset(self, seed):
         super().reset(seed)
@@ -68,21 +71,37 @@ def make_town(name: str, folder: Path) -> Path:
     network = folder / "town.net.xml"
     words = [program, *TOWNS[name], "--no-turnarounds", "true", "--output-file", str(network)]
     subprocess.run(words, check=True, capture_output=True)
-    edges = [edge.get("id", "") for edge in ET.parse(network).getroot().findall("edge") if not edge.get("function")]
-    rng = random.Random(name)
+    write_traffic(network, folder, seed=name, seconds=_SECONDS, step_s=0.1)
+    (folder / "erring.py").write_text(AGENT, encoding="utf-8")
+    return folder / "town.sumocfg"
+
+
+def write_traffic(network: Path, folder: Path, *, seed: str, seconds: float, step_s: float) -> None:
+    """Write trips at random on a network, and ``town.sumocfg``, which names both.
+
+    Args:
+        network: of which the folder has a copy named ``town.net.xml``.
+        folder: into which the files are written.
+        seed: of the trips.
+        seconds: how long vehicles depart, in s.
+        step_s: length of a step, in s.
+    """
+    edges = [
+        edge.get("id", "")
+        for edge in ET.parse(network).getroot().findall("edge")
+        if not edge.get("function") and any(lane.get("allow") != "pedestrian" for lane in edge.findall("lane"))
+    ]
+    rng = random.Random(seed)
     trips = ET.Element("routes")
-    for number in range(round(_SECONDS / _PERIOD_S)):
+    for number in range(round(seconds / _PERIOD_S)):
         start, end = rng.sample(edges, 2)
-        depart = f"{number * _PERIOD_S:g}"
-        trip = {"id": f"v{number}", "depart": depart, "from": start, "to": end}
+        trip = {"id": f"v{number}", "depart": f"{number * _PERIOD_S:g}", "from": start, "to": end}
         ET.SubElement(trips, "trip", {**trip, "departLane": "best", "departSpeed": "max"})
     ET.ElementTree(trips).write(folder / "town.rou.xml")
     config = ET.Element("configuration")
     files = ET.SubElement(config, "input")
     ET.SubElement(files, "net-file", value="town.net.xml")
     ET.SubElement(files, "route-files", value="town.rou.xml")
-    ET.SubElement(ET.SubElement(config, "time"), "step-length", value="0.1")
+    ET.SubElement(ET.SubElement(config, "time"), "step-length", value=f"{step_s:g}")
     ET.SubElement(ET.SubElement(config, "processing"), "ignore-route-errors", value="true")
     ET.ElementTree(config).write(folder / "town.sumocfg")
-    (folder / "erring.py").write_text(AGENT, encoding="utf-8")
-    return folder / "town.sumocfg"

@@ -45,6 +45,7 @@ __all__ = [
     "SMALL",
     "SNAPSHOTS",
     "STACK",
+    "TRAINED_ON",
     "TRIALS",
     "crash_folder",
     "numbered",
@@ -87,6 +88,9 @@ SCENARIO: Final = "scenario.toml"
 CODE: Final = "code"
 FILES: Final = "files"  # which arguments name
 SCENARIO_FILES: Final = "scenario"
+
+# Next to a policy: the traffics that it was trained on.
+TRAINED_ON: Final = "trained_on.json"
 
 # Of an exported crash; and of this user on this machine, what it is signed with.
 ARCHIVE_INDEX: Final = "archive.json"

@@ -39,6 +39,7 @@ from crashhunt.cli._report import add_report
 from crashhunt.cli._run import add_run
 from crashhunt.cli._show import add_show
 from crashhunt.cli._shrink import add_shrink
+from crashhunt.cli._split import add_split
 from crashhunt.cli._status import add_status
 from crashhunt.cli._suite import add_rerun, add_suite
 from crashhunt.cli._trials import add_trials
@@ -165,7 +166,7 @@ def make_parser() -> argparse.ArgumentParser:
     for add in (
         add_run, add_init, add_replay, add_show, add_report, add_dashboard, add_export, add_suite, add_status, add_logs,
         add_rerun, add_trials, add_crashes, add_judge, add_whatif, add_shrink, add_corpus, add_bisect,
-        add_trust_command, add_check, add_compare, add_gate, add_rate, add_lists, add_guide, add_completion,
+        add_trust_command, add_check, add_split, add_compare, add_gate, add_rate, add_lists, add_guide, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

@@ -97,7 +97,7 @@ def _source(options: argparse.Namespace) -> MapSource:
         return MapSource(kind="opendrive", path=options.opendrive)
     if options.net is not None:
         return MapSource(kind="net", path=options.net)
-    raise UsageError("names no map", fix="give one of --osm, --opendrive, --net, --grid, --spider")
+    raise UsageError("no map is given", fix="give one of --osm, --opendrive, --net, --grid, --spider")
 
 
 def _demand(text: str) -> tuple[float, float]:

@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from crashhunt.base.errors import SimulatorError
 from crashhunt.base.forks import CannotForkError, fork, held
+from crashhunt.base.plugins import load_object
 from crashhunt.base.processes import outlive_parent
 from crashhunt.executors import worker_environment
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
 
     import numpy as np
     from gymnasium import Space
@@ -49,12 +49,16 @@ _GOOD_BYE_S = 5.0  # time for SUMO to close before the process is killed
 class RemoteEpisodes:
     """`Episodes` in a child process, which ends with this object and with this process.
 
-    The arguments are those of `Episodes`. Exceptions of the child process are raised here.
+    Exceptions of the child process are raised here.
+
+    Args:
+        words: The arguments of `Episodes`, or of the class that a subclass serves. They can be pickled.
     """
 
-    def __init__(
-        self, scenario: str | Path, agent: str, action: str, disturb: Sequence[str] = (), max_steps: int = 0
-    ) -> None:
+    served = "crashhunt.envs._episodes:Episodes"
+    """The class whose methods the child process calls."""
+
+    def __init__(self, *words: object) -> None:
         here, there = Pipe()
         # Not a child of multiprocessing: the daemonic workers of an AsyncVectorEnv may not have one.
         self._process: subprocess.Popen[bytes] | _Fork = subprocess.Popen(
@@ -67,7 +71,7 @@ class RemoteEpisodes:
         there.close()
         self._pipe, self._name, self.pid = here, "the environment", self._process.pid
         self._end = weakref.finalize(self, _end, self._process, here, os.getpid())
-        found = self._ask("made", str(scenario), agent, action, tuple(disturb), max_steps)
+        found = self._ask("made", self.served, *words)
         self.observation_space: Space[object] = found["observation_space"]
         self.action_space: Space[object] = found["action_space"]
         self.step_length_s: float = found["step_length_s"]
@@ -204,8 +208,6 @@ def main() -> None:
 
 def _serve(pipe: Ours, is_orphan: Callable[[], bool], episodes: Episodes | None) -> Episodes | None:
     """Answer requests until the connection is closed, or the user's program is gone."""
-    from crashhunt.envs._episodes import Episodes
-
     with suppress(EOFError, ConnectionError):
         while True:
             # Forks of the user's program hold the other end open as well, so its end does not close the connection.
@@ -216,7 +218,7 @@ def _serve(pipe: Ours, is_orphan: Callable[[], bool], episodes: Episodes | None)
             answer: object
             try:
                 if episodes is None:
-                    episodes = Episodes(*words)
+                    episodes = load_object(words[0])(*words[1:])
                     names = ("observation_space", "action_space", "step_length_s", "agent")
                     answer = {name: getattr(episodes, name) for name in names}
                 elif name == "branch":

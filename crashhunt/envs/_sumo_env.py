@@ -77,7 +77,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         if process is None:
             process = _process == [os.getpid()] and len(_here) > 0
         if process:
-            self._episodes = RemoteEpisodes(scenario, agent, action, words, max_steps or 0)
+            self._episodes = RemoteEpisodes(str(scenario), agent, action, words, max_steps or 0)
         else:
             self._episodes = Episodes(scenario, agent, action, words, max_steps or 0)
             if _process != [os.getpid()]:

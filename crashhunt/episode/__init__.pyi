@@ -17,6 +17,7 @@ from ._observers import (
     Nearness as Nearness,
     Observer as Observer,
     Recorder as Recorder,
+    observation_restorers as observation_restorers,
     options_of as options_of,
     ready_recorder as ready_recorder,
 )

@@ -11,7 +11,7 @@ import csv
 import json
 import math
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
@@ -24,6 +24,7 @@ from crashhunt.estimation._rates import measure_rates
 from crashhunt.hunts import HuntResults, counting_rule
 from crashhunt.ledger import Ledger
 from crashhunt.rates import CountingRule, Interval, PairSequence, PairTest, facts_of_plain
+from crashhunt.training import held_out_traffics
 from crashhunt.trial import Constant, Outcome
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ class Pair:
         difference: interval of the difference in crashes per trial, second minus first; None where there is none.
         units: independent pairs: of trials, or of traffics.
         excluded: how many trials of both do not count: they have ended, but one of a lower number has not; or they are
-            invalid in one of the hunts.
+            invalid in one of the hunts; or an agent was trained on this part of the traffics.
         answer: ``first`` or ``second``, which certainly crashes less; ``undecided``; empty where nothing can be said.
     """
 
@@ -298,9 +299,20 @@ def _pair(first: HuntResults, figures: HuntFigures, second: HuntResults, other: 
     counts = (figures.crashes, figures.trials, other.crashes, other.trials)
     why_not = why_unpaired(first.settings, second.settings)
     if not why_not:
-        sequence, test = _paired(first, second)
+        sequence, test, trained_on = _paired(first, second)
         if test.pairs and not sequence.why_not:
-            return _by_pairs(first, second, sequence, test, counts)
+            found = _by_pairs(first, second, sequence, test, counts)
+            return replace(
+                found,
+                caution="; ".join(filter(None, (found.caution, _only_held_out(trained_on, test.trials)))),
+                excluded=found.excluded + 2 * trained_on,
+            )
+        if trained_on and not test.pairs:
+            raise UsageError(
+                f"an agent was trained on all {trained_on} traffics that {first.directory} and {second.directory} have "
+                "in common",
+                fix="run both with another --seed, or train with a test share",
+            )
         if sequence.why_not:
             why_not = f"they have too few valid trials in common: {sequence.why_not}"
         elif sequence.not_same:
@@ -346,9 +358,18 @@ def _by_pairs(
     )
 
 
+def _only_held_out(trained_on: int, counted: int) -> str:
+    if not trained_on:
+        return ""
+    return f"only {counted} held-out pairs count: an agent was trained on traffics of the other {trained_on}"
+
+
 def _by_intervals(first: HuntResults, second: HuntResults, why_not: str, counts: tuple[int, int, int, int]) -> Pair:
     """Compare hunts without common traffic; each interval has half of the error probability."""
-    a, b = (_rate(hunt, 100 * (1 - _ALPHA / 2)).certain for hunt in (first, second))
+    trained = [hunt for hunt in (first, second) if not _is_new_traffic(hunt)]
+    if trained:
+        why_not += f"; {trained[0].directory} has no rate, because its agent was trained on this --seed"
+    a, b = (_rate(hunt, 100 * (1 - _ALPHA / 2)).certain if hunt not in trained else None for hunt in (first, second))
     p_value, difference, answer = None, None, ""
     if a is not None and b is not None:
         difference = Interval(b.low - a.high, b.high - a.low)
@@ -375,14 +396,23 @@ def _by_intervals(first: HuntResults, second: HuntResults, why_not: str, counts:
     )
 
 
+def _is_new_traffic(hunt: HuntResults) -> bool:
+    """Return whether the agents of a hunt were not trained on the traffics of its seed."""
+    records = held_out_traffics(hunt.settings, [hunt.directory]).records
+    return not any(hunt.settings.seed in record.hunt_seeds for record in records)
+
+
 def _is_fixed_ahead(hunt: HuntResults) -> bool:
     """Return whether the number of trials did not depend on the crashes, so that a test with one look is valid."""
     settings = hunt.settings
     return not (settings.seeds or settings.run.until_rate) and _rate(hunt).estimate is not None
 
 
-def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, PairTest]:
+def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, PairTest, int]:
+    """Return the pairs, what they say, and how many do not count because an agent was trained on their traffics."""
     hunts = first, second
+    held_out = held_out_traffics(first.settings, [hunt.directory for hunt in hunts])
+    trained_on = 0
     rules = _rule(first), _rule(second)
     with_arguments = not _same_draws(first, second)
     sequence = PairSequence(rules, lambda one, other: one.tags == other.tags)
@@ -390,8 +420,11 @@ def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, Pair
     for side in (0, 1):
         for trial in _trials(hunts[side], with_arguments=with_arguments):
             for pair in sequence.add(side, trial):
-                test.add(pair)
-    return sequence, test
+                if all(held_out.has(int(one.tags[0])) for one, _ in pair):
+                    test.add(pair)
+                else:
+                    trained_on += len(pair)
+    return sequence, test, trained_on
 
 
 def _rule(hunt: HuntResults) -> CountingRule:

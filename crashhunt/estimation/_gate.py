@@ -21,6 +21,7 @@ from crashhunt.hunts import counting_rule
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.rates import PairSequence, PairTest, facts_of_plain
+from crashhunt.training import HeldOutTraffics, held_out_traffics
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -107,6 +108,7 @@ class GateReport:
         why: why the verdict is not that of the pairs, or why there is none; empty where nothing has to be said.
         is_interrupted: whether a request to stop came before the end.
         dir: where the hunts are; empty where they are not kept.
+        trained_on: how many pairs do not count, because an agent was trained on this part of the traffics.
     """
 
     verdict: PairVerdict
@@ -127,6 +129,7 @@ class GateReport:
     why: str = ""
     is_interrupted: bool = False
     dir: str = ""
+    trained_on: int = 0
 
     @property
     def back(self) -> tuple[GateCase, ...]:
@@ -163,6 +166,7 @@ class GateReport:
             "why": self.why,
             "interrupted": self.is_interrupted,
             "dir": self.dir or None,
+            "trained_on": self.trained_on,
         }
 
 
@@ -174,10 +178,15 @@ class PairedHunts:
         base: directory of BASE's hunt.
         head: of HEAD's.
         pairs: how many trials each has at most.
+
+    Attributes:
+        trained_on: how many pairs do not count, because an agent was trained on this part of the traffics.
     """
 
     def __init__(self, name: str, base: Path, head: Path, pairs: int) -> None:
         self.name, self.folders, self.most = name, (base, head), pairs
+        self.trained_on = 0
+        self._held_out = HeldOutTraffics(0)
         self._sequence: PairSequence | None = None
         self._crash_on: tuple[str, ...] = ()
         self._test = PairTest()
@@ -199,6 +208,9 @@ class PairedHunts:
         for pair in self._read(sequence):
             if watch.verdict != "undecided" or sequence.position > self.most:
                 return
+            if not all(self._held_out.has(int(one.tags[0])) for one, _ in pair):
+                self.trained_on += 1
+                continue
             self._test.add(pair)
             watch.test.add(pair)
             if not self.why_not:
@@ -257,6 +269,7 @@ class PairedHunts:
         if why := why_unpaired(base, head):
             raise HuntDirectoryError(f"the hunts of BASE and HEAD cannot be compared: {why}", where=self.name)
         self._crash_on = tuple(map(str, base.crash_on))
+        self._held_out = held_out_traffics(base, self.folders)
         return PairSequence((counting_rule(base, {}), counting_rule(head, {})), _is_same)
 
     def _read(self, sequence: PairSequence) -> Iterator[Pair]:

@@ -82,7 +82,7 @@ def convert(source: MapSource, options: ConvertOptions, tools: Tools, folder: Pa
     """
     notes: list[str] = []
     if source.path is not None:
-        _bring(source.path, folder)
+        _bring(source, folder)
         if source.kind == "opendrive" and not options.left_hand and _keeps_left(source.path):
             options = replace(options, left_hand=True)
             notes.append("traffic keeps to the left: the map has roads with rule LHT")
@@ -110,16 +110,14 @@ def _given(source: MapSource) -> str:
     return f"{stem}.gz" if lower.endswith(".gz") else stem
 
 
-def _bring(path: Path, folder: Path) -> None:
-    from crashhunt.maps._source import MapSource, kind_of_file
-
-    kind = kind_of_file(path)
-    assert kind is not None
-    target = folder / _given(MapSource(kind=kind, path=path))
-    if path.name.lower().endswith(".pbf"):
-        _unpack_pbf(path, target)
+def _bring(source: MapSource, folder: Path) -> None:
+    """Copy the map into the folder, as XML."""
+    assert source.path is not None
+    target = folder / _given(source)
+    if source.path.name.lower().endswith(".pbf"):
+        _unpack_pbf(source.path, target)
     else:
-        shutil.copyfile(path, target)
+        shutil.copyfile(source.path, target)
 
 
 def _unpack_pbf(path: Path, target: Path) -> None:

@@ -302,6 +302,11 @@ def readme(
 
 
 WORKFLOW = ".github/workflows/crashhunt.yml"
+_SET_UP = """\
+      - uses: actions/checkout@v4
+      - uses: actions/setup-python@v5
+        with: { python-version: "3.12" }
+"""
 _WORKFLOW = """# Hunts for crashes of the agent on every push, and runs kept crashes again.
 # GitHub reads this file at .github/workflows/crashhunt.yml of the top of a repository.
 name: crashhunt
@@ -313,10 +318,7 @@ jobs:
   hunt:
     runs-on: ubuntu-latest
     steps:
-      - uses: actions/checkout@v4
-      - uses: actions/setup-python@v5
-        with: { python-version: "3.12" }
-      - uses: crashhunt/crashhunt/.github/actions/hunt@vVERSION
+SET_UP      - uses: crashhunt/crashhunt/.github/actions/hunt@vVERSION
         with:
           arguments: ARGUMENTS
           trials: "200"
@@ -325,10 +327,7 @@ jobs:
   corpus:
     runs-on: ubuntu-latest
     steps:
-      - uses: actions/checkout@v4
-      - uses: actions/setup-python@v5
-        with: { python-version: "3.12" }
-      - uses: crashhunt/crashhunt/.github/actions/corpus@vVERSION
+SET_UP      - uses: crashhunt/crashhunt/.github/actions/corpus@vVERSION
         if: EXISTS # crashhunt corpus add keeps the first crash
         with: { corpus: CRASHES }
 """
@@ -345,8 +344,8 @@ def workflow(folder: str, steps: int) -> str:
     words = f"--scenario {shlex.quote(folder)} --agent {AGENT} --seed 1"
     exists = f"hashFiles({_expression(f'{crashes}/**')}) != ''"
     values = {
-        "CRASHES": _scalar(crashes), "FOLDER": _scalar(folder), "VERSION": __version__, "ARGUMENTS": _scalar(words),
-        "STEPS": str(steps), "EXISTS": _scalar(exists),
+        "SET_UP": _SET_UP, "CRASHES": _scalar(crashes), "FOLDER": _scalar(folder), "VERSION": __version__,
+        "ARGUMENTS": _scalar(words), "STEPS": str(steps), "EXISTS": _scalar(exists),
         "KNOWN": _scalar(f"${{{{ {exists} && {_expression(crashes)} || '' }}}}"),
     }  # fmt: skip
     # In one pass: a folder may have any of these names.

@@ -28,6 +28,8 @@ def describe_gate(found: GateReport) -> str:
     if found.why:
         lines.append(f"  {found.why}")
     lines += [f"  {line}" for line in _evidence(found)]
+    if found.trained_on:
+        lines.append(f"  {found.trained_on:,} pairs do not count: an agent was trained on traffics of this part")
     if found.rates is not None:
         lines += [f"  {name}: {_rate(rate)}" for name, rate in zip(("BASE", "HEAD"), found.rates, strict=True)]
     if len(found.scenarios) > 1:

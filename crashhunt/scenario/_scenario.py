@@ -492,6 +492,7 @@ class Backend:
             scenario arguments, and the specifications of those that are texts. Without, strangers are refused.
         right_of_way: returns who has to give way at the junctions of the map; None where that is not known.
         plays_paths: whether it can move others along recorded ways.
+        one_per_process: whether a process can have only one simulation at a time.
         forkable: whether it is known that a process can be forked after it has made the simulator, which starts no
             threads. Otherwise a fork finds out before the first trial.
         survey: how it finds, before a hunt, the vehicles that an agent can replace in one of its ``configurations``.
@@ -524,6 +525,7 @@ class Backend:
     side_effect: Callable[[Scenario, Mapping[str, Value], Iterable[str]], str] | None = None
     right_of_way: Callable[[Scenario], RightOfWay | None] | None = None
     plays_paths: bool = False
+    one_per_process: bool = False
     forkable: bool = False
     survey: TrafficSurvey | None = None
 

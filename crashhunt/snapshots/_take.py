@@ -325,6 +325,7 @@ def take_snapshot(
         modules = [*scenario.modules(), *modules_of(settings.oracles)]
         found = find_sources(locators, modules, roots=options.roots, without=snapshots.parent)
     argument_files = _argument_files(settings) if options.code else {}
+    argument_files |= _training_records(scenario, argument_files)
     files = found.files | {argument_files[value]: Path(value) for value in argument_files}
     _check_size(files, options.limit_mb)
     try:
@@ -406,6 +407,19 @@ def _argument_files(settings: HuntSettings) -> dict[str, str]:
                 if isinstance(value, str) and value not in found and os.path.isfile(value):  # noqa: PTH113
                     found[value] = f"{layout.FILES}/{len(found)}-{Path(value).name}"
     return found
+
+
+def _training_records(scenario: Scenario, argument_files: dict[str, str]) -> dict[str, str]:
+    """Return the records of trainings next to policies and next to agents' modules, and their places.
+
+    A comparison of hunts must know which traffics an agent was trained on.
+    """
+    modules = (sys.modules.get(setup.agent.partition(":")[0]) for setup in scenario.agents.values())
+    policies = [*argument_files, *filter(None, (getattr(module, "__file__", None) for module in modules))]
+    records = dict.fromkeys(str(Path(policy).parent / layout.TRAINED_ON) for policy in policies)
+    there = [record for record in records if os.path.isfile(record)]  # noqa: PTH113
+    first = len(argument_files)
+    return {record: f"{layout.FILES}/{place}-{layout.TRAINED_ON}" for place, record in enumerate(there, first)}
 
 
 def _check_size(files: dict[str, Path], limit_mb: float) -> None:

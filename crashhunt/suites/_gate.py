@@ -500,6 +500,8 @@ class _Run:
             return invalid
         if time.monotonic() > self._until:
             return "the time is up; give --for more, or --most fewer pairs with a greater --margin"
+        if not self._pairs.test.pairs and any(one.trained_on for one in self._hunts):
+            return "an agent was trained on all these traffics; give another --seed"
         if ended := next((said for one in self._hunts if not one.is_complete and (said := _ended_early(one))), ""):
             return ended
         return f"all {self._gate.most} pairs have ended; give more with --most, or a greater --margin"
@@ -534,6 +536,7 @@ class _Run:
             why=why,
             is_interrupted=self._is_interrupted,
             dir=str(self._place) if self._is_kept else "",
+            trained_on=sum(one.trained_on for one in self._hunts),
         )
         self._write(report)
         return report

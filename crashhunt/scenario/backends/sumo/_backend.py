@@ -160,6 +160,7 @@ BACKEND = Backend(
     relocated=_relocated,
     notes=_notes,
     versions=("libsumo",),
+    one_per_process=True,
     variables=("SUMO_HOME",),
     reported_events=tuple(EVENT_WORDS),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "step_out", "ignore_priority", "unseen"),

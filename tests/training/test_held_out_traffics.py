@@ -1,0 +1,216 @@
+"""The split of traffics, the record of a training, and comparisons of agents that were trained."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import shutil
+from contextlib import closing
+
+import pytest
+from conftest import Shell
+from hypothesis import given, strategies as st
+
+import crashhunt
+from crashhunt.crashes import list_bundles
+from crashhunt.errors import HuntDirectoryError, UsageError
+from crashhunt.ledger import Ledger
+from crashhunt.report import describe_comparison
+from crashhunt.training import (
+    CrashEnv,
+    HeldOutTraffics,
+    TrainedOn,
+    is_test_traffic,
+    read_trained_on,
+    split_crashes,
+)
+
+TOY = """
+title = "A toy"
+schema = 1
+simulator = "toy"
+[arguments.gap_m]
+default = 12.0
+range = "8:16"
+[agents.ego]
+agent = "held_out_driver:Driver"
+"""
+DRIVER = '''
+from pathlib import Path
+
+class Driver:
+    """Drives with the speed in a file: its policy."""
+
+    def __init__(self, path: str = "policy/speed.txt"):
+        self.speed = float(Path(path).read_text())
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return self.speed, 0
+'''
+TRIALS = 16
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with a hunt, an agent that was trained on its crashes, and hunts of that agent."""
+    folder = tmp_path_factory.mktemp("held-out")
+    (folder / "held.toml").write_text(TOY)
+    (folder / "held_out_driver.py").write_text(DRIVER)
+    for name, speed in (("policy", "12"), ("trained", "2")):
+        (folder / name).mkdir()
+        (folder / name / "speed.txt").write_text(speed)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.syspath_prepend(str(folder))
+        run(folder, "before", "policy/speed.txt")
+        CrashEnv("before", before_s=1.0, trained_on="trained").close()
+        run(folder, "after", "trained/speed.txt")
+        run(folder, "elsewhere", "trained/speed.txt", seed=5)
+        yield folder
+
+
+def run(folder, name, policy, seed=4):
+    words = ("run", name, "2", str(TRIALS), "60", "--scenario", "held.toml", "--seed", str(seed), "--keep-going")
+    Shell(folder).crashhunt(*words, "--arg", f"path={policy}")
+
+
+def seeds_of(hunt):
+    with closing(Ledger(hunt / "ledger.sqlite")) as ledger:
+        return [result.spec.seed for result in ledger.results()]
+
+
+# The split.
+
+
+@given(st.integers(0, 2**31 - 1), st.floats(0, 1), st.floats(0, 1))
+def test_a_larger_share_only_adds_to_the_test_part(seed, one, other):
+    assert is_test_traffic(seed, min(one, other)) <= is_test_traffic(seed, max(one, other))
+    assert not is_test_traffic(seed, 0.0)
+    assert is_test_traffic(seed, 1.0)
+
+
+def test_the_share_is_that_of_the_traffics_and_stays_the_same():
+    for share in (0.1, 0.5, 0.8):
+        count = sum(is_test_traffic(seed, share) for seed in range(20_000))
+        assert abs(count / 20_000 - share) < 0.015
+    # Files of a training name the share only, so later versions must draw the same line.
+    assert [seed for seed in range(12) if is_test_traffic(seed, 0.5)] == [2, 4, 6]
+
+
+def test_the_command_prints_the_parts(place, shell):
+    shell.folder = place
+    found = shell.crashhunt("split", "before", "--test", "0.5", "--json").json
+    split = split_crashes([place / "before"], 0.5)
+    assert [one["id"] for one in found["training"]] == [crash.bundle.id for crash in split.training]
+    assert [one["id"] for one in found["held_out"]] == [crash.bundle.id for crash in split.held_out]
+    assert len(found["training"]) + len(found["held_out"]) == len(list_bundles(place / "before"))
+    done = shell.crashhunt("split", "before", "--part", "test")
+    assert done.out.splitlines() == [one["path"] for one in found["held_out"]]
+    assert "--test is 1; give a share" in shell.crashhunt("split", "before", "--test", "1", expect=2).err
+    assert "'gone' is no directory" in shell.crashhunt("split", "gone", expect=2).err
+
+
+# The record of a training.
+
+
+def test_the_record_names_the_training_part_and_is_carried_in_snapshots(place):
+    record = read_trained_on(place / "trained" / "trained_on.json")
+    split = split_crashes([place / "before"], 0.5)
+    assert record == TrainedOn(test=0.5, seeds=frozenset(one.seed for one in split.training), hunt_seeds=frozenset({4}))
+    (carried,) = (place / "after").glob("snapshots/*/files/*-trained_on.json")
+    assert read_trained_on(carried) == record
+    assert not list((place / "before").glob("snapshots/*/files/*-trained_on.json"))
+
+
+def _write(path, seed):
+    TrainedOn(test=0.5, seeds=frozenset({seed}), hunt_seeds=frozenset({1})).write(path)
+
+
+def test_processes_that_write_at_once_lose_nothing(tmp_path):
+    file = tmp_path / "trained_on.json"
+    context = multiprocessing.get_context("fork")
+    children = [context.Process(target=_write, args=(file, seed)) for seed in range(8)]
+    for child in children:
+        child.start()
+    for child in children:
+        child.join()
+    assert read_trained_on(file).seeds == frozenset(range(8))
+    assert [path.name for path in tmp_path.iterdir()] == ["trained_on.json"]
+
+
+def test_a_record_of_another_split_or_a_damaged_one_is_refused(tmp_path):
+    file = tmp_path / "trained_on.json"
+    _write(file, 1)
+    with pytest.raises(UsageError, match=r"with test=0.5, and this one has test=0.2"):
+        TrainedOn(test=0.2).write(file)
+    for text in ("", "[]", "{}", '{"schema": 1, "test": 2, "seeds": [], "hunt_seeds": []}'):
+        file.write_text(text)
+        with pytest.raises(HuntDirectoryError, match="cannot be read: ") as caught:
+            read_trained_on(file)
+        assert "\n" not in str(caught.value)
+
+
+# Comparisons.
+
+
+def test_in_a_hunt_that_was_trained_on_only_the_hash_decides():
+    record = TrainedOn(test=0.5, seeds=frozenset({3}), hunt_seeds=frozenset({4}))
+    test = {seed for seed in range(40) if is_test_traffic(seed, 0.5)}
+    assert {seed for seed in range(40) if HeldOutTraffics(4, (record,)).has(seed)} == test
+    elsewhere = HeldOutTraffics(5, (record,))
+    assert {seed for seed in range(40) if not elsewhere.has(seed)} == {3} - test
+
+
+def test_compare_counts_held_out_traffics_only(place):
+    seeds = seeds_of(place / "before")
+    held_out = sum(is_test_traffic(seed, 0.5) for seed in seeds)
+    assert 0 < held_out < TRIALS
+    (pair,) = crashhunt.compare("before", "after").pairs
+    crashed = [bundle for bundle in list_bundles(place / "before") if is_test_traffic(bundle.result.spec.seed, 0.5)]
+    assert (pair.trials, pair.only_first, pair.only_second) == (held_out, len(crashed), 0)
+    assert pair.excluded == 2 * (TRIALS - held_out)
+    expected = f"only {held_out} held-out pairs count: an agent was trained on traffics of the other"
+    assert expected in describe_comparison(crashhunt.compare("before", "after"))
+    # Training on other traffic changes nothing, and neither does an agent without a record.
+    (plain,) = crashhunt.compare("before", "before").pairs
+    assert (plain.trials, plain.excluded) == (TRIALS, 0)
+
+
+def test_compare_refuses_traffic_of_which_nothing_is_held_out(place, tmp_path):
+    (carried,) = (place / "after").glob("snapshots/*/files/*-trained_on.json")
+    before = carried.read_text()
+    carried.write_text(json.dumps({**json.loads(before), "test": 0.0}))
+    try:
+        with pytest.raises(UsageError, match=f"an agent was trained on all {TRIALS} traffics"):
+            crashhunt.compare("before", "after")
+    finally:
+        carried.write_text(before)
+
+
+def test_a_rate_in_traffic_that_was_trained_on_is_no_evidence(place):
+    (pair,) = crashhunt.compare("elsewhere", "after").pairs
+    assert (pair.test, pair.answer, pair.difference) == ("", "", None)
+    assert "has no rate, because its agent was trained on this --seed" in pair.verdict
+    (pair,) = crashhunt.compare("before", "elsewhere").pairs
+    assert pair.test == "intervals"
+
+
+def test_gate_counts_held_out_traffics_only(place, shell):
+    shell.folder = place
+    for name, speed in (("gate_before", 12), ("gate_after", 2)):
+        (place / name).mkdir()
+        agent = DRIVER.replace("float(Path(path).read_text())", str(speed))
+        (place / name / "driver.py").write_text(agent)
+    shutil.copy(place / "trained" / "trained_on.json", place / "gate_after")  # next to the agent's module
+    words = ("gate", "gate_before.driver:Driver", "gate_after.driver:Driver", "--scenario", "held.toml", "--json")
+    found = shell.crashhunt(*words, "--max-steps", "60", "--most", str(TRIALS), "--seed", "4", expect=None)
+    assert found.code in (0, 3), found.err
+    held_out = sum(is_test_traffic(seed, 0.5) for seed in seeds_of(place / "before"))
+    assert found.json["pairs"] <= held_out
+    assert found.json["trained_on"] > 0
+    assert "pairs do not count: an agent was trained on traffics of this part" in found.err
+    elsewhere = shell.crashhunt(*words, "--max-steps", "60", "--most", "4", "--seed", "5", expect=None).json
+    assert (elsewhere["pairs"], elsewhere["trained_on"]) == (4, 0)

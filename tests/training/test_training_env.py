@@ -1,0 +1,353 @@
+"""The environment that begins with saved crashes: where it begins, what it draws, and what it refuses."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from conftest import Shell
+from gymnasium.utils.env_checker import check_env
+
+import crashhunt
+from crashhunt.crashes import list_bundles
+from crashhunt.errors import CrashhuntError, SimulatorError, UsageError
+from crashhunt.replays import ReplayOptions, prepare
+from crashhunt.training import CrashEnv, is_test_traffic
+from crashhunt.training._episodes import _Start
+from crashhunt.training._replay import CrashReplay
+
+TOY = """
+title = "A toy"
+schema = 1
+simulator = "toy"
+step_length_s = 0.1
+[arguments.gap_m]
+default = 12.0
+range = "8:16"
+[agents.ego]
+agent = "crashhunt.agents:KeepLaneWithSpeed"
+action = "ACTION"
+[agents.ego.arguments.speed]
+default = 12.0
+"""
+BEFORE_S = 1.0
+
+
+def hunt(folder, name, *, action="meta", trials=8, scenario="toy"):
+    (folder / f"{scenario}.toml").write_text(TOY.replace("ACTION", action))
+    words = ("run", name, "1", str(trials), "60", "--scenario", f"{scenario}.toml", "--seed", "4", "--keep-going")
+    Shell(folder).crashhunt(*words, "--no-snapshot")
+    return folder / name
+
+
+@pytest.fixture(scope="module")
+def crashes(tmp_path_factory):
+    return hunt(tmp_path_factory.mktemp("training"), "hunt")
+
+
+@pytest.fixture
+def env(crashes):
+    made = CrashEnv(crashes, before_s=BEFORE_S, share=1.0)
+    yield made
+    made.close()
+
+
+def finish(env, action=1):
+    """Drive to the end of the episode; return the last info and the sum of rewards."""
+    total = 0.0
+    while True:
+        _, reward, terminated, truncated, info = env.step(action)
+        total += reward
+        if terminated or truncated:
+            return info, total
+
+
+def bundle_of(crashes, name):
+    return next(bundle for bundle in list_bundles(crashes) if bundle.id == name.rpartition("/")[2])
+
+
+def test_recorded_actions_lead_to_the_same_crash(env, crashes):
+    assert len(env.crashes) >= 2
+    for name in env.crashes:
+        bundle = bundle_of(crashes, name)
+        recording, steps = bundle.recording(), bundle.result.steps
+        observation, info = env.reset(options={"crash": name})
+        assert info["step"] == max(0, steps - round(BEFORE_S / 0.1))
+        assert np.array_equal(observation, recording.observations("ego")[info["step"]])
+        assert (info["crash"], info["seed"]) == (name, bundle.result.spec.seed)
+        for action in recording.actions("ego")[info["step"] :]:
+            _, _, terminated, truncated, last = env.step(action)
+        assert (terminated, truncated) == (True, False)
+        assert (last["step"], last["outcome"], last["has_crashed"]) == (steps, "collision", True)
+
+
+def test_a_crash_can_be_avoided_and_the_episode_is_truncated_later(crashes):
+    env = CrashEnv(crashes, before_s=2.0, after_s=1.5, share=1.0)
+    for name in env.crashes:
+        env.reset(options={"crash": name})
+        info, _ = finish(env, action=4)  # SLOWER
+        if not info["has_crashed"]:
+            assert info["outcome"] == "survived"
+            assert info["step"] == min(60, bundle_of(crashes, name).result.steps + 15)
+            assert env.scores[name] < 1.0
+            return
+    pytest.fail("braking 2 s earlier avoids none of them")
+
+
+def test_same_seed_gives_the_same_episodes(crashes):
+    seen = []
+    env = CrashEnv(crashes, before_s=BEFORE_S, share=0.5)
+    for _ in range(2):
+        found = []
+        for episode in range(6):
+            observation, info = env.reset(seed=7 if episode == 0 else None)
+            found.append((observation.tobytes(), tuple(info.items()), finish(env)[1]))
+        seen.append(found)
+    assert seen[0] == seen[1]
+    names = {dict(facts)["crash"] for _, facts, _ in seen[0]}
+    assert "" in names
+    assert len(names) > 1
+
+
+def test_only_training_traffics_are_used(crashes):
+    env = CrashEnv(crashes, before_s=BEFORE_S, share=0.3, test=0.6, max_steps=1)
+    seeds = [env.reset(seed=1)[1]["seed"], *(env.reset()[1]["seed"] for _ in range(30))]
+    assert len(set(seeds)) > 15
+    assert not any(is_test_traffic(seed, 0.6) for seed in seeds)
+    held_out = [bundle.id for bundle in list_bundles(crashes) if is_test_traffic(bundle.result.spec.seed, 0.6)]
+    with pytest.raises(UsageError, match="is in the test part"):
+        env.reset(options={"crash": held_out[0]})
+
+
+def test_the_users_random_generators_keep_their_state(env):
+    before = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002 - which scenarios may use
+    env.reset(seed=1)
+    finish(env)
+    assert (random.getstate(), np.random.get_state()[1].tolist()) == before  # noqa: NPY002
+
+
+def test_crash_reward_is_added_once(crashes):
+    totals = []
+    for reward in (0.0, -100.0):
+        env = CrashEnv(crashes, before_s=BEFORE_S, share=1.0, crash_reward=reward)
+        env.reset(seed=1)
+        info, total = finish(env)
+        assert info["has_crashed"]
+        totals.append(total)
+    assert totals[0] - totals[1] == pytest.approx(100.0)
+
+
+def test_passes_gymnasiums_checker(crashes):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env = crashhunt.make_training_env([crashes], before_s=BEFORE_S)
+        check_env(env.unwrapped, skip_render_check=True)
+    assert isinstance(env.unwrapped, CrashEnv)
+
+
+def test_vector_environments(crashes):
+    def make():
+        return gymnasium.make("crashhunt:crashhunt/Crashes-v0", crashes=[crashes], before_s=BEFORE_S)
+
+    vector = gymnasium.vector.SyncVectorEnv([make, make])
+    observations, _ = vector.reset(seed=[5, 5])
+    assert np.array_equal(observations[0], observations[1])
+    for _ in range(20):
+        observations, *_ = vector.step(np.array([1, 1]))
+        assert np.array_equal(observations[0], observations[1])
+    vector.close()
+
+
+def test_a_process_of_its_own_gives_the_same_episodes(crashes):
+    found = []
+    for process in (False, True):
+        env = CrashEnv(crashes, before_s=BEFORE_S, share=0.5, process=process)
+        episodes = []
+        for episode in range(3):
+            observation, info = env.reset(seed=2 if episode == 0 else None)
+            episodes.append((observation.tobytes(), info, finish(env)))
+        env.close()
+        found.append(episodes)
+    assert found[0] == found[1]
+
+
+def test_a_recording_that_differs_is_not_used(crashes):
+    env = CrashEnv(crashes, before_s=BEFORE_S, share=1.0)
+    first = env.crashes[0]
+    env.reset(options={"crash": first})
+    start = env._episodes._starts[0]
+    other = tuple(np.asarray(4 - action) for action in start.actions)  # SLOWER in place of IDLE and FASTER
+    env._episodes._starts[0] = replace(start, actions=other)
+    with pytest.raises(SimulatorError, match=f"{first} is not used: the (scene|observation) of step"):
+        env.reset(options={"crash": first})
+    with pytest.warns(UserWarning, match=first):
+        names = {env.reset(seed=1)[1]["crash"], *(env.reset()[1]["crash"] for _ in range(20))}
+    assert first not in names
+    assert names
+
+
+def test_a_compact_recording_is_compared_by_the_actors_that_it_has(crashes):
+    env = CrashEnv(crashes, before_s=BEFORE_S, share=1.0)
+    name = env.crashes[0]
+    rerun = prepare(bundle_of(crashes, name), ReplayOptions(code="current"))
+    compact = rerun.recorded.compacted((), radius_m=0.1, observations=False)
+    start = _Start.of(replace(rerun, recorded=compact), "ego", BEFORE_S)
+    assert start.scenes[0][0] == ("ego",)  # without the vehicle ahead
+    env._episodes._starts[0] = start
+    assert env.reset(options={"crash": name})[1]["step"] == len(start.actions)
+    env._episodes._starts[0] = replace(start, actions=tuple(np.asarray(4 - action) for action in start.actions))
+    with pytest.raises(SimulatorError, match="the scene of step"):
+        env.reset(options={"crash": name})
+
+
+def test_crashes_of_a_corpus(crashes, shell):
+    bundles = list_bundles(crashes)[:2]
+    shell.crashhunt("corpus", "add", *(str(bundle.path) for bundle in bundles), "--to", "corpus")
+    env = CrashEnv(shell.folder / "corpus", before_s=BEFORE_S, share=1.0, test=0.0)
+    assert [name.rpartition("/")[2] for name in env.crashes] == [bundle.id for bundle in bundles]
+    assert env.reset(seed=1)[1]["crash"] in env.crashes
+
+
+def refused(crashes, **options):
+    with pytest.raises(CrashhuntError) as caught:
+        CrashEnv(crashes, **{"before_s": BEFORE_S, **options})
+    assert "\n" not in str(caught.value)
+    assert caught.value.fix
+    return str(caught.value)
+
+
+def test_bad_input_is_one_line(crashes, tmp_path):
+    assert "crashes is empty" in refused([])
+    assert "'nowhere' is no directory" in refused("nowhere")
+    assert "no crash was saved here" in refused(tmp_path)
+    for name, value in (
+        ("before_s", 0.0), ("after_s", float("nan")), ("share", 1.5), ("test", 1.0), ("max_steps", 0),
+        ("crash_reward", float("inf")),
+    ):  # fmt: skip
+        assert f"{name} is " in refused(crashes, **{name: value}), name
+    assert "no controlled vehicle 'other'" in refused(crashes, agent="other")
+    assert "crashes is in the training part (test=0.999999)" in refused(crashes, test=0.999999)
+
+
+def test_crashes_of_other_scenarios_and_spaces_are_refused(crashes, tmp_path):
+    other = hunt(tmp_path, "other", scenario="another", trials=2)
+    assert "the crashes are of two scenarios: 'toy.toml' and 'another.toml'" in refused([crashes, other], test=0.0)
+    continuous = hunt(tmp_path, "continuous", action="continuous", trials=2)
+    assert "the action spaces differ: Discrete(5) and " in refused([crashes, continuous], test=0.0)
+
+
+def test_a_crash_without_its_snapshot_is_refused(crashes, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(crashes, copy)
+    shutil.rmtree(copy / "snapshots")
+    assert "the snapshot has no manifest" in refused(copy)
+
+
+def test_wrong_use_is_reported(env):
+    with pytest.raises(SimulatorError, match="no episode is running"):
+        env.step(1)
+    with pytest.raises(UsageError, match="options has 'crashes'"):
+        env.reset(options={"crashes": "x"})
+    with pytest.raises(UsageError, match="there is no crash '000999-collision'"):
+        env.reset(options={"crash": "000999-collision"})
+
+
+# The other simulators, and other libraries' vectors of environments.
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("scenario", "steps", "disturb"), [("loop", 400, ("brake=0.05",)), ("highway", 40, ())], ids=["sumo", "highway"]
+)
+def test_recorded_actions_lead_to_the_same_crash_elsewhere(scenario, steps, disturb, tmp_path):
+    crashhunt.run(
+        tmp_path / "hunt", 2, 40, steps, scenario=scenario, seed=1, keep_going=True, disturb=disturb,
+        snapshot_code=False,
+    )  # fmt: skip
+    env = CrashEnv(tmp_path / "hunt", before_s=3.0, share=1.0, test=0.0)
+    assert env.crashes
+    for name in env.crashes:
+        bundle = bundle_of(tmp_path / "hunt", name)
+        recording = bundle.recording()
+        observation, info = env.reset(options={"crash": name})
+        assert np.array_equal(observation, recording.observations(env.agent)[info["step"]])
+        for action in recording.actions(env.agent)[info["step"] :]:
+            _, _, terminated, _, last = env.step(action)
+        assert (terminated, last["step"], last["has_crashed"]) == (True, bundle.result.steps, True)
+    env.reset(options={"crash": ""})
+    env.close()
+
+
+VECTORS = """
+import sys
+import gymnasium
+import numpy as np
+
+def make():
+    return gymnasium.make("crashhunt:crashhunt/Crashes-v0", crashes=[sys.argv[1]], before_s=1.0)
+
+if __name__ == "__main__":
+    vector = gymnasium.vector.AsyncVectorEnv([make, make])
+    first, _ = vector.reset(seed=[5, 5])
+    assert np.array_equal(first[0], first[1])
+    vector.step(np.array([1, 1]))
+    vector.close()
+    try:
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+    except ImportError:
+        sys.exit()
+    for kind in (DummyVecEnv, SubprocVecEnv):
+        several = kind([make, make])
+        PPO("MlpPolicy", several, n_steps=32, batch_size=32, n_epochs=1, device="cpu", seed=1).learn(128)
+        several.close()
+"""
+
+
+@pytest.mark.nightly
+def test_vectors_of_processes_and_of_stable_baselines3(crashes, tmp_path):
+    (tmp_path / "vectors.py").write_text(VECTORS)
+    words = [sys.executable, "vectors.py", str(crashes)]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=500, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+# Which crash is drawn.
+
+
+def test_unsolved_crashes_are_drawn_more_often_and_solved_ones_return():
+    replay, rng = CrashReplay(4), np.random.default_rng(1)
+    draws = np.zeros(4)
+    for _ in range(400):
+        index = replay.draw(rng)
+        draws[index] += 1
+        replay.record(index, has_crashed=index == 2)
+    assert draws[2] > 0.75 * draws.sum()
+    assert all(draws >= 5)
+    assert replay.probabilities().sum() == pytest.approx(1.0)
+
+
+def test_a_removed_crash_is_never_drawn_also_after_a_restart():
+    replay, rng = CrashReplay(3), np.random.default_rng(1)
+    replay.remove(1)
+    for index in (0, 2):
+        for _ in range(60):
+            replay.record(index, has_crashed=False)
+    replay.restart()
+    assert {replay.draw(rng) for _ in range(60)} == {0, 2}
+    replay.remove(0)
+    replay.remove(2)
+    assert replay.is_empty
+
+
+def test_solved_crashes_only_are_drawn_evenly():
+    replay = CrashReplay(2)
+    replay.scores[:] = 0.0
+    assert replay.probabilities().tolist() == [0.5, 0.5]
