@@ -52,6 +52,8 @@ def test_copies_of_a_root_crash_from_the_start_as_they_did_and_change_nothing(as
         kind = one.get("second") or one["cell"]
         assert one["onset"] - one["branched"] == (2 if kind.startswith("late_observation") else 1)
         assert one["step"] == 150 - 30 * (scenario == "toy") or one["crash"]  # never to a horizon
+    for onset, within, ended in found["late"]:  # no second onset from the step after the first to the last one
+        assert within == pytest.approx((1 - found["chance"]) ** (ended - onset))
     if scenario != "merge":
         assert crashes
         pilot = next(one for one in forced["copies"] if one.get("within", 1.0) < 1.0 and not one.get("second"))
