@@ -72,6 +72,7 @@ MIN_EFFECTIVE: Final = 20.0
 MIN_ROOTS_WITH_CRASH: Final = 20
 MAX_SHARE: Final = 0.2
 _RISK_OF_COPIES: Final = 0.25  # share of the risk that the certain lower end by copies alone takes
+_ONLY_RUNNING: Final = ("origin", "bar", "verdict")  # which an estimate does not have
 MAX_EXCLUDED: Final = 0.05
 """Share of roots without a complete result above which nothing is estimated."""
 
@@ -190,18 +191,10 @@ class RareEstimate:
 
     def to_json(self) -> JsonObject:
         """Return plain data without NaN."""
-        low, high = self.certain or (None, None)
+        shared = {key: value for key, value in self.running().items() if key not in _ONLY_RUNNING}
         return {
-            "method": "rare",
-            "per": "trial",
-            "confidence": 100 * self.confidence,
-            "units": self.roots,
-            "trials": self.plain,
-            "crashes": self.plain_crashes,
-            "estimate": self.estimate,
-            "certain": {"low": low, "high": high} if self.certain is not None else None,
+            **shared,
             "estimated": _plain(self.estimated),
-            "why_not": self.why_not,
             "more_roots": self.more_roots,
             "left_out": self.excluded,
             "parts": {
@@ -220,7 +213,6 @@ class RareEstimate:
 
     def running(self) -> RunningRate:
         """Return what ``status`` reports of it."""
-        low, high = self.certain or (0.0, None)
         one = self.estimated
         return {
             "method": "rare",
@@ -230,7 +222,7 @@ class RareEstimate:
             "trials": self.plain,
             "crashes": self.plain_crashes,
             "origin": "",
-            "certain": None if self.certain is None else {"low": low, "high": high},
+            "certain": None if self.certain is None else {"low": self.certain[0], "high": self.certain[1]},
             "estimate": self.estimate,
             "estimated": None if one is None else {"low": one.low, "high": one.high},
             "why_not": self.why_not,
