@@ -16,6 +16,7 @@ from ._models import (
 from ._onsets import (
     COPIES_PER_ROOT as COPIES_PER_ROOT,
     FIRST_STEP as FIRST_STEP,
+    SECONDS_PER_COPY as SECONDS_PER_COPY,
     FirstOnsets as FirstOnsets,
     Onset as Onset,
     first_forcing as first_forcing,

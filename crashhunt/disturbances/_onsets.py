@@ -25,6 +25,12 @@ Order within a step: disturbances of the agent first, because the agent notices 
 around it in the next step are not known. Models later in this order are drawn as ever in the step of the onset. Models
 before it are drawn on the condition that they are not effective.
 
+Second onsets: a copy after its first onset is a root again. It has either no further effective onset before it ends,
+or a second one, with the same closed form from the next step on. So a copy may run without later disturbances, and
+copies of it begin with one forced second onset each. The copy itself then counts with the probability of no second
+onset. Which copies do so does not depend on what becomes of them, so there is no bias. Forcing says for which first
+onsets it pays. In addition one copy of each root does it, because the hunt learns from that where it pays.
+
 Source: stratified importance sampling (Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 and 9).
 Cost: per step of the root one look at each place around the agent at which a model may find a vehicle.
 """
@@ -46,7 +52,16 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances._rates import DisturbanceSampler
 
-__all__ = ["COPIES_PER_ROOT", "FIRST_STEP", "FirstOnsets", "HasTarget", "Onset", "cell_of", "first_forcing"]
+__all__ = [
+    "COPIES_PER_ROOT",
+    "FIRST_STEP",
+    "SECONDS_PER_COPY",
+    "FirstOnsets",
+    "HasTarget",
+    "Onset",
+    "cell_of",
+    "first_forcing",
+]
 
 HasTarget = Callable[[Disturbance], bool]
 """Whether a disturbance that begins in the next step finds a vehicle."""
@@ -55,6 +70,8 @@ COPIES_PER_ROOT: Final = 8
 """Mean number of copies: more share one root and are correlated, fewer leave the root's own steps unused."""
 FIRST_STEP: Final = 2
 """The first step in which an onset is forced: a fork after step 0 is too late for what an agent sees in step 1."""
+SECONDS_PER_COPY: Final = 2
+"""Mean number of second onsets that are forced on a copy, where that pays."""
 _POINTS = 0x6F6E7365  # separates these draws from others with the seed of the trial
 _LATER = 0x6C617465
 _ANY = Drawn("", 0.0, 0.0)  # of a model that cannot list what it draws
@@ -70,12 +87,16 @@ class Onset:
         weight: probability of the onsets that it represents.
         step: in which it begins.
         planned: the onset and all later disturbances of the copy, in turn.
+        alone: the same without those of later steps, for a copy on which second onsets are forced.
+        number: of the onset in its root.
     """
 
     cell: str
     weight: float
     step: int
     planned: tuple[Disturbance, ...]
+    alone: tuple[Disturbance, ...] = ()
+    number: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +133,8 @@ def first_forcing(sampler: DisturbanceSampler, last: int) -> Forcing:
     none = 1.0
     for name in sampler.models:
         none *= (1.0 - sampler.chance(name)) ** (len(sampler.agents) * max(0, last - FIRST_STEP + 1))
-    return Forcing(max((1.0 - none) / COPIES_PER_ROOT, np.finfo(float).tiny))
+    any_onset = max(1.0 - none, np.finfo(float).tiny * COPIES_PER_ROOT)
+    return Forcing(any_onset / COPIES_PER_ROOT, second_spacing=any_onset / SECONDS_PER_COPY)
 
 
 class FirstOnsets:
@@ -123,20 +145,32 @@ class FirstOnsets:
         forcing: of the root.
         seed: of the root.
         last: the last step of the root.
+        first: the first step in which an onset is forced.
+        stream: numbers that separate the draws from others with the same seed.
 
     Attributes:
         survival: probability that no onset was effective so far.
         masses: by cell, the probability that the first onset is of this cell and begins so far.
     """
 
-    def __init__(self, sampler: DisturbanceSampler, forcing: Forcing, seed: int, last: int) -> None:
+    def __init__(
+        self,
+        sampler: DisturbanceSampler,
+        forcing: Forcing,
+        seed: int,
+        last: int,
+        *,
+        first: int = FIRST_STEP,
+        stream: tuple[int, ...] = (),
+    ) -> None:
         self.survival = 1.0
         self.masses: dict[str, float] = {}
         self._sampler, self._forcing, self._seed, self._last = sampler, forcing, seed, last
+        self._first, self._stream = first, stream
         places = [self._place(agent, name) for agent in sampler.agents for name in sampler.models]
         self._of_agent = [place for place in places if place.what in OF_AGENT]
         self._traffic = [place for place in places if place.what not in OF_AGENT]
-        self._points = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_POINTS,)))
+        self._points = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_POINTS, *stream)))
         self._proposed = 0.0
         self._number = 0
         self._point = self._points.random() * forcing.spacing
@@ -150,7 +184,7 @@ class FirstOnsets:
         """
         found: list[Onset] = []
         begins = step + 1
-        if FIRST_STEP <= begins <= self._last:
+        if self._first <= begins <= self._last:
             skipped: list[tuple[_Place, frozenset[Drawn]]] = []
             for number, place in enumerate(self._traffic):
                 there = [
@@ -161,12 +195,30 @@ class FirstOnsets:
                 found += [self._onset(place, cell, begins, later, n) for cell, n in self._propose(place, cells)]
                 skipped.append((place, frozenset(cell.drawn for cell in cells)))
         begins = step + 2
-        if begins <= self._last:
+        if self._first <= begins <= self._last:
             for number, place in enumerate(self._of_agent):
                 cells = [cell for some in place.cells.values() for cell in some]
                 later = [(one, None) for one in (*self._of_agent[number + 1 :], *self._traffic)]
                 found += [self._onset(place, cell, begins, later, n) for cell, n in self._propose(place, cells)]
         return found
+
+    def following(self, onset: Onset) -> FirstOnsets | None:
+        """Return what proposes the second onsets in the copy of an onset; None where none are forced on it.
+
+        It has to be called after every step of the copy, from the one before the onset on.
+        """
+        forcing = self._forcing
+        is_pilot = onset.number == self._seed % COPIES_PER_ROOT
+        if not forcing.second_spacing or not (is_pilot or onset.cell in forcing.second):
+            return None
+        return FirstOnsets(
+            self._sampler,
+            Forcing(forcing.second_spacing),
+            self._seed,
+            self._last,
+            first=onset.step + 1,
+            stream=(onset.number,),
+        )
 
     def _place(self, agent: str, name: str) -> _Place:
         model, ratios = self._sampler.models[name], self._forcing.ratios
@@ -215,7 +267,7 @@ class FirstOnsets:
                 excluded because they are effective; None to draw as ever.
             number: of the onset in the root.
         """
-        rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(_LATER, number)))
+        rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(_LATER, number, *self._stream)))
         sampler, last = self._sampler, self._last
         if cell.drawn is _ANY:
             planned = [sampler.draw_one(step, place.name, place.agent, rng)]
@@ -227,9 +279,17 @@ class FirstOnsets:
                 begun = sampler.draw_between(step - 1, step, other.name, other.agent, rng)
             # A model that cannot list its draws is effective whenever it begins.
             planned += [] if excluded is not None and _ANY in excluded else begun
+        alone = in_turn(planned)
         for other in (*self._of_agent, *self._traffic):
             planned += sampler.draw_between(step, last, other.name, other.agent, rng)
-        return Onset(cell=cell.key, weight=self._forcing.spacing / cell.ratio, step=step, planned=in_turn(planned))
+        return Onset(
+            cell=cell.key,
+            weight=self._forcing.spacing / cell.ratio,
+            step=step,
+            planned=in_turn(planned),
+            alone=alone,
+            number=number,
+        )
 
 
 def _disturbance(place: _Place, drawn: Drawn, step: int) -> Disturbance:

@@ -6,6 +6,9 @@ root, makes a copy for each onset, and notes how the copy ended.
 Invariant: the root itself is a plain trial without disturbances after step 1. Looking for vehicles and making copies
 changes no bit of it.
 
+Where second onsets are forced too, a copy runs without later disturbances and is copied again for each of them. These
+copies are made by the copy itself, which answers for all of them.
+
 A copy always runs to the end of its trial: a horizon would bias the estimate, because crashes after it would be lost.
 A root with a copy that has no answer counts as incomplete, since a lost copy may have been the one that crashed.
 
@@ -17,11 +20,12 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Final, cast
 
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.disturbances import FirstOnsets, disturber_of, parse_rates
+from crashhunt.base.forks import NoAnswer
+from crashhunt.disturbances import SECONDS_PER_COPY, FirstOnsets, disturber_of, parse_rates
 from crashhunt.episode._questions import Questions
 from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import Disturbance, Forced, ForcedCopy, Outcome
@@ -30,13 +34,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.base.forks import NoAnswer
     from crashhunt.base.json_types import Plain
     from crashhunt.disturbances import DisturbanceSampler, Onset
     from crashhunt.episode._episode import Episode
     from crashhunt.trial import TrialResult
 
 __all__ = ["OnsetForcer"]
+
+_PATIENCE_WITH_SECONDS: Final = 2 + SECONDS_PER_COPY  # such a copy waits for as many others, on average
 
 
 class OnsetForcer:
@@ -124,46 +129,100 @@ class OnsetForcer:
         return FirstOnsets(self._sampler, spec.forcing, spec.seed, spec.max_steps)
 
     def _follow(self, episode: Episode, onset: Onset) -> None:
-        """Have a copy run to the end of its trial, and note how that was."""
+        """Run a copy to the end of its trial, with copies of its own for second onsets, and note how they ended."""
+        assert self._onsets is not None
+        seconds = self._onsets.following(onset)
+        patience_s = self._patience_s * (1 if seconds is None else _PATIENCE_WITH_SECONDS)
 
         def run(copy: Episode) -> Plain:
-            copy.replan(onset.planned)
-            while copy.result is None:
-                copy.step()
-            result = copy.result
-            return {
-                "outcome": str(result.outcome),
-                "step": result.steps,
-                "disturbed": result.disturbed,
-                "planned": [one.to_json() for one in copy.spec.disturbances],
-            }
+            if seconds is None:
+                copy.replan(onset.planned)
+                return {"ends": [_run_to_end(copy, onset)]}
+            copy.replan(onset.alone)
+            return self._run_with_seconds(copy, onset, seconds)
 
         def attempt() -> tuple[Plain | None, NoAnswer | None]:
             copy = episode.fork(run, observed=False)
-            return copy.answer(self._patience_s), copy.no_answer
+            return copy.answer(patience_s), copy.no_answer
 
         answer = self._questions.ask(attempt)
         if answer is None:
             return
-        outcome, step = str(answer["outcome"]), cast(int, answer["step"])
-        self._steps += step - episode.steps
+        if lost := answer.get("lost"):
+            self._questions.skip(str(lost), is_from_outside=bool(answer["is_from_outside"]))
+            return
+        for end in cast("list[JsonObject]", answer["ends"]):
+            self._note(onset, end)
+
+    def _run_with_seconds(self, copy: Episode, onset: Onset, seconds: FirstOnsets) -> Plain:
+        """Run a copy without later disturbances, and copies of it with second onsets; return how they ended."""
+        ends: list[Plain] = []
+        branched = copy.steps
+        while copy.result is None:
+            due = copy.steps >= onset.step - 1
+            for second in seconds.after(copy.steps, partial(_has_target, copy)) if due else ():
+                other = copy.fork(partial(_run_second, onset=second), observed=False)
+                end = other.answer(self._patience_s)
+                if end is None:
+                    why = other.no_answer or NoAnswer("did not answer")
+                    return {"lost": f"a copy {why.why}", "is_from_outside": why.is_from_outside}
+                ends.append(end)
+            copy.step()
+        alone = _end_of(copy, onset, branched, within=seconds.survival)
+        return {"ends": [alone, *ends]}
+
+    def _note(self, first: Onset, end: JsonObject) -> None:
+        """Note how a copy ended."""
+        outcome, step, within = str(end["outcome"]), cast(int, end["step"]), cast(float, end["within"])
+        branched = cast(int, end["branched"])
+        self._steps += step - branched
         if outcome in (Outcome.SIMULATOR_ERROR, Outcome.INVALID):
             self._questions.skip(f"a copy ended by {outcome}")  # perhaps because it is a copy
             return
         crashed = outcome in self._crashes
-        planned = cast("list[JsonObject]", answer["planned"])
+        planned = cast("list[JsonObject]", end["planned"])
         self._copies.append(
             ForcedCopy(
-                cell=onset.cell,
-                onset=onset.step,
-                weight=onset.weight,
-                branched=episode.steps,
+                cell=first.cell,
+                onset=cast(int, end["onset"]),
+                weight=first.weight * within,
+                branched=branched,
                 crash=outcome if crashed else "",
                 step=step,
-                disturbed=bool(answer["disturbed"]),
+                disturbed=bool(end["disturbed"]),
                 disturbances=tuple(map(Disturbance.from_json, planned)) if crashed else (),
+                within=within,
+                second=str(end["second"]),
             )
         )
+
+
+def _run_second(copy: Episode, onset: Onset) -> Plain:
+    copy.replan(onset.planned)
+    return _run_to_end(copy, onset, within=onset.weight, second=onset.cell)
+
+
+def _run_to_end(copy: Episode, onset: Onset, *, within: float = 1.0, second: str = "") -> Plain:
+    branched = copy.steps
+    while copy.result is None:
+        copy.step()
+    return _end_of(copy, onset, branched, within=within, second=second)
+
+
+def _end_of(copy: Episode, onset: Onset, branched: int, *, within: float, second: str = "") -> Plain:
+    """Return how a copy ended, with the names of `ForcedCopy`; it ends with its process."""
+    result = copy.result
+    assert result is not None
+    return {
+        "outcome": str(result.outcome),
+        "step": result.steps,
+        "disturbed": result.disturbed,
+        "planned": [one.to_json() for one in copy.spec.disturbances],
+        "onset": onset.step,
+        "branched": branched,
+        "within": within,
+        "second": second,
+    }
 
 
 def _has_target(episode: Episode, planned: Disturbance) -> bool:

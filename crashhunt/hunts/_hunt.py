@@ -97,6 +97,7 @@ class Hunt:
         self._seed_given = seed_given
         self._snapshot_options = snapshot
         self._stops: Sequence[int] = ()
+        self._progress: Progress | None = None  # once the ledger says that the hunt runs
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
         """Hunt until a crash, the last trial or an interrupt.
@@ -136,7 +137,8 @@ class Hunt:
         """Write down why the hunt ends, where that can still be written."""
         remove_scratch(self._place.scratch)  # on a disk that is full, this makes room for a line
         with suppress(CrashhuntError):
-            ledger.enter("error", encodable(why))
+            last: Noted = self._progress.noted(now=True) if self._progress is not None else {}
+            ledger.enter("error", encodable(why), **last)
 
     def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
         settings = self.settings
@@ -197,6 +199,10 @@ class Hunt:
             ends_at=None,
         )
         progress.counted = progress.rate or rate_watch(settings, ledger)
+        if progress.rare is not None:
+            progress.rare.read(trials.upcoming)
+        self._progress = progress
+        ledger.note(**progress.noted())  # so that a hunt that fails before the first heartbeat has the same facts
         runs_again = TrialReruns(
             place=self._place,
             ledger=ledger,

@@ -39,7 +39,7 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from crashhunt.disturbances import COPIES_PER_ROOT
+from crashhunt.disturbances import COPIES_PER_ROOT, SECONDS_PER_COPY
 from crashhunt.rates._betting import Bets, RateTest
 from crashhunt.trial import Forcing, Outcome
 
@@ -64,10 +64,15 @@ TRIALS_PER_ROOT: Final = 1 + PLAIN_PER_ROOT
 PLAIN_SHARE: Final = 0.1
 """Share of the proposal that is the law itself: no weight is above 10 times that of the law."""
 _PRIOR_COPIES: Final = 4.0  # weight of the common crash share in that of a cell
+MIN_SHARE_OF_SECONDS: Final = 0.1
+"""Share of the crashes from which on second onsets are forced: below that, the copies cost more than they tell."""
+_PILOT_ROOTS: Final = 128  # after so many without such a cell, no copy has forced second onsets any more
+_MOST_MORE_SECONDS: Final = 8  # times as many as the first forcing would have: a copy may be long, and others short
 MIN_EFFECTIVE: Final = 20.0
 MIN_ROOTS_WITH_CRASH: Final = 20
 MAX_SHARE: Final = 0.2
 _RISK_OF_COPIES: Final = 0.25  # share of the risk that the certain lower end by copies alone takes
+_ONLY_RUNNING: Final = ("origin", "bar", "verdict")  # which an estimate does not have
 MAX_EXCLUDED: Final = 0.05
 """Share of roots without a complete result above which nothing is estimated."""
 
@@ -186,18 +191,10 @@ class RareEstimate:
 
     def to_json(self) -> JsonObject:
         """Return plain data without NaN."""
-        low, high = self.certain or (None, None)
+        shared = {key: value for key, value in self.running().items() if key not in _ONLY_RUNNING}
         return {
-            "method": "rare",
-            "per": "trial",
-            "confidence": 100 * self.confidence,
-            "units": self.roots,
-            "trials": self.plain,
-            "crashes": self.plain_crashes,
-            "estimate": self.estimate,
-            "certain": {"low": low, "high": high} if self.certain is not None else None,
+            **shared,
             "estimated": _plain(self.estimated),
-            "why_not": self.why_not,
             "more_roots": self.more_roots,
             "left_out": self.excluded,
             "parts": {
@@ -216,7 +213,6 @@ class RareEstimate:
 
     def running(self) -> RunningRate:
         """Return what ``status`` reports of it."""
-        low, high = self.certain or (0.0, None)
         one = self.estimated
         return {
             "method": "rare",
@@ -226,7 +222,7 @@ class RareEstimate:
             "trials": self.plain,
             "crashes": self.plain_crashes,
             "origin": "",
-            "certain": None if self.certain is None else {"low": low, "high": high},
+            "certain": None if self.certain is None else {"low": self.certain[0], "high": self.certain[1]},
             "estimate": self.estimate,
             "estimated": None if one is None else {"low": one.low, "high": one.high},
             "why_not": self.why_not,
@@ -318,7 +314,9 @@ def _bound(forcing: Forcing, hazard: float) -> float:
     """
     ratios = (1.0, *forcing.ratios.values())
     most_proposed = min(1.0, hazard) * max(ratios)
-    return (most_proposed + forcing.spacing) / min(ratios)
+    # The probabilities of no second onset and of all second onsets have the sum 1, and one more may be forced.
+    most_within = 1.0 + forcing.second_spacing
+    return (most_proposed + forcing.spacing) / min(ratios) * most_within
 
 
 def learn_forcing(earlier: Iterable[Forced], start: Forcing) -> Forcing:
@@ -328,27 +326,78 @@ def learn_forcing(earlier: Iterable[Forced], start: Forcing) -> Forcing:
         earlier: what came of the copies of earlier roots.
         start: the forcing of the first roots, where earlier ones say nothing.
     """
-    masses: Counter[str] = Counter()
-    copies: Counter[str] = Counter()
-    crashes: Counter[str] = Counter()
+    learned = _Learned()
     roots = 0
     for one in earlier:
         roots += 1
-        masses.update(one.masses)
-        for copy in one.copies:
-            copies[copy.cell] += 1
-            crashes[copy.cell] += bool(copy.crash)
+        learned.add(one)
+    masses = learned.masses
     total = math.fsum(masses.values())
     if not roots or total <= 0.0:
         return start
-    common = (crashes.total() + 0.5) / (copies.total() + 1.0)
-    roots_of_shares = {
-        cell: math.sqrt((crashes[cell] + _PRIOR_COPIES * common) / (copies[cell] + _PRIOR_COPIES))
+    common = (math.fsum(learned.squares.values()) + 0.5) / (learned.copies.total() + 1.0)
+    spreads = {
+        cell: math.sqrt((learned.squares[cell] + _PRIOR_COPIES * common) / (learned.copies[cell] + _PRIOR_COPIES))
         for cell in sorted(masses)
     }
-    mean = math.fsum(masses[cell] / total * share for cell, share in roots_of_shares.items())
-    ratios = {cell: PLAIN_SHARE + (1.0 - PLAIN_SHARE) * share / mean for cell, share in roots_of_shares.items()}
-    return Forcing(total / roots / COPIES_PER_ROOT, ratios)
+    mean = math.fsum(masses[cell] / total * spread for cell, spread in spreads.items())
+    ratios = {cell: PLAIN_SHARE + (1.0 - PLAIN_SHARE) * spread / mean for cell, spread in spreads.items()}
+    second = learned.cells_with_seconds()
+    least = start.second_spacing / _MOST_MORE_SECONDS
+    second_spacing = max(least, learned.second_mass / SECONDS_PER_COPY) if learned.second_mass else start.second_spacing
+    if not second and roots >= _PILOT_ROOTS:
+        second_spacing = 0.0
+    return Forcing(total / roots / COPIES_PER_ROOT, ratios, second=second, second_spacing=second_spacing)
+
+
+class _Learned:
+    """What the copies of earlier roots suggest, by the cell of their first onset.
+
+    Attributes:
+        masses: probability of the first onset, summed over roots.
+        copies: number of copies of roots.
+        squares: sum of the squares of their values. A value estimates the crash probability given the first onset, from
+            one copy and the copies of it.
+    """
+
+    def __init__(self) -> None:
+        self.masses: Counter[str] = Counter()
+        self.copies: Counter[str] = Counter()
+        self.squares: defaultdict[str, float] = defaultdict(float)
+        self._values: defaultdict[str, float] = defaultdict(float)
+        # Of copies that could have a second onset, and on which these were forced: their number, and the crash
+        # probability after a second onset.
+        self._forced: Counter[str] = Counter()
+        self._after_second: defaultdict[str, float] = defaultdict(float)
+        self._mass = 0.0
+
+    def add(self, one: Forced) -> None:
+        """Count the copies of a root."""
+        self.masses.update(one.masses)
+        for first, *seconds in one.by_first_onset():
+            cell, alone = first.cell, first.within if first.crash else 0.0
+            after_second = math.fsum(copy.within for copy in seconds if copy.crash)
+            self.copies[cell] += 1
+            self._values[cell] += alone + after_second
+            self.squares[cell] += (alone + after_second) ** 2
+            if first.within < 1.0:
+                self._forced[cell] += 1
+                self._mass += 1.0 - first.within
+                self._after_second[cell] += after_second
+
+    @property
+    def second_mass(self) -> float:
+        """Mean probability of a second onset after a first one; 0 where no second onset was forced."""
+        return self._mass / self._forced.total() if self._forced else 0.0
+
+    def cells_with_seconds(self) -> tuple[str, ...]:
+        """Return the cells in which crashes after a second onset are a considerable part of all crashes."""
+        total = math.fsum(self.masses[cell] * self._values[cell] / count for cell, count in self.copies.items())
+        return tuple(
+            cell
+            for cell, count in sorted(self._forced.items())
+            if self.masses[cell] * self._after_second[cell] / count > MIN_SHARE_OF_SECONDS * total
+        )
 
 
 class RareCounter:

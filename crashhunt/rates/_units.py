@@ -47,6 +47,7 @@ Per: TypeAlias = RatePer
 
 PERS: tuple[Per, ...] = RATE_PERS
 MAX_INVALID_SHARE = 0.05  # of the trials that have ended
+_SURELY_INVALID_SHARE = 0.04  # against 5 % itself, a share of just 5 % would never be decided
 MAX_SPEED_MPS = 100.0  # 360 km/h: no trial's vehicle is faster, so the exposure in km has a bound before it begins
 _S_PER_HOUR, _M_PER_1000KM = 3600.0, 1e6
 _SPARE_STEPS = 1  # of the bound: exposures are rounded
@@ -162,7 +163,7 @@ class UnitSequence:
         self._traffics: dict[int, list[TrialFacts]] = {}
         self._next = 0  # trial, or traffic
         self.valid = self.invalid = self.not_random = 0  # of the trials in the sequence
-        self.hopeless_at: int | None = None  # the first trial with which too many are certainly invalid
+        self.hopeless_at: int | None = None  # the first trial with which too many are invalid, see has_too_many_invalid
 
     def add(self, trial: TrialFacts) -> Iterator[Unit]:
         """Add a trial, and yield the units that are complete now."""
@@ -227,16 +228,17 @@ class UnitSequence:
 
 
 def has_too_many_invalid(invalid: int, valid: int) -> bool:
-    """Return whether the share of invalid trials is certainly above `MAX_INVALID_SHARE`, so that more change nothing.
+    """Return whether the share of invalid trials is above `MAX_INVALID_SHARE`, and more trials will hardly change it.
 
-    The probability that it ever is, at a smaller share, is 5 % at most.
+    The share in all trials is certainly above 4 %. The probability that it ever seems so at a smaller share is 5 % at
+    most. So a hunt ends after some thousand trials at any share from 5 % on.
     """
     if invalid <= MAX_INVALID_SHARE * (invalid + valid):
         return False
     test = RateTest()
     test.add(1, times=invalid)
     test.add(0, times=valid)
-    return test.verdict(MAX_INVALID_SHARE) == "above"
+    return test.verdict(_SURELY_INVALID_SHARE) == "above"
 
 
 class RateCounter:

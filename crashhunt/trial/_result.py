@@ -81,14 +81,17 @@ class ForcedCopy(Serializable):
     """What came of a copy with a forced first onset.
 
     Args:
-        cell: the model and strength of the onset, as in `Forcing.ratios`.
-        onset: step of the onset.
+        cell: the model and strength of the first onset, as in `Forcing.ratios`.
+        onset: step of the onset; of the second one where that is forced.
         weight: probability of the onsets that this copy represents, given the root.
-        branched: the step after which it left the root.
+        branched: the step after which it left the root, or the copy that it is a copy of.
         crash: the outcome where that is one of the hunt's crashes, else empty.
         step: at which the copy ended.
         disturbed: whether any disturbance had an effect on the copy.
         disturbances: of a crash, all that were planned from the start of the trial.
+        within: probability of what this copy represents, given its first onset. It is 1 where later disturbances are
+            drawn as ever. With forced second onsets it is the probability of that onset, or of none.
+        second: the cell of its forced second onset; empty for none.
     """
 
     cell: str
@@ -99,6 +102,8 @@ class ForcedCopy(Serializable):
     step: int = 0
     disturbed: bool = True
     disturbances: tuple[Disturbance, ...] = field(default=(), metadata=OMIT_DEFAULT)
+    within: float = field(default=1.0, metadata=OMIT_DEFAULT)
+    second: str = field(default="", metadata=OMIT_DEFAULT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +113,7 @@ class Forced(Serializable):
     Args:
         survival: probability that no first onset begins before the root ends.
         masses: by cell, the probability that the first onset is of this cell and begins before the root ends.
-        copies: in the order of their onsets.
+        copies: in the order of their onsets; after each copy its own copies, with a second onset.
         steps: how many steps they took.
         unanswered: how many further copies there were to be, of which nothing is known.
         why_unanswered: the reason for the first of them; empty where there is none.
@@ -122,6 +127,16 @@ class Forced(Serializable):
     unanswered: int = field(default=0, metadata=_NOT_ALL_ANSWERED)
     why_unanswered: str = field(default="", metadata=_NOT_ALL_ANSWERED)
     may_be_asked_again: bool = field(default=False, metadata=_NOT_ALL_ANSWERED)
+
+    def by_first_onset(self) -> list[tuple[ForcedCopy, ...]]:
+        """Return the copies of each first onset: the copy of the root, then the copies of that with a second onset."""
+        groups: list[tuple[ForcedCopy, ...]] = []
+        for copy in self.copies:
+            if copy.second:
+                groups[-1] += (copy,)
+            else:
+                groups.append((copy,))
+        return groups
 
 
 # Robustness probes: the minimal disturbance that makes a fork of the trial crash.

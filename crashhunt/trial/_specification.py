@@ -81,10 +81,14 @@ class Forcing(Serializable):
         spacing: proposed probability per copy. One copy is made in each interval of this length.
         ratios: by cell, how many times more often than by its own law a first onset is proposed; 1 where it is missing.
             A cell is a model with one strength, such as ``brake=4.0``.
+        second: cells of first onsets whose copies have forced second onsets.
+        second_spacing: probability per forced second onset; 0 for none.
     """
 
     spacing: float
     ratios: Mapping[str, float] = field(default_factory=dict)
+    second: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
+    second_spacing: float = field(default=0.0, metadata=OMIT_DEFAULT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,6 +53,32 @@ def test_survival_is_the_product_over_effective_draws():
     assert math.fsum(m for cell, m in onsets.masses.items() if cell.startswith("brake")) > 0
 
 
+def test_second_onsets_follow_the_law_from_the_step_after_the_first():
+    some = sampler(late_action=0.1, brake=0.05)
+    forcing = Forcing(0.02, second=("brake=2.0", "brake=4.0", "brake=6.0"), second_spacing=0.1)
+    first = next(one for one in run(FirstOnsets(some, forcing, 3, LAST)) if one.cell in forcing.second)
+    assert all(one.step == first.step for one in first.alone)
+    assert set(first.alone) <= set(first.planned)
+    law = FirstOnsets(some, forcing, 3, LAST).following(first)
+    found = [one for step in range(first.step - 1, LAST) for one in law.after(step, lambda _: True)]
+    assert law.survival == pytest.approx((0.9 * 0.95) ** (LAST - first.step))
+    assert law.survival + math.fsum(law.masses.values()) == pytest.approx(1.0)
+    assert all(one.weight == 0.1 and one.step > first.step for one in found)
+    assert abs(len(found) * 0.1 - (1 - law.survival)) <= 0.1
+    assert found[0].planned != first.planned
+
+
+def test_one_copy_of_a_root_is_a_pilot_of_second_onsets_unless_there_are_none():
+    some = sampler(late_action=0.1, brake=0.05)
+
+    def with_seconds(forcing, seed):
+        onsets = FirstOnsets(some, forcing, seed, LAST)
+        return [one.number for one in run(onsets) if onsets.following(one) is not None]
+
+    assert [with_seconds(Forcing(0.02, second_spacing=0.1), seed) for seed in (3, 9)] == [[3], [1]]
+    assert with_seconds(Forcing(0.02), 3) == []
+
+
 def test_agent_kinds_begin_two_steps_after_the_fork_and_others_one():
     some = sampler(late_action=0.1, brake=0.1)
     onsets = FirstOnsets(some, Forcing(0.02), 3, LAST)

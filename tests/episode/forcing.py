@@ -38,6 +38,11 @@ def sampler_of(place, rates):
     return disturber_of(parse_rates(rates), agents=("ego",), step_length_s=place.simulator.step_length_s)
 
 
+def cells_of(place, rates):
+    """The cells of all first onsets in a root."""
+    return run(place, forcer_of(rates), forcing=first_forcing(sampler_of(place, rates), place.steps)).forced.masses
+
+
 def roots(name, stage, speed, seed, steps, rates=RATES):
     """What the copies of a root come to, and whether each that crashed does so from the start."""
     place = Place(name, stage, speed, seed, steps)
@@ -48,7 +53,12 @@ def roots(name, stage, speed, seed, steps, rates=RATES):
     again = run(place, forcer_of(rates), disturbances=early, forcing=first)
     starts = [run(place, disturbances=one.disturbances) for one in root.forced.copies if one.crash]
     other = run(place, forcer_of(rates), forcing=replace(first, ratios={"stop=6.0": 4.0}))
+    always = ("late_observation=0.05",)  # of the agent: each onset is effective
+    law = replace(first_forcing(sampler_of(place, always), steps), second_spacing=0.1)
+    late = run(place, forcer_of(always), forcing=replace(law, second=tuple(cells_of(place, always)))).forced
     return {
+        "chance": sampler_of(place, always).chance("late_observation"),
+        "late": [[one.onset, one.within, one.step] for one in late.copies if not one.second and not one.crash],
         "same": plain.digest == root.digest,
         "outcome": str(root.outcome),
         "again": again.forced == root.forced,

@@ -49,10 +49,18 @@ def test_copies_of_a_root_crash_from_the_start_as_they_did_and_change_nothing(as
     steps = sum(one["step"] - one["branched"] for one in forced["copies"])
     assert forced["steps"] == found["other_steps"] == steps
     for one in forced["copies"]:
-        assert one["onset"] - one["branched"] == (2 if one["cell"].startswith("late_observation") else 1)
+        kind = one.get("second") or one["cell"]
+        assert one["onset"] - one["branched"] == (2 if kind.startswith("late_observation") else 1)
         assert one["step"] == 150 - 30 * (scenario == "toy") or one["crash"]  # never to a horizon
+    for onset, within, ended in found["late"]:  # no second onset from the step after the first to the last one
+        assert within == pytest.approx((1 - found["chance"]) ** (ended - onset))
     if scenario != "merge":
         assert crashes
+        pilot = next(one for one in forced["copies"] if one.get("within", 1.0) < 1.0 and not one.get("second"))
+        seconds = [one for one in forced["copies"] if one.get("second")]
+        assert 0 < len(seconds) <= 3
+        assert all(one["weight"] / one["within"] == pytest.approx(pilot["weight"] / pilot["within"]) for one in seconds)
+        assert all(one["branched"] >= pilot["onset"] - 1 for one in seconds)
         weights = {weight for cell, weight in found["proposed"] if cell == "stop=6.0"}
         assert weights == {found["spacing"] / 4}
 

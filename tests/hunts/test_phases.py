@@ -190,8 +190,8 @@ def test_confirmation_is_seen_while_it_runs_and_resumed_after_an_interrupt(toy):
 
 def two_hunts(shell):
     for name, speed in (("a", "12:20"), ("b", "4:20")):
-        words = ("--scenario", "toy", "--arg", f"speed={speed}", "--seed", "4", "--keep-going")
-        shell.crashhunt("run", name, "2", "25", "99", *words)
+        words = ("--scenario", "toy", "--arg", f"speed={speed}", "--seed", "4", "--keep-going", "--keep", "1")
+        shell.crashhunt("run", name, "2", "12", "99", *words)
 
 
 def test_a_comparison_knows_whether_trials_are_left_or_only_confirmations(toy, made_once):
@@ -205,9 +205,9 @@ def test_a_comparison_knows_whether_trials_are_left_or_only_confirmations(toy, m
         return found.hunts[1], found.pairs[0]
 
     phase = {"name": "confirming", "done": 3, "total": 9, "seconds_left": 4.0}
-    whole, pair = compared(planned=25)
+    whole, pair = compared(planned=12)
     assert (whole.state, whole.interval is not None, pair.test) == ("running", True, "pairs")
-    figures, pair = compared(planned=30)
+    figures, pair = compared(planned=15)
     assert (figures.interval, pair.test) == (whole.interval, "pairs")  # both hold at any time
     figures, pair = compared(planned=0, phase=phase)  # its time was up
     assert (figures.interval, pair.test) == (whole.interval, "pairs")

@@ -12,7 +12,7 @@ import pytest
 import crashhunt
 from crashhunt.disturbances import DisturbanceSampler, brake
 from crashhunt.errors import UsageError
-from crashhunt.hunts import hunt_state
+from crashhunt.hunts import _rare as rare_module, hunt_state
 from crashhunt.hunts._rare import Forcings, RareWatch
 from crashhunt.ledger import Ledger
 from crashhunt.rates import BLOCK, TRIALS_PER_ROOT, is_root
@@ -182,30 +182,29 @@ def estimate_of(report):
 
 
 @pytest.mark.nightly
-def test_a_hunt_in_rare_mode_is_the_same_with_any_number_of_workers_and_resumed(tmp_path):
+def test_a_hunt_in_rare_mode_is_the_same_with_any_number_of_workers_and_resumed(tmp_path, monkeypatch):
+    monkeypatch.setattr(rare_module, "BLOCK", 4)  # of 32, the third would begin after 320 trials
     options = OPTIONS | {"disturb": ["brake=0.02", "stop=0.02"]}
-    one = crashhunt.run(tmp_path / "one", 1, 350, 60, **options)
-    three = crashhunt.run(tmp_path / "three", 3, 350, 60, **options)
-    crashhunt.run(tmp_path / "again", 2, 203, 60, **options)
-    again = crashhunt.run(tmp_path / "again", 2, 350, 60, **options)
-    assert estimate_of(one) == estimate_of(three) == estimate_of(again)
-    assert one.rare.is_verified
-    assert one.rare.verified == 5
-    assert len(one.rare.crashes) == 5
-    assert one.rare.estimate.roots == 70
-    with closing(Ledger(tmp_path / "one" / "ledger.sqlite")) as ledger:
+    whole = crashhunt.run(tmp_path / "whole", 1, 60, 60, **options)
+    crashhunt.run(tmp_path / "again", 3, 33, 60, **options)
+    again = crashhunt.run(tmp_path / "again", 2, 60, 60, **options)
+    assert estimate_of(whole) == estimate_of(again)
+    assert whole.rare.is_verified
+    assert whole.rare.verified == len(whole.rare.crashes) > 0
+    assert whole.rare.estimate.roots == 12
+    with closing(Ledger(tmp_path / "whole" / "ledger.sqlite")) as ledger:
         results = list(ledger.results())
     roots = [result for result in results if is_root(result.spec.number)]
     assert all(one.step == 1 for result in roots for one in result.spec.disturbances)
-    assert roots[0].spec.forcing.ratios == {} != roots[69].spec.forcing.ratios
-    assert 4 < sum(len(result.forced.copies) for result in roots) / 70 <= 8
+    assert roots[0].spec.forcing.ratios == {} != roots[11].spec.forcing.ratios
+    assert 3 < sum(len(result.forced.copies) for result in roots) / 12 <= 9
     others = [result for result in results if not is_root(result.spec.number)]
     assert all(result.forced is None and result.spec.forcing is None for result in others)
     assert any(one.step > 1 for result in others for one in result.spec.disturbances)
     crashed = [result for result in others if result.outcome in CRASHES]
-    assert one.rare.estimate.plain_crashes == len(crashed)
-    found = hunt_state(tmp_path / "one").rate
-    assert found == one.rare.estimate.running()
+    assert whole.rare.estimate.plain_crashes == len(crashed)
+    found = hunt_state(tmp_path / "whole").rate
+    assert found == whole.rare.estimate.running()
 
 
 @pytest.mark.nightly

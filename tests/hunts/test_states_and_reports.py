@@ -15,9 +15,10 @@ from types import SimpleNamespace
 
 import pytest
 
+import crashhunt
 from crashhunt.base import layout
-from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import HuntStatus, check, find_hunts, hunt_state, is_hunt, load, salvage
+from crashhunt.errors import CrashhuntError, HuntDirectoryError
+from crashhunt.hunts import HuntStatus, _hunt as hunt_module, check, find_hunts, hunt_state, is_hunt, load, salvage
 from crashhunt.hunts._next_trials import Unanswered, find_unanswered
 from crashhunt.hunts._progress import Progress
 from crashhunt.hunts._state import draws_independently, ledger_owner
@@ -105,6 +106,31 @@ def test_what_not_every_hunt_has_is_in_its_json_only_where_it_has_it(hunt):
     assert more.keys() - plain.keys() == {"disturbed", "core", "kinds", "newest_kind_s"}
     assert (more["disturbed"], more["core"], more["kinds"]) == (0, "used", [kind])
     assert more["newest_kind_s"] == pytest.approx(30, abs=5)
+
+
+def test_hunt_that_fails_before_its_first_trial_has_the_facts_of_a_hunt_that_ran(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise CrashhuntError("no worker can be started")
+
+    monkeypatch.setattr(hunt_module, "make_executor", fail)
+    monkeypatch.chdir(tmp_path)
+    Path("toy.toml").write_text('title = "A toy"\nschema = 1\nsimulator = "toy"\n[agents.ego]\n')
+    with pytest.raises(CrashhuntError, match="no worker"):
+        crashhunt.run(
+            tmp_path / "h",
+            1,
+            3,
+            9,
+            scenario="toy.toml",
+            agent="crashhunt.agents:KeepLaneWithSpeed",
+            seed=4,
+            keep_going=True,
+            snapshot_code=False,
+        )
+    found = hunt_state(tmp_path / "h")
+    assert (found.state, found.detail, found.kinds) == ("error", "no worker can be started", [])
+    assert found.rate["why_not"] == "no trial counts yet"
+    assert found.to_json()["newest_kind_s"] is None
 
 
 def test_a_hunt_that_is_planned_is_queued_and_one_without_its_ledger_is_damaged(hunt, tmp_path):

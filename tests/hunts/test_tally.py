@@ -50,13 +50,13 @@ class Driver:
     def fail_4(self):
         pass
 """
-WORDS = ("--scenario", "toy", "--agent", "driver:Driver", "--arg", "bug=0:9", "--seed", "3", "--keep-going", "--json")
+WORDS = ("--scenario", "toy", "--agent", "driver:Driver", "--arg", "bug=0:5", "--seed", "3", "--keep-going", "--json")
 
 
 def hunted(shell):
     (shell.folder / "driver.py").write_text(AGENT)
     for name, more in (("all", ()), ("kept", ("--keep", "1"))):
-        done = shell.crashhunt("run", name, "2", "40", "40", *WORDS, *more)
+        done = shell.crashhunt("run", name, "2", "18", "40", *WORDS, *more)
         (shell.folder / f"{name}.json").write_text(json.dumps(done.json))
         (shell.folder / f"{name}.txt").write_text(done.err)
 

@@ -168,14 +168,10 @@ def run_root(model, sampler, forcing, seed):
     onsets, copies, steps = FirstOnsets(sampler, forcing, seed, model.steps), [], 0
     while True:
         for onset in onsets.after(episode.steps, episode.has_target):
-            made = episode.fork([*(one for one in spec.disturbances if one.step > episode.steps), *onset.planned])
-            while not made.over:
-                made.step()
-            steps += made.steps - episode.steps
-            crash = "collision" if made.crashed else ""
-            copies.append(
-                ForcedCopy(onset.cell, onset.step, onset.weight, episode.steps, crash, made.steps, made.disturbed)
-            )
+            kept = [one for one in spec.disturbances if one.step > episode.steps]
+            found, taken = run_copy(episode, kept, onset, onsets.following(onset))
+            copies += found
+            steps += taken
         episode.step()
         if episode.over:
             break
@@ -183,6 +179,33 @@ def run_root(model, sampler, forcing, seed):
     outcome = Outcome.COLLISION if episode.crashed else Outcome.SURVIVED
     there = spec.disturbances if episode.disturbed else ()
     return replace(TrialResult(spec, outcome, steps=episode.steps), forced=forced, disturbances=there)
+
+
+def run_copy(episode, kept, onset, following):
+    """Return the copies of a first onset, and the steps that they take."""
+    made = episode.fork([*kept, *(onset.planned if following is None else onset.alone)])
+    found, steps = [], 0
+    while not made.over:
+        for second in (
+            following.after(made.steps, made.has_target) if following and made.steps >= onset.step - 1 else ()
+        ):
+            other = made.fork([*(one for one in made.planned if one.step > made.steps), *second.planned])
+            while not other.over:
+                other.step()
+            steps += other.steps - made.steps
+            found.append(copy_of(onset, made, other, second))
+        made.step()
+    steps += made.steps - episode.steps
+    return [copy_of(onset, episode, made, within=following.survival if following else 1.0), *found], steps
+
+
+def copy_of(onset, left, made, second=None, *, within=None):
+    within = second.weight if second else within
+    return ForcedCopy(
+        cell=onset.cell, onset=(second or onset).step, weight=onset.weight * within, branched=left.steps,
+        crash="collision" if made.crashed else "", step=made.steps, disturbed=made.disturbed, within=within,
+        second=second.cell if second else "",
+    )  # fmt: skip
 
 
 def run_plain(model, sampler, seed):

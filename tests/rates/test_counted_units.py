@@ -168,6 +168,13 @@ def test_many_invalid_trials_end_a_hunt_undecided_and_few_do_not():
     assert (shuffled.decided_at, shuffled.counter.units) == (many.decided_at, many.counter.units)
 
 
+def test_share_of_invalid_trials_just_above_the_limit_ends_a_hunt_too():
+    outcomes = (["survived"] * 9 + ["invalid"] + ["survived"] * 9) * 400  # 5.26 %
+    watch = watched(outcomes, bar=1e-5)
+    assert watch.decided_at is not None
+    assert watch.why_undecided == "too many trials are invalid, so more of them do not help"
+
+
 def test_trial_without_exposure_ends_a_hunt_undecided():
     watch = BarWatch(RULE, 1.0, "hour", ("collision",))
     watch.add(data(0, driven_s=None, step_length_s=None))

@@ -6,11 +6,11 @@ import math
 import statistics
 
 import pytest
-from markov import Model, run_roots
+from markov import Model, run_root, run_roots
 
-from crashhunt.disturbances import first_forcing
-from crashhunt.rates import TRIALS_PER_ROOT, Root, learn_forcing, rare_estimate
-from crashhunt.trial import Forced, ForcedCopy, Forcing
+from crashhunt.disturbances import SECONDS_PER_COPY, first_forcing
+from crashhunt.rates import TRIALS_PER_ROOT, Root, learn_forcing, rare_estimate, root_of
+from crashhunt.trial import CRASHES, Forced, ForcedCopy, Forcing
 
 SPARSE = {"late_action": 1e-4, "brake": 2e-4, "stop": 1e-4}
 DENSE = {"late_action": 0.05, "brake": 0.1, "stop": 0.02}
@@ -33,6 +33,39 @@ def test_roots_estimate_both_parts_without_bias(model):
     estimate = rare_estimate(roots)
     assert estimate.disturbed == pytest.approx(sum(estimate.parts.values()), rel=0.2)
     assert all(root.copies <= root.bound for root in roots)
+
+
+@pytest.mark.parametrize("scale", [1.0, 20.0])  # of 20: most copies have several onsets
+def test_forced_second_onsets_have_no_bias(scale):
+    model = Model({name: scale * chance for name, chance in TWO.items()})
+    sampler, spacing = model.sampler(), first_forcing(model.sampler(), model.steps).spacing
+    forcing = Forcing(spacing, {"brake=2.0": 0.5}, second=("late_action=0.5", "brake=2.0"), second_spacing=2 * spacing)
+    results = [run_root(model, sampler, forcing, 7919 * number) for number in range(250)]
+    found = [root_of(result, CRASHES, model.hazard) for result in results]
+    assert abs(z_score([root.disturbed for root in found], model.truth()[1])) < 3
+    assert all(root.copies <= root.bound for root in found)
+    copies = [copy for result in results for copy in result.forced.copies]
+    assert {copy.cell for copy in copies if copy.second} >= {"late_action=0.5", "brake=2.0"}
+    after_second = sum(copy.weight for copy in copies if copy.second and copy.crash)
+    assert after_second > 0.3 * sum(copy.weight for copy in copies if copy.crash)
+
+
+def test_second_onsets_are_forced_where_they_matter_and_given_up_where_they_do_not():
+    start = first_forcing(Model(SPARSE).sampler(), 40)
+
+    def forced(crashes_alone, crashes_after):
+        first = ForcedCopy("brake=2.0", 3, 0.008, 2, crashes_alone, 9, within=0.8)
+        seconds = [ForcedCopy("brake=2.0", 5, 0.001, 4, crashes_after, 9, within=0.1, second="stop=6.0")] * 2
+        return Forced(0.96, {"brake=2.0": 0.04}, (first, *seconds))
+
+    assert [len(group) for group in forced("", "").by_first_onset()] == [3]
+    matters = learn_forcing([forced("", "collision")] * 130, start)
+    assert matters.second == ("brake=2.0",)
+    assert matters.second_spacing == pytest.approx(0.2 / SECONDS_PER_COPY)
+    seldom = [forced("collision", "collision")] + [forced("collision", "")] * 126
+    assert learn_forcing(seldom, start).second == ()
+    assert learn_forcing(seldom, start).second_spacing > 0  # of pilots
+    assert learn_forcing([*seldom, *seldom[1:3]], start).second_spacing == 0
 
 
 def test_copies_take_far_fewer_steps_than_plain_trials_for_a_rare_crash():
