@@ -147,7 +147,6 @@ class CrashList:
         return {
             **player_data(bundle, story),
             "near_miss": bundle.is_near_miss,
-            "table_lines": story.table(),
             "parameters": {agent: dict(given) for agent, given in result.spec.arguments.items()},
             "scenario_parameters": dict(result.spec.scenario_arguments),
             "judged": story.judgement.to_json() if story.judgement is not None else None,

@@ -20,19 +20,15 @@ async function begin() {
   }
   document.title = `${crash.id} - crashhunt`;
   setText($("title"), crash.id);
-  setText($("summary"), crash.summary);
-  for (const id of ["player", "about", "more"]) $(id).hidden = false;
+  for (const id of ["player", "more"]) $(id).hidden = false;
   await window.load(crash);
-  $("words").replaceChildren(...window.paragraphs(crash.words));
-  $("facts").replaceChildren(...facts(crash).flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
   $("commands").replaceChildren(...crash.commands.flatMap(([name, command]) => [make("span", name), make("code", command), copyButton(command, name)]));
   $("log").href = `${API}/log`;
   $("export").href = `${API}/export`;
-  setText($("steps"), crash.table_lines.join("\n"));
   const output = [crash.run_log, crash.error_log].filter((text) => text).join("\n");
   $("logs").hidden = !output;
   setText($("output"), output);
-  window.show(crash);
+  window.show(crash, facts(crash));
   window.addEventListener("resize", window.draw);
   onScheme(window.draw);
   document.body.dataset.complete = "true";
