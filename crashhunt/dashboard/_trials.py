@@ -374,6 +374,7 @@ def _point(data: JsonObject, crash_on: Collection[str]) -> Point:
         "ttc": _rounded(row.time_to_collision_s),
         "origin": row.origin,
         "parent": row.parent,
+        "disturbances": len(data.get("disturbances", ())),
         "values": values_of(row),
     }
 

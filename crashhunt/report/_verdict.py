@@ -179,8 +179,9 @@ def _avoided(story: Story, omission: Omission | None) -> str:
         best = judgement.best
         if best is not None and best.last_step is not None:
             also = "".join(f" and {each.removeprefix(f'{story.agent} ')}" for each in best.changed)
-            how = f"{_MANOEUVRES.get(best.manoeuvre, best.manoeuvre)}{also}"
-            return f"if {story.agent} {how}, {story.before_contact_s(best.last_step):.1f} s before, there is no crash"
+            how = _MANOEUVRES.get(best.manoeuvre, best.manoeuvre)
+            when = f"{story.before_contact_s(best.last_step):.1f} s before"
+            return f"if {story.agent} {how} {when}{also}, there is no crash"
         return "no run avoids it" if judgement.avoidable is False else ""
     if tried is None or tried.why_not or tried.step is None:
         return ""

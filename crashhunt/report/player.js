@@ -63,13 +63,18 @@ async function load(crash) {
   }
 }
 
-/* Puts a crash that is loaded into the page; the rows are names and values of facts of its trial. */
-function show(crash, rows) {
+/* Shows what is said of a crash; the rows are names and values of facts of its trial. */
+function describe(crash, rows) {
   $("verdict").textContent = crash.verdict;
   $("badges").replaceChildren(...crash.badges.map((text) => make("span", text, "badge")));
   $("words").replaceChildren(...paragraphs(crash.words));
   $("steps").textContent = crash.table_lines.join("\n");
   $("facts").replaceChildren(...rows.flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
+}
+
+/* Puts a crash that is loaded into the page; the rows are names and values of facts of its trial. */
+function show(crash, rows) {
+  describe(crash, rows);
   /* Without an animation of what went wrong, the traceback is the answer. */
   $("evidence").open = crash.category === "software fault";
   $("key-agent").textContent = crash.agent;

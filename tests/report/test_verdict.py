@@ -121,10 +121,10 @@ def omitted(**more):
         ),
         ({"escape": SimpleNamespace(step=30, why_not="the run differed", too_late=None)}, f"{TOUCHED}."),
         ({"escape": SimpleNamespace(step=None, why_not="", too_late=0)}, f"{TOUCHED}."),
-        ({"judgement": Judgement((attempt(25),))}, f"{TOUCHED}; if ego brakes, 1.5 s before, there is no crash."),
+        ({"judgement": Judgement((attempt(25),))}, f"{TOUCHED}; if ego brakes 1.5 s before, there is no crash."),
         (
             {"judgement": Judgement((attempt(25, changed=("ego does not change lanes",)),))},
-            f"{TOUCHED}; if ego brakes and does not change lanes, 1.5 s before, there is no crash.",
+            f"{TOUCHED}; if ego brakes 1.5 s before and does not change lanes, there is no crash.",
         ),
         (
             {"judgement": Judgement((attempt(-1),))},

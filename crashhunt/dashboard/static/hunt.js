@@ -117,7 +117,7 @@ function showCrashes() {
   const filter = $("crash-filter").value;
   const lines = crashes.filter((one) => !filter || (filter === "near misses" ? one.near_miss : one.type === filter));
   renew("crashes", lines, () => $("crashes").replaceChildren(table([["Crash"], ["What happened"], ["Type"], ["At fault"], ["Steps", "number"], ["Confirmed"]], lines.map((one) => [
-    one.damaged && !one.summary ? one.id : link(one.id), one.damaged || one.summary, one.near_miss ? "near miss" : one.type ?? "", one.fault ?? "", one.steps === undefined ? "" : count(one.steps),
+    one.damaged && !one.summary ? one.id : link(one.id), one.damaged || one.summary, one.near_miss ? (one.disturbed ? "near miss, disturbed" : "near miss") : one.type ?? "", one.fault ?? "", one.steps === undefined ? "" : count(one.steps),
     one.near_miss ? "" : one.confirmed === true ? "yes" : one.confirmed === false ? "no: flaky" : one.why_unconfirmed || "not yet",
   ]), "Crashes")));
 }
@@ -160,7 +160,7 @@ function drawProgress() {
   })), { barmode: "stack", bargap: 0, xaxis: { title: "trial" }, yaxis: { title: "trials" } }, `Outcomes over the hunt: ${Object.entries(hunt.outcomes).map(([name, number]) => `${name} ${number}`).join(", ")}`);
 }
 
-const about = (one) => spelled([`trial ${one.number}: ${one.outcome}`, one.danger === null ? "" : `criticality ${one.danger.toFixed(2)}`, one.origin && `from ${one.origin}`, ...Object.entries(one.values).map(([name, value]) => `${name} ${short(value)}${units[name] ? ` ${units[name]}` : ""}`)].filter((part) => part).join("\n")).replaceAll("\n", "<br>");
+const about = (one) => spelled([`trial ${one.number}: ${one.outcome}`, one.danger === null ? "" : `criticality ${one.danger.toFixed(2)}`, one.disturbances ? plural(one.disturbances, "disturbance", "disturbances") : "", one.origin && `from ${one.origin}`, ...Object.entries(one.values).map(([name, value]) => `${name} ${short(value)}${units[name] ? ` ${units[name]}` : ""}`)].filter((part) => part).join("\n")).replaceAll("\n", "<br>");
 function drawTrials() {
   const measured = points.filter((one) => one.danger !== null || one.crash), origins = [...new Set(points.map((one) => one.origin))].sort();
   $("criticality-figure").hidden = !measured.length;
@@ -334,7 +334,7 @@ function pick(number) {
   const command = run.map(quoted).join(" "), box = make("div", undefined, "command");
   box.append(make("span", "run its arguments again, with other seeds"), make("code", command), copyButton(command, `the arguments of trial ${number}`));
   const facts = make("dl");
-  facts.append(...[["outcome", one.outcome], ["steps", one.steps], ["criticality", one.danger ?? "-"], ["least time to collision", one.ttc === null ? "-" : `${one.ttc.toFixed(2)} s`], ["came from", [one.origin, one.parent === null ? "" : `trial ${one.parent}`].filter((part) => part).join(", ") || "-"], ...Object.entries(one.values).map(([name, value]) => [name, `${short(value)}${units[name] ? ` ${units[name]}` : ""}`])].flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
+  facts.append(...[["outcome", one.outcome], ["steps", one.steps], ["criticality", one.danger ?? "-"], ["disturbances", one.disturbances], ["least time to collision with any actor", one.ttc === null ? "-" : `${one.ttc.toFixed(2)} s`], ["came from", [one.origin, one.parent === null ? "" : `trial ${one.parent}`].filter((part) => part).join(", ") || "-"], ...Object.entries(one.values).map(([name, value]) => [name, `${short(value)}${units[name] ? ` ${units[name]}` : ""}`])].flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
   panel.replaceChildren(make("h3", `Trial ${number}`), facts, box);
   panel.scrollIntoView({ block: "nearest" });
 }
