@@ -6,7 +6,27 @@ const make = (tag, text, className) => {
   if (className) node.className = className;
   return node;
 };
-const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+/* Each look-up of a style costs as much as drawing a vehicle, so colours are kept until the scheme changes. */
+const STYLES = new Map();
+function css(name) {
+  if (!STYLES.has(name)) STYLES.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+  return STYLES.get(name);
+}
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { STYLES.clear(); PAINTED.clear(); });
+
+/* Curves of a crash stay the same while it plays, so they are painted once and copied below the cursor. */
+const PAINTED = new Map();
+function copied(id, crash, context, width, height, paint) {
+  const ratio = window.devicePixelRatio || 1, known = PAINTED.get(id);
+  if (!known || known.crash !== crash || known.size !== `${width} ${height} ${ratio}`) {
+    const canvas = new OffscreenCanvas(Math.max(1, Math.round(width * ratio)), Math.max(1, Math.round(height * ratio)));
+    const below = canvas.getContext("2d");
+    below.setTransform(ratio, 0, 0, ratio, 0, 0);
+    paint(below);
+    PAINTED.set(id, { crash, canvas, size: `${width} ${height} ${ratio}` });
+  }
+  context.drawImage(PAINTED.get(id).canvas, 0, 0, width, height);
+}
 const COLORS = { "traffic crash": "--crash", "traffic event": "--crash", "software fault": "--fault", "no crash": "--fine" };
 
 async function unpack(text) {
@@ -226,51 +246,53 @@ function drawPlot() {
   const left = 34, right = width - 54, top = 16, bottom = height - 18, last = Math.max(1, crash.steps - 1);
   const x = (step) => left + ((right - left) * step) / last;
   if (!crash.speeds) crash.speeds = Array.from({ length: crash.steps }, (_, step) => (view.agent >= 0 && state(step, view.agent) ? state(step, view.agent)[3] : NaN));
-  const speeds = crash.speeds, fastest = speeds.reduce((most, speed) => Math.max(most, Math.ceil(speed) || 0), 10);
-  const curves = [["--crash", crash.ttcs, 10], ["--accent", speeds, fastest]];
-  context.strokeStyle = css("--line");
-  context.strokeRect(left + 0.5, top + 0.5, right - left, bottom - top);
-  context.font = "11px system-ui";
-  for (const [color, series, limit] of curves) {
-    context.strokeStyle = css(color);
-    context.lineWidth = 1.5;
-    context.beginPath();
-    let down = false;
-    for (let step = 0; step < crash.steps; step++) {
-      const value = series[step];
-      const there = Number.isFinite(value);
-      if (there) context[down ? "lineTo" : "moveTo"](x(step), bottom - ((bottom - top) * Math.min(value, limit)) / limit);
-      down = there;
+  copied("plot", crash, context, width, height, (context) => {
+    const speeds = crash.speeds, fastest = speeds.reduce((most, speed) => Math.max(most, Math.ceil(speed) || 0), 10);
+    const curves = [["--crash", crash.ttcs, 10], ["--accent", speeds, fastest]];
+    context.strokeStyle = css("--line");
+    context.strokeRect(left + 0.5, top + 0.5, right - left, bottom - top);
+    context.font = "11px system-ui";
+    for (const [color, series, limit] of curves) {
+      context.strokeStyle = css(color);
+      context.lineWidth = 1.5;
+      context.beginPath();
+      let down = false;
+      for (let step = 0; step < crash.steps; step++) {
+        const value = series[step];
+        const there = Number.isFinite(value);
+        if (there) context[down ? "lineTo" : "moveTo"](x(step), bottom - ((bottom - top) * Math.min(value, limit)) / limit);
+        down = there;
+      }
+      context.stroke();
     }
-    context.stroke();
-  }
-  context.fillStyle = css("--crash");
-  context.textAlign = "right";
-  context.fillText("10 s", left - 4, top + 9);
-  context.fillText("TTC", left - 4, bottom);
-  context.textAlign = "left";
-  context.fillText(crash.other ? `time to collision with ${crash.other}` : "least time to collision with any actor", left, top - 5, right - left);
-  context.textAlign = "right";
-  context.fillStyle = css("--accent");
-  context.textAlign = "left";
-  context.fillText(`${fastest} m/s`, right + 4, top + 9);
-  context.fillText("speed", right + 4, bottom);
-  context.fillStyle = css("--faint");
-  context.textAlign = "center";
-  const ticks = right - left < 300 ? 2 : 4;
-  for (let part = 0; part <= ticks; part++) context.fillText(`${(crash.time0 + (part * last * crash.dt) / ticks).toFixed(1)} s`, Math.min(right - 14, Math.max(left + 14, left + ((right - left) * part) / ticks)), height - 4);
-  if (crash.escape !== null) {
-    context.strokeStyle = css("--faint");
-    context.setLineDash([3, 3]);
-    context.beginPath();
-    context.moveTo(x(crash.escape), top);
-    context.lineTo(x(crash.escape), bottom);
-    context.stroke();
-    context.setLineDash([]);
-  }
-  /* when others erred, or the agent saw or acted late; the scene of a step is what has come of it */
-  context.fillStyle = css("--fault");
-  for (const [from, to] of crash.disturbances) context.fillRect(x(Math.min(from, last)), bottom - 3, Math.max(2, x(Math.min(to, last)) - x(Math.min(from, last))), 3);
+    context.fillStyle = css("--crash");
+    context.textAlign = "right";
+    context.fillText("10 s", left - 4, top + 9);
+    context.fillText("TTC", left - 4, bottom);
+    context.textAlign = "left";
+    context.fillText(crash.other ? `time to collision with ${crash.other}` : "least time to collision with any actor", left, top - 5, right - left);
+    context.textAlign = "right";
+    context.fillStyle = css("--accent");
+    context.textAlign = "left";
+    context.fillText(`${fastest} m/s`, right + 4, top + 9);
+    context.fillText("speed", right + 4, bottom);
+    context.fillStyle = css("--faint");
+    context.textAlign = "center";
+    const ticks = right - left < 300 ? 2 : 4;
+    for (let part = 0; part <= ticks; part++) context.fillText(`${(crash.time0 + (part * last * crash.dt) / ticks).toFixed(1)} s`, Math.min(right - 14, Math.max(left + 14, left + ((right - left) * part) / ticks)), height - 4);
+    if (crash.escape !== null) {
+      context.strokeStyle = css("--faint");
+      context.setLineDash([3, 3]);
+      context.beginPath();
+      context.moveTo(x(crash.escape), top);
+      context.lineTo(x(crash.escape), bottom);
+      context.stroke();
+      context.setLineDash([]);
+    }
+    /* when others erred, or the agent saw or acted late; the scene of a step is what has come of it */
+    context.fillStyle = css("--fault");
+    for (const [from, to] of crash.disturbances) context.fillRect(x(Math.min(from, last)), bottom - 3, Math.max(2, x(Math.min(to, last)) - x(Math.min(from, last))), 3);
+  });
   drawCursor(context, x(view.step), top, bottom);
 }
 
@@ -289,47 +311,49 @@ function drawDanger() {
   const [context, width, height] = fit($("danger"));
   const left = 34, right = width - 54, top = 16, bottom = height - 6, last = Math.max(1, crash.steps - 1);
   const x = (step) => left + ((right - left) * step) / last;
-  context.strokeStyle = css("--line");
-  context.strokeRect(left + 0.5, top + 0.5, right - left, bottom - top);
-  for (const [color, series, dashes] of [["--accent", crash.behinds, [4, 3]], ["--ego", crash.dangers, []]]) {
-    context.strokeStyle = css(color);
-    context.lineWidth = 1.5;
-    context.setLineDash(dashes);
-    context.beginPath();
-    let down = false;
-    for (let step = 0; step < crash.steps; step++) {
-      const there = Number.isFinite(series[step]);
-      const y = bottom - (bottom - top) * series[step];
-      if (there) context[down ? "lineTo" : "moveTo"](x(step), y);
-      /* A step between two without a value, such as that of a lane change, would be no line. */
-      if (there && !down && !Number.isFinite(series[step + 1])) context.rect(x(step) - 1, y - 1, 2, 2);
-      down = there;
+  copied("danger", crash, context, width, height, (context) => {
+    context.strokeStyle = css("--line");
+    context.strokeRect(left + 0.5, top + 0.5, right - left, bottom - top);
+    for (const [color, series, dashes] of [["--accent", crash.behinds, [4, 3]], ["--ego", crash.dangers, []]]) {
+      context.strokeStyle = css(color);
+      context.lineWidth = 1.5;
+      context.setLineDash(dashes);
+      context.beginPath();
+      let down = false;
+      for (let step = 0; step < crash.steps; step++) {
+        const there = Number.isFinite(series[step]);
+        const y = bottom - (bottom - top) * series[step];
+        if (there) context[down ? "lineTo" : "moveTo"](x(step), y);
+        /* A step between two without a value, such as that of a lane change, would be no line. */
+        if (there && !down && !Number.isFinite(series[step + 1])) context.rect(x(step) - 1, y - 1, 2, 2);
+        down = there;
+      }
+      context.stroke();
     }
-    context.stroke();
-  }
-  context.setLineDash([]);
-  context.font = "11px system-ui";
-  context.fillStyle = css("--faint");
-  context.textAlign = "right";
-  context.fillText("1", left - 4, top + 9);
-  context.fillText("0", left - 4, bottom);
-  context.textAlign = "left";
-  context.fillText("criticality (all actors)", left, top - 5);
-  context.fillStyle = css("--ego");
-  context.fillText("own", right + 4, top + 9);
-  context.fillStyle = css("--accent");
-  context.fillText("rear", right + 4, bottom);
-  if (crash.nearest !== null || COLORS[crash.category] === "--crash") {
-    const at = crash.nearest === null ? last : crash.nearest;
-    context.strokeStyle = context.fillStyle = css("--crash");
-    context.lineWidth = 2;
-    context.beginPath();
-    context.moveTo(x(at), top);
-    context.lineTo(x(at), bottom);
-    context.stroke();
-    context.textAlign = x(at) > (left + right) / 2 ? "right" : "left";
-    context.fillText(crash.nearest === null ? "crash" : "nearest", x(at), top - 5);
-  }
+    context.setLineDash([]);
+    context.font = "11px system-ui";
+    context.fillStyle = css("--faint");
+    context.textAlign = "right";
+    context.fillText("1", left - 4, top + 9);
+    context.fillText("0", left - 4, bottom);
+    context.textAlign = "left";
+    context.fillText("criticality (all actors)", left, top - 5);
+    context.fillStyle = css("--ego");
+    context.fillText("own", right + 4, top + 9);
+    context.fillStyle = css("--accent");
+    context.fillText("rear", right + 4, bottom);
+    if (crash.nearest !== null || COLORS[crash.category] === "--crash") {
+      const at = crash.nearest === null ? last : crash.nearest;
+      context.strokeStyle = context.fillStyle = css("--crash");
+      context.lineWidth = 2;
+      context.beginPath();
+      context.moveTo(x(at), top);
+      context.lineTo(x(at), bottom);
+      context.stroke();
+      context.textAlign = x(at) > (left + right) / 2 ? "right" : "left";
+      context.fillText(crash.nearest === null ? "crash" : "nearest", x(at), top - 5);
+    }
+  });
   drawCursor(context, x(view.step), top, bottom);
 }
 
