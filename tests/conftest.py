@@ -33,6 +33,8 @@ from crashhunt.snapshots._snapshot import code_of_manifest
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator
 
+pytest_plugins = ["browsers"]
+
 # Every worker, and every process that a test starts, would compile the same files again: seconds each. What is imported
 # from now on is kept, as it is for users.
 sys.dont_write_bytecode = False
@@ -249,14 +251,6 @@ def _warm(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
                 TimeoutExpired=subprocess.TimeoutExpired,
             ),
         )
-
-
-def needed(*names: str) -> str:
-    """Where a program that is no Python package is; without it, the test cannot run, and in CI fails."""
-    found = next(filter(None, map(shutil.which, names)), None)
-    if found is None:
-        (pytest.fail if os.environ.get("CRASHHUNT_TEST_SCREEN") == "required" else pytest.skip)(f"needs {names[0]}")
-    return found
 
 
 def mostly_nightly(cases: Iterable[Any], always: Container[Any]) -> list[Any]:

@@ -29,6 +29,7 @@ from ._encounter import (
     Encounter as Encounter,
     Moment as Moment,
     Position as Position,
+    closest_actors as closest_actors,
     danger_course as danger_course,
     last_escape as last_escape,
     most_dangerous as most_dangerous,

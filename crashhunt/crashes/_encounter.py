@@ -39,6 +39,7 @@ __all__ = [
     "Manner",
     "Moment",
     "Position",
+    "closest_actors",
     "danger_course",
     "last_escape",
     "most_dangerous",
@@ -329,6 +330,10 @@ def _turned(vectors: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArr
 
 _DECAY_S, _MOST = 1.2, 0.999  # as in `crashhunt.world._danger`
 _SAME_LANE = math.radians(30)
+_CHANGE_S = 3.0  # a gradual lane change takes no longer
+_BEND = math.radians(5)
+_SIDEWAYS_M = 0.8  # more than the other actor: less is drift within a lane
+_SAME_MEASURE = 1e-6  # s or m: the same pair, measured by another function
 _UNKNOWN_S = 4.0  # before the end, a criticality of 0 is unknown: later actors are not in the recording
 
 
@@ -402,27 +407,25 @@ def danger_course(recording: Recording, agent: str) -> DangerCourse | None:
 def _with_lane_changes(
     scenes: Sequence[Scene], agent: str, own: NDArray[np.float64], greatest: DangerousMoment
 ) -> tuple[NDArray[np.float64], DangerousMoment]:
-    """Return the criticality with that of instantaneous lane changes towards the vehicles in the target lane.
+    """Return the criticality with that of lane changes towards the vehicles behind in the target lane.
 
     The way of an agent after a lane change does not lead through the vehicles behind it, so `dangers` does not count
-    them. Here the post-encroachment time is that from the lane change until the vehicle behind is where the agent is.
+    them. Here the post-encroachment time is that from the step in which the agent comes into their way until the
+    vehicle behind is where the agent is.
     """
     own = own.copy()
     for number, (before, after) in enumerate(pairwise(scenes), 1):
-        if not lane_jump(before, after, agent):
+        if agent not in before.roster.index or agent not in after.roster.index:
             continue
         row = after.roster.index[agent]
-        own_size = after.roster.half_sizes[row]
-        c, s = math.cos(after.headings[row]), math.sin(after.headings[row])
-        for other, (dx, dy) in enumerate(after.centers - after.centers[row]):
-            turn = abs(math.remainder(after.headings[other] - after.headings[row], math.tau))
-            ahead, aside = dx * c + dy * s, abs(dy * c - dx * s)
-            size = after.roster.half_sizes[other]
-            if other == row or turn > _SAME_LANE or ahead > 0 or aside > own_size[1] + size[1]:
-                continue
-            if not on_one_level(after, row, other):
-                continue
-            gap_m = max(0.0, -ahead - own_size[0] - size[0])
+        entered = _behind_in_its_way(after, row)
+        if not lane_jump(before, after, agent):
+            followed = {before.roster.actors[one].id for one in _behind_in_its_way(before, before.roster.index[agent])}
+            fresh = [other for other in entered if after.roster.actors[other].id not in followed]
+            entered = [other for other in fresh if _moved_into_its_way(scenes[: number + 1], agent, after, other)]
+        for other in entered:
+            gap_m = max(0.0, -_ahead_m(after, row, other) - after.roster.half_sizes[row][0])
+            gap_m = max(0.0, gap_m - after.roster.half_sizes[other][0])
             danger = min(math.exp(-gap_m / max(after.speeds[other], 1e-3) / _DECAY_S), _MOST)
             own[number] = max(own[number], danger)
             if danger > greatest.danger:
@@ -430,6 +433,45 @@ def _with_lane_changes(
                     danger=danger, step=number, agent=agent, other=after.roster.actors[other].id
                 )
     return own, greatest
+
+
+def _ahead_m(scene: Scene, row: int, other: int) -> float:
+    """Return how far the centre of another actor is ahead of that of an actor, along its heading, in m."""
+    dx, dy = scene.centers[other] - scene.centers[row]
+    return float(dx * math.cos(scene.headings[row]) + dy * math.sin(scene.headings[row]))
+
+
+def _behind_in_its_way(scene: Scene, row: int) -> list[int]:
+    """Return the actors behind an actor that drive in the same direction, and whose way leads over its place."""
+    half = np.array(scene.roster.half_sizes)
+    c, s = math.cos(scene.headings[row]), math.sin(scene.headings[row])
+    dx, dy = (scene.centers - scene.centers[row]).T
+    same_way = np.cos(np.array(scene.headings) - scene.headings[row]) >= math.cos(_SAME_LANE)
+    over = (dx * c + dy * s <= 0) & (np.abs(dy * c - dx * s) <= half[:, 1] + half[row, 1]) & same_way
+    return [int(other) for other in np.flatnonzero(over) if other != row and on_one_level(scene, row, int(other))]
+
+
+def _moved_into_its_way(scenes: Sequence[Scene], agent: str, after: Scene, other: int) -> bool:
+    """Whether an agent came into the way of another actor by its own sideways motion, on a straight road.
+
+    In a bend, the paths of two lanes do not show which of the two vehicles changed lanes.
+    """
+    name, heading = after.roster.actors[other].id, after.headings[other]
+    earliest = None
+    for scene in reversed(scenes):
+        index = scene.roster.index
+        if agent not in index or name not in index or scene.time_s < after.time_s - _CHANGE_S - 1e-6:
+            break
+        if abs(math.remainder(scene.headings[index[name]] - heading, math.tau)) > _BEND:
+            return False
+        earliest = scene
+    if earliest is None:
+        return False
+    own, its = (
+        after.centers[after.roster.index[one]] - earliest.centers[earliest.roster.index[one]] for one in (agent, name)
+    )
+    across = np.array([-math.sin(heading), math.cos(heading)])
+    return bool(abs(own @ across) > abs(its @ across) + _SIDEWAYS_M)
 
 
 def _nearest(scenes: Sequence[Scene], steps: Sequence[int], agent: str) -> tuple[str, float, int] | None:
@@ -446,6 +488,51 @@ def _nearest(scenes: Sequence[Scene], steps: Sequence[int], agent: str) -> tuple
         if on_one_level(scene, row, other):
             found.append((min(_outline_gap(one, two) for one, two in pairs), scene.roster.actors[other].id))
     return (min(found)[1], float(gaps[number]), steps[number]) if found else None
+
+
+def closest_actors(recording: Recording, agent: str) -> list[tuple[str, str]]:
+    """Return for each scene the actors with the least time to collision and with the least gap to an agent.
+
+    Args:
+        recording: of the episode.
+        agent: the controlled vehicle.
+
+    Returns:
+        Two identifiers for each scene. An identifier is empty where `approaches` finds no such actor, or where several
+        are equally close.
+    """
+    scenes = recording.scenes()
+    times, gaps, _ = approaches([scene.frame for scene in scenes], agent)
+    found = []
+    for scene, time_s, gap_m in zip(scenes, times, gaps, strict=True):
+        if agent not in scene.roster.index or not (math.isfinite(time_s) or math.isfinite(gap_m)):
+            found.append(("", ""))
+            continue
+        row = scene.roster.index[agent]
+        own_times, own_gaps = _to_all(scene, row)
+        found.append((_only(scene, own_times, time_s), _only(scene, own_gaps, gap_m)))
+    return found
+
+
+def _to_all(scene: Scene, row: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return time to collision (s) and gap (m) of one actor to each actor of a scene, NaN to itself."""
+    headings, speeds, half = np.array(scene.headings), np.array(scene.speeds), np.array(scene.roster.half_sizes)
+    velocities = speeds[:, None] * np.stack((np.cos(headings), np.sin(headings)), axis=1)
+    own = np.full(len(headings), headings[row])
+    offset, relative = _turned(scene.centers - scene.centers[row], own), _turned(velocities - velocities[row], own)
+    sizes = np.broadcast_to(half[row], half.shape), half
+    times = time_to_contact(offset, relative, headings - headings[row], *sizes)
+    gaps = rectangle_gap(offset, headings - headings[row], *sizes)
+    times[row] = gaps[row] = math.nan
+    return times, gaps
+
+
+def _only(scene: Scene, measured: NDArray[np.float64], least: float) -> str:
+    """Return the only actor with a measured value; empty where none or several have it."""
+    if not math.isfinite(least):
+        return ""
+    rows = np.flatnonzero(np.abs(measured - least) <= _SAME_MEASURE)
+    return scene.roster.actors[rows[0]].id if len(rows) == 1 else ""
 
 
 def _outline_gap(one: Rectangle, two: Rectangle) -> float:

@@ -58,8 +58,19 @@ class CrashList:
         self._thread: threading.Thread | None = None
 
     def folder(self, crash: str) -> Path | None:
-        """Return the folder of a crash or near miss by its identifier; None where there is none in this hunt."""
-        return self._folders().get(crash)
+        """Return the folder of a crash, near miss or minimized crash by its identifier; None where it is missing."""
+        folders = self._folders()
+        if crash in folders:
+            return folders[crash]
+        return self._minimized(folders.get(crash.removesuffix(layout.SMALL))) if crash.endswith(layout.SMALL) else None
+
+    @staticmethod
+    def _minimized(folder: Path | None) -> Path | None:
+        """Return the folder of the minimized crash of a crash; None where there is none."""
+        if folder is None:
+            return None
+        found = folder.with_name(f"{folder.name}{layout.SMALL}")
+        return found if found.is_dir() else None
 
     def _folders(self) -> dict[str, Path]:
         path = self._found.path
@@ -143,11 +154,13 @@ class CrashList:
             return None
         bundle = self._read(folder)
         story = Story(bundle)
+        small = self._minimized(folder)
         result, root = bundle.result, self._found.path
         return {
             **player_data(bundle, story),
             "near_miss": bundle.is_near_miss,
-            "table_lines": story.table(),
+            "minimized": small.name if small is not None else "",
+            "minimized_from": crash.removesuffix(layout.SMALL) if crash.endswith(layout.SMALL) else "",
             "parameters": {agent: dict(given) for agent, given in result.spec.arguments.items()},
             "scenario_parameters": dict(result.spec.scenario_arguments),
             "judged": story.judgement.to_json() if story.judgement is not None else None,
@@ -254,11 +267,12 @@ def _summary(bundle: Bundle) -> JsonObject:
 def _commands(hunt: Path, crash: str, bundle: Bundle) -> list[list[str]]:
     """Return name and text of the commands for a crash, ready to be pasted into a shell."""
     near = bundle.is_near_miss
+    may_shrink = not near and not crash.endswith(layout.SMALL)
     words = {
         "show": ["show", str(hunt), "--crash", crash],
         "replay": ["replay", str(hunt), "--crash", crash],
         **({} if near else {"judge": ["judge", str(hunt), "--crash", crash]}),
-        **({} if near else {"minimize": ["shrink", str(hunt), "--crash", crash]}),
+        **({} if not may_shrink else {"minimize": ["shrink", str(hunt), "--crash", crash]}),
         "export": ["export", str(hunt), f"{crash}.zip", "--crash", crash],
         **({} if near else {"add to corpus": ["corpus", "add", str(bundle.path), "--to", "corpus"]}),
     }

@@ -38,6 +38,7 @@ MAX_CRASHES = 5_000
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 _TAIL = 4_000  # numbers among which workers leave gaps
+_CHUNK = 65_536  # numbers at a time, so that the memory does not grow with the hunt
 _MAX_GAPS = 1_000  # that are read one by one; of more, the range over all of them is read
 
 Point: TypeAlias = "dict[str, object]"
@@ -286,7 +287,9 @@ class Sample:
         while crashes * self.crash_share > MAX_CRASHES:
             self.crash_share /= 2
         numbers = {number for number in ledger.numbers_of(self._crash_on) if _is_drawn(number, self.crash_share)}
-        numbers.update(np.flatnonzero(np.arange(last + 1) * _GOLDEN % 1.0 < self.share).tolist())
+        for first in range(0, last + 1, _CHUNK):
+            block = np.arange(first, min(first + _CHUNK, last + 1))
+            numbers.update(block[block * _GOLDEN % 1.0 < self.share].tolist())
         self._take(ledger, sorted(numbers))
 
     def add(self, ledger: Ledger, trials: Iterable[tuple[int, str]]) -> None:
@@ -374,6 +377,7 @@ def _point(data: JsonObject, crash_on: Collection[str]) -> Point:
         "ttc": _rounded(row.time_to_collision_s),
         "origin": row.origin,
         "parent": row.parent,
+        "disturbances": len(data.get("disturbances", ())),
         "values": values_of(row),
     }
 

@@ -18,7 +18,7 @@ from crashhunt.base import layout
 from crashhunt.base.files import whole_file
 from crashhunt.base.version import __version__
 from crashhunt.base.watching import watched
-from crashhunt.crashes import signature_of
+from crashhunt.crashes import closest_actors, signature_of
 from crashhunt.hunts import TrialRow, find_crashes
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
@@ -27,6 +27,7 @@ from crashhunt.report._rate import describe_running
 from crashhunt.report._show import Story
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import argument_units
+from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import by_likelihood, may_be_disturbed, traffic_of
 from crashhunt.trial import Outcome, steps_of
 from crashhunt.world import approaches
@@ -436,7 +437,10 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
         "summary": result.summary,
         "outcome": str(result.outcome),
         "category": result.outcome.category,
+        "verdict": verdict_of(story),
+        "badges": _badges(story),
         "words": story.words(),
+        "table_lines": story.table(),
         "arguments": format_arguments(result),
         "facts": {
             "trial": str(result.spec.number),
@@ -462,13 +466,29 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
         "agents": list(recording.agents),
         "dt": recording.prologue.step_length_s,
         **_scenes(recording, story.agent),
-        **({} if story.encounter is None else _to_other(story.encounter, recording)),
+        **(_to_closest(story) if story.encounter is None else _to_other(story.encounter, recording)),
         "lanes": _lanes(bundle, recording),
         "disturbances": [
             [one.step, one.step + steps_of(one.how_long, recording.prologue.step_length_s) - 1, one.words, one.vehicle]
             for one in result.disturbances
         ],
     }
+
+
+def _badges(story: Story) -> list[str]:
+    """Return the few facts that stand below the verdict."""
+    result = story.bundle.result
+    found: list[str] = [result.outcome.category if story.nearest is None else "near miss"]
+    if story.encounter is not None and story.nearest is None:
+        rules = " and ".join(finding.rule for finding in story.fault.findings)
+        parties = {"ego": story.agent, "the other": story.other, "both": f"{story.agent} and {story.other}"}
+        party = parties.get(story.fault.verdict)
+        found.append(f"at fault: {party} ({rules})" if party else "fault: not decided by any rule")
+    if story.bundle.confirmed is not None:
+        found.append("confirmed: bit-identical in a new process" if story.bundle.confirmed else "not confirmed: flaky")
+    if may_be_disturbed(result):
+        found.append("with disturbances" if result.disturbed else "in undisturbed traffic")
+    return found
 
 
 def _danger(story: Story) -> dict[str, object]:
@@ -544,6 +564,12 @@ def _to_other(encounter: Encounter, recording: Recording) -> dict[str, str]:
         key: _packed(np.array([getattr(moments[step], name) if step in moments else np.nan for step in steps]))
         for key, name in found.items()
     }
+
+
+def _to_closest(story: Story) -> dict[str, object]:
+    """Return, for each step, the actors to which the least time to collision and the least gap belong."""
+    closest = closest_actors(story.recording, story.agent) if story.recording.compact is None else []
+    return {"closest": [list(one) for one in closest]}
 
 
 def _lanes(bundle: Bundle, recording: Recording) -> list[list[str]]:

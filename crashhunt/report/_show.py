@@ -7,7 +7,15 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
-from crashhunt.crashes import Encounter, danger_course, fault_of, judgement_of, last_escape, most_dangerous
+from crashhunt.crashes import (
+    Encounter,
+    contact_record,
+    danger_course,
+    fault_of,
+    judgement_of,
+    last_escape,
+    most_dangerous,
+)
 from crashhunt.recording import describe_value, is_opaque
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
@@ -66,7 +74,8 @@ class Story:
         self._first, self._last = window_of(self.recording, last_s, near)
         self.encounter = Encounter(self.recording, self.agent, self.other) if self.other else None
         self.judgement = judgement_of(bundle)
-        self.fault = fault_of(bundle, self.recording)
+        self.contact = contact_record(bundle, self.recording)
+        self.fault = fault_of(bundle, self.recording, self.contact)
         tried = bundle.result.escape
         self.escape = tried.step if tried is not None else None
         if braking is not None:
@@ -131,7 +140,8 @@ class Story:
             decision = self._opaque_action(end) or _words(before, self._names())
             sentences.append(f"{whose} last decision was {decision}.")
         if self.danger is not None:
-            sentences.append(about_danger(self.danger))
+            words = about_danger(self.danger, touched=self.bundle.result.collision is not None and bool(self.other))
+            sentences += [words] if words else []
         if (compact := recording.compact) is not None:
             sentences.append(
                 "The log is compact: it has the vehicles of the crash, and others up to "
@@ -282,8 +292,12 @@ class Story:
             f"{self.other} moved as it did; that is calculated, not run."
         )
 
+    def before_contact_s(self, step: int) -> float:
+        """Return how long before the contact, or else before the end of the episode, a step ended, in s."""
+        return self._end_s - self.recording.scene(step).time_s
+
     def _ago(self, step: int) -> str:
-        return f"{self._end_s - self.recording.scene(step).time_s:.1f} s before, after step {step}"
+        return f"{self.before_contact_s(step):.1f} s before, after step {step}"
 
     def _at(self, step: int) -> str:
         return f"{self.recording.scene(min(step, self.recording.steps)).time_s:.1f} s"

@@ -117,8 +117,17 @@ def about_nearest(encounter: Encounter, nearest: DangerousMoment) -> list[str]:
     ]
 
 
-def about_danger(course: DangerCourse) -> str:
-    """Return the greatest criticality of both kinds, and their sums over the trial."""
+def about_danger(course: DangerCourse, *, touched: bool = False) -> str:
+    """Return the greatest criticality of both kinds, and their sums over the trial.
+
+    Args:
+        course: of the recording.
+        touched: whether the agent touched another actor. That no actor was near is then not reported: an actor that
+            jumps into another lane is on no way before the contact.
+
+    Returns:
+        A sentence; empty where it would say nothing.
+    """
     parts = []
     for whose, moment, total, relation, absent in (
         (f"{course.agent}'s own", course.greatest, course.own_total, "towards", _no_danger(course)),
@@ -131,11 +140,11 @@ def about_danger(course: DangerCourse) -> str:
         ),
     ):
         if moment.danger <= 0:
-            parts.append(absent)
+            parts += [] if touched else [absent]
             continue
         most = f"at most {moment.danger:.2f}, after step {moment.step}, {relation} {moment.other}"
         parts.append(f"{whose} was {most} ({total:.2f} over the trial)")
-    return f"Danger: {parts[0]}; {parts[1]}."
+    return f"Danger: {'; '.join(parts)}." if parts else ""
 
 
 def _no_danger(course: DangerCourse) -> str:

@@ -6,7 +6,27 @@ const make = (tag, text, className) => {
   if (className) node.className = className;
   return node;
 };
-const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+/* Each look-up of a style costs as much as drawing a vehicle, so colours are kept until the scheme changes. */
+const STYLES = new Map();
+function css(name) {
+  if (!STYLES.has(name)) STYLES.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+  return STYLES.get(name);
+}
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { STYLES.clear(); PAINTED.clear(); });
+
+/* Curves of a crash stay the same while it plays, so they are painted once and copied below the cursor. */
+const PAINTED = new Map();
+function copied(id, crash, context, width, height, paint) {
+  const ratio = window.devicePixelRatio || 1, known = PAINTED.get(id);
+  if (!known || known.crash !== crash || known.size !== `${width} ${height} ${ratio}`) {
+    const canvas = new OffscreenCanvas(Math.max(1, Math.round(width * ratio)), Math.max(1, Math.round(height * ratio)));
+    const below = canvas.getContext("2d");
+    below.setTransform(ratio, 0, 0, ratio, 0, 0);
+    paint(below);
+    PAINTED.set(id, { crash, canvas, size: `${width} ${height} ${ratio}` });
+  }
+  context.drawImage(PAINTED.get(id).canvas, 0, 0, width, height);
+}
 const COLORS = { "traffic crash": "--crash", "traffic event": "--crash", "software fault": "--fault", "no crash": "--fine" };
 
 async function unpack(text) {
@@ -63,8 +83,20 @@ async function load(crash) {
   }
 }
 
-/* Puts a crash that is loaded into the player. */
-function show(crash) {
+/* Shows what is said of a crash; the rows are names and values of facts of its trial. */
+function describe(crash, rows) {
+  $("verdict").textContent = crash.verdict;
+  $("badges").replaceChildren(...crash.badges.map((text) => make("span", text, "badge")));
+  $("words").replaceChildren(...paragraphs(crash.words));
+  $("steps").textContent = crash.table_lines.join("\n");
+  $("facts").replaceChildren(...rows.flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
+}
+
+/* Puts a crash that is loaded into the page; the rows are names and values of facts of its trial. */
+function show(crash, rows) {
+  describe(crash, rows);
+  /* Without an animation of what went wrong, the traceback is the answer. */
+  $("evidence").open = crash.category === "software fault";
   $("key-agent").textContent = crash.agent;
   $("key-other").textContent = crash.other;
   $("key-other-box").hidden = !crash.other;
@@ -211,50 +243,56 @@ function drawScene() {
 function drawPlot() {
   const crash = view.crash, [context, width, height] = fit($("plot"));
   if (!crash) return;
-  const left = 34, right = width - 54, top = 6, bottom = height - 18, last = Math.max(1, crash.steps - 1);
+  const left = 34, right = width - 54, top = 16, bottom = height - 18, last = Math.max(1, crash.steps - 1);
   const x = (step) => left + ((right - left) * step) / last;
   if (!crash.speeds) crash.speeds = Array.from({ length: crash.steps }, (_, step) => (view.agent >= 0 && state(step, view.agent) ? state(step, view.agent)[3] : NaN));
-  const speeds = crash.speeds, fastest = speeds.reduce((most, speed) => Math.max(most, Math.ceil(speed) || 0), 10);
-  const curves = [["--crash", crash.ttcs, 10], ["--accent", speeds, fastest]];
-  context.strokeStyle = css("--line");
-  context.strokeRect(left + 0.5, top + 0.5, right - left, bottom - top);
-  context.font = "11px system-ui";
-  for (const [color, series, limit] of curves) {
-    context.strokeStyle = css(color);
-    context.lineWidth = 1.5;
-    context.beginPath();
-    let down = false;
-    for (let step = 0; step < crash.steps; step++) {
-      const value = series[step];
-      const there = Number.isFinite(value);
-      if (there) context[down ? "lineTo" : "moveTo"](x(step), bottom - ((bottom - top) * Math.min(value, limit)) / limit);
-      down = there;
+  copied("plot", crash, context, width, height, (context) => {
+    const speeds = crash.speeds, fastest = speeds.reduce((most, speed) => Math.max(most, Math.ceil(speed) || 0), 10);
+    const curves = [["--crash", crash.ttcs, 10], ["--accent", speeds, fastest]];
+    context.strokeStyle = css("--line");
+    context.strokeRect(left + 0.5, top + 0.5, right - left, bottom - top);
+    context.font = "11px system-ui";
+    for (const [color, series, limit] of curves) {
+      context.strokeStyle = css(color);
+      context.lineWidth = 1.5;
+      context.beginPath();
+      let down = false;
+      for (let step = 0; step < crash.steps; step++) {
+        const value = series[step];
+        const there = Number.isFinite(value);
+        if (there) context[down ? "lineTo" : "moveTo"](x(step), bottom - ((bottom - top) * Math.min(value, limit)) / limit);
+        down = there;
+      }
+      context.stroke();
     }
-    context.stroke();
-  }
-  context.fillStyle = css("--crash");
-  context.textAlign = "right";
-  context.fillText("10 s", left - 4, top + 9);
-  context.fillText("TTC", left - 4, bottom);
-  context.fillStyle = css("--accent");
-  context.textAlign = "left";
-  context.fillText(`${fastest} m/s`, right + 4, top + 9);
-  context.fillText("speed", right + 4, bottom);
-  context.fillStyle = css("--faint");
-  context.textAlign = "center";
-  for (let part = 0; part <= 4; part++) context.fillText(`${(crash.time0 + (part * last * crash.dt) / 4).toFixed(1)} s`, Math.min(right - 14, Math.max(left + 14, left + ((right - left) * part) / 4)), height - 4);
-  if (crash.escape !== null) {
-    context.strokeStyle = css("--faint");
-    context.setLineDash([3, 3]);
-    context.beginPath();
-    context.moveTo(x(crash.escape), top);
-    context.lineTo(x(crash.escape), bottom);
-    context.stroke();
-    context.setLineDash([]);
-  }
-  /* when others erred, or the agent saw or acted late; the scene of a step is what has come of it */
-  context.fillStyle = css("--fault");
-  for (const [from, to] of crash.disturbances) context.fillRect(x(Math.min(from, last)), bottom - 3, Math.max(2, x(Math.min(to, last)) - x(Math.min(from, last))), 3);
+    context.fillStyle = css("--crash");
+    context.textAlign = "right";
+    context.fillText("10 s", left - 4, top + 9);
+    context.fillText("TTC", left - 4, bottom);
+    context.textAlign = "left";
+    context.fillText(crash.other ? `time to collision with ${crash.other}` : "least time to collision with any actor", left, top - 5, right - left);
+    context.textAlign = "right";
+    context.fillStyle = css("--accent");
+    context.textAlign = "left";
+    context.fillText(`${fastest} m/s`, right + 4, top + 9);
+    context.fillText("speed", right + 4, bottom);
+    context.fillStyle = css("--faint");
+    context.textAlign = "center";
+    const ticks = right - left < 300 ? 2 : 4;
+    for (let part = 0; part <= ticks; part++) context.fillText(`${(crash.time0 + (part * last * crash.dt) / ticks).toFixed(1)} s`, Math.min(right - 14, Math.max(left + 14, left + ((right - left) * part) / ticks)), height - 4);
+    if (crash.escape !== null) {
+      context.strokeStyle = css("--faint");
+      context.setLineDash([3, 3]);
+      context.beginPath();
+      context.moveTo(x(crash.escape), top);
+      context.lineTo(x(crash.escape), bottom);
+      context.stroke();
+      context.setLineDash([]);
+    }
+    /* when others erred, or the agent saw or acted late; the scene of a step is what has come of it */
+    context.fillStyle = css("--fault");
+    for (const [from, to] of crash.disturbances) context.fillRect(x(Math.min(from, last)), bottom - 3, Math.max(2, x(Math.min(to, last)) - x(Math.min(from, last))), 3);
+  });
   drawCursor(context, x(view.step), top, bottom);
 }
 
@@ -273,54 +311,66 @@ function drawDanger() {
   const [context, width, height] = fit($("danger"));
   const left = 34, right = width - 54, top = 16, bottom = height - 6, last = Math.max(1, crash.steps - 1);
   const x = (step) => left + ((right - left) * step) / last;
-  context.strokeStyle = css("--line");
-  context.strokeRect(left + 0.5, top + 0.5, right - left, bottom - top);
-  for (const [color, series, dashes] of [["--accent", crash.behinds, [4, 3]], ["--ego", crash.dangers, []]]) {
-    context.strokeStyle = css(color);
-    context.lineWidth = 1.5;
-    context.setLineDash(dashes);
-    context.beginPath();
-    let down = false;
-    for (let step = 0; step < crash.steps; step++) {
-      const there = Number.isFinite(series[step]);
-      if (there) context[down ? "lineTo" : "moveTo"](x(step), bottom - (bottom - top) * series[step]);
-      down = there;
+  copied("danger", crash, context, width, height, (context) => {
+    context.strokeStyle = css("--line");
+    context.strokeRect(left + 0.5, top + 0.5, right - left, bottom - top);
+    for (const [color, series, dashes] of [["--accent", crash.behinds, [4, 3]], ["--ego", crash.dangers, []]]) {
+      context.strokeStyle = css(color);
+      context.lineWidth = 1.5;
+      context.setLineDash(dashes);
+      context.beginPath();
+      let down = false;
+      for (let step = 0; step < crash.steps; step++) {
+        const there = Number.isFinite(series[step]);
+        const y = bottom - (bottom - top) * series[step];
+        if (there) context[down ? "lineTo" : "moveTo"](x(step), y);
+        /* A step between two without a value, such as that of a lane change, would be no line. */
+        if (there && !down && !Number.isFinite(series[step + 1])) context.rect(x(step) - 1, y - 1, 2, 2);
+        down = there;
+      }
+      context.stroke();
     }
-    context.stroke();
-  }
-  context.setLineDash([]);
-  context.font = "11px system-ui";
-  context.fillStyle = css("--faint");
-  context.textAlign = "right";
-  context.fillText("1", left - 4, top + 9);
-  context.fillText("0", left - 4, bottom);
-  context.textAlign = "left";
-  context.fillText("danger", left, top - 5);
-  context.fillStyle = css("--ego");
-  context.fillText("own", right + 4, top + 9);
-  context.fillStyle = css("--accent");
-  context.fillText("behind", right + 4, bottom);
-  if (crash.nearest !== null || COLORS[crash.category] === "--crash") {
-    const at = crash.nearest === null ? last : crash.nearest;
-    context.strokeStyle = context.fillStyle = css("--crash");
-    context.lineWidth = 2;
-    context.beginPath();
-    context.moveTo(x(at), top);
-    context.lineTo(x(at), bottom);
-    context.stroke();
-    context.textAlign = x(at) > (left + right) / 2 ? "right" : "left";
-    context.fillText(crash.nearest === null ? "crash" : "nearest", x(at), top - 5);
-  }
+    context.setLineDash([]);
+    context.font = "11px system-ui";
+    context.fillStyle = css("--faint");
+    context.textAlign = "right";
+    context.fillText("1", left - 4, top + 9);
+    context.fillText("0", left - 4, bottom);
+    context.textAlign = "left";
+    context.fillText("criticality (all actors)", left, top - 5);
+    context.fillStyle = css("--ego");
+    context.fillText("own", right + 4, top + 9);
+    context.fillStyle = css("--accent");
+    context.fillText("rear", right + 4, bottom);
+    if (crash.nearest !== null || COLORS[crash.category] === "--crash") {
+      const at = crash.nearest === null ? last : crash.nearest;
+      context.strokeStyle = context.fillStyle = css("--crash");
+      context.lineWidth = 2;
+      context.beginPath();
+      context.moveTo(x(at), top);
+      context.lineTo(x(at), bottom);
+      context.stroke();
+      context.textAlign = x(at) > (left + right) / 2 ? "right" : "left";
+      context.fillText(crash.nearest === null ? "crash" : "nearest", x(at), top - 5);
+    }
+  });
   drawCursor(context, x(view.step), top, bottom);
 }
 
 const share = (value) => (Number.isFinite(value) ? value.toFixed(2) : "-");
 
+/* The actors to which time to collision and gap of a step belong: the collision partner, or the closest ones. */
+function partners(crash, step) {
+  if (crash.other) return [crash.other, crash.other];
+  return crash.closest[step] ?? ["", ""];
+}
+
 function showNow() {
   const crash = view.crash, own = view.agent >= 0 ? state(view.step, view.agent) : null;
   const number = (value, unit) => (Number.isFinite(value) ? `${value.toFixed(1)} ${unit}` : "-");
-  const parts = [["step", `${view.step} of ${crash.steps - 1}`], ["time", number(crash.time0 + view.step * crash.dt, "s")], ["speed", number(own ? own[3] : NaN, "m/s")], [crash.other ? `TTC with ${crash.other}` : "least TTC", number(crash.ttcs[view.step], "s")], [crash.other ? `gap to ${crash.other}` : "nearest gap", number(crash.gaps[view.step], "m")]];
-  if (crash.dangers) parts.push(["danger", share(crash.dangers[view.step])], ["from behind", share(crash.behinds[view.step])]);
+  const [ttcWith, gapTo] = partners(crash, view.step);
+  const parts = [["step", `${view.step} of ${crash.steps - 1}`], ["time", number(crash.time0 + view.step * crash.dt, "s")], ["speed", number(own ? own[3] : NaN, "m/s")], [`TTC${ttcWith && ` with ${ttcWith}`}`, number(crash.ttcs[view.step], "s")], [`gap${gapTo && ` to ${gapTo}`}`, number(crash.gaps[view.step], "m")]];
+  if (crash.dangers) parts.push(["criticality", share(crash.dangers[view.step])], ["rear criticality", share(crash.behinds[view.step])]);
   crash.actionNames.forEach((name, place) => {
     const value = crash.acts[view.step * crash.actionNames.length + place];
     parts.push([name, Number.isNaN(value) ? "-" : String(Number(value.toPrecision(4)))]);
@@ -396,8 +446,9 @@ function tellStep(event) {
   const crash = view.crash, box = $("plot").getBoundingClientRect();
   const at = Math.min(Math.max(0, Math.round(((event.clientX - box.left - 34) / (box.width - 88)) * (crash.steps - 1))), crash.steps - 1);
   const number = (value, unit) => (Number.isFinite(value) ? `${value.toFixed(1)} ${unit}` : "-");
-  const parts = [`step ${at}, ${(crash.time0 + at * crash.dt).toFixed(1)} s`, `speed ${number(crash.speeds[at], "m/s")}`, `${crash.other ? `time to collision with ${crash.other}` : "least time to collision"} ${number(crash.ttcs[at], "s")}`, `${crash.other ? `gap to ${crash.other}` : "nearest gap"} ${number(crash.gaps[at], "m")}`];
-  if (crash.dangers) parts.push(`danger ${share(crash.dangers[at])}, by those behind ${share(crash.behinds[at])}`);
+  const [ttcWith, gapTo] = partners(crash, at);
+  const parts = [`step ${at}, ${(crash.time0 + at * crash.dt).toFixed(1)} s`, `speed ${number(crash.speeds[at], "m/s")}`, `time to collision${ttcWith && ` with ${ttcWith}`} ${number(crash.ttcs[at], "s")}`, `gap${gapTo && ` to ${gapTo}`} ${number(crash.gaps[at], "m")}`];
+  if (crash.dangers) parts.push(`criticality ${share(crash.dangers[at])}, rear criticality ${share(crash.behinds[at])}`);
   showTip(event.clientX, event.clientY, parts.join("\n"));
 }
 /* Whoever clicks does not want the keys to go to what was clicked; whoever presses a key there does. */

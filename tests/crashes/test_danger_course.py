@@ -76,8 +76,38 @@ def test_lane_change_counts_the_vehicle_behind_in_the_target_lane(turn):
     assert found.nearest[1] == pytest.approx(1.0, abs=1e-6)  # a step later
     for other in (course(lane=6.4), course(heading=math.pi), course(ahead=-7.0, other_speed=9.0)):
         assert other.greatest.step != 20 or other.greatest.danger == 0.0
-    words = about_danger(replace(found, greatest=found.greatest._replace(danger=0.0)))
+    calm = replace(found, greatest=found.greatest._replace(danger=0.0))
+    assert "no actor" not in about_danger(calm, touched=True)
+    words = about_danger(calm)
     assert "no actor was on its way; ahead came nearest, 1.0 m away after step 21" in words
     assert "no actor came within 50 m" in about_danger(
         replace(found, greatest=found.greatest._replace(danger=0.0), nearest=None)
     )
+
+
+@pytest.mark.parametrize(
+    ("mover", "bends", "counts"), [("ego", False, True), ("ahead", False, False), ("ego", True, False)]
+)
+def test_gradual_lane_change_counts_the_vehicle_behind_in_the_target_lane(mover, bends, counts):
+    """The mover needs 3 s for 3.2 m to the side; the ego is ahead of the other vehicle all the time."""
+    scenes = []
+    for step in range(60):
+        time_s = step * DT
+        aside = 3.2 * min(1.0, max(0.0, (time_s - 1.0) / 3.0))
+        turned = 0.1 * time_s * bends
+        poses = {"ego": (20.0 + 10.0 * time_s, 0.0), "ahead": (12.0 * time_s, -3.2)}
+        sides = {"ego": -aside, "ahead": aside}
+        points = [(x, y + (sides[name] if name == mover else 0.0)) for name, (x, y) in poses.items()]
+        scenes.append(Scene(time_s, BOTH, points, [turned, turned], [10.0, 12.0]))
+    records = [StepRecord(number, scene) for number, scene in enumerate(scenes)]
+    course = danger_course(SimpleNamespace(all_steps=records, scenes=lambda: scenes, prologue=Prologue((), DT)), "ego")
+    entered = next(n for n, one in enumerate(scenes) if abs(one.points[0][1] - one.points[1][1]) <= 2.0)
+    gap_m = scenes[entered].points[0][0] - 5.0 - scenes[entered].points[1][0]
+    assert gap_m > 0
+    expected = math.exp(-gap_m / 12.0 / 1.2)
+    if counts:
+        assert course.own[entered] == pytest.approx(expected)
+        assert (course.greatest.step, course.greatest.other) == (entered, "ahead")
+        assert not course.own[entered + 1] >= expected  # the moment of the change counts, not each step after it
+    else:
+        assert course.greatest.danger == 0.0

@@ -10,12 +10,10 @@ from contextlib import closing, suppress
 
 import pytest
 from dashboard_hunts import hunted
-from dashboard_pages import browser, page
 from served import served
 
 from crashhunt.base.integrity import digest_of_row
 
-__all__ = ["browser", "page"]  # fixtures
 pytestmark = pytest.mark.long
 STRANGE = "<img src=x onerror='window.hacked=1'><script>window.hacked=1</script>&amp;"
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
 import signal
 import socket
 import subprocess
 import sys
 import urllib.request
+from contextlib import suppress
 
 import pytest
 from dashboard_hunts import hunted
@@ -108,6 +111,28 @@ def test_a_missing_extra_names_the_command_that_installs_it(shell):
     )
     assert done.returncode == 2
     assert done.stderr == ("crashhunt: the dashboard needs plotly; run: pip install 'crashhunt[dashboard]'\n")
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_hunt_with_crashes_ends_with_the_command_on_a_terminal_only(toy, terminal):
+    words = ["run", "my hunt", "1", "1", "99", "--scenario", "toy", "--arg", "speed=20", "--seed", "1"]
+    reader, writer = pty.openpty() if terminal else os.pipe()
+    environment = {**toy.environment, "TERM": "xterm", "COLUMNS": "100"}
+    with subprocess.Popen(
+        [sys.executable, "-m", "crashhunt", *words],
+        cwd=toy.folder,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=writer,
+        stderr=subprocess.STDOUT,
+    ):
+        os.close(writer)
+        shown = b""
+        with suppress(OSError), open(reader, "rb", buffering=0) as screen:  # EIO when a terminal is closed
+            while part := screen.read(65_536):
+                shown += part
+    assert b"000000-collision" in shown
+    assert (b"Look at it: crashhunt dashboard 'my hunt'" in shown) is terminal
 
 
 def test_other_commands_import_nothing_of_it(shell):

@@ -52,19 +52,60 @@ def test_other_sites_control_nothing(hunt):
         assert dashboard.ask(f"{one}/stop", OURS, method="GET").status == 405
 
 
-def test_a_crash_is_replayed_and_unknown_jobs_are_refused(hunt):
+def test_unknown_jobs_and_what_cannot_be_stopped_are_refused(hunt):
     with served(hunt, control=True) as dashboard:
         one = f"/api/hunts/{dashboard.hunts()['one']['id']}"
-        crash = min(dashboard.get(f"{one}/crashes")["crashes"], key=lambda row: row["steps"])["id"]
+        crash = dashboard.get(f"{one}/crashes")["crashes"][0]["id"]
         jobs = f"{one}/crashes/{crash}/jobs"
         for name in ("rm", "export", "..%2freplay", "--version"):
             assert dashboard.ask(f"{jobs}/{name}", OURS, method="POST").status in (404, 409)
         assert dashboard.ask(f"{one}/crashes/nothing/jobs/replay", OURS, method="POST").status == 404
         assert dashboard.ask(f"{one}/stop", OURS, method="POST").status == 409
-        assert dashboard.ask(f"{jobs}/replay", OURS, method="POST").status == 200
-        (job,) = wait_until(lambda: [one for one in dashboard.get(jobs)["jobs"] if one["state"] == "ended"])
-        assert (job["name"], job["exit_code"]) == ("replay", 0), job["output"]
-        assert "reproduced" in job["output"]
+        assert dashboard.get(jobs)["jobs"] == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "names", [{"replay"}, pytest.param({"replay", "judge", "shrink"}, marks=pytest.mark.nightly)], ids=len
+)
+def test_commands_are_started_from_the_page_and_run(toy, page, names):
+    words = ("--scenario", "toy", "--arg", "speed=8:20", "--seed", "4")
+    toy.crashhunt("run", "one", "1", "1", "99", *words)
+    with served(toy.folder / "one", control=True) as dashboard:
+        one = f"/hunts/{dashboard.hunts()['one']['id']}"
+        (crash,) = dashboard.get(f"/api{one}/crashes")["crashes"]
+        page.open(f"{dashboard.url}{one}/crashes/{crash['id']}")
+        page.wait("!document.getElementById('control').hidden")
+        before = page.text("#verdict")
+        assert before.startswith("ego drove into the back of leader")
+        for name in sorted(names):
+            page.run("document.querySelector(`[data-job=${arguments[0]}]`).click()", name)
+        jobs = f"/api{one}/crashes/{crash['id']}/jobs"
+        ended = wait_until(
+            lambda: (
+                len(found := [job for job in dashboard.get(jobs)["jobs"] if job["state"] == "ended"]) == len(names)
+                and found
+            )
+        )
+        assert {job["name"]: job["exit_code"] for job in ended} == dict.fromkeys(names, 0), ended
+        output = {job["name"]: job["output"] for job in ended}
+        assert "reproduced" in output["replay"]
+        page.wait("document.getElementById('jobs').innerText.includes('replay: ended with exit code 0')")
+        if "judge" not in names:
+            return
+        assert "saved in" in output["shrink"]
+        assert "It could be avoided until" in output["judge"]
+        # Without a reload; textContent, because the evidence is folded.
+        page.wait("document.getElementById('words').textContent.includes('It could be avoided until')")
+        judged = dashboard.get(f"/api{one}/crashes/{crash['id']}")
+        assert judged["judged"]["verdict"] == "avoidable"
+        assert page.text("#verdict") == judged["verdict"]
+        page.wait("document.querySelector('#related a')?.innerText === arguments[0]", f"{crash['id']}.small")
+        page.run("document.querySelector('#related a').click()")
+        page.wait("location.pathname.endsWith('.small') && window.crashhuntView?.crash")
+        assert page.text("#related") == f"minimized from {crash['id']}"
+        for name in (".small", "x.small", f"..%2F{crash['id']}.small", f"{crash['id']}.small.small"):
+            assert dashboard.ask(f"/api{one}/crashes/{name}").status == 404
 
 
 def test_a_running_hunt_is_stopped_as_by_ctrl_c(shell):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import subprocess
 
 import pytest
-from conftest import CRASHHUNT, needed
+from browsers import needed
+from conftest import CRASHHUNT
 
 # Everything that bash would set when somebody presses the key at the end of the line.
 ASK = """

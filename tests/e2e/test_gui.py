@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import needed
+from browsers import needed
 from PIL import ImageGrab
 
 ORANGE, RED = (224, 138, 0), (198, 40, 40)

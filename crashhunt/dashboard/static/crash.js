@@ -10,6 +10,13 @@ function facts(crash) {
   return [["arguments", crash.arguments], ...(lineage.length ? [["made from", lineage.join(", ")]] : []), ...Object.entries(crash.facts), ...(fault.length ? [["rules", fault.join("\n")]] : []), ["folder", crash.path]];
 }
 
+/* The minimized crash of a crash, and the crash that a minimized one was made from. */
+function relate(crash) {
+  const links = [["minimized crash: ", crash.minimized], ["minimized from ", crash.minimized_from]].filter(([, id]) => id);
+  $("related").hidden = !links.length;
+  $("related").replaceChildren(...links.flatMap(([words, id]) => [words, make("a", id, "", { href: `/hunts/${ID}/crashes/${encodeURIComponent(id)}` })]));
+}
+
 async function begin() {
   let crash;
   try { crash = await get(API, { always: true }); } catch (error) {
@@ -20,19 +27,16 @@ async function begin() {
   }
   document.title = `${crash.id} - crashhunt`;
   setText($("title"), crash.id);
-  setText($("summary"), crash.summary);
-  for (const id of ["player", "about", "more"]) $(id).hidden = false;
+  for (const id of ["player", "more"]) $(id).hidden = false;
   await window.load(crash);
-  $("words").replaceChildren(...window.paragraphs(crash.words));
-  $("facts").replaceChildren(...facts(crash).flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
   $("commands").replaceChildren(...crash.commands.flatMap(([name, command]) => [make("span", name), make("code", command), copyButton(command, name)]));
   $("log").href = `${API}/log`;
   $("export").href = `${API}/export`;
-  setText($("steps"), crash.table_lines.join("\n"));
   const output = [crash.run_log, crash.error_log].filter((text) => text).join("\n");
   $("logs").hidden = !output;
   setText($("output"), output);
-  window.show(crash);
+  relate(crash);
+  window.show(crash, facts(crash));
   window.addEventListener("resize", window.draw);
   onScheme(window.draw);
   document.body.dataset.complete = "true";
@@ -41,9 +45,18 @@ async function begin() {
 async function control() {
   if (!(await mayControl())) return;
   $("control").hidden = false;
+  let ended = 0;
   const refresh = async () => {
     const found = await get(`${API}/jobs`);
     if (!found) return;
+    const done = found.jobs.filter((job) => job.state === "ended").length;
+    if (done > ended) {
+      /* A job such as judge adds to the crash; the player stays where it is. */
+      const crash = await get(API, { always: true });
+      window.describe(crash, facts(crash));
+      relate(crash);
+    }
+    ended = done;
     $("jobs").replaceChildren(...found.jobs.flatMap((job) => {
       const said = job.state === "ended" ? `ended with exit code ${job.exit_code}` : job.state, output = make("pre", job.output, "log", { tabindex: "0", role: "region", "aria-label": `Output of ${job.name}` });
       return [make("p", `${job.name}: ${said}`), ...(job.output ? [output] : [])];

@@ -117,7 +117,7 @@ function showCrashes() {
   const filter = $("crash-filter").value;
   const lines = crashes.filter((one) => !filter || (filter === "near misses" ? one.near_miss : one.type === filter));
   renew("crashes", lines, () => $("crashes").replaceChildren(table([["Crash"], ["What happened"], ["Type"], ["At fault"], ["Steps", "number"], ["Confirmed"]], lines.map((one) => [
-    one.damaged && !one.summary ? one.id : link(one.id), one.damaged || one.summary, one.near_miss ? "near miss" : one.type ?? "", one.fault ?? "", one.steps === undefined ? "" : count(one.steps),
+    one.damaged && !one.summary ? one.id : link(one.id), one.damaged || one.summary, one.near_miss ? (one.disturbed ? "near miss, disturbed" : "near miss") : one.type ?? "", one.fault ?? "", one.steps === undefined ? "" : count(one.steps),
     one.near_miss ? "" : one.confirmed === true ? "yes" : one.confirmed === false ? "no: flaky" : one.why_unconfirmed || "not yet",
   ]), "Crashes")));
 }
@@ -160,9 +160,22 @@ function drawProgress() {
   })), { barmode: "stack", bargap: 0, xaxis: { title: "trial" }, yaxis: { title: "trials" } }, `Outcomes over the hunt: ${Object.entries(hunt.outcomes).map(([name, number]) => `${name} ${number}`).join(", ")}`);
 }
 
-const about = (one) => spelled([`trial ${one.number}: ${one.outcome}`, one.danger === null ? "" : `criticality ${one.danger.toFixed(2)}`, one.origin && `from ${one.origin}`, ...Object.entries(one.values).map(([name, value]) => `${name} ${short(value)}${units[name] ? ` ${units[name]}` : ""}`)].filter((part) => part).join("\n")).replaceAll("\n", "<br>");
+/* The trials that charts draw as dots: all crashes, and of the others an even share. Each dot costs 0.1 ms and more of
+   the browser, and more than these cover each other. The sample itself keeps more, for its figures and for a click. */
+const MAX_DOTS = 1000, GOLDEN = (Math.sqrt(5) - 1) / 2;
+let drawn = [];
+function chooseDots() {
+  const others = points.filter((one) => !one.crash);
+  let share = 1;
+  const isDrawn = (one) => (one.number * GOLDEN) % 1 < share;
+  while (others.filter(isDrawn).length > MAX_DOTS) share /= 2;
+  drawn = points.filter((one) => one.crash || isDrawn(one));
+}
+
+const about = (one) => spelled([`trial ${one.number}: ${one.outcome}`, one.danger === null ? "" : `criticality ${one.danger.toFixed(2)}`, one.disturbances ? plural(one.disturbances, "disturbance", "disturbances") : "", one.origin && `from ${one.origin}`, ...Object.entries(one.values).map(([name, value]) => `${name} ${short(value)}${units[name] ? ` ${units[name]}` : ""}`)].filter((part) => part).join("\n")).replaceAll("\n", "<br>");
 function drawTrials() {
-  const measured = points.filter((one) => one.danger !== null || one.crash), origins = [...new Set(points.map((one) => one.origin))].sort();
+  chooseDots();
+  const measured = drawn.filter((one) => one.danger !== null || one.crash), origins = [...new Set(points.map((one) => one.origin))].sort();
   $("criticality-figure").hidden = !measured.length;
   if (measured.length) {
     const traces = origins.map((origin, place) => {
@@ -181,7 +194,7 @@ function drawTrials() {
     const sums = counts[0].map((_, bin) => counts.reduce((sum, own) => sum + own[bin], 0));
     draw($("origins"), origins.map((origin, place) => ({ type: "scatter", mode: "lines", stackgroup: "one", name: spelled(origin || "none"), x: counts[place].map((_, bin) => ((bin + 0.5) * last) / bins), y: counts[place].map((number, bin) => (sums[bin] ? (100 * number) / sums[bin] : 0)), line: { color: css(PALETTE[place % PALETTE.length]), width: 0.5 } })), { xaxis: { title: "trial" }, yaxis: { title: "share in %", range: [0, 100] } }, "Share of the trials that each strategy proposed");
   }
-  const some = shares.share < 1 ? `The plots show ${count(points.length)} of ${count(hunt.trials_run)} trials: ${shares.crash_share < 1 ? "an even share of the crashes and of the others" : "all crashes, and an even share of the others"}.` : "";
+  const some = drawn.length < hunt.trials_run ? `The dots are ${count(drawn.length)} of ${count(hunt.trials_run)} trials: ${shares.crash_share < 1 ? "an even share of the crashes and of the others" : "all crashes, and an even share of the others"}.` : "";
   setText($("thinned"), some);
 }
 
@@ -203,9 +216,9 @@ function drawArguments() {
   const axis = (name) => ({ title: titled(name), ...(points.every((one) => typeof valueOf(one, name) === "number" || valueOf(one, name) === null) ? {} : { type: "category" }) });
   const trace = (own, more) => ({ type: "scatter", mode: "markers", x: own.map((one) => valueOf(one, across)), y: own.map((one) => valueOf(one, up)), customdata: own.map((one) => one.number), text: own.map(about), hovertemplate: "%{text}<extra></extra>", ...more });
   const traces = byDanger
-    ? [trace(points, { name: "criticality", showlegend: false, marker: { size: 6, color: points.map((one) => (one.crash ? 1 : one.danger ?? 0)), cmin: 0, cmax: 1, colorscale: "Cividis", colorbar: { title: { text: "criticality" }, thickness: 12 } } })]
-    : Object.keys(COLORS).reverse().map((category) => [category, points.filter((one) => one.category === category)]).filter(([, own]) => own.length).map(([category, own]) => trace(own, { name: category, marker: { color: css(COLORS[category]), size: category === "no crash" ? 5 : 8, opacity: category === "no crash" ? 0.55 : 0.95, symbol: category === "no crash" ? "circle" : category === "software fault" ? "diamond" : "x" } }));
-  draw($("scatter"), traces, { xaxis: axis(across), yaxis: axis(up) }, `${plural(points.length, "trial", "trials")} by ${across} and ${up}, coloured by ${byDanger ? "criticality" : "outcome"}`);
+    ? [trace(drawn, { name: "criticality", showlegend: false, marker: { size: 6, color: drawn.map((one) => (one.crash ? 1 : one.danger ?? 0)), cmin: 0, cmax: 1, colorscale: "Cividis", colorbar: { title: { text: "criticality" }, thickness: 12 } } })]
+    : Object.keys(COLORS).reverse().map((category) => [category, drawn.filter((one) => one.category === category)]).filter(([, own]) => own.length).map(([category, own]) => trace(own, { name: category, marker: { color: css(COLORS[category]), size: category === "no crash" ? 5 : 8, opacity: category === "no crash" ? 0.55 : 0.95, symbol: category === "no crash" ? "circle" : category === "software fault" ? "diamond" : "x" } }));
+  draw($("scatter"), traces, { xaxis: axis(across), yaxis: axis(up) }, `${plural(drawn.length, "trial", "trials")} by ${across} and ${up}, coloured by ${byDanger ? "criticality" : "outcome"}`);
   drawParallel(names);
 }
 
@@ -334,7 +347,7 @@ function pick(number) {
   const command = run.map(quoted).join(" "), box = make("div", undefined, "command");
   box.append(make("span", "run its arguments again, with other seeds"), make("code", command), copyButton(command, `the arguments of trial ${number}`));
   const facts = make("dl");
-  facts.append(...[["outcome", one.outcome], ["steps", one.steps], ["criticality", one.danger ?? "-"], ["least time to collision", one.ttc === null ? "-" : `${one.ttc.toFixed(2)} s`], ["came from", [one.origin, one.parent === null ? "" : `trial ${one.parent}`].filter((part) => part).join(", ") || "-"], ...Object.entries(one.values).map(([name, value]) => [name, `${short(value)}${units[name] ? ` ${units[name]}` : ""}`])].flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
+  facts.append(...[["outcome", one.outcome], ["steps", one.steps], ["criticality", one.danger ?? "-"], ["disturbances", one.disturbances], ["least time to collision with any actor", one.ttc === null ? "-" : `${one.ttc.toFixed(2)} s`], ["came from", [one.origin, one.parent === null ? "" : `trial ${one.parent}`].filter((part) => part).join(", ") || "-"], ...Object.entries(one.values).map(([name, value]) => [name, `${short(value)}${units[name] ? ` ${units[name]}` : ""}`])].flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
   panel.replaceChildren(make("h3", `Trial ${number}`), facts, box);
   panel.scrollIntoView({ block: "nearest" });
 }
@@ -404,7 +417,10 @@ function drawAll() {
 async function showWeights() {
   const found = await get(`${API}/importance`);
   if (!found) return;
-  units = found.units;
+  if (JSON.stringify(units) !== JSON.stringify(found.units)) {
+    units = found.units;
+    drawArguments();
+  }
   $("weights-figure").hidden = !found.importance.length;
   $("weights").replaceChildren(...found.importance.flatMap(({ name, share, low, high }) => {
     const box = make("div", undefined, "weight"), bar = make("div", undefined, "bar"), span = make("div", undefined, "span"), percent = (value) => (100 * value).toFixed(0);
@@ -469,7 +485,6 @@ async function turn() {
   if (hunt && points.length >= 40 && now() - weighedAt > (weighedAt ? 30 : 0)) {
     weighedAt = now();
     await showWeights();
-    drawArguments();
   }
 }
 for (const id of ["over", "across", "up", "colour", "crash-filter"]) {

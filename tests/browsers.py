@@ -1,13 +1,26 @@
-"""A page of the dashboard in a real browser."""
+"""A page of the report or of the dashboard in a real browser."""
 
 from __future__ import annotations
 
+import os
+import shutil
 import time
+from contextlib import suppress
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import needed
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def needed(*names: str) -> str:
+    """Where a program that is no Python package is; without it, the test cannot run, and in CI fails."""
+    found = next(filter(None, map(shutil.which, names)), None)
+    if found is None:
+        (pytest.fail if os.environ.get("CRASHHUNT_TEST_SCREEN") == "required" else pytest.skip)(f"needs {names[0]}")
+    return found
 
 
 class Page:
@@ -82,24 +95,72 @@ class Page:
         ]
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    """Chromium without a window."""
-    program, driver = needed("chromium", "chromium-browser", "google-chrome"), needed("chromedriver")
-    webdriver = pytest.importorskip("selenium.webdriver")
-    service = pytest.importorskip("selenium.webdriver.chrome.service")
-    options = webdriver.ChromeOptions()
-    options.binary_location = program
-    for word in (
-        "headless=new", "no-sandbox", "disable-gpu", "no-first-run", "disable-background-networking",
-        "disable-component-update", "disable-sync", "window-size=1280,1000", "disable-dev-shm-usage",
-        f"user-data-dir={tmp_path_factory.mktemp('chromium')}",
-    ):  # fmt: skip
-        options.add_argument(f"--{word}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    opened = webdriver.Chrome(options=options, service=service.Service(driver))
+class Chromium:
+    """One Chromium without a window for all tests of a worker; starting it takes seconds.
+
+    Args:
+        profile: folder for its profile.
+    """
+
+    def __init__(self, profile: Path) -> None:
+        self._profile = profile
+        self._driver: Any = None
+
+    def driver(self) -> Any:
+        """Return the driver of a browser that answers; one that a test has crashed is replaced."""
+        from selenium.common.exceptions import WebDriverException
+        from urllib3.exceptions import HTTPError
+
+        if self._driver is not None:
+            try:
+                self._driver.get("about:blank")
+                return self._driver
+            except (WebDriverException, HTTPError, OSError):
+                self.quit()
+        self._driver = self._start()
+        return self._driver
+
+    def _start(self) -> Any:
+        program, driver = needed("chromium", "chromium-browser", "google-chrome"), needed("chromedriver")
+        webdriver = pytest.importorskip("selenium.webdriver")
+        service = pytest.importorskip("selenium.webdriver.chrome.service")
+        options = webdriver.ChromeOptions()
+        options.binary_location = program
+        for word in (
+            "headless=new", "no-sandbox", "disable-gpu", "no-first-run", "disable-background-networking",
+            "disable-component-update", "disable-sync", "window-size=1280,1000", "disable-dev-shm-usage",
+            f"user-data-dir={self._profile}",
+        ):  # fmt: skip
+            options.add_argument(f"--{word}")
+        options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+        return webdriver.Chrome(options=options, service=service.Service(driver))
+
+    def quit(self) -> None:
+        """End the browser."""
+        if self._driver is not None:
+            with suppress(Exception):
+                self._driver.quit()
+        self._driver = None
+
+
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory):
+    """The browser of this worker."""
+    found = Chromium(tmp_path_factory.mktemp("chromium"))
+    yield found
+    found.quit()
+
+
+@pytest.fixture
+def browser(chromium):
+    """A browser in an ordinary window and light colours, without what an earlier test has left."""
+    opened = chromium.driver()
+    opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    opened.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    opened.delete_all_cookies()
+    opened.get_log("browser")
     yield opened
-    opened.quit()
+    opened.get("about:blank")  # ends the requests of the page before its dashboard ends
 
 
 @pytest.fixture
@@ -108,6 +169,4 @@ def page(browser):
     opened = Page(browser)
     opened.size(1280, 1000)
     opened.scheme("light")
-    browser.get_log("browser")
-    yield opened
-    browser.get("about:blank")
+    return opened

@@ -1,0 +1,202 @@
+"""The verdict of a crash page: one sentence, built only from the recorded contact and from runs.
+
+Clauses are separated by semicolons: what happened at the contact, the gap where a lane change made it, and which run
+avoided it. A clause whose facts are unknown, or contradict each other, is omitted.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crashhunt.world import is_person, lane_jump
+
+if TYPE_CHECKING:
+    from crashhunt.crashes import ContactRecord, Omission
+    from crashhunt.report._show import Story
+
+__all__ = ["describe_contact", "verdict_of"]
+
+_CHANGE_S = 3.0  # before the contact: the rules of fault call a lane change that began earlier complete
+_STRAIGHT = math.radians(10)  # in a bend, a sideways displacement is no lane change
+_SIDEWAYS_M = 1.0  # less does not say to which side
+_MOVES_MPS = 1.0  # a time gap to a slower vehicle is no useful number
+_SHORT_S = 0.1  # a shorter time gap is given in m
+_MANOEUVRES = {
+    "brake": "brakes",
+    "left": "changes to the lane on the left and brakes",
+    "right": "changes to the lane on the right and brakes",
+}
+
+
+def verdict_of(story: Story) -> str:
+    """Return one sentence on a crash or near miss: what happened, and which run avoids it.
+
+    Args:
+        story: of the crash or near miss.
+    """
+    if story.nearest is not None:
+        return _of_a_near_miss(story)
+    if story.contact is None:
+        return f"{story.bundle.result.summary}."
+    omission = _omission(story)
+    clauses = [describe_contact(story.contact, omission), _avoided(story, omission)]
+    return f"{'; '.join(clause for clause in clauses if clause)}."
+
+
+def _of_a_near_miss(story: Story) -> str:
+    near = story.nearest
+    assert near is not None
+    moments = story.encounter.moments if story.encounter is not None else []
+    moment = next((one for one in moments if one.step == near.step), None)
+    if moment is None:
+        return f"{story.bundle.result.summary}."
+    return (
+        f"{near.agent} came close to {near.other} at {moment.time_s:.1f} s: the gap was {moment.gap_m:.1f} m, and the "
+        f"criticality {near.danger:.2f}."
+    )
+
+
+def describe_contact(contact: ContactRecord, omission: Omission | None = None) -> str:
+    """Return what happened at a contact, without a period.
+
+    Args:
+        contact: of the agent with the other actor.
+        omission: the lane change that runs have shown to be the cause, where there is one.
+    """
+    changers = contact.lane_changers(_CHANGE_S) if contact.same_way else ()
+    if len(changers) != 1:
+        return _what_touched(contact)
+    (changer,) = changers
+    partner, since = contact.partner(changer), contact.changed_s(changer)
+    is_cause = omission is not None and (omission.instead, omission.actor) == ("changed lanes", partner)
+    gap = _gap_of(omission) if omission is not None and is_cause else _gap_at(contact, changer)
+    side = _side(contact, changer)
+    lane = f"changed to the {side} lane" if side else "changed lanes"
+    gap = f"; {gap}" if gap else ""
+    if changer in contact.jumpers:
+        return f"{changer} {lane} into {partner}{gap}"
+    what = _what_touched(contact)
+    when = f"{since:.1f} s before" if since is not None else "just before"
+    if what.startswith(f"{changer} "):
+        return f"{changer} {lane} {when} and {what.removeprefix(f'{changer} ')}{gap}"
+    return f"{changer} {lane} {when}, and {what}{gap}"
+
+
+def _what_touched(contact: ContactRecord) -> str:
+    """Return which actor drove into which, and with which sides."""
+    agent, manner, mover = contact.agent, contact.manner, contact.collider
+    met = contact.partner(mover)
+    if manner == "rear end":
+        follower = contact.follower
+        leader = contact.partner(follower)
+        own, its = contact.speed_at_contact(follower), contact.speed_at_contact(leader)
+        speeds = f" at {own:.1f} m/s against {its:.1f} m/s" if own > its else ""
+        return f"{follower} drove into the back of {leader}{speeds}"
+    if manner == "head-on":
+        return f"{agent} and {contact.other} collided head-on"
+    if manner == "pedestrian":
+        return f"{mover} {'walked' if is_person(mover) else 'drove'} into {met}"
+    if manner == "side swipe":
+        return f"{mover} touched the side of {met}" if _touches_a_side(contact, met) else f"{mover} drove into {met}"
+    side = manner.rpartition(" ")[2]
+    if mover == agent:
+        return f"{agent} drove into {met}, which came from the {side}"
+    return f"{mover}, which came from the {side}, drove into {agent}"
+
+
+def _touches_a_side(contact: ContactRecord, met: str) -> bool:
+    face = contact.touch.face if met == contact.agent else contact.touch.other_face
+    return face in ("left", "right")
+
+
+def _side(contact: ContactRecord, changer: str) -> str:
+    """Return to which side an actor changed lanes; empty where its path does not show it."""
+    if changer in contact.jumpers and len(contact.through) > 1:
+        jump = lane_jump(contact.through[-2], contact.through[-1], changer)
+        return ("left" if jump > 0 else "right") if jump else ""
+    way = contact.way(changer)
+    recent = contact.times <= _CHANGE_S + 1e-6
+    headings, points = way.headings[recent], way.centers[recent]
+    if len(headings) < 2 or np.ptp(headings) > _STRAIGHT:
+        return ""
+    dx, dy = points[-1] - points[0]
+    heading = float(headings[0])
+    moved = dy * math.cos(heading) - dx * math.sin(heading)
+    return "" if abs(moved) < _SIDEWAYS_M else "left" if moved > 0 else "right"
+
+
+def _gap_at(contact: ContactRecord, changer: str) -> str:
+    """Return the gap between the two when one changed lanes; empty where it is unknown."""
+    since = 0.0 if changer in contact.jumpers else contact.changed_s(changer)
+    if since is None:
+        return ""
+    back = len(contact.times) - 1 if not since else int(np.argmin(np.abs(contact.times - since)))
+    partner = contact.partner(changer)
+    ahead_m, behind_m = contact.gap_m(changer, back), contact.gap_m(partner, back)
+    if max(ahead_m, behind_m) <= 0:
+        return f"{partner} was alongside"
+    follower = partner if ahead_m > 0 else changer
+    return _gap_words(max(ahead_m, behind_m), float(contact.way(follower).speeds[back]))
+
+
+def _gap_of(omission: Omission) -> str:
+    relation = omission.kind.rpartition(" ")[0]
+    if relation == "alongside":
+        return f"{omission.actor} was alongside"
+    if relation not in ("ahead", "behind") or omission.gap_m is None:
+        return ""
+    return _gap_words(omission.gap_m, (omission.actor_speed_mps or 0.0) if relation == "behind" else omission.speed_mps)
+
+
+def _gap_words(gap_m: float, speed_mps: float) -> str:
+    """Return a gap as the time in which the vehicle behind covers it, and in m."""
+    gap_m = max(0.0, gap_m)
+    if speed_mps < _MOVES_MPS or gap_m < _SHORT_S * speed_mps:
+        return f"the gap was {gap_m:.1f} m"
+    return f"the gap was {gap_m / speed_mps:.1f} s ({gap_m:.1f} m)"
+
+
+def _omission(story: Story) -> Omission | None:
+    """Return the omission that runs have shown, where it is about the collision partner or about no actor."""
+    reference = story.judgement.reference if story.judgement is not None else None
+    found = reference.omission if reference is not None else None
+    return found if found is not None and found.actor in ("", story.other) else None
+
+
+def _avoided(story: Story, omission: Omission | None) -> str:
+    """Return which run avoided the crash, or that no run did; empty where that is unknown."""
+    judgement, tried = story.judgement, story.bundle.result.escape
+    if omission is not None:
+        return f"{_omitted(story.agent, omission)}with a reference driver there is no crash"
+    if judgement is not None and judgement.runs:
+        if judgement.verdict == "invalid":
+            return "no run avoids it: the trial starts in an unavoidable situation"
+        if judgement.verdict == "too late when visible":
+            return f"when {story.agent} first observed {story.other}, no run avoided it any more"
+        best = judgement.best
+        if best is not None and best.last_step is not None:
+            also = "".join(f" and {each.removeprefix(f'{story.agent} ')}" for each in best.changed)
+            how = _MANOEUVRES.get(best.manoeuvre, best.manoeuvre)
+            when = f"{story.before_contact_s(best.last_step):.1f} s before"
+            return f"if {story.agent} {how} {when}{also}, there is no crash"
+        return "no run avoids it" if judgement.avoidable is False else ""
+    if tried is None or tried.why_not or tried.step is None:
+        return ""
+    if story.contact is not None and story.agent in story.contact.lane_changers(_CHANGE_S):
+        return ""  # the run that brakes also drops the lane change, and the hunt has not recorded which of both helps
+    return f"if {story.agent} brakes {story.before_contact_s(tried.step):.1f} s before, there is no crash"
+
+
+def _omitted(agent: str, omission: Omission) -> str:
+    """Return what the agent omitted as a clause that ends with a semicolon; empty for a lane change."""
+    if omission.instead == "changed lanes":
+        return ""
+    if omission.kind == "red light":
+        return f"{agent} did not stop for a red light; "
+    if omission.instead == "braked too little":
+        return f"{agent} braked too little; "
+    verb = "yield" if omission.kind == "crossing" else "brake"
+    return f"{agent} did not {verb} and {omission.instead}; "

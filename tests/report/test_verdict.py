@@ -1,0 +1,159 @@
+"""The verdict of a crash page is built from the contact and from runs, and says nothing that they do not show."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.crashes import Attempt, Judgement, Omission, Reference, ReferenceRun
+from crashhunt.crashes._contact import record_in
+from crashhunt.report._verdict import describe_contact, verdict_of
+from crashhunt.trial import Collision
+from crashhunt.world import Actor, Roster, Scene
+
+DT = 0.1
+BOTH = Roster((Actor("ego", "car", 5.0, 2.0), Actor("x", "car", 5.0, 2.0)))
+
+
+def contact(poses, *, turn=0.0):
+    """Return the record of a contact.
+
+    Args:
+        poses: returns x, y, heading and speed of ego and of the other at a time in s; the last scene is at 0 s.
+        turn: by which the whole map is turned, in rad.
+    """
+    c, s = math.cos(turn), math.sin(turn)
+    scenes = []
+    for step in range(-40, 1):
+        found = poses(step * DT)
+        points = [(c * x - s * y, s * x + c * y) for x, y, *_ in found]
+        scenes.append(Scene(4.0 + step * DT, BOTH, points, [one[2] + turn for one in found], [one[3] for one in found]))
+    hit = Collision(
+        agent="ego", role="collider", collider="ego", victim="x", collider_speed=1.0, victim_speed=1.0, x=0.0, y=0.0
+    )
+    record = record_in(scenes, hit)
+    assert record is not None
+    return record
+
+
+def jump(side, ahead_m, *, own=10.0, its=20.0, mover=0):
+    """One of the two is in the next lane until its last step, and then in that of the other."""
+
+    def poses(time_s):
+        found = [[ahead_m + own * time_s, 0.0, 0.0, own], [its * time_s, 0.0, 0.0, its]]
+        found[mover][1] = side * 3.2 if time_s < -DT / 2 else 0.0
+        return found
+
+    return poses
+
+
+@pytest.mark.parametrize("turn", [0.0, 2.1])
+@pytest.mark.parametrize(
+    ("poses", "words"),
+    [
+        (jump(-1, 4.0), "ego changed to the left lane into x; x was alongside"),
+        (jump(1, 4.0), "ego changed to the right lane into x; x was alongside"),
+        (jump(-1, 4.9), "ego changed to the left lane into x; the gap was 0.9 m"),
+        (jump(-1, 4.0, mover=1), "x changed to the left lane into ego; ego was alongside"),
+        (
+            lambda time_s: [(20 * time_s, 0.0, 0.0, 20.0), (4.9 + 12 * time_s, 0.0, 0.0, 12.0)],
+            "ego drove into the back of x at 20.0 m/s against 12.0 m/s",
+        ),
+        (
+            lambda time_s: [(4.9 + 12 * time_s, 0.0, 0.0, 12.0), (20 * time_s, 0.0, 0.0, 20.0)],
+            "x drove into the back of ego at 20.0 m/s against 12.0 m/s",
+        ),
+        (
+            lambda time_s: [(10 * time_s, 0.0, 0.0, 10.0), (-0.1 - 10 * time_s, 0.0, math.pi, 10.0)],
+            "ego and x collided head-on",
+        ),
+        (
+            lambda time_s: [(10 * time_s, 0.0, 0.0, 10.0), (0.9, 2.0 + time_s, math.pi / 2, 1.0)],
+            "ego drove into x, which came from the right",
+        ),
+    ],
+)
+def test_contact_in_one_clause(poses, words, turn):
+    assert describe_contact(contact(poses, turn=turn)) == words
+
+
+def story(judgement=None, escape=None, poses=None):
+    record = contact(poses or (lambda time_s: [(20 * time_s, 0.0, 0.0, 20.0), (4.9 + 12 * time_s, 0.0, 0.0, 12.0)]))
+    result = SimpleNamespace(escape=escape, summary="ego drove into x at step 40")
+    return SimpleNamespace(
+        nearest=None,
+        contact=record,
+        judgement=judgement,
+        bundle=SimpleNamespace(result=result),
+        agent="ego",
+        other="x",
+        encounter=None,
+        before_contact_s=lambda step: (40 - step) * DT,
+    )
+
+
+TOUCHED = "ego drove into the back of x at 20.0 m/s against 12.0 m/s"
+
+
+def attempt(avoided, changed=()):
+    endings = {step: "avoided" if step <= avoided else "hit" for step in range(40)}
+    return Attempt(manoeuvre="brake", end=40, endings=endings, changed=changed)
+
+
+def omitted(**more):
+    given = {
+        "faculty": "longitudinal", "kind": "vehicle", "actor": "x", "step": 20, "instead": "sped up", "speed_mps": 20.0,
+        "actor_speed_mps": 12.0, "gap_m": 9.0, "safe": 14.0,
+    }  # fmt: skip
+    run = ReferenceRun(faculty="longitudinal", step=20, ending="none")
+    return Judgement(reference=Reference(omission=Omission(**given | more), runs=(run,)))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({}, f"{TOUCHED}."),
+        (
+            {"escape": SimpleNamespace(step=30, why_not="", too_late=31)},
+            f"{TOUCHED}; if ego brakes 1.0 s before, there is no crash.",
+        ),
+        ({"escape": SimpleNamespace(step=30, why_not="the run differed", too_late=None)}, f"{TOUCHED}."),
+        ({"escape": SimpleNamespace(step=None, why_not="", too_late=0)}, f"{TOUCHED}."),
+        ({"judgement": Judgement((attempt(25),))}, f"{TOUCHED}; if ego brakes 1.5 s before, there is no crash."),
+        (
+            {"judgement": Judgement((attempt(25, changed=("ego does not change lanes",)),))},
+            f"{TOUCHED}; if ego brakes 1.5 s before and does not change lanes, there is no crash.",
+        ),
+        (
+            {"judgement": Judgement((attempt(-1),))},
+            f"{TOUCHED}; no run avoids it: the trial starts in an unavoidable situation.",
+        ),
+        ({"judgement": Judgement((), why_not="interrupted")}, f"{TOUCHED}."),
+        (
+            {"judgement": omitted()},
+            f"{TOUCHED}; ego did not brake and sped up; with a reference driver there is no crash.",
+        ),
+        ({"judgement": omitted(actor="y")}, f"{TOUCHED}."),  # about another actor than the page
+        (
+            {"judgement": omitted(kind="red light", actor="")},
+            f"{TOUCHED}; ego did not stop for a red light; with a reference driver there is no crash.",
+        ),
+    ],
+)
+def test_verdict_reports_only_what_was_run(given, words):
+    assert verdict_of(story(**given)) == words
+
+
+def test_braking_is_no_answer_where_the_agent_changed_lanes():
+    """The run that brakes also drops the lane change, and the hunt has not recorded which of both helps."""
+    found = verdict_of(story(escape=SimpleNamespace(step=39, why_not="", too_late=None), poses=jump(-1, 4.0)))
+    assert found == "ego changed to the left lane into x; x was alongside."
+
+
+def test_lane_change_of_the_reference_runs_gives_the_gap():
+    found = omitted(instead="changed lanes", kind="behind left", faculty="lateral", gap_m=6.0, actor_speed_mps=20.0)
+    assert verdict_of(story(judgement=found, poses=jump(-1, 4.9))) == (
+        "ego changed to the left lane into x; the gap was 0.3 s (6.0 m); with a reference driver there is no crash."
+    )
