@@ -28,10 +28,11 @@ SECTIONS = {
 
 _ORDER = [
     "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed", "how-often-does-it-crash",
-    "which-version-is-better", "cluster", "your-town", "from-a-map", "highway-env", "gymnasium", "learn-from-crashes", "ci",
-    "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
+    "which-version-is-better", "cluster", "your-town", "from-a-map", "highway-env", "gymnasium", "learn-from-crashes",
+    "ci", "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
     "kinds-of-crashes", "fault", "omissions", "judge", "causes", "what-if", "shrink", "film", "near-misses",
-    "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train", "train-on-crashes",
+    "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
+    "train-on-crashes",
     "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "determinism", "security",
     "disturbance-kinds", "forks", "fault-rules", "minimization", "export", "clusters",
     "gallery", "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",

@@ -11,21 +11,17 @@ from typing import Any, Literal, NotRequired, TypedDict
 from crashhunt.base.codec import JsonObject
 from crashhunt.base.json_types import ErrorData, Plain
 from crashhunt.base.schemas import json_schema
-from crashhunt.crashes._bundle import CrashSummary
-from crashhunt.hunts._check import Finding
-from crashhunt.hunts._reports import AuditReport, StoppedBecause
-from crashhunt.hunts._state import HuntState
-from crashhunt.ledger._reader import KindData
-from crashhunt.recording._divergence import DivergenceData
-from crashhunt.replays._prepare import Code
-from crashhunt.replays._replay import ReplayData
+from crashhunt.crashes import CrashSummary
+from crashhunt.hunts import AuditReport, Finding, HuntState, StoppedBecause
+from crashhunt.ledger import KindData
+from crashhunt.replays import Code, Verdict
 from crashhunt.trial import Value
 
 __all__ = ["SCHEMAS", "describe_schemas"]
 
 _NAMES = {
     "Code": Code,
-    "DivergenceData": DivergenceData,
+    "Verdict": Verdict,
     "Value": Value,
     "JsonObject": JsonObject,
     "Plain": Plain,
@@ -115,6 +111,38 @@ class RunData(TypedDict):
     copied: NotRequired[str]
     rare: NotRequired[JsonObject]
     rate: NotRequired[RateEntry]
+
+
+class DivergenceData(TypedDict):
+    """The first difference between a recording and its replay."""
+
+    step: int
+    agent: str
+    field: str
+    recorded: Any
+    replayed: Any
+
+
+class ReplayData(TypedDict):
+    """A replay of a crash, compared with its recording."""
+
+    crash: str
+    verdict: Verdict
+    code: Code
+    steps_recorded: int
+    steps_replayed: int
+    digest_recorded: str
+    digest_replayed: str
+    divergence: DivergenceData | None
+    outcome_recorded: str
+    outcome_replayed: str
+    reason: str
+    edits: list[str]
+    warnings: list[str]
+    times: int
+    agreed: int
+    verdicts: dict[Verdict, int]
+    table: NotRequired[list[Plain]]
 
 
 class OneReplay(ReplayData):

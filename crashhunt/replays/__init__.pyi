@@ -9,6 +9,7 @@ from ._prepare import (
 )
 from ._replay import (
     ReplayReport as ReplayReport,
+    Verdict as Verdict,
     confirm as confirm,
     replay as replay,
     up_to as up_to,
