@@ -185,3 +185,13 @@ def test_lane_change_of_the_reference_runs_gives_the_gap():
     assert verdict_of(story(judgement=found, poses=jump(-1, 4.9))) == words.format("0.3 s")
     ahead = omitted(instead="changed lanes", kind="ahead left", faculty="lateral", gap_m=6.0, speed_mps=10.0)
     assert verdict_of(story(judgement=ahead, poses=jump(-1, 4.9))) == words.format("0.6 s")  # ego is behind
+
+
+def test_road_departure_names_the_missing_lane():
+    found = omitted(instead="changed lanes", kind="no lane left", faculty="lateral", actor="")
+    left = story(judgement=found)
+    left.contact, left.other, left.bundle.result.summary = None, "", "ego left the road at step 13"
+    assert verdict_of(left) == (
+        "ego left the road at step 13; ego changed to the left, where it has no lane; with a reference driver there is "
+        "no crash."
+    )
