@@ -21,6 +21,7 @@ __all__ = ["describe_contact", "verdict_of"]
 
 _CHANGE_S = 3.0  # before the contact: the rules of fault call a lane change that began earlier complete
 _STRAIGHT = math.radians(10)  # in a bend, a sideways displacement is no lane change
+_MERGES = math.radians(30)  # between their headings, as in the rules of fault
 _SIDEWAYS_M = 1.0  # less does not say to which side
 _MOVES_MPS = 1.0  # a time gap to a slower vehicle is no useful number
 _SHORT_S = 0.1  # a shorter time gap is given in m
@@ -39,10 +40,9 @@ def verdict_of(story: Story) -> str:
     """
     if story.nearest is not None:
         return _of_a_near_miss(story)
-    if story.contact is None:
-        return f"{story.bundle.result.summary}."
     omission = _omission(story)
-    clauses = [describe_contact(story.contact, omission), _avoided(story, omission)]
+    what = describe_contact(story.contact, omission) if story.contact is not None else story.bundle.result.summary
+    clauses = [what, _avoided(story, omission)]
     return f"{'; '.join(clause for clause in clauses if clause)}."
 
 
@@ -71,6 +71,8 @@ def describe_contact(contact: ContactRecord, omission: Omission | None = None) -
         return _what_touched(contact)
     (changer,) = changers
     partner, since = contact.partner(changer), contact.changed_s(changer)
+    if since is not None and contact.turned(since) > _MERGES:
+        return _what_touched(contact)  # in a bend or a roundabout, lanes lead apart and together
     is_cause = omission is not None and (omission.instead, omission.actor) == ("changed lanes", partner)
     gap = _gap_of(omission) if omission is not None and is_cause else _gap_at(contact, changer)
     side = _side(contact, changer)
@@ -192,6 +194,8 @@ def _avoided(story: Story, omission: Omission | None) -> str:
 
 def _omitted(agent: str, omission: Omission) -> str:
     """Return what the agent omitted as a clause that ends with a semicolon; empty for a lane change."""
+    if omission.kind.startswith("no lane"):
+        return f"{agent} changed to the {omission.kind.rpartition(' ')[2]}, where it has no lane; "
     if omission.instead == "changed lanes":
         return ""
     if omission.kind == "red light":

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from crashhunt.crashes import danger_course
+from crashhunt.crashes import closest_actors, danger_course
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.report._words import about_danger
 from crashhunt.world import Actor, Roster, Scene
@@ -111,3 +111,20 @@ def test_gradual_lane_change_counts_the_vehicle_behind_in_the_target_lane(mover,
         assert not course.own[entered + 1] >= expected  # the moment of the change counts, not each step after it
     else:
         assert course.greatest.danger == 0.0
+
+
+def test_least_time_and_gap_have_the_name_of_their_actor():
+    """Time to collision with one vehicle, gap to another; of two that are equally near, none is named."""
+    names = Roster(tuple(Actor(name, "car", 5.0, 2.0) for name in ("ego", "slow", "side", "other side")))
+
+    def closest(*places):
+        points = [(0.0, 0.0), (30.0, 0.0), *places]
+        scenes = [Scene(0.0, names, points, [0.0] * 4, [10.0, 4.0, 10.0, 10.0])]
+        records = [StepRecord(0, scenes[0])]
+        found = SimpleNamespace(all_steps=records, scenes=lambda: scenes, prologue=Prologue((), DT))
+        return closest_actors(found, "ego")
+
+    assert closest((1.0, 3.5), (1.0, -4.0)) == [("slow", "side")]
+    assert closest((1.0, 4.0), (1.0, -3.5)) == [("slow", "other side")]
+    assert closest((1.0, 3.5), (1.0, -3.5)) == [("slow", "")]
+    assert closest_actors(recording(3, (1,)), "ego") == [("", ""), ("", "ahead"), ("", "")]

@@ -68,8 +68,7 @@ def test_a_taken_port_is_one_line_with_the_next_free_one(shell):
     (line,) = done.err.splitlines()
     assert f"port {port} of 127.0.0.1 is taken" in line
     free = int(line.partition("--port ")[2].partition(",")[0])
-    assert free > port
-    socket.create_server(("127.0.0.1", free)).close()
+    assert port < free <= port + 100  # not bound again here: another test may take it at any time
 
 
 @pytest.mark.parametrize(

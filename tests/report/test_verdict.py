@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from crashhunt.crashes import Attempt, Judgement, Omission, Reference, ReferenceRun
+from crashhunt.crashes import Attempt, Judgement, LaneMap, Omission, Reference, ReferenceRun
 from crashhunt.crashes._contact import record_in
 from crashhunt.report._verdict import describe_contact, verdict_of
 from crashhunt.trial import Collision
@@ -77,6 +79,31 @@ def jump(side, ahead_m, *, own=10.0, its=20.0, mover=0):
 )
 def test_contact_in_one_clause(poses, words, turn):
     assert describe_contact(contact(poses, turn=turn)) == words
+
+
+@pytest.mark.parametrize("turn", [0.0, 2.1])
+@pytest.mark.parametrize(("side", "word"), [(-1, "left"), (1, "right")])
+def test_gradual_lane_change_reports_its_side_and_the_gap_at_that_time(side, word, turn):
+    """The ego needs 1.5 s for 3.2 m; the faster vehicle behind in the target lane then drives into its back."""
+
+    def poses(time_s):
+        aside = side * 3.2 * (1.0 - min(1.0, max(0.0, (time_s + 2.5) / 1.5)))
+        return [(4.9 + 12 * time_s, aside, 0.0, 12.0), (20 * time_s, 0.0, 0.0, 20.0)]
+
+    c, s = math.cos(turn), math.sin(turn)
+
+    def line(y):
+        return np.array([(c * x - s * y, s * x + c * y) for x in (-200.0, 0.0, 200.0)])
+
+    lanes = LaneMap([(line(y - 1.6), line(y + 1.6)) for y in (-3.2, 0.0, 3.2)], (0.0, 0.0))
+    record = replace(contact(poses, turn=turn), lanes=lanes)
+    since = record.changed_s("ego")
+    assert 1.0 <= since <= 2.5
+    gap_m = 4.9 - 12 * since + 20 * since - 5.0
+    assert describe_contact(record) == (
+        f"ego changed to the {word} lane {since:.1f} s before, and x drove into the back of ego at 20.0 m/s against "
+        f"12.0 m/s; the gap was {gap_m / 20.0:.1f} s ({gap_m:.1f} m)"
+    )
 
 
 def story(judgement=None, escape=None, poses=None):
@@ -154,6 +181,17 @@ def test_braking_is_no_answer_where_the_agent_changed_lanes():
 
 def test_lane_change_of_the_reference_runs_gives_the_gap():
     found = omitted(instead="changed lanes", kind="behind left", faculty="lateral", gap_m=6.0, actor_speed_mps=20.0)
-    assert verdict_of(story(judgement=found, poses=jump(-1, 4.9))) == (
-        "ego changed to the left lane into x; the gap was 0.3 s (6.0 m); with a reference driver there is no crash."
+    words = "ego changed to the left lane into x; the gap was {} (6.0 m); with a reference driver there is no crash."
+    assert verdict_of(story(judgement=found, poses=jump(-1, 4.9))) == words.format("0.3 s")
+    ahead = omitted(instead="changed lanes", kind="ahead left", faculty="lateral", gap_m=6.0, speed_mps=10.0)
+    assert verdict_of(story(judgement=ahead, poses=jump(-1, 4.9))) == words.format("0.6 s")  # ego is behind
+
+
+def test_road_departure_names_the_missing_lane():
+    found = omitted(instead="changed lanes", kind="no lane left", faculty="lateral", actor="")
+    left = story(judgement=found)
+    left.contact, left.other, left.bundle.result.summary = None, "", "ego left the road at step 13"
+    assert verdict_of(left) == (
+        "ego left the road at step 13; ego changed to the left, where it has no lane; with a reference driver there is "
+        "no crash."
     )
