@@ -111,7 +111,7 @@ def test_time_of_standing_is_that_of_the_stop_between_scenes(step_s, phase):
     assert case.stood_s("other") == pytest.approx(5.3, abs=0.03)
 
 
-def bends(speed, ahead=0.0, radius=12.0):
+def bends(speed, ahead=0.0, radius=9.0):
     """Drives straight on until x is 0, and then on an arc to the left; it is at 16 m of the arc plus ``ahead`` at 0."""
 
     def way(t):
