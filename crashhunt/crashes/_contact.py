@@ -425,17 +425,21 @@ class ContactRecord:
         """For how long an actor had stood until the contact, in s; 0 where it moved when they touched."""
         if self.speed_at_contact(actor) >= STANDS_MPS:
             return 0.0
-        found, slowest = 0.0, self.speed_at_contact(actor)
+        found, place = 0.0, None
         for scene in reversed(self.scenes):
             row = scene.roster.index.get(actor)
             if scene.time_s >= self.time_s - 1e-6:
                 continue
             if row is None:
                 break
-            speed, ago = scene.speeds[row], self.time_s - scene.time_s
-            if speed >= STANDS_MPS:  # it stopped between two scenes
-                return found + (ago - found) * (STANDS_MPS - slowest) / (speed - slowest)
-            found, slowest = ago, speed
+            ago = self.time_s - scene.time_s
+            if scene.speeds[row] >= STANDS_MPS:
+                if place is None:
+                    break
+                # It stopped between two scenes. With a constant deceleration, the distance says when.
+                moved_s = 2 * math.dist(scene.points[row], place) / scene.speeds[row]
+                return max(found, ago - moved_s)
+            found, place = ago, scene.points[row]
         return found
 
     def slowed(self, actor: str, since_s: float) -> float:

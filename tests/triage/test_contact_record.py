@@ -99,6 +99,39 @@ def test_vehicle_that_stands_is_driven_into(step_s, phase, angle):
 
 
 @settings(max_examples=10, deadline=None)
+@given(step_s=STEPS, phase=PHASES)
+def test_time_of_standing_is_that_of_the_stop_between_scenes(step_s, phase):
+    """It brakes by 4 m/s² and stops 5.3 s before the contact."""
+
+    def stops(t):
+        left = max(0.0, -5.3 - t)
+        return 5.0 - 2.0 * left**2, 0.0, 0.0, 4.0 * left
+
+    case = record(drives(10.0), stops, step_s=step_s, phase=phase, seconds=12.0)
+    assert case.stood_s("other") == pytest.approx(5.3, abs=0.03)
+
+
+def bends(speed, ahead=0.0, radius=9.0):
+    """Drives straight on until x is 0, and then on an arc to the left; it is at 16 m of the arc plus ``ahead`` at 0."""
+
+    def way(t):
+        along = 16.0 + ahead + speed * t
+        turn = max(0.0, along) / radius
+        return min(along, 0.0) + radius * math.sin(turn), radius * (1 - math.cos(turn)), turn, speed
+
+    return way
+
+
+@settings(max_examples=15, deadline=None)
+@given(step_s=st.sampled_from((0.1, 0.2, 0.5)), phase=PHASES, angle=ANGLES)
+def test_leader_on_a_bend_had_been_ahead_at_every_phase_of_every_step(step_s, phase, angle):
+    case = record(bends(9.0), bends(6.0, ahead=4.9), step_s=step_s, phase=phase, lanes=Map((), (0.0, 0.0)))
+    manner, collider, follower, _, verdict, (finding,) = same_in_every_view(case, angle)
+    assert (manner, collider, follower, verdict, finding.rule) == ("rear end", "ego", "ego", "ego", "rear end")
+    assert case.in_its_way_s("other") == pytest.approx(4.0)
+
+
+@settings(max_examples=10, deadline=None)
 @given(step_s=STEPS, angle=ANGLES, side=st.sampled_from((4.0, -4.0)), along=st.floats(-4.5, 4.5), its=st.floats(0, 20))
 def test_jump_into_the_next_lane_is_the_fault_of_the_jumper(step_s, angle, side, along, its):
     jumps, stays = drives(10.0, y=-side, changes_s=0.0), drives(its, x=along)
