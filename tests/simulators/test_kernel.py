@@ -31,6 +31,9 @@ from highway_env.vehicle.objects import Landmark, Obstacle
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.accelerator import _kernel, _roads, switch_off, switch_on
+from crashhunt.scenario import load_scenario
+from crashhunt.scenario.backends import highway
+from crashhunt.scenario.backends.highway import BACKEND
 
 assert HighwaySimulator
 pytestmark = [
@@ -99,6 +102,16 @@ def test_a_function_with_one_other_bit_disables_the_kernel(name, monkeypatch):
 def test_without_the_kernel_there_is_a_reason(error, reason, monkeypatch):
     monkeypatch.setattr(_kernel.importlib, "import_module", error)
     assert _kernel._found.__wrapped__() == (None, reason)
+
+
+def test_missing_kernel_is_noted_before_a_hunt(monkeypatch):
+    scenario = load_scenario("highway")
+    assert BACKEND.accelerator.note(scenario) == ""
+    monkeypatch.setattr(highway, "find_spec", lambda _: None)
+    assert "the kernel of the accelerator is not built. Fix: install a C++ compiler" in BACKEND.accelerator.note(
+        scenario
+    )
+    assert BACKEND.accelerator.note(BACKEND.accelerator.switched_off(scenario)) == ""
 
 
 def test_kernel_runs_all_substeps_of_an_environment():

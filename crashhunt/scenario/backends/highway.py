@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from importlib import metadata
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
@@ -20,6 +21,7 @@ __all__ = ["ACCELERATED", "BACKEND", "HighwaySetup"]
 ACCELERATED = {"1.12.1": "744f46c99845090f"}
 """The versions of highway-env that the accelerator knows, and the digest of the modules in which it replaces
 something."""
+_KERNEL = "_crashhunt_highway"  # the compiled module of the accelerator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,10 +60,17 @@ def _as_it_is(scenario: Scenario) -> Scenario:
 
 def _not_accelerated(scenario: Scenario) -> str:
     version = metadata.version("highway-env")
-    if not scenario.table(HighwaySetup).accelerate or version in ACCELERATED:
+    if not scenario.table(HighwaySetup).accelerate:
         return ""
-    known = ", ".join(ACCELERATED)
-    return f"the accelerator does not know highway-env {version} and steps aside; it knows {known}"
+    if version not in ACCELERATED:
+        known = ", ".join(ACCELERATED)
+        return f"the accelerator does not know highway-env {version} and steps aside; it knows {known}"
+    if find_spec(_KERNEL) is None:
+        return (
+            "highway-env runs at its own speed: the kernel of the accelerator is not built. "
+            "Fix: install a C++ compiler and Python's headers, then install crashhunt again"
+        )
+    return ""
 
 
 def _side_effect(scenario: Scenario, values: Mapping[str, Value], specifications: Iterable[str]) -> str:
