@@ -11,14 +11,11 @@ from typing import Any, Literal, NotRequired, TypedDict
 from crashhunt.base.codec import JsonObject
 from crashhunt.base.json_types import ErrorData, Plain
 from crashhunt.base.schemas import json_schema
-from crashhunt.crashes._bundle import CrashSummary
-from crashhunt.hunts._check import Finding
-from crashhunt.hunts._reports import AuditReport, StoppedBecause
-from crashhunt.hunts._state import HuntState
-from crashhunt.ledger._reader import KindData
-from crashhunt.recording._divergence import DivergenceData
-from crashhunt.replays._prepare import Code
-from crashhunt.replays._replay import ReplayData
+from crashhunt.crashes import CrashSummary
+from crashhunt.hunts import AuditReport, Finding, HuntState, StoppedBecause
+from crashhunt.ledger import KindData
+from crashhunt.recording import DivergenceData
+from crashhunt.replays import Code, ReplayData
 from crashhunt.trial import Value
 
 __all__ = ["SCHEMAS", "describe_schemas"]

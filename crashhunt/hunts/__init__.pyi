@@ -1,4 +1,4 @@
-from ._check import Checked as Checked, check as check, salvage as salvage
+from ._check import Checked as Checked, Finding as Finding, check as check, salvage as salvage
 from ._hunt import Hunt as Hunt
 from ._next_trials import Trials as Trials, spec_of as spec_of
 from ._phases import PhaseStatus as PhaseStatus
@@ -8,7 +8,7 @@ from ._progress import (
     SearchStatus as SearchStatus,
     StrategyStatus as StrategyStatus,
 )
-from ._reports import HuntReport as HuntReport
+from ._reports import AuditReport as AuditReport, HuntReport as HuntReport, StoppedBecause as StoppedBecause
 from ._results import (
     FACTS as FACTS,
     Cell as Cell,
