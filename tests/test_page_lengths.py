@@ -96,3 +96,9 @@ def test_misspelling_fails_with_its_place(project, capsys):
     (project / "README.md").write_text("A colision.\n")
     assert pages.main([]) == 1
     assert "README.md:1: colision ==> collision" in capsys.readouterr().out
+
+
+def test_failure_of_the_spelling_check_is_reported(project, monkeypatch, capsys):
+    monkeypatch.setattr(pages, "SPELLED", ("--no-such-option",))
+    assert pages.main([]) == 1
+    assert "codespell: exit code" in capsys.readouterr().out

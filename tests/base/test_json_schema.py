@@ -28,17 +28,22 @@ class Shape(TypedDict):
     sides: NotRequired[int]
 
 
+class Partial(TypedDict, total=False):
+    name: str
+
+
 @dataclass(frozen=True)
 class Part(Serializable):
     where: Path
     size: float = field(default=1.0, metadata=null_is(float("inf")))
     note: str = field(default="", metadata=OMIT_DEFAULT)
+    hint: str | None = None
 
     @property
     def is_big(self) -> bool:
         return self.size > 1
 
-    json_keys = ("where", "size", "note", "is_big")
+    json_keys = ("where", "size", "note", "hint?", "is_big")
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,7 @@ class Own(Serializable):
         (dict[str, int] | None, {"anyOf": [{"type": "object", "additionalProperties": {"type": "integer"}},
                                            {"type": "null"}]}),
         (Own, {"type": "object"}),
+        (Partial, {"type": "object", "properties": {"name": {"type": "string"}}}),
     ],
 )  # fmt: skip
 def test_schema_of_a_type(hint, schema):
@@ -87,6 +93,7 @@ def test_optional_keys_of_a_typed_dictionary_are_not_required():
 def test_schema_of_a_dataclass_accepts_what_the_codec_writes(part):
     schema = describe_type(Part)
     assert schema["required"] == ["is_big", "size", "where"]
+    assert schema["properties"]["hint"] == {"type": ["string", "null"]}
     jsonschema.validate(part.to_json(), schema)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate({**part.to_json(), "where": 3}, schema)
