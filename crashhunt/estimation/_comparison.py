@@ -101,8 +101,8 @@ class Pair:
         evidence: e-value that they do not crash equally often; 20 and more is 95 % confidence. None without pairs.
         difference: interval of the difference in crashes per trial, second minus first; None where there is none.
         units: independent pairs: of trials, or of traffics.
-        excluded: how many trials of both do not count: they have ended, but one of a lower number has not; or they are
-            invalid in one of the hunts; or an agent was trained on this part of the traffics.
+        excluded: how many trials of both do not count. They have ended, but one of a lower number has not; or they are
+            invalid in one of the hunts. Or an agent was trained on this part of the traffics.
         answer: ``first`` or ``second``, which certainly crashes less; ``undecided``; empty where nothing can be said.
     """
 
