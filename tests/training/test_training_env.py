@@ -285,6 +285,22 @@ def test_recorded_actions_lead_to_the_same_crash_elsewhere(scenario, steps, dist
     env.close()
 
 
+@pytest.mark.nightly
+@pytest.mark.parametrize("agent", ["ego", "second"])
+def test_the_other_agents_drive_as_in_the_hunt(agent, tmp_path):
+    second = '[agents.second]\nagent = "crashhunt.agents:CarFollowing"\naction = "meta"\n'
+    (tmp_path / "two.toml").write_text(TOY.replace("ACTION", "meta") + second)
+    words = ("run", "hunt", "1", "6", "60", "--scenario", "two.toml", "--seed", "4", "--keep-going", "--no-snapshot")
+    Shell(tmp_path).crashhunt(*words)
+    env = CrashEnv(tmp_path / "hunt", before_s=BEFORE_S, share=1.0, test=0.0, agent=agent)
+    for name in env.crashes:
+        bundle = bundle_of(tmp_path / "hunt", name)
+        _, info = env.reset(options={"crash": name})
+        for action in bundle.recording().actions(agent)[info["step"] :]:
+            _, _, terminated, _, last = env.step(action)
+        assert (terminated, last["step"]) == (True, bundle.result.steps)
+
+
 VECTORS = """
 import sys
 import gymnasium
