@@ -89,16 +89,17 @@ def test_recorded_actions_lead_to_the_same_crash(env, crashes):
 
 
 def test_a_crash_can_be_avoided_and_the_episode_is_truncated_later(crashes):
-    env = CrashEnv(crashes, before_s=2.0, after_s=1.5, share=1.0)
+    env = CrashEnv(crashes, before_s=2.0, after_s=0.5, share=1.0)
+    avoided = 0
     for name in env.crashes:
+        steps = bundle_of(crashes, name).result.steps
         env.reset(options={"crash": name})
         info, _ = finish(env, action=4)  # SLOWER
-        if not info["has_crashed"]:
-            assert info["outcome"] == "survived"
-            assert info["step"] == min(60, bundle_of(crashes, name).result.steps + 15)
+        if not info["has_crashed"] and steps + 5 < 60:  # before the hunt's own limit
+            avoided += 1
+            assert (info["outcome"], info["step"]) == ("survived", steps + 5)
             assert env.scores[name] < 1.0
-            return
-    pytest.fail("braking 2 s earlier avoids none of them")
+    assert avoided
 
 
 def test_same_seed_gives_the_same_episodes(crashes):
