@@ -185,6 +185,9 @@ class CrashEnv(gymnasium.Env[Any, Any]):
         found = [place for place, known in enumerate(self.crashes) if name in (known, known.rpartition("/")[2])]
         if len(found) == 1:
             return found[0]
+        if found:
+            fix = "give the whole name, and hunts whose directories have different names"
+            raise UsageError(f"{len(found)} crashes are named {name!r}", fix=fix)
         if any(name in (crash.name, crash.bundle.id) for crash in self._split.held_out):
             raise UsageError(f"the crash {name!r} is in the test part", fix="choose one of env.unwrapped.crashes")
         raise UsageError(f"there is no crash {name!r} in the training part", fix=one_of(str(name), self.crashes))

@@ -89,16 +89,17 @@ def test_recorded_actions_lead_to_the_same_crash(env, crashes):
 
 
 def test_a_crash_can_be_avoided_and_the_episode_is_truncated_later(crashes):
-    env = CrashEnv(crashes, before_s=2.0, after_s=1.5, share=1.0)
+    env = CrashEnv(crashes, before_s=2.0, after_s=0.5, share=1.0)
+    avoided = 0
     for name in env.crashes:
+        steps = bundle_of(crashes, name).result.steps
         env.reset(options={"crash": name})
         info, _ = finish(env, action=4)  # SLOWER
-        if not info["has_crashed"]:
-            assert info["outcome"] == "survived"
-            assert info["step"] == min(60, bundle_of(crashes, name).result.steps + 15)
+        if not info["has_crashed"] and steps + 5 < 60:  # before the hunt's own limit
+            avoided += 1
+            assert (info["outcome"], info["step"]) == ("survived", steps + 5)
             assert env.scores[name] < 1.0
-            return
-    pytest.fail("braking 2 s earlier avoids none of them")
+    assert avoided
 
 
 def test_same_seed_gives_the_same_episodes(crashes):
@@ -283,6 +284,22 @@ def test_recorded_actions_lead_to_the_same_crash_elsewhere(scenario, steps, dist
         assert (terminated, last["step"], last["has_crashed"]) == (True, bundle.result.steps, True)
     env.reset(options={"crash": ""})
     env.close()
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("agent", ["ego", "second"])
+def test_the_other_agents_drive_as_in_the_hunt(agent, tmp_path):
+    second = '[agents.second]\nagent = "crashhunt.agents:CarFollowing"\naction = "meta"\n'
+    (tmp_path / "two.toml").write_text(TOY.replace("ACTION", "meta") + second)
+    words = ("run", "hunt", "1", "6", "60", "--scenario", "two.toml", "--seed", "4", "--keep-going", "--no-snapshot")
+    Shell(tmp_path).crashhunt(*words)
+    env = CrashEnv(tmp_path / "hunt", before_s=BEFORE_S, share=1.0, test=0.0, agent=agent)
+    for name in env.crashes:
+        bundle = bundle_of(tmp_path / "hunt", name)
+        _, info = env.reset(options={"crash": name})
+        for action in bundle.recording().actions(agent)[info["step"] :]:
+            _, _, terminated, _, last = env.step(action)
+        assert (terminated, last["step"]) == (True, bundle.result.steps)
 
 
 VECTORS = """
