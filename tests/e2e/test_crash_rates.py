@@ -161,12 +161,13 @@ def test_workers_decide_at_the_same_trial(toy):
 
 
 def test_resumed_hunt_decides_as_one_that_was_never_interrupted(toy):
-    whole = until(toy, "whole", "1", "0", "0.02/trial", expect=1)["rate"]
-    first = until(toy, "parts", "2", "0", "0.02/trial", "--most", "1", expect=3)["rate"]
-    assert first["units"] == 1
-    assert until(toy, "parts", "2", "0", "0.02/trial", expect=1)["rate"] == {**whole, "dir": "parts"}
+    few = ("--keep", "1")  # every crash with a bundle is confirmed
+    whole = until(toy, "whole", "2", "0", "0.005/trial", *few, expect=1)["rate"]
+    first = until(toy, "parts", "2", "0", "0.005/trial", *few, "--most", "1", expect=3)["rate"]
+    assert first["units"] == 1 < whole["units"]
+    assert until(toy, "parts", "1", "0", "0.005/trial", *few, expect=1)["rate"] == {**whole, "dir": "parts"}
     trials = len(results(toy.folder / "parts"))
-    assert until(toy, "parts", "2", "0", "0.02/trial", expect=1)["rate"] == {**whole, "dir": "parts"}
+    assert until(toy, "parts", "1", "0", "0.005/trial", *few, expect=1)["rate"] == {**whole, "dir": "parts"}
     assert len(results(toy.folder / "parts")) == trials  # decided before, so nothing runs
 
 
