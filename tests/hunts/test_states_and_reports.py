@@ -247,7 +247,9 @@ def test_what_the_ledger_is_to_know_now_is_noted():
     assert progress.noted()["failed_steps"] == 3 + 5 + progress.failed[0].other_steps
     assert {"nodes", "kinds", "audits_left"}.isdisjoint(Progress().noted())
     assert "failed_steps" not in Progress().noted()
-    progress.resume([], SimpleNamespace(keep_going=True, only_at_fault=False, distinct=2, by_cause=0), {"newest_kind": 5.0})
+    progress.resume(
+        [], SimpleNamespace(keep_going=True, only_at_fault=False, distinct=2, by_cause=0), {"newest_kind": 5.0}
+    )
     assert (progress.noted()["kinds"], progress.noted()["newest_kind"]) == ([], 5.0)
     assert progress.failed_steps == 0
     only = Progress()
