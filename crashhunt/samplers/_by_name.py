@@ -73,6 +73,11 @@ class NamedSampler:
         """The origin of the trials that it draws independently of all others; empty where it keeps none apart."""
         return self._sampler.plain_origin if isinstance(self._sampler, PlainStream) else ""
 
+    @property
+    def version(self) -> int:
+        """The version of its proposals, 1 if it has none: another one proposes other trials for the same results."""
+        return int(getattr(self._sampler, "version", 1))
+
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
         """Return its proposal.
 

@@ -72,8 +72,9 @@ class Sampler(Protocol):
     - Before the proposal for trial n, it receives all new results up to trial n - lag, in the order of their numbers.
     - A trial that has not ended by then is reported late, before the first proposal after its end. One trial that
       hangs therefore does not stop the sampler from learning.
-    - A hunt with ``--deterministic`` waits: the sampler receives exactly the results up to n - lag. The lag is 32, or
-      the parallel trials of the first run, if those are more. The trials are then the same at any speed.
+    - A hunt with ``--deterministic`` waits: the sampler receives exactly the results up to n - lag. The lag is
+      4 + n / 8, rounded down. It is at most 32, or the parallel trials of the first run if those are more. The trials
+      are then the same at any speed.
     - The ledger stores proposals, and the results reported before each, before their trials start. A resumed hunt runs
       the same trials, and reports results in the same order.
     """
