@@ -17,7 +17,7 @@ from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
 from crashhunt.executors import SharedExecutors, make_executor, read_map
 from crashhunt.hunts._fork_results import CopiedCrashes, verify_fork_results, verify_rare
-from crashhunt.hunts._next_trials import LAG, Trials, Unanswered, settings_of_workers
+from crashhunt.hunts._next_trials import GREATEST_LAG, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._phases import PhaseClock, PhaseStatus, RemainingTime
 from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
 from crashhunt.hunts._progress import HuntStatus, Progress
@@ -427,7 +427,7 @@ class Hunt:
             return under_way, False
         if lag := before.get("lag"):  # a hunt of before has one lag for all trials
             return lag, bool(before.get("lag_grows"))
-        return max(LAG, under_way), True
+        return max(GREATEST_LAG, under_way), True
 
     def _listen(
         self, executor: Executor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0

@@ -30,11 +30,20 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance, Forcing, TrialResult, Value
 
 
-__all__ = ["LAG", "Trials", "Unanswered", "find_unanswered", "settings_again", "settings_of_workers", "spec_of"]
+__all__ = [
+    "GREATEST_LAG",
+    "Trials",
+    "Unanswered",
+    "find_unanswered",
+    "growing_lag",
+    "settings_again",
+    "settings_of_workers",
+    "spec_of",
+]
 
 
 _TRAFFIC = 0x74726166  # apart from what else is drawn of the hunt's seed
-LAG = 32
+GREATEST_LAG = 32
 """Greatest delay of results for a sampler in a deterministic hunt, in trials. It does not depend on the workers, so
 that 1 and 16 of them run the same trials."""
 _FIRST_LAG, _TRIALS_PER_LAG = 4, 8  # delay of the first trials, and trials after which it is one more
