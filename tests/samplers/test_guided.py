@@ -8,7 +8,7 @@ from hypothesis import example, given, settings, strategies as st
 from spaces import ask, spec_of
 
 from crashhunt.samplers import CrossEntropySampler, Cube, GuidedSampler, HuntFacts, MutationSampler
-from crashhunt.samplers._guided import Niches, Portfolio
+from crashhunt.samplers._guided import Niches, Portfolio, _has_moved
 from crashhunt.samplers._model import Model
 from crashhunt.samplers._strategy import CRASHED, ScoredTrial
 from crashhunt.space import Choice, Range
@@ -68,23 +68,32 @@ def test_greater_danger_at_the_same_place_is_no_progress():
     assert not stuck_after([(0.1 + 0.4 * least * number, 0.5) for number in range(30)])
 
 
-def test_another_peak_is_abandoned_where_greater_danger_stays_at_one_place():
+def test_a_place_is_new_from_a_fiftieth_of_the_diagonal_on():
+    least, middle = 0.02 * 2**0.5, np.array([0.5, 0.5])
+    assert _has_moved(middle, None)
+    assert _has_moved(middle + np.array([0.0, 1.01 * least]), middle)
+    assert not _has_moved(middle + np.array([0.0, 0.99 * least]), middle)
+
+
+def test_another_peak_is_abandoned_without_greater_danger_at_new_places():
     cube = Cube(SPACE)
 
-    def climbs(step):
+    def is_climbed(step, gain, trials):
         niches = Niches(cube, Model(cube))
         for number in range(40):
             niches.tell(ScoredTrial(number, PLACES[number], number, 0.01 * number))
         niches.begin()
         foot = niches._foot
-        for number in range(40, 52):
-            point = foot.point + step * (number - 39) / 12 * niches._reach
-            niches.tell(ScoredTrial(number, point, number, foot.score + 0.001 * (number - 39), "niche"))
-        assert niches._record > foot.score
+        for number in range(1, trials + 1):
+            point = foot.point + number / 12 * niches._reach * np.array([step, step])
+            niches.tell(ScoredTrial(39 + number, point, 39 + number, foot.score + gain * number, "niche"))
+        assert niches._record == pytest.approx(foot.score + max(gain * trials, 0.0))
         return niches._foot is foot
 
-    assert climbs(np.array([0.6, 0.6]))
-    assert not climbs(np.array([1e-4, 1e-4]))
+    assert is_climbed(0.6, 0.001, 12)
+    assert is_climbed(1e-4, 0.001, 6)
+    assert not is_climbed(1e-4, 0.001, 7)  # five, and one for each argument
+    assert not is_climbed(0.6, -0.001, 7)
 
 
 def test_after_a_crash_strategies_begin_again_with_what_is_not_near_to_it():
