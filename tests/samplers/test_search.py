@@ -122,7 +122,7 @@ def test_danger_that_leads_nowhere_has_a_try_and_then_next_to_nothing():
     asked, _ = hunt(GuidedSampler(UNIT), lambda proposal: 0.9 - float(np.linalg.norm(values(proposal) - 0.5)) / 2, 800)
     unguided = [proposal.origin in ("halton", "random") for proposal in asked]
     assert sum(unguided[:200]) < 160  # it does try
-    assert sum(unguided[200:]) > 0.8 * 600
+    assert sum(unguided[200:]) > 0.75 * 600
 
 
 def test_a_hunt_that_continues_looks_for_other_crashes():
