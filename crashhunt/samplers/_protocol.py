@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "HuntFacts", "Independent", "Key", "OnlyAsked", "PlainStream", "Proposal", "Sampler", "Space",
-    "WantsHunt",
+    "Versioned", "WantsHunt",
 ]  # fmt: skip
 
 Key = tuple[str, str]
@@ -112,6 +112,16 @@ class WantsHunt(Protocol):
     """
 
     wants_hunt: bool
+
+
+@runtime_checkable
+class Versioned(Protocol):
+    """A sampler whose proposals have a version, from 1: another version proposes other trials for the same results.
+
+    A hunt cannot resume with another version than it began with. A sampler without a version has version 1.
+    """
+
+    version: int
 
 
 @runtime_checkable
