@@ -1,17 +1,15 @@
 """The portfolio behind the sampler `guided`: distributes trials between a model, mutation and an even search.
 
 Computes shares of trials by payoff. A trial that is more critical than a share of 1 - q of the unguided trials has
-payoff -log q. The mean payoff is 1 where a strategy learns nothing.
-
-Invariant: only the order of scores matters, so any strictly monotonic measure of criticality gives the same proposals.
+payoff -log q. The mean payoff is 1 where a strategy learns nothing, so only ranks matter for payoffs. Two thresholds
+read the scale of criticality: the progress of strategies, and the criticality of 0.5 that caps their share.
 
 Invariant: a strategy keeps at least 2 % of the trials (probes), and the even search gets everything that strategies
 do not earn. A hunt with a misleading criticality is therefore never much worse than an even search.
 
-Why not the best strategy alone: rising criticality does not imply a crash, which is unknown before the first one. One
-sign shows that it misleads: strategies are far ahead of the unguided trials and make no progress. Progress is a new
-greatest criticality at a new place, because the gain itself depends on the scale of criticality. Without progress, the
-share of strategies is capped, and a part of it explores other peaks (`Niches`).
+Why not the best strategy alone: rising criticality does not imply a crash, which is unknown before the first one. Two
+signs show that it misleads: strategies are far ahead of the unguided trials and make no progress, or they never
+exceed a criticality of 0.5. In both cases their share is capped, and a part of it explores other peaks (`Niches`).
 
 After the first crash, new crash types count: the share falls with the ratio of the rate of new types that strategies
 find to the rate of the unguided trials.
@@ -48,14 +46,6 @@ if TYPE_CHECKING:
 __all__ = ["KnownCrashes", "Niches", "Portfolio"]
 
 
-_MOVED = 0.02  # distance of a new record from the last one that is progress, times the square root of the dimensions
-
-
-def _has_moved(point: NDArray[np.float64], before: NDArray[np.float64] | None) -> bool:
-    """Return whether a point is far enough from the one before to be progress; every point is, without one before."""
-    return before is None or float(np.linalg.norm(point - before)) >= _MOVED * math.sqrt(len(point))
-
-
 # Niches: other peaks of criticality, explored when trials around the most critical one make no more progress.
 #
 # Criticality has several peaks, and the highest may not contain a crash. A trial that is far from every more critical
@@ -68,6 +58,7 @@ _RETRY_AFTER = 32  # trials between two searches without success
 _FAR_FOOT = 2.0  # times the mean distance to the next more critical trial: beyond that it is the foot of another peak
 _TRIED = 16  # last feet, which are not visited again
 _NICHE_PATIENCE, _NICHE_PATIENCE_PER_ARGUMENT = 5, 1  # trials without progress before a peak is abandoned
+_NEARER = 0.85  # progress: the distance of the score from 1 shrinks to this share or less
 _TRIES = 4  # proposals of the model, of which the first inside the ball is used
 
 
@@ -88,12 +79,11 @@ class Niches:
         self._foot: ScoredTrial | None = None
         self._model = like
         self._reach = self._record = 0.0
-        self._settled = np.zeros(cube.dimensions)  # point of the last progress
         self._without_record = self._told = self._not_before = 0
 
     @property
     def climbs(self) -> bool:
-        """Whether a trial is more critical than the foot of the peak."""
+        """Whether a trial is nearer to a crash than the foot of the peak."""
         return self._foot is not None and self._record > self._foot.score
 
     def tell(self, trial: ScoredTrial) -> None:
@@ -106,11 +96,8 @@ class Niches:
         within = float(np.linalg.norm(trial.point - self._foot.point)) < self._reach
         if within:
             self._model.tell(trial)
-        has_moved = within and trial.score > self._record and _has_moved(trial.point, self._settled)
-        if within:
-            self._record = max(self._record, trial.score)
-        if has_moved:
-            self._settled, self._without_record = trial.point, 0
+        if within and 1.0 - trial.score < _NEARER * (1.0 - self._record):
+            self._record, self._without_record = trial.score, 0
         elif trial.origin == "niche":
             self._without_record += 1
         if self._without_record >= self._patience:
@@ -153,7 +140,6 @@ class Niches:
     def _go(self, foot: ScoredTrial, reach: float, trials: list[ScoredTrial]) -> None:
         self._tried.append(foot)
         self._foot, self._reach, self._record, self._without_record = foot, reach, foot.score, 0
-        self._settled = foot.point
         self._model = Model(self._cube, like=self._like)
         self._model.remember(trial for trial in trials if float(np.linalg.norm(trial.point - foot.point)) < reach)
 
@@ -259,7 +245,8 @@ class KnownCrashes:
 _EVEN, _MODEL, _MUTATION, _NICHE = "halton", "model", "mutation", "niche"
 _FIRST = 10  # unguided trials before payoffs are computed
 _OF_OURS = 0.8  # share of a hunt's trials that the portfolio proposes; the shares below are of all trials
-_CLIMBING, _STUCK = 0.55, 0.05  # maximum share of strategies, with and without progress
+_CLIMBING, _STUCK = 0.7, 0.05  # maximum share of strategies, with and without progress
+_FAR, _NEAR = 0.35, 0.5  # maximum share while no criticality has exceeded the second number
 _PROBING = 0.02  # minimum share of each strategy: its payoff may have changed
 _OTHER_PEAKS, _CLIMBING_THERE = 0.08, 0.15  # share of niches where strategies are stuck, and while a niche climbs
 _PATIENCE, _PATIENCE_PER_ARGUMENT = 8, 3  # trials of strategies without progress before they may be stuck
@@ -302,10 +289,9 @@ class Portfolio:
         self._model.remember(kept)
         self._strategies: dict[str, Strategy] = {_MODEL: self._model, _MUTATION: mutation}
         self._niches = Niches(self._cube, self._model)
-        self._record, self._top = -math.inf, np.zeros(self._cube.dimensions)  # greatest criticality, and its point
-        self._settled: NDArray[np.float64] | None = None  # point of the last progress
-        self._without_record = 0  # trials of strategies since then
-        self._rival = -math.inf  # greatest criticality of an unguided trial
+        self._record, self._without_record = -1.0, 0  # greatest criticality, and trials since then
+        self._top = np.zeros(self._cube.dimensions)  # its point
+        self._rival = 0.0  # greatest criticality of an unguided trial
         self._ahead = 0.0  # recent share of strategy trials above all unguided ones
         for trial in kept:
             self._best.add(trial)
@@ -363,11 +349,8 @@ class Portfolio:
 
     def _measure(self, trial: ScoredTrial) -> None:
         """Update the greatest criticality and the progress of strategies."""
-        is_record = trial.score > self._record
-        if is_record:
-            self._record, self._top = trial.score, trial.point
-        if is_record and _has_moved(trial.point, self._settled):
-            self._settled, self._without_record = trial.point, 0
+        if 1.0 - trial.score < _NEARER * (1.0 - self._record):
+            self._record, self._top, self._without_record = trial.score, trial.point, 0
         elif trial.origin in self._strategies:
             self._without_record += 1
         if trial.origin in self._strategies:
@@ -388,7 +371,7 @@ class Portfolio:
     def _shares(self) -> dict[str, float]:
         """Return the share of each strategy in all trials of the hunt."""
         gains = {name: max(total / count - 1.0, 0.05) ** 2 for name, (total, count) in self._earned.items()}
-        most = _STUCK if self._is_stuck else _CLIMBING
+        most = _STUCK if self._is_stuck else _CLIMBING if self._record > _NEAR else _FAR
         whole = most * min(1.0, max(gains.values()))
         if self._known:
             (ours, of), (theirs, among) = self._kinds[True], self._kinds[False]

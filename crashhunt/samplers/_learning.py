@@ -98,7 +98,6 @@ class GuidedSampler(Learning):
     """Gives each strategy a share of the trials by its success (`Portfolio`)."""
 
     origin = "guided"
-    version = 2  # 1 compared gains of criticality, 2 compares ranks
 
     def _make(self, space: Space) -> Strategy:
         return Portfolio(self._cube, space, self._hunt)

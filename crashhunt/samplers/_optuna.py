@@ -30,7 +30,6 @@ __all__ = ["ORIGIN", "PREFIX", "OptunaMaker", "Storage", "optuna_maker"]
 
 PREFIX = "optuna:"
 ORIGIN = "optuna"
-_NEAREST = 0.999  # upper bound of the criticality of a trial without a crash
 _LONGEST = 2**29  # points of a sequence that are surely there
 _INSTEAD = {
     "bruteforce": "--sampler grid tries every combination",
@@ -154,9 +153,7 @@ class _Study:
         """Report a result to the study; CMA-ES receives only the results of its own draws."""
         if self._kind == "QMCSampler" or (self._kind == "CmaEsSampler" and scored.origin != ORIGIN):
             return
-        # Some samplers of Optuna compute with the values, so a crash needs a finite one above all others.
-        value = 1.0 if scored.crashed else min(max(scored.score, 0.0), _NEAREST)
-        self._add(scored.point.tolist(), value, scored.number)
+        self._add(scored.point.tolist(), scored.score, scored.number)
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
         """Return what the study suggests."""

@@ -1,9 +1,9 @@
 """Three strategies that search for critical trials: CMA-ES, cross-entropy and mutation.
 
-All of them see a trial as a point in the unit cube with a score: the criticality, or `CRASHED`. Each section says what
-its strategy computes and where it comes from. All use ranks of scores, because criticality is not linear in the
-distance to a crash; CMA-ES alone also ends a run where scores are nearly equal. None depends on anything but the
-reported results and the generator.
+All of them see a trial as a point in the unit cube with a score from 0 to 1, the criticality, or 1 for a crash. Each
+section says what its strategy computes and where it comes from. All use ranks of scores, because criticality is not
+linear in the distance to a crash; CMA-ES alone also ends a run where scores are nearly equal. None depends on anything
+but the reported results and the generator.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ __all__ = ["CmaEs", "CrossEntropy", "Mutation"]
 
 
 _FIRST = 10  # trials before a run begins, at the most critical of them
-_CRASH_VALUE = 2.0  # of a crash for CMA-ES, which computes the range of values: above any criticality, and finite
 _SIGMA = 0.2  # initial standard deviation, in widths of the cube: a fifth covers most of it
 
 
@@ -68,7 +67,7 @@ class CmaEs:
             return
         if trial.origin != "cma-es":
             return
-        self._generation.append((trial.point, -_CRASH_VALUE if trial.crashed else -trial.score))
+        self._generation.append((trial.point, -trial.score))
         if len(self._generation) == self._run.population_size:
             self._run.tell(self._generation)
             self._generation = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from bisect import insort
 from dataclasses import dataclass
@@ -58,7 +57,8 @@ def reflected(point: NDArray[np.float64]) -> NDArray[np.float64]:
 
 # Results as a sampler that learns sees them: a point, and a score that says how near it came to a crash.
 
-CRASHED = math.inf  # above any criticality; no arithmetic is done on scores, so that only their order counts
+CRASHED = 1.0
+_NEAREST = 0.999  # upper bound of the score of a trial without a crash
 _NUMBER_AT_END = re.compile(r"[\W_]*\d+\W*$")  # of a lane id: the lane's index on its road
 
 
@@ -70,7 +70,7 @@ class ScoredTrial:
         number: of the trial.
         point: where it was in the cube.
         seed: of the trial.
-        score: the criticality; `CRASHED` for a crash. Strategies compare scores and compute nothing else with them.
+        score: 0 to 1, `CRASHED` for a crash.
         origin: from which strategy it was.
         parent: the number of the trial that it was made from; None where there is none.
         kind: of a crash, its manner and its place as far as its result says so; empty where it does not.
@@ -97,7 +97,7 @@ def scored_trial(result: TrialResult, cube: Cube, hunt: HuntFacts) -> ScoredTria
     elif result.danger is None or result.outcome.category != "no crash":
         return None  # a crash that is not hunted says nothing about the crashes that are
     else:
-        score = result.danger
+        score = min(max(result.danger, 0.0), _NEAREST)
     spec = result.spec
     kind = _kind(result) if score == CRASHED else ""
     return ScoredTrial(

@@ -9,7 +9,7 @@ from spaces import ask, spec_of
 
 from crashhunt.samplers import Cube, GuidedSampler, HuntFacts, RandomSampler
 from crashhunt.samplers._guided import KnownCrashes
-from crashhunt.samplers._strategy import CRASHED, ScoredTrial, scored_trial
+from crashhunt.samplers._strategy import ScoredTrial, scored_trial
 from crashhunt.space import Range
 from crashhunt.trial import Collision, Failure, Outcome, TrialResult
 from crashhunt.world import Event
@@ -18,7 +18,7 @@ UNIT = {("ego", f"x{index}"): Range(0.0, 1.0) for index in range(4)}
 
 
 def crash(x, kind="", seed=0):
-    return ScoredTrial(0, np.array([x, x, x, x]), seed, CRASHED, kind=kind)
+    return ScoredTrial(0, np.array([x, x, x, x]), seed, 1.0, kind=kind)
 
 
 def at(x):
@@ -134,16 +134,16 @@ def test_kinds_are_reported_by_manner_and_road_and_by_what_was_raised():
     assert kind_of(event=light) == "collision red_light north"
 
 
-def test_a_danger_is_never_a_crash_and_a_crash_is_above_any_danger():
+def test_a_danger_is_never_a_crash_and_a_crash_is_the_greatest_danger():
     spec = spec_of(0, ask(RandomSampler(UNIT), 0))
     for outcome, danger, score in (
-        (Outcome.SURVIVED, 1.0, 1.0),
-        (Outcome.FINISHED, -0.5, -0.5),
-        (Outcome.COLLISION, None, CRASHED),
-        (Outcome.HANG, 0.2, CRASHED),
+        (Outcome.SURVIVED, 1.0, 0.999),
+        (Outcome.FINISHED, -0.5, 0.0),
+        (Outcome.COLLISION, None, 1.0),
+        (Outcome.HANG, 0.2, 1.0),
     ):
         told = scored_trial(TrialResult(spec, outcome, danger=danger), Cube(UNIT), HuntFacts())
-        assert (told.score, told.crashed) == (score, score == CRASHED)
+        assert (told.score, told.crashed) == (score, score == 1.0)
     assert scored_trial(TrialResult(spec, Outcome.SURVIVED), Cube(UNIT), HuntFacts()) is None
     assert scored_trial(TrialResult(spec, Outcome.INVALID), Cube(UNIT), HuntFacts()) is None
 
