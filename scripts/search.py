@@ -1,10 +1,10 @@
 """How many trials samplers need to the first crash: problems, peers and the table. ``scripts/bench search`` runs it.
 
-Every sampler is given the same arguments with the same bounds, the same seeds, and the same lag: before trial n it is
-told what came of all trials up to n - 4, as in a hunt with two workers. A hunt without a crash is given up after three
-times what random draws need on the average. The problems without a simulator have crash regions whose size is known; on
-real ones, every crash is run again, and what counts is steps of all trials, warm-ups and those second runs. A trial
-that two hunts have in common runs once, and counts in both.
+Every sampler is given the same arguments with the same bounds, the same seeds, and the same lag (``--lag``): before
+trial n it receives the results up to n - 4, as in a hunt with two workers. A hunt without a crash ends after three
+times the trials that random draws need on average. The problems without a simulator have crash regions of known size.
+On real ones, every crash runs again. The cost is the steps of all trials, of their setup (such as a warm-up) and of
+these second runs. A trial that two hunts have in common runs once, and counts in both.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from search_plot import GIVE_UP, table, write_plot
 from search_pool import trials_on
 from search_wall import wall_table
 
-from crashhunt.hunts import spec_of
+from crashhunt.hunts import GREATEST_LAG, growing_lag, spec_of
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, plan, sampler_of
 from crashhunt.trial import Outcome, TrialResult
 
@@ -42,7 +42,9 @@ if TYPE_CHECKING:
 
 Hunt = tuple[str, str, int]
 """Problem, sampler and seed."""
-LAG = 4
+LAG = "4"
+GROWING = "growing"
+"""The lag of a hunt with ``--deterministic``."""
 OURS = ("random", "halton", "sobol", "guided", "cross-entropy", "mutation", "cma-es")
 FIRST_SEED = 100
 
@@ -73,10 +75,6 @@ class Run:
 class Place(Protocol):
     """Where trials end."""
 
-    @property
-    def warmup_steps(self) -> int:
-        """Of each trial."""
-
     def confirmed(self, crash: TrialResult) -> bool:
         """Whether it comes again."""
 
@@ -92,7 +90,6 @@ class AtOnce:
     """Trials of a problem without a simulator."""
 
     problem: Problem
-    warmup_steps: int = 0
     done: deque[TrialResult] = field(default_factory=deque)
 
     def confirmed(self, crash: TrialResult) -> bool:
@@ -124,11 +121,6 @@ class Workers:
     trials: Trials
     known: dict[str, TrialResult] = field(default_factory=dict)
     waiting: deque[TrialResult] = field(default_factory=deque)
-
-    @property
-    def warmup_steps(self) -> int:
-        """Of each."""
-        return self.trials.warmup_steps
 
     def submit(self, spec: TrialSpec) -> None:
         """Hand it over, or look it up."""
@@ -167,14 +159,26 @@ def _what(spec: TrialSpec) -> str:
     return json.dumps([spec.seed, spec.arguments, spec.scenario_arguments, spec.max_steps], sort_keys=True)
 
 
-def hunted(settings: HuntSettings, place: Place, most: int, name: str) -> Run:
+def a_lag(word: str) -> str:
+    """Return a lag as it is given, for argparse."""
+    if word != GROWING and not (word.isdecimal() and int(word) > 0):
+        raise argparse.ArgumentTypeError(f"{word!r} is no lag; give trials above 0, or {GROWING!r}")
+    return word
+
+
+def lag_of(number: int, lag: str) -> int:
+    """Return by how many trials results are delayed before a trial."""
+    return growing_lag(number, GREATEST_LAG) if lag == GROWING else int(lag)
+
+
+def hunted(settings: HuntSettings, place: Place, most: int, name: str, *, lag: str = LAG) -> Run:
     """Ask and tell as a deterministic hunt does, up to the first crash."""
     sampler = sampler_of(settings)
     results: dict[int, TrialResult] = {}
     spent, steps, first = 0.0, 0, most
     asked = told = 0
     while asked < min(first, most) or len(results) < asked:
-        if asked < min(first, most) and told >= asked - LAG + 1:
+        if asked < min(first, most) and told >= asked - lag_of(asked, lag) + 1:
             began = time.process_time()
             spec = spec_of(asked, settings, sampler)
             spent += time.process_time() - began
@@ -183,18 +187,18 @@ def hunted(settings: HuntSettings, place: Place, most: int, name: str) -> Run:
             continue
         for result in place.ended():
             results[result.spec.number] = result
-            steps += result.steps + place.warmup_steps
+            steps += result.steps + (result.setup_steps or 0)
             if result.outcome in settings.crash_on:
                 first = min(first, result.spec.number)
         began = time.process_time()
-        while told in results and told <= asked - LAG:
+        while told in results and told <= asked - lag_of(asked, lag):
             if sampler.learns:
                 sampler.tell(results[told])
             told += 1
         spent += time.process_time() - began
     found = first < most
     if found:
-        steps += results[first].steps + place.warmup_steps
+        steps += results[first].steps + (results[first].setup_steps or 0)
         if not place.confirmed(results[first]):
             print(f"{name}, {settings.sampler}, {settings.seed}: trial {first} does not come again", file=sys.stderr)
     return Run(
@@ -208,7 +212,7 @@ def hunted(settings: HuntSettings, place: Place, most: int, name: str) -> Run:
     )
 
 
-def synthetic_run(name: str, sampler: str, seed: int) -> Run:
+def synthetic_run(name: str, sampler: str, seed: int, lag: str = LAG) -> Run:
     """One hunt on a problem without a simulator."""
     problem = PROBLEMS[name]
     settings = HuntSettings(
@@ -217,7 +221,7 @@ def synthetic_run(name: str, sampler: str, seed: int) -> Run:
             argument: ArgumentSpec(spec=spec, kind=kind) for argument, (spec, kind) in problem.arguments.items()
         })},
     )  # fmt: skip
-    found = hunted(settings, AtOnce(problem), math.ceil(GIVE_UP / problem.rate), name)
+    found = hunted(settings, AtOnce(problem), math.ceil(GIVE_UP / problem.rate), name, lag=lag)
     return Run(
         problem=name,
         sampler=sampler,
@@ -230,7 +234,12 @@ def synthetic_run(name: str, sampler: str, seed: int) -> Run:
 
 
 def real_runs(
-    name: str, samplers: Sequence[str], seeds: Sequence[int], parallel: int, known: Collection[Hunt]
+    name: str,
+    samplers: Sequence[str],
+    seeds: Sequence[int],
+    parallel: int,
+    known: Collection[Hunt],
+    lag: str = LAG,
 ) -> Iterator[Run]:
     """All hunts on a problem with a simulator that are not known, on the same warm workers."""
     problem: Real = REAL[name]
@@ -244,16 +253,21 @@ def real_runs(
                 if (name, sampler, seed) in known:
                     continue
                 asked = Request(trials=1, seed=seed, sampler=PEERS.get(sampler, sampler), **problem.request)
-                yield replace(hunted(plan(asked)[1], place, most, name), sampler=sampler)
+                yield replace(hunted(plan(asked)[1], place, most, name, lag=lag), sampler=sampler)
 
 
 def all_runs(
-    samplers: Sequence[str], seeds: Sequence[int], names: Sequence[str], workers: int, known: Collection[Hunt] = ()
+    samplers: Sequence[str],
+    seeds: Sequence[int],
+    names: Sequence[str],
+    workers: int,
+    known: Collection[Hunt] = (),
+    lag: str = LAG,
 ) -> Iterator[Run]:
     """Every sampler on every problem without a simulator, but for what is known."""
     with ProcessPoolExecutor(workers) as pool:
         jobs = [
-            pool.submit(synthetic_run, name, sampler, seed)
+            pool.submit(synthetic_run, name, sampler, seed, lag)
             for name in names for sampler in samplers for seed in seeds if (name, sampler, seed) not in known
         ]  # fmt: skip
         for job in jobs:
@@ -303,6 +317,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--kinds", type=int, help="instead, hunts of so many trials that go on, for kinds of crashes")
     parser.add_argument("--wall", action="store_true", help="instead, hunts of the product, for time by the clock")
     parser.add_argument("--again", action="store_true", help="hunts that are stored already, too")
+    parser.add_argument("--lag", default=LAG, type=a_lag, help=f"of results, in trials, or {GROWING!r}")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     options = parser.parse_args(words)
     if options.quick:
@@ -319,8 +334,8 @@ def main(words: Sequence[str] | None = None) -> int:
     runs = stored(options.store) if options.store is not None and options.store.exists() else {}
     known = () if options.again else (*runs,)
     for found in (
-        all_runs(samplers, seeds, [name for name in names if name in PROBLEMS], options.parallel, known),
-        *(real_runs(name, samplers, seeds, options.parallel, known) for name in names if name in REAL),
+        all_runs(samplers, seeds, [name for name in names if name in PROBLEMS], options.parallel, known, options.lag),
+        *(real_runs(name, samplers, seeds, options.parallel, known, options.lag) for name in names if name in REAL),
     ):
         for run in found:
             runs[run.problem, run.sampler, run.seed] = run

@@ -30,11 +30,9 @@ class Trials:
     Args:
         pool: of workers.
         scratch: where they write.
-        warmup_steps: of each trial.
     """
 
-    def __init__(self, pool: PoolExecutor, scratch: Path, warmup_steps: int) -> None:
-        self.warmup_steps = warmup_steps
+    def __init__(self, pool: PoolExecutor, scratch: Path) -> None:
         self._pool, self._scratch = pool, scratch
         self._numbers = itertools.count()
         self._under_way: dict[int, TrialSpec] = {}
@@ -61,16 +59,14 @@ def trials_on(problem: Real, parallel: int) -> Iterator[Trials]:
     """Start workers for a problem, and end them."""
     with tempfile.TemporaryDirectory(prefix="crashhunt-search-") as folder:
         scenario, settings = plan(Request(trials=1, seed=1, **problem.request))
-        warmup_steps = 0
         if problem.warmup_s is not None:
             scenario = replace(scenario, warmup_s=problem.warmup_s)
-            warmup_steps = round(problem.warmup_s / scenario.step_length_s)
         working = WorkerSettings(
             scenario=with_settings(scenario, settings), oracles=settings.oracles, crash_on=settings.crash_on,
             scratch=Path(folder),
         )  # fmt: skip
         pool = PoolExecutor(working, parallel=parallel)
         try:
-            yield Trials(pool, Path(folder), warmup_steps)
+            yield Trials(pool, Path(folder))
         finally:
             pool.close()

@@ -33,6 +33,7 @@ from crashhunt.recording import (
 from crashhunt.simulators import (
     FlattensObservations,
     LeavesOut,
+    NamesCrashCell,
     NamesDanger,
     NamesObservations,
     OfAnyLength,
@@ -236,6 +237,9 @@ class Nearness(Observer):
         if danger is None and supports(self._simulator, NamesDanger):
             named = self._simulator.named_danger
             danger = None if named is None or math.isnan(named) else min(max(named, 0.0), 1.0)
+        collision = result.collision
+        if collision is not None and supports(self._simulator, NamesCrashCell):
+            result = replace(result, collision=replace(collision, cell=self._simulator.crash_cell))
         driven = self._driven
         return replace(
             result, closest=closest, danger=danger, driven_m=driven.driven_m, driven_s=driven.driven_s,

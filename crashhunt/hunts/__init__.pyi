@@ -1,6 +1,11 @@
 from ._check import Checked as Checked, Finding as Finding, check as check, salvage as salvage
 from ._hunt import Hunt as Hunt
-from ._next_trials import Trials as Trials, spec_of as spec_of
+from ._next_trials import (
+    GREATEST_LAG as GREATEST_LAG,
+    Trials as Trials,
+    growing_lag as growing_lag,
+    spec_of as spec_of,
+)
 from ._phases import PhaseStatus as PhaseStatus
 from ._preflight import Preflight as Preflight, TrafficSurveyor as TrafficSurveyor
 from ._progress import (

@@ -17,7 +17,7 @@ from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
 from crashhunt.executors import SharedExecutors, make_executor, read_map
 from crashhunt.hunts._fork_results import CopiedCrashes, verify_fork_results, verify_rare
-from crashhunt.hunts._next_trials import LAG, Trials, Unanswered, settings_of_workers
+from crashhunt.hunts._next_trials import GREATEST_LAG, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._phases import PhaseClock, PhaseStatus, RemainingTime
 from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
 from crashhunt.hunts._progress import HuntStatus, Progress
@@ -162,7 +162,7 @@ class Hunt:
         progress.tally = tally_crashes(ledger, settings.crash_on, disturbed=self._disturber is not None)
         self._resume_counts(ledger, progress, before, settings)
         progress.rate = bar_watch(settings, ledger)
-        lag, alike = self._lag(before), not finished or draws_independently(before, settings)
+        (lag, lag_grows), alike = self._lag(before), not finished or draws_independently(before, settings)
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
         self._audits_left = AuditsLeft(ledger, before, worker_settings)
         again = self._unanswered.specs
@@ -172,6 +172,8 @@ class Hunt:
             ledger,
             finished,
             lag=lag,
+            lag_grows=lag_grows,
+            begun_with=(before.get("sampler_version") or 1) if finished else None,
             disturber=self._disturber,
             unanswered=again,
             forcings=self._rare(ledger, Forcings),
@@ -194,6 +196,10 @@ class Hunt:
             copies=copies_to_come(settings),
             audits_left=self._audits_left.numbers or before.get("audits_left"),
             lag=lag if sampler.learns and settings.run.deterministic else None,
+            lag_grows=lag_grows if sampler.learns and settings.run.deterministic else None,
+            sampler_version=(before.get("sampler_version") or (1 if finished else sampler.version))
+            if sampler.learns
+            else None,
             until_rate=None if progress.rate is None else progress.rate.noted(),
             phase=None,
             ends_at=None,
@@ -424,10 +430,14 @@ class Hunt:
         executor.cancel(above=above)
         return {number for number in in_flight if number <= above}
 
-    def _lag(self, before: Facts) -> int:
-        """Return by how many trials the results for a sampler that learns are delayed."""
+    def _lag(self, before: Facts) -> tuple[int, bool]:
+        """Return by how many trials the results of trials are delayed for a sampler, and whether by fewer at first."""
         under_way = _under_way(self.settings.run.parallel or self._parallel_here)
-        return int(before.get("lag") or max(LAG, under_way)) if self.settings.run.deterministic else under_way
+        if not self.settings.run.deterministic:
+            return under_way, False
+        if lag := before.get("lag"):  # a hunt of before has one lag for all trials
+            return lag, bool(before.get("lag_grows"))
+        return max(GREATEST_LAG, under_way), True
 
     def _listen(
         self, executor: Executor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.disturbances import FIRST_STEP
 from crashhunt.episode import WorkerSettings
 from crashhunt.ledger import Turn
@@ -29,13 +30,37 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance, Forcing, TrialResult, Value
 
 
-__all__ = ["LAG", "Trials", "Unanswered", "find_unanswered", "settings_again", "settings_of_workers", "spec_of"]
+__all__ = [
+    "GREATEST_LAG",
+    "Trials",
+    "Unanswered",
+    "find_unanswered",
+    "growing_lag",
+    "settings_again",
+    "settings_of_workers",
+    "spec_of",
+]
 
 
 _TRAFFIC = 0x74726166  # apart from what else is drawn of the hunt's seed
-LAG = 32
-"""Delay of results for a sampler in a deterministic hunt, in trials. It is constant, so that 1 and 16 workers run the
-same trials."""
+GREATEST_LAG = 32
+"""Greatest delay of results for a sampler in a deterministic hunt, in trials. It does not depend on the workers, so
+that 1 and 16 of them run the same trials."""
+_FIRST_LAG, _TRIALS_PER_LAG = 4, 8  # delay of the first trials, and trials after which it is one more
+
+
+def growing_lag(number: int, most: int) -> int:
+    """Return the delay of results before a trial of a deterministic hunt, in trials: it grows to the greatest.
+
+    A sampler learns most from its first results, and a delay costs it about as many trials as its length (Joulani,
+    György and Szepesvári 2013, for stochastic bandits). Two workers are never idle for the small delay, and 16 only
+    before trial 96.
+
+    Args:
+        number: of the trial.
+        most: the greatest delay.
+    """
+    return min(most, _FIRST_LAG + number // _TRIALS_PER_LAG)
 
 
 class Trials:
@@ -54,8 +79,11 @@ class Trials:
             it. The sampler receives the result in the ledger, and not that of the second run, so that a resumed hunt
             proposes the same trials.
         lag: how many trials the hunt has under way at once; where it is deterministic, how many it may.
+        lag_grows: whether the first trials of a deterministic hunt have a smaller lag (`growing_lag`).
         disturber: what draws their disturbances; None where they have none.
         forcings: the forcing of each root, in rare mode; None in any other hunt.
+
+        begun_with: the version of the sampler's proposals in the hunt so far; None if the hunt has none.
 
     Raises:
         CrashhuntError: the sampler fails, or the ledger is damaged.
@@ -69,6 +97,8 @@ class Trials:
         finished: set[int],
         *,
         lag: int,
+        lag_grows: bool = False,
+        begun_with: int | None = None,
         disturber: DisturbanceSampler | None = None,
         unanswered: Sequence[TrialSpec] = (),
         forcings: Forcings | None = None,
@@ -77,6 +107,8 @@ class Trials:
         self._sampler = sampler
         self._ledger = ledger
         self._lag = lag
+        self._lag_grows = lag_grows
+        self._begun_with = sampler.version if begun_with is None else begun_with
         self._disturber = disturber
         self._waiting = iter(number for number in range(settings.most_trials) if number not in finished)
         self._next = next(self._waiting, None)
@@ -120,7 +152,8 @@ class Trials:
             if spec is None and self._sampler.learns:
                 if self._must_wait(self._next):
                     break
-                told = self._tell(self._next - self._lag)
+                self._refuse_other_version()
+                told = self._tell(self._next - self._lag_of(self._next))
                 spec = spec_of(self._next, self._settings, self._sampler, self._disturber)
                 turns.append(Turn(told, spec))
             elif spec is None:
@@ -151,9 +184,22 @@ class Trials:
             self._results[number] = result
             heappush(self._untold, number)
 
+    def _refuse_other_version(self) -> None:
+        """Refuse to mix proposals of two versions: the seed of the hunt would no longer repeat it."""
+        name, version = self._settings.sampler, self._sampler.version
+        if version != self._begun_with:
+            raise HuntDirectoryError(
+                f"the hunt began with version {self._begun_with} of the sampler {name!r}, and this crashhunt has "
+                f"version {version}: trial {self._next} cannot be proposed as before",
+                fix="begin a new hunt, or resume this one with the crashhunt that began it",
+            )
+
     def _must_wait(self, number: int) -> bool:
         """Whether a result that the sampler must receive before this proposal is missing."""
-        return self._settings.run.deterministic and min(self._open, default=number) <= number - self._lag
+        return self._settings.run.deterministic and min(self._open, default=number) <= number - self._lag_of(number)
+
+    def _lag_of(self, number: int) -> int:
+        return growing_lag(number, self._lag) if self._lag_grows else self._lag
 
     def _tell(self, last: int) -> tuple[int, ...]:
         """Pass finished results up to a number to the sampler; return their numbers."""

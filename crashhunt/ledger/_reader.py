@@ -114,7 +114,9 @@ class Noted(TypedDict, total=False):
         hunt_seed: what its trials are drawn from.
         independent: whether they were drawn independently of each other.
         plain_origin: of the trials that were, where its sampler keeps some apart that it does not guide; else None.
-        lag: by how many trials the results for a sampler that learns are delayed.
+        lag: by how many trials the results for a sampler that learns are delayed at most.
+        lag_grows: whether they are delayed by fewer at the beginning; None in hunts of before, where the lag is fixed.
+        sampler_version: of the proposals of a sampler that learns; None in hunts of before, which have version 1.
         origins: whether its sampler says where trials come from.
         core: whether the simulator's compiled core is used; None where it has none.
         disturb: how often what disturbs its trials; None where nothing does.
@@ -146,6 +148,8 @@ class Noted(TypedDict, total=False):
     independent: bool
     plain_origin: str | None
     lag: int | None
+    lag_grows: bool | None
+    sampler_version: int | None
     origins: bool
     core: str | None
     disturb: list[str] | None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from crashhunt.base.errors import CrashhuntError, PluginError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.plugins import locate
-from crashhunt.samplers._protocol import HuntFacts, Independent, OnlyAsked, PlainStream, Proposal, WantsHunt
+from crashhunt.samplers._protocol import HuntFacts, Independent, OnlyAsked, PlainStream, Proposal, Versioned, WantsHunt
 
 if TYPE_CHECKING:
     import numpy as np
@@ -72,6 +72,11 @@ class NamedSampler:
     def plain_origin(self) -> str:
         """The origin of the trials that it draws independently of all others; empty where it keeps none apart."""
         return self._sampler.plain_origin if isinstance(self._sampler, PlainStream) else ""
+
+    @property
+    def version(self) -> int:
+        """The version of its proposals, 1 if it has none: another one proposes other trials for the same results."""
+        return self._sampler.version if isinstance(self._sampler, Versioned) else 1
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
         """Return its proposal.

@@ -1,7 +1,8 @@
 """The portfolio behind the sampler `guided`: distributes trials between a model, mutation and an even search.
 
 Computes shares of trials by payoff. A trial that is more critical than a share of 1 - q of the unguided trials has
-payoff -log q. The mean payoff is 1 where a strategy learns nothing, so only ranks matter, not the scale of criticality.
+payoff -log q. The mean payoff is 1 where a strategy learns nothing, so only ranks matter for payoffs. Two thresholds
+read the scale of criticality: the progress of strategies, and the criticality of 0.5 that caps their share.
 
 Invariant: a strategy keeps at least 2 % of the trials (probes), and the even search gets everything that strategies
 do not earn. A hunt with a misleading criticality is therefore never much worse than an even search.

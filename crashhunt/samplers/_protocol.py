@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "HuntFacts", "Independent", "Key", "OnlyAsked", "PlainStream", "Proposal", "Sampler", "Space",
-    "WantsHunt",
+    "Versioned", "WantsHunt",
 ]  # fmt: skip
 
 Key = tuple[str, str]
@@ -72,8 +72,9 @@ class Sampler(Protocol):
     - Before the proposal for trial n, it receives all new results up to trial n - lag, in the order of their numbers.
     - A trial that has not ended by then is reported late, before the first proposal after its end. One trial that
       hangs therefore does not stop the sampler from learning.
-    - A hunt with ``--deterministic`` waits: the sampler receives exactly the results up to n - lag. The lag is 32, or
-      the parallel trials of the first run, if those are more. The trials are then the same at any speed.
+    - A hunt with ``--deterministic`` waits: the sampler receives exactly the results up to n - lag. The lag is
+      4 + n / 8, rounded down. It is at most 32, or the parallel trials of the first run if those are more. The trials
+      are then the same at any speed.
     - The ledger stores proposals, and the results reported before each, before their trials start. A resumed hunt runs
       the same trials, and reports results in the same order.
     """
@@ -111,6 +112,16 @@ class WantsHunt(Protocol):
     """
 
     wants_hunt: bool
+
+
+@runtime_checkable
+class Versioned(Protocol):
+    """A sampler whose proposals have a version, from 1: another version proposes other trials for the same results.
+
+    A hunt cannot resume with another version than it began with. A sampler without a version has version 1.
+    """
+
+    version: int
 
 
 @runtime_checkable

@@ -1,8 +1,9 @@
 """Three strategies that search for critical trials: CMA-ES, cross-entropy and mutation.
 
 All of them see a trial as a point in the unit cube with a score from 0 to 1, the criticality, or 1 for a crash. Each
-section says what its strategy computes and where it comes from. All use ranks of scores only, because criticality is
-not linear in the distance to a crash. None depends on anything but the reported results and the generator.
+section says what its strategy computes and where it comes from. All use ranks of scores, because criticality is not
+linear in the distance to a crash; CMA-ES alone also ends a run where scores are nearly equal. None depends on anything
+but the reported results and the generator.
 """
 
 from __future__ import annotations

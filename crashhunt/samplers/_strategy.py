@@ -116,14 +116,14 @@ def _kind(result: TrialResult) -> str:
     hit, failed, event = result.collision, result.failure, result.event
     words = [str(result.outcome)]
     if hit is not None:
-        words += [hit.role, hit.kind, _NUMBER_AT_END.sub("", hit.lane)]
+        words += [hit.role, hit.kind, _NUMBER_AT_END.sub("", hit.lane), hit.cell]
     elif failed is not None:
         words += [failed.kind, failed.agent]
     elif event is not None:
         words += [event.kind, _NUMBER_AT_END.sub("", event.lane)]
     else:
         return ""
-    return " ".join(words)
+    return " ".join(words).rstrip()
 
 
 # The best trials so far, in order and limited in number.

@@ -21,6 +21,7 @@ from ._protocol import (
     HoldsBack as HoldsBack,
     Info as Info,
     LeavesOut as LeavesOut,
+    NamesCrashCell as NamesCrashCell,
     NamesDanger as NamesDanger,
     NamesObservations as NamesObservations,
     Observations as Observations,

@@ -34,6 +34,7 @@ __all__ = [
     "HoldsBack",
     "Info",
     "LeavesOut",
+    "NamesCrashCell",
     "NamesDanger",
     "NamesObservations",
     "Observations",
@@ -235,6 +236,14 @@ class NamesDanger(Protocol):
     @property
     def named_danger(self) -> float | None:
         """The highest criticality of the episode until now, from 0 (nothing near) to 1 (contact); None if unknown."""
+
+
+class NamesCrashCell(Protocol):
+    """A simulator that describes the state after a crash coarsely, because its scenes have no actors."""
+
+    @property
+    def crash_cell(self) -> str:
+        """The description, equal for similar crashes; empty before a crash, or if the environment names the type."""
 
 
 class HasMap(Protocol):
@@ -476,6 +485,7 @@ FACULTIES: tuple[type, ...] = (
     TellsNotices,
     FlattensObservations,
     RestoresObservations,
+    NamesCrashCell,
     NamesDanger,
     NamesObservations,
     TellsEvents,

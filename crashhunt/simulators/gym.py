@@ -17,6 +17,7 @@ from crashhunt.base.plugins import load_object
 from crashhunt.base.text import encodable, one_of
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.gym import GymSetup
+from crashhunt.simulators._crash_cells import coarse_cell
 from crashhunt.simulators._gymnasium import ObservationForm, action_form, as_tables, merge, native, reseed_in_place
 from crashhunt.simulators._parallel import OneLearner, is_parallel, takes_turns
 from crashhunt.world import Contact, Roster, Scene
@@ -67,6 +68,7 @@ class GymSimulator:
         self._rule = _Rule(self._setup.crash)
         self._near, _, self._key = self._setup.danger.partition("info.")
         self.named_danger: float | None = None
+        self.crash_cell = ""
         self.agents: list[str] = []
         self.notices: dict[str, None] = {}
         self._steps = 0
@@ -92,6 +94,7 @@ class GymSimulator:
         self.agents = [self._agent]
         self._steps = 0
         self._crashed = False
+        self.crash_cell = ""
         self.named_danger = None
         self._look("")
         return {self._agent: self._shown(observation)}, {self._agent: info}
@@ -112,6 +115,10 @@ class GymSimulator:
         self._steps += 1
         with _INFO:  # the crash rule may be a function of the user's
             what = self._rule(observation, reward, terminated, truncated, info)
+            if what and not self._crashed:
+                self.crash_cell = (
+                    "" if self._rule.has_named else coarse_cell(self._form.encode(observation), self._form.space, info)
+                )
             reported = info[self._key] if self._key and self._key in info else None
         self._look(what)
         if reported is not None:
@@ -250,6 +257,8 @@ class _Rule:
         self._rule = rule
         self._function = load_object(rule.function) if rule.function else None
         self._kind = load_object(rule.kind) if rule.kind else None
+        self.has_named = False
+        """Whether the environment or the function has named the type of the last crash."""
 
     def __call__(self, observation: object, reward: float, terminated: bool, truncated: bool, info: Info) -> str:
         """Return a description of the crash, by default its type; empty if the step has no crash."""
@@ -259,6 +268,7 @@ class _Rule:
         given = observation, reward, terminated, truncated, info
         kind = info.get(_KIND) if self._kind is None else self._kind(*given)
         text = " ".join(encodable(kind).split()) if isinstance(kind, str) else ""
+        self.has_named = bool(text)
         return text[:_MAX_KIND_CHARACTERS] or found
 
     def _find(self, observation: object, reward: float, terminated: bool, truncated: bool, info: Info) -> str:

@@ -14,7 +14,7 @@ from columns import FEWER_COLUMNS
 from hypothesis import given, settings as how, strategies as st
 
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.errors import PluginError
+from crashhunt.errors import HuntDirectoryError, PluginError
 from crashhunt.hunts import Trials, spec_of
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
@@ -52,13 +52,13 @@ class Killed(BaseException):
     """The process of a hunt is gone."""
 
 
-def hunt(path, chosen, chance, *, kill_after=10**9, lag=None, slow=frozenset(), log=None):
+def hunt(path, chosen, chance, *, kill_after=10**9, lag=None, slow=frozenset(), log=None, **more):
     """What a hunt does with its trials, which end in any order, until it is killed; return how many were open then."""
     ledger = Ledger(path, writable=True)
     finished = ledger.finished()
     capacity = 2 * chosen.run.parallel
     sampler = NamedSampler(chosen.sampler, chosen.space, points=chosen.points)
-    trials = Trials(chosen, sampler, ledger, finished, lag=lag or capacity)
+    trials = Trials(chosen, sampler, ledger, finished, lag=lag or capacity, **more)
     running = []
     while True:
         for spec in trials.take(capacity - len(running)):
@@ -180,6 +180,35 @@ def test_a_trial_that_hangs_keeps_no_one_from_learning(tmp_path):
         hunt(tmp_path / "other.sqlite", settings(deterministic=True), random.Random(1), lag=8, slow=slow,
              log=log, kill_after=6)  # fmt: skip
     assert max(spec.number for spec in log) <= 7 + 8
+
+
+@pytest.mark.parametrize("parallel", [1, 9])
+def test_first_results_of_a_deterministic_hunt_arrive_soon_with_any_number_of_workers(tmp_path, parallel):
+    path = tmp_path / "ledger.sqlite"
+    chosen = settings(deterministic=True, parallel=parallel)
+    hunt(path, chosen, random.Random(1), lag=10, lag_grows=True)
+    with closing(Ledger(path)) as ledger:
+        turns = list(ledger.turns())
+    last = [max((number for turn in turns[: n + 1] for number in turn.told), default=-1) for n in range(TRIALS)]
+    assert [n - told for n, told in enumerate(last)][:4] == [1, 2, 3, 4]
+    assert [n - told for n, told in enumerate(last)][4:] == [min(4 + n // 8, 10) for n in range(4, TRIALS)]
+    assert [turn.spec for turn in turns] == specs(path)
+
+
+def test_a_hunt_that_began_with_another_version_of_the_sampler_is_refused_before_its_next_proposal(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    chosen = settings(trials=20)
+    hunt(path, chosen, random.Random(1), begun_with=1)  # which is the version of one that has none
+    hunt(path, chosen, random.Random(1), begun_with=2)  # nothing is left to propose
+    with pytest.raises(HuntDirectoryError) as refused:
+        hunt(path, settings(trials=21), random.Random(1), begun_with=2)
+    assert "began with version 2 of the sampler 'climber:Climber', and this crashhunt has version 1" in str(
+        refused.value
+    )
+    assert "trial 20 " in str(refused.value)
+    assert "\n" not in str(refused.value)
+    hunt(path, settings(trials=21), random.Random(1))
+    assert len(specs(path)) == 21
 
 
 def test_a_trial_that_is_run_again_is_what_was_proposed(tmp_path):

@@ -49,6 +49,26 @@ def test_as_long_as_nothing_came_near_strategies_have_a_third_at_most():
     assert far["model"] > 2 * far["mutation"]
 
 
+def test_another_peak_is_abandoned_where_danger_stays_as_far_from_a_crash():
+    cube = Cube(SPACE)
+
+    def is_climbed(nearer, trials):
+        niches = Niches(cube, Model(cube))
+        for number in range(40):
+            niches.tell(ScoredTrial(number, PLACES[number], number, 0.01 * number))
+        niches.begin()
+        foot = niches._foot
+        for number in range(40, 40 + trials):
+            niches.tell(ScoredTrial(number, foot.point, number, 1.0 - nearer * (1.0 - foot.score), "niche"))
+        assert niches.climbs == (niches._foot is not None and nearer < 0.85)
+        return niches._foot is foot
+
+    assert is_climbed(0.86, 6)
+    assert not is_climbed(0.86, 7)  # five, and one for each argument
+    assert is_climbed(0.84, 7)
+    assert not is_climbed(0.84, 8)
+
+
 def test_after_a_crash_strategies_begin_again_with_what_is_not_near_to_it():
     made = portfolio_told(*[("random", 0.02 * number) for number in range(40)])
     model, mutation = made._strategies.values()

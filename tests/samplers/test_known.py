@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from spaces import ask, spec_of
 
@@ -117,6 +119,7 @@ def kind_of(**evidence):
 def test_kinds_are_reported_by_manner_and_road_and_by_what_was_raised():
     hit = Collision("ego", "collider", "ego", "a", kind="collision", lane="north_1")
     assert kind_of(collision=hit) == "collision collider collision north"
+    assert kind_of(collision=replace(hit, cell="fell 012")) == "collision collider collision north fell 012"
     same = Collision("ego", "collider", "ego", "b", kind="collision", lane="north_0", x=3.0)
     assert kind_of(collision=same) == kind_of(collision=hit)
     other = Collision("ego", "victim", "b", "ego", kind="collision", lane="north_0")

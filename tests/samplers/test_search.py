@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import HealthCheck, example, given, settings, strategies as st
 from spaces import are_inside, ask, spaces, spec_of
 
 from crashhunt.errors import UsageError
@@ -107,6 +107,35 @@ def test_the_even_search_leaves_no_part_of_an_argument_out():
     assert len(even) == 100
     for drawn in even.T:  # the third of which has base 5
         assert np.histogram(drawn, bins=5, range=(0.0, 1.0))[0].min() >= 15
+
+
+@pytest.mark.parametrize("make", [MutationSampler, CrossEntropySampler])
+@pytest.mark.parametrize("crashes", [False, True])
+@settings(deadline=None, max_examples=3)
+@given(scale=st.floats(0.05, 0.9), power=st.sampled_from([0.2, 0.45, 3.0]), seed=st.integers(0, 2**20))
+@example(scale=0.45, power=1.0, seed=5)
+def test_only_the_order_of_danger_counts_for_the_strategies_alone(make, crashes, scale, power, seed):
+    """Any strictly rising function of danger gives the same proposals, before and after crashes."""
+
+    space = {("ego", "x"): Range(0.0, 1.0), ("ego", "y"): Range(0.0, 1.0)}
+
+    def hunted(seen_as):
+        sampler, asked = make(space, hunt=HuntFacts(seed)), []
+        for number in range(130):
+            asked.append(ask(sampler, number, seed))
+            x, y = asked[-1].arguments.values()
+            danger = max(0.9 - abs(x - 0.3) - 0.5 * abs(y - 0.4), 0.8 - abs(x - 0.9) - abs(y - 0.8), 0.05)
+            danger += 1e-6 * number  # no two are equal
+            crashed = crashes and danger > 0.85
+            outcome = Outcome.COLLISION if crashed else Outcome.SURVIVED
+            sampler.tell(TrialResult(spec_of(number, asked[-1]), outcome, danger=1.0 if crashed else seen_as(danger)))
+        return asked
+
+    asked = hunted(lambda danger: danger)
+    assert hunted(lambda danger: scale * danger**power) == asked
+    assert len({one.origin for one in asked}) > 1
+    # The order does count.
+    assert hunted(lambda danger: 1.0 - danger) != asked
 
 
 def test_danger_that_states_nothing_gets_probes_only():

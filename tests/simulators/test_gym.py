@@ -344,6 +344,10 @@ def test_environment_or_function_names_the_crash_type(tmp_path, size, rule, kind
     fall(simulator)
     (contact,) = simulator.scene().contacts
     assert contact.kind == kind
+    # A cell describes the crash where neither the environment nor a function names its type.
+    assert (simulator.crash_cell == "") == (kind not in ("fell",))
+    simulator.reset(seed=2)
+    assert simulator.crash_cell == ""
 
 
 TWO_KINDS = """
