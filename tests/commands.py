@@ -21,7 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn
 
-from warm import Process, Warm, at_start, leave_after, path_of
+from warm import OF_THE_GROUP, Process, Warm, ask, at_start, leave_after, path_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -129,7 +129,7 @@ class Begun(Process):
             file.write(typed.encode())
             file.seek(0)
             files = [theirs.fileno(), file.fileno(), out, terminal or err]
-            socket.send_fds(control, [json.dumps(request).encode()], files)
+            ask(control, request, files, reply)
         super().__init__(["crashhunt", *request["words"]], reply)
 
     def communicate(self, timeout: float | None = None) -> tuple[str, str]:
@@ -181,7 +181,8 @@ def _serve(control: socket.socket) -> None:
         for descriptor in streams:
             os.close(descriptor)
         reply = socket.socket(fileno=asker)
-        reply.send(str(pid).encode())
+        with suppress(OSError):  # whoever asked has gone
+            reply.send(str(pid).encode())
         running[os.pidfd_open(pid)] = pid, reply
 
 
@@ -199,7 +200,7 @@ def _be_command(request: dict, typed: int, out: int, err: int) -> NoReturn:
     sys.argv = [str(CRASHHUNT), *request["words"]]
     from crashhunt.cli import main
 
-    leave_after(main)
+    leave_after(lambda: (signal.pthread_sigmask(signal.SIG_UNBLOCK, OF_THE_GROUP), main()))
 
 
 class Hunt:
@@ -257,7 +258,7 @@ class Hunt:
 
 
 if __name__ == "__main__":
-    signal.pthread_sigmask(signal.SIG_SETMASK, ())  # as in warm.py
+    signal.pthread_sigmask(signal.SIG_SETMASK, OF_THE_GROUP)  # until a fork is a command
     sys.path[0] = str(CRASHHUNT.parent)  # where the script lies, and not these tests
     import crashhunt.base.processes
     import crashhunt.suites._processes

@@ -42,6 +42,9 @@ _SET_LATER = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX")
 _OF_SIMULATORS = {"gym": "gymnasium", "highway": "crashhunt.simulators.highway._lean", "sumo": "libsumo"}
 _MESSAGE = 1 << 20
 _FREE = 500  # where a process has no files of its own
+# Whoever interrupts a session, such as `timeout`, sends these to its whole group. A hunt that a test runs takes that as
+# a request to stop, and the test goes on: what serves it must not have ended by then.
+OF_THE_GROUP = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM)
 
 
 _compiled: dict[bytes | str, types.CodeType] = {}  # what a file of crashhunt says, to what Python makes of it
@@ -132,6 +135,18 @@ class Warm:
         return Forked(self.control, words, **options)
 
 
+_GONE = "the process that the tests fork has ended"
+
+
+def ask(control: socket.socket, request: Mapping[str, Any], descriptors: Sequence[int], reply: socket.socket) -> None:
+    """Ask for a fork."""
+    try:
+        socket.send_fds(control, [json.dumps(request).encode()], descriptors)
+    except ConnectionError as error:  # which must not look as if crashhunt had lost a process of its own
+        reply.close()
+        raise RuntimeError(_GONE) from error
+
+
 class Process:
     """A fork of a process that is there already, as far as somebody uses a `subprocess.Popen`.
 
@@ -143,7 +158,11 @@ class Process:
     def __init__(self, words: Sequence[str], reply: socket.socket) -> None:
         self.returncode: int | None = None
         self._words, self._reply = words, reply
-        self.pid = int(reply.recv(_MESSAGE))
+        pid = reply.recv(_MESSAGE)
+        if not pid:
+            reply.close()
+            raise RuntimeError(_GONE)
+        self.pid = int(pid)
 
     def poll(self) -> int | None:
         """Return how it has ended, if it has."""
@@ -195,7 +214,7 @@ class Forked(Process):
                 "words": words[2:], "environment": dict(env), "folder": str(Path.cwd()), "numbers": numbers,
                 "simulator": _simulator_of(words[-1]), "apart": start_new_session,
             }  # fmt: skip
-            socket.send_fds(control, [json.dumps(request).encode()], [theirs.fileno(), *given, *pass_fds])
+            ask(control, request, [theirs.fileno(), *given, *pass_fds], reply)
         super().__init__(words, reply)
 
 
@@ -304,7 +323,8 @@ def _serve(control: socket.socket, simulator: str = "") -> None:
             if pid == 0:
                 _be_keeper(request, descriptors[1:])
             reply = socket.socket(fileno=os.dup(descriptors[0]))
-            reply.send(str(pid).encode())
+            with suppress(OSError):  # whoever asked was killed meanwhile, which the keeper sees as well
+                reply.send(str(pid).encode())
             running[os.pidfd_open(pid)] = pid, reply
         for descriptor in descriptors:
             os.close(descriptor)
@@ -411,8 +431,8 @@ def _put_back(begins_with: str) -> None:
 
 
 if __name__ == "__main__":
-    # A process that starts a reaper blocks signals meanwhile, and may be the first that needs this one.
-    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    # A keeper begins with these blocked, here as elsewhere, and admits them itself.
+    signal.pthread_sigmask(signal.SIG_SETMASK, OF_THE_GROUP)
     _remember()
     _compile()
     _import_ours()

@@ -200,11 +200,16 @@ class SimulatorError(EpisodeError):
 
 
 def remedy(error: OSError) -> str:
-    """Return what to do about an error of the operating system, as an imperative."""
+    """Return what to do about an error of the operating system, as an imperative.
+
+    Empty where the user can do nothing, as for a broken pipe between two processes of crashhunt.
+    """
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return "raise the limit on open files (ulimit -n), and run the same command again"
     if error.errno == errno.EFBIG:
         return "raise the limit on the size of a file (ulimit -f), and run the same command again"
     if error.errno in (errno.EAGAIN, errno.ENOMEM):
         return "leave it more processes (ulimit -u) or memory (ulimit -v), and run the same command again"
-    return "free some space or make the folder writable, and run the same command again"
+    if error.errno in DISK | {errno.EACCES, errno.EPERM}:
+        return "free some space or make the folder writable, and run the same command again"
+    return "see to that file or folder, and run the same command again" if error.filename is not None else ""

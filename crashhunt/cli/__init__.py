@@ -7,6 +7,7 @@ import errno
 import io
 import json
 import os
+import select
 import sys
 import traceback
 from contextlib import suppress
@@ -77,9 +78,12 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     try:
         code = _run(words)
         _flush()
-    except BrokenPipeError:  # the reader of our output has closed it
-        _give_up_output()
+    except BrokenPipeError as error:
         code = 0
+        if _is_output_closed():
+            _give_up_output()
+        else:
+            code = _report(_explained(error), as_json="--json" in words)
     except KeyboardInterrupt:
         code = INTERRUPTED
     except Exception as error:
@@ -125,7 +129,8 @@ def _explained(error: Exception) -> CrashhuntError:
         if error.filename is None and error.errno in DISK | {errno.EBADF}:
             _give_up_output()
             return CrashhuntError(f"the output cannot be written: {error.strerror}", fix="send it elsewhere")
-        return CrashhuntError(str(error.strerror or error), fix=remedy(error), where=str(error.filename or ""))
+        if fix := remedy(error):
+            return CrashhuntError(str(error.strerror or error), fix=fix, where=str(error.filename or ""))
     if limit := limit_behind(error):
         return CrashhuntError(f"the memory does not suffice: {type(error).__name__}", fix=limit)
     from crashhunt.base.exceptions import in_words
@@ -139,6 +144,14 @@ def _explained(error: Exception) -> CrashhuntError:
 def _flush() -> None:
     if sys.stdout is not None:
         sys.stdout.flush()
+
+
+def _is_output_closed() -> bool:
+    """Whether the reader of standard output or standard error has closed it."""
+    closed = select.poll()
+    for descriptor in (1, 2):
+        closed.register(descriptor, 0)  # which reports errors and hang-ups alone
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in closed.poll(0))
 
 
 def _give_up_output() -> None:

@@ -76,15 +76,19 @@ class ForkServerLink:
         # Messages stay apart from each other, and file descriptors with theirs.
         self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs, self._log.open("wb") as log:
-            self._kept = Kept(
-                "crashhunt.executors._fork_server",
-                [str(theirs.fileno()), str(job)],
-                environment=environment,
-                inherited=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-            )
+            try:
+                self._kept = Kept(
+                    "crashhunt.executors._fork_server",
+                    [str(theirs.fileno()), str(job)],
+                    environment=environment,
+                    inherited=[theirs.fileno()],
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                )
+            except BaseException:
+                self.control.close()
+                raise
         self.control.setblocking(False)
 
     def fork(self, slot: int, end: socket.socket) -> None:

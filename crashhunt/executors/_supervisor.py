@@ -24,7 +24,7 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.processes import die_with, resume
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import describe_death, is_sent_from_outside
-from crashhunt.episode import scratch_of
+from crashhunt.episode import internal_error, scratch_of
 from crashhunt.executors._postmortem import KEY_BYTES, Report, check_report, damaged, died, hung, read_tail
 from crashhunt.executors._time_limits import START_UP_S, has_hung
 from crashhunt.recording import BlackBoxFile, Recording, read_black_box
@@ -376,9 +376,11 @@ def _answer(supervisor: Supervisor, settings: WorkerSettings, spec: TrialSpec) -
     except FileNotFoundError:  # another trial has removed the scratch folder meanwhile
         return {"lost": -signal.SIGKILL}
     except OSError as error:
-        limit = limit_behind(error)
+        limit, fix = limit_behind(error), remedy(error)
+        if not (limit or fix):
+            return internal_error(error, spec.number).to_json()
         return RecorderError(
-            f"the trial cannot be kept: {limit or error.strerror}", fix="" if limit else remedy(error),
+            f"the trial cannot be kept: {limit or error.strerror}", fix="" if limit else fix,
             where=str(error.filename or ""),
         ).to_json()  # fmt: skip
 

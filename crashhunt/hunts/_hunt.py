@@ -14,7 +14,7 @@ from crashhunt.base.signals import stop_requests
 from crashhunt.base.temporary import release_shared_memory, remove_scratch
 from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
-from crashhunt.episode import scratch_of
+from crashhunt.episode import internal_error, scratch_of
 from crashhunt.executors import SharedExecutors, make_executor, read_map
 from crashhunt.hunts._fork_results import CopiedCrashes, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import GREATEST_LAG, Trials, Unanswered, settings_of_workers
@@ -107,7 +107,7 @@ class Hunt:
 
         Raises:
             HuntDirectoryError: the directory is busy, foreign, unwritable or full.
-            CrashhuntError: the machinery failed.
+            CrashhuntError: the machinery failed; an `InternalError` where crashhunt itself is to blame.
         """
         with self._place.locked(), stop_requests() as self._stops:
             self.settings = self._place.claim(
@@ -121,8 +121,10 @@ class Hunt:
                 raise
             except OSError as error:
                 self._fail(ledger, f"{error.strerror or error}: {error.filename or self.directory}")
+                if not (fix := remedy(error)):
+                    raise internal_error(error) from error
                 raise HuntDirectoryError(
-                    f"{error.strerror or error}", fix=remedy(error), where=str(error.filename or self.directory)
+                    f"{error.strerror or error}", fix=fix, where=str(error.filename or self.directory)
                 ) from error
             except Exception as error:
                 self._fail(ledger, f"{type(error).__name__}: {error}")

@@ -7,6 +7,7 @@ import resource
 
 import pytest
 
+from crashhunt.base.errors import remedy
 from crashhunt.base.resources import limit_behind
 from crashhunt.episode._failures import failure_of
 
@@ -69,3 +70,21 @@ def test_trial_that_failed_by_a_limit_states_so(limits):
     assert failure_of(MemoryError(), "ego").message == "the limit on memory is 1024 MiB: raise it with ulimit -v"
     said = failure_of(OSError(errno.EFBIG, "File too large"), "ego").message
     assert said == "[Errno 27] File too large (the limit on the size of a file is 1024 MiB: raise it with ulimit -f)"
+
+
+DISK = "free some space or make the folder writable, and run the same command again"
+FILE = "see to that file or folder, and run the same command again"
+REMEDIES = [
+    (OSError(errno.ENOSPC, "No space left on device"), DISK),
+    (OSError(errno.EDQUOT, "Disk quota exceeded"), DISK),
+    (PermissionError(errno.EACCES, "Permission denied", "hunt.toml"), DISK),
+    (FileNotFoundError(errno.ENOENT, "No such file or directory", "hunt.toml"), FILE),
+    (BrokenPipeError(errno.EPIPE, "Broken pipe"), ""),
+    (ConnectionResetError(errno.ECONNRESET, "Connection reset by peer"), ""),
+    (OSError("without a number"), ""),
+]
+
+
+@pytest.mark.parametrize(("error", "fix"), REMEDIES, ids=lambda one: type(one).__name__)
+def test_only_what_a_disk_causes_is_blamed_on_the_disk(error, fix):
+    assert remedy(error) == fix

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from contextlib import closing
 
 import pytest
 
 import crashhunt
+from crashhunt.base.errors import InternalError
 from crashhunt.crashes import list_bundles, list_near_misses
 from crashhunt.errors import HuntDirectoryError, UsageError
 from crashhunt.hunts import check, hunt_state
@@ -121,3 +124,24 @@ def test_a_hunt_without_one_valid_trial_states_why(tmp_path):
     assert report.reason
     assert hunt_state(tmp_path / "h").state == "error"
     assert report.crashes == ()
+
+
+@pytest.mark.parametrize(
+    ("number", "kind", "says"),
+    [
+        (errno.ENOSPC, HuntDirectoryError, "No space left on device; free some space"),
+        (errno.EPIPE, InternalError, "crashhunt itself failed: BrokenPipeError: .*Broken pipe; report it"),
+    ],
+)
+def test_only_an_error_of_the_disk_is_blamed_on_the_disk(tmp_path, monkeypatch, number, kind, says):
+    def fail(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("crashhunt.base.reaper.subprocess.Popen", fail)  # of the thread of the pool
+    with pytest.raises(kind, match=says) as caught:
+        crashhunt.run(tmp_path / "h", 1, 2, 20, **OPTIONS)
+    state = hunt_state(tmp_path / "h")
+    assert state.state == "error"
+    assert os.strerror(number) in state.detail
+    if kind is InternalError:
+        assert "in fail" in caught.value.traceback

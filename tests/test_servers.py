@@ -1,0 +1,67 @@
+"""The processes that commands and keepers of tests are forked from: they outlast what ends those."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+import warm
+from conftest import _commands
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals to stopped processes are of Linux")
+
+NOTHING = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+
+
+@pytest.fixture
+def start_keeper(tmp_path):
+    """Starts a process of an empty script."""
+    script = tmp_path / "keeper.py"
+    script.touch()
+    words, environment = [sys.executable, "-P", str(script), "0"], {**os.environ, **_commands().warm._at_start}
+
+    def start(server=None):
+        server = server or _commands().warm
+        return warm.Forked(server.control, words, env=environment, pass_fds=(), start_new_session=True, **NOTHING)
+
+    return start
+
+
+def test_servers_outlast_a_signal_to_the_group_of_the_session(toy):
+    # `timeout 500 pytest` sends SIGTERM to the group. A hunt of the test ends as asked, and the next one of the same
+    # test failed with "Broken pipe".
+    toy.crashhunt("--version")
+    for server in (_commands()._process, _commands()._kept):
+        for number in warm.OF_THE_GROUP:
+            server.send_signal(number)
+    run = ("run", "h", "1", "2", "20", "--scenario", "toy", "--arg", "speed=5", "--no-snapshot", "--json")
+    assert toy.crashhunt(*run).json["outcomes"] == {"survived": 2}
+    command = toy.begin("run", "h2", "1", "2", "20", "--scenario", "toy", "--set", "step_wall_s=5", "--no-snapshot")
+    command.terminate()  # which a command itself heeds, even before it has begun
+    assert command.wait(60) != 0
+    command.communicate()
+
+
+def test_server_of_keepers_outlasts_a_killed_process_that_asked(start_keeper, monkeypatch):
+    assert start_keeper().wait(60) == 0
+    server = _commands()._kept.pid
+    with monkeypatch.context() as patch:
+        patch.setattr(warm.Process, "__init__", lambda self, words, reply: reply.close())  # as the kernel does
+        os.kill(server, signal.SIGSTOP)
+        os.waitpid(server, os.WUNTRACED)
+        try:
+            start_keeper()
+        finally:
+            os.kill(server, signal.SIGCONT)
+    assert start_keeper().wait(60) == 0
+
+
+def test_server_that_is_gone_is_no_broken_pipe_of_crashhunt(start_keeper):
+    lost, kept = warm.Warm.start(os.environ)
+    kept.kill()
+    kept.wait()
+    with lost.control, pytest.raises(RuntimeError, match="the process that the tests fork has ended"):
+        start_keeper(lost)
