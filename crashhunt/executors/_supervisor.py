@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError, remedy
-from crashhunt.base.files import whole_file
 from crashhunt.base.processes import die_with, resume
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import describe_death, is_sent_from_outside
@@ -202,11 +201,13 @@ class Supervisor:
         if text is None:
             return
         path = self._settings.scratch / layout.MAP
-        if not path.exists():
-            with whole_file(path, lasting=False, noted=False) as temporary:
-                temporary.write_text(text, encoding="utf-8")
-        elif kept is not None and path.read_text(encoding="utf-8") != text:
-            (kept / layout.MAP).write_text(text, encoding="utf-8")
+        try:
+            # Another slot may write its map at this moment. It must not replace the map on which a kept trial relies.
+            with path.open("x", encoding="utf-8") as file:
+                file.write(text)
+        except FileExistsError:
+            if kept is not None and path.read_text(encoding="utf-8") != text:
+                (kept / layout.MAP).write_text(text, encoding="utf-8")
 
     def _wait(self, box: BlackBoxFile, given_at: float) -> tuple[FromZygote, bool]:
         """Wait for the end of a trial's process; kill it where it hangs. Return whether that was so."""
