@@ -27,19 +27,21 @@ _BEFORE_S = 10.0  # earlier braking is not examined
 _WALL_S = 60.0  # the search runs while the user waits for the confirmation of a crash
 _GUESS = 4.5  # m/s², if the deceleration is unknown; a wrong guess only costs more runs
 _STANDS = 0.1  # m/s
+_MAX_DECELERATION_MPS2 = 15.0  # more than the tyres of a road vehicle hold
 _AFTERWARDS_S = 5.0  # past the old end, so that a collision that only comes later is seen
 _AS_IT_CAN = "as hard as it can"
 _UNCLEAR = {
     "other": "another crash follows",
     "unclear": "the run ends before the outcome is clear",
     "diverged": "the run deviates before the braking",
+    "impossible": "the vehicle stops harder than any vehicle can",
 }
 
-Ending = Literal["avoided", "hit", "other", "unclear", "diverged"]
+Ending = Literal["avoided", "hit", "other", "unclear", "diverged", "impossible"]
 """The result of a run with overridden actions.
 
 In order: no crash, a crash of the same two actors, another crash, an unclear end, a run that deviated before the
-override."""
+override, no crash because the simulator stopped the vehicle harder than any vehicle can."""
 
 
 def partner(result: TrialResult) -> str:
@@ -166,9 +168,10 @@ class _Search:
         return "unclear"
 
     def _run(self, after: int) -> Ending:
-        result, recording = self.run(overruled_trial(self.result, self.recording, after, self.braking.deceleration))
-        found = ending_of(self.result, self.recording, after, result, recording)
-        if found != "diverged":
+        braking = self.braking.deceleration
+        result, recording = self.run(overruled_trial(self.result, self.recording, after, braking))
+        found = ending_of(self.result, self.recording, after, result, recording, deceleration=braking)
+        if found in ("avoided", "hit"):
             assert self.result.collision is not None
             self.decelerations.append(slowing(self.result.collision.agent, after, result, recording))
         return found
@@ -195,7 +198,13 @@ def overruled_trial(
 
 
 def ending_of(
-    result: TrialResult, recording: Recording, after: int, rerun: TrialResult, rerun_recording: Recording
+    result: TrialResult,
+    recording: Recording,
+    after: int,
+    rerun: TrialResult,
+    rerun_recording: Recording,
+    *,
+    deceleration: float | None = None,
 ) -> Ending:
     """Return what became of a collision in a run with its agent overruled after a step.
 
@@ -205,6 +214,7 @@ def ending_of(
         after: the step.
         rerun: what the run came to.
         rerun_recording: of the run.
+        deceleration: with which the vehicle can brake, in m/s²; None if it is unknown.
     """
     hit = result.collision
     assert hit is not None
@@ -217,7 +227,11 @@ def ending_of(
         return "other"
     if rerun.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
         return "unclear"
-    return "avoided" if _is_over(rerun_recording, hit.agent, partner(result)) else "unclear"
+    if not _is_over(rerun_recording, hit.agent, partner(result)):
+        return "unclear"
+    # SUMO stops a vehicle within one step at the end of a lane that does not lead on.
+    limit = max(_MAX_DECELERATION_MPS2, 1.01 * (deceleration or 0.0))
+    return "avoided" if slowing(hit.agent, after, rerun, rerun_recording) <= limit else "impossible"
 
 
 def _is_over(recording: Recording, agent: str, other: str) -> bool:

@@ -195,7 +195,7 @@ class Attempt:
         manoeuvre: as in `Overruled`.
         end: the step of the crash.
         endings: step to what became of it where the agent was overruled after that step.
-        deceleration: the greatest in those runs, in m/s²; None where it never slowed down.
+        deceleration: the greatest in the runs that avoided the crash, in m/s²; None where it never slowed down.
         changed: What else the agent does otherwise in the run from the last step that avoids the crash.
     """
 

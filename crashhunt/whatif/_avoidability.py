@@ -354,5 +354,6 @@ class _Trials:
         ending = ending_of(self.result, self.recorded, step, result, recording)
         agent = self.result.collision.agent
         changed = changes_of(self.recorded, recording, agent, self.lanes, step) if manoeuvre == "brake" else ()
-        deceleration = slowing(agent, step, result, recording)
+        # What the simulator did with the vehicle in a run that does not count is no deceleration of the vehicle.
+        deceleration = slowing(agent, step, result, recording) if ending == "avoided" else 0.0
         return Tried(step=step, ending=ending, deceleration=deceleration, changed=changed)

@@ -235,8 +235,15 @@ def test_the_partner_is_the_other_one():
 
 def test_who_brakes_better_than_was_said_is_looked_at_up_to_the_last_step():
     for gap in (60.0, 75.0, 90.0, 103.0):
-        world = World(gap, braking=60.0)
-        assert world.escape(said=1.5).step == world.truth() == world.crash()[0].steps - 1
+        world = World(gap, braking=14.0)
+        assert world.escape(said=1.5).step == world.truth()
+
+
+def test_run_that_stops_harder_than_any_vehicle_avoids_nothing():
+    """SUMO stops a vehicle within one step where its lane does not lead on."""
+    found = World(braking=60.0).escape(said=1.5)
+    assert found.step is None
+    assert "stops harder than any vehicle can" in found.why_not
 
 
 def test_how_long_it_is_run_and_how_hard_it_braked_by_hand():
