@@ -41,7 +41,7 @@ Ending = Literal["avoided", "hit", "other", "unclear", "diverged", "impossible"]
 """The result of a run with overridden actions.
 
 In order: no crash, a crash of the same two actors, another crash, an unclear end, a run that deviated before the
-override, no crash because the simulator stopped the vehicle harder than any vehicle can."""
+override. The last is no crash, but the simulator stopped the vehicle harder than any vehicle can."""
 
 
 def partner(result: TrialResult) -> str:
