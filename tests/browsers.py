@@ -68,8 +68,10 @@ class Page:
         return [entry["message"] for entry in self.browser.get_log("browser") if entry["level"] == "SEVERE"]
 
     def keys(self, *keys: str) -> None:
-        """Type keys where the focus is."""
-        self.browser.switch_to.active_element.send_keys(*keys)
+        """Type keys where the focus is; an element that was asked for could be replaced before the key arrives."""
+        from selenium.webdriver import ActionChains
+
+        ActionChains(self.browser).send_keys(*keys).perform()
 
     def tab_to(self, condition: str, most: int = 80) -> None:
         """Move the focus with the tabulator until an expression about `at`, where it is, is true."""
