@@ -50,7 +50,7 @@ class HuntCall(HuntOptions):
 
 @dataclass(frozen=True)
 class RunCall(HuntCall):
-    """What `run` takes: all that `prepare` does, and who watches.
+    """What `run` takes: everything that `prepare` takes, and the observers.
 
     Args:
         directory: where everything is kept; made where it does not exist. The same hunt there resumes.
@@ -72,7 +72,7 @@ def prepare(asked: HuntCall) -> Hunt:
     """Return a hunt that is ready to run.
 
     Raises:
-        CrashhuntError: with what is wrong.
+        CrashhuntError: the input is invalid; the message says why.
     """
     return _prepared(asked)
 
@@ -105,10 +105,10 @@ def _prepared(asked: HuntCall) -> Hunt:
 
 @called_with(RunCall, documents=hunt_options())
 def run(asked: RunCall) -> HuntReport:
-    """Hunt for a crash, as ``crashhunt run`` does, and return what came of it.
+    """Hunt for a crash, as ``crashhunt run`` does, and return the result.
 
     Raises:
-        CrashhuntError: with what is wrong.
+        CrashhuntError: the input is invalid; the message says why.
     """
     return _prepared(asked).run(asked.watch)
 
@@ -131,7 +131,7 @@ def replay(
     Args:
         crash: the directory of a hunt or of one crash, or a crash of what `load` has returned.
         crash_id: which of a hunt; the one with the fewest steps by default.
-        code: who drives: the code of the ``snapshot``, the ``current`` code, or the actions of the ``log``.
+        code: which code drives: that of the ``snapshot``, the ``current`` code, or the actions of the ``log``.
         changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value.
         times: how often.
         force: replay even from a snapshot that is damaged.
@@ -189,13 +189,13 @@ def what_if(
         from_step: how many steps stay as they were recorded.
         before_s: the same, in s of simulation time before the crash.
         agent: ``module:Name`` of an agent that takes over after that step.
-        arguments: of that agent.
+        arguments: arguments of that agent.
         futures: give the simulator's random generators another seed after that step, a different one in each run.
         overrule: ``brake``, ``left``, ``right``, ``keep_lane``, ``keep_speed``, ``reference_speed``,
             ``reference_lanes`` or ``reference``, after that step.
         leave_out: ids of actors that do not take part.
         interventions: further ones, of `crashhunt.whatif`.
-        code: who drives: the code of the ``snapshot``, or the ``current`` code, which is the default with ``agent``.
+        code: which code drives: that of the ``snapshot``, or the ``current`` code, which is the default with ``agent``.
         times: how many runs; 0 for 50 with ``futures``, else 1.
         parallel: how many at a time; 0 for one per core.
         time_s: the most wall time for all of them, in s.

@@ -1,9 +1,10 @@
 """How well crash types agree with planted bugs: by signature, and divided by cause. Run it as ``scripts/causes``.
 
-Agents with two or three planted bugs are hunted. The label of a crash is the bug without which the same trial has no
-crash with the same two actors until 5 s after it; of several such bugs, the one that acted last. A crash without such a
-bug is not labelled, and does not count. Crashes that need a single bug are also compared on their own. The
-adjusted Rand index (Hubert and Arabie 1985) compares labels with types: 1 is equal, 0 chance.
+Agents with two or three planted bugs are hunted. The label of a crash is the set of bugs without each of which the same
+trial has no crash with the same two actors until 5 s after it. A crash with an empty set does not count. The adjusted
+Rand index (Hubert and Arabie 1985) compares types with the labels of the crashes that need a single bug: 1 is equal, 0
+chance. A crash that needs several bugs has no single label: removing either one is a fix. Its cause is consistent if it
+is also the cause of crashes that need one of these bugs alone, and of no crash that needs another bug alone.
 
     scripts/causes --folder DIR [--trials N] [--judge N] [SCENARIO:BUGS…]     goes on where it was
 """
@@ -13,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -43,7 +43,6 @@ AGENTS = (
 )  # fmt: skip
 _AFTER_S = 5.0
 _KEEP = 3
-_PLANTED = re.compile(r"PLANTED (\w+) (\d+)")
 
 
 def adjusted_rand_index(labels: Sequence[object], found: Sequence[object]) -> float:
@@ -63,14 +62,15 @@ def main() -> int:
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--trials", type=int, default=30)
     parser.add_argument("--steps", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--judge", type=int, default=8)
     given = parser.parse_args()
     given.folder = given.folder.resolve()
     given.folder.mkdir(parents=True, exist_ok=True)
     shutil.copy(Path(__file__).with_name("planted_bugs.py"), given.folder)
-    print("| scenario | bugs | crashes | labels | types | by cause | ARI types | ARI by cause | ARI causes alone | "
-          "of crashes that need one bug | hidden by --keep 3 |")  # fmt: skip
-    print(f"{'| --- ' * 11}|", flush=True)
+    print("| scenario | bugs | crashes | need one bug | of bugs | ARI types | ARI types and causes | "
+          "ARI causes alone | need several | consistent | contradictory | hidden by --keep 3 |")  # fmt: skip
+    print(f"{'| --- ' * 12}|", flush=True)
     chosen = [tuple(one.split(":", 1)) for one in given.only] or AGENTS
     for scenario, bugs in chosen:
         store = given.folder / f"{scenario}-{bugs}.json"
@@ -85,7 +85,8 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
     if not (hunt / "ledger.sqlite").is_file():
         command = [sys.executable, "-m", "crashhunt", "run", str(hunt), str(len(os.sched_getaffinity(0)))]
         command += [str(given.trials), str(given.steps), "--scenario", scenario, "--agent", "planted_bugs:Planted"]
-        command += ["--arg", f"bugs={bugs}", "--arg", "desired_speed=18:28", "--seed", "7", "--keep-going"]
+        command += ["--arg", f"bugs={bugs}", "--arg", "desired_speed=18:28", "--seed", str(given.seed)]
+        command += ["--keep-going"]
         command += ["--action", "continuous"] if scenario == "motorway" else []
         subprocess.run(command, check=True, capture_output=True, cwd=given.folder)
     rows = []
@@ -95,8 +96,7 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
             rows += [
                 {
                     "crash": bundle.id,
-                    "label": labels[bundle.id][0],
-                    "needs": labels[bundle.id][1],
+                    "needs": labels[bundle.id],
                     "type": str(group.signature),
                     "cause": str(part.cause),
                     "judged": bundle in part.judged,
@@ -107,9 +107,9 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
     return {"scenario": scenario, "bugs": bugs, "rows": rows}
 
 
-def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, tuple[str, int]]:
-    """Return the bug behind each crash and how many bugs it needs, by runs of its trial without one bug at a time."""
-    found: dict[str, tuple[str, int]] = {bundle.id: ("", 0) for bundle in bundles}
+def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, list[str]]:
+    """Return the bugs that each crash needs, by runs of its trial without one bug at a time."""
+    found: dict[str, list[str]] = {bundle.id: [] for bundle in bundles}
     if not bundles:
         return found
     reruns = [prepare(bundle, ReplayOptions(trusted=True)) for bundle in bundles]
@@ -120,18 +120,13 @@ def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, tuple[s
         for bug in bugs:
             given = {**rerun.spec.arguments["ego"], "bugs": "+".join(name for name in bugs if name != bug)}
             specs.append(replace(rerun.spec, arguments={"ego": given}, max_steps=longer))
-    needed: dict[str, list[str]] = {}
     with TemporaryDirectory(prefix="crashhunt-causes-") as scratch:
         runs = Reruns(reruns[0], Path(scratch), parallel=2, stopped=lambda: False)
         for ended in runs.run(specs, recorded=False):
             bundle, bug = asked[ended.place]
             if not _is_same(ended.result, bundle.result):
-                needed.setdefault(bundle.id, []).append(bug)
+                found[bundle.id].append(bug)
         runs.close()
-    for bundle in bundles:
-        acted = {name: int(step) for name, step in _PLANTED.findall((bundle.path / "run.log").read_text())}
-        those = needed.get(bundle.id, [])
-        found[bundle.id] = max(those, key=lambda name: acted.get(name, 0), default=""), len(those)
     return found
 
 
@@ -149,25 +144,29 @@ def _is_same(rerun: TrialResult, result: TrialResult) -> bool:
 
 
 def _line(study: dict[str, Any]) -> str:
-    rows = [row for row in study["rows"] if row["label"]]
-    labels = [row["label"] for row in rows]
-    types, causes = [row["type"] for row in rows], [(row["type"], row["cause"]) for row in rows]
-    merged = [row["cause"] for row in rows]
-    single = [row for row in rows if row["needs"] == 1]
-    alone = adjusted_rand_index([row["label"] for row in single], [row["cause"] for row in single])
-    hidden = [", ".join(sorted({*labels} - _kept(rows, key))) or "none" for key in ("type", "cause")]
+    rows = [row for row in study["rows"] if row["needs"]]
+    single = [row for row in rows if len(row["needs"]) == 1]
+    labels = [row["needs"][0] for row in single]
+    types, causes = [row["type"] for row in single], [(row["type"], row["cause"]) for row in single]
+    merged = [row["cause"] for row in single]
+    of_cause: dict[str, set[str]] = {}
+    for row in single:
+        of_cause.setdefault(row["cause"], set()).add(row["needs"][0])
+    several = [(of_cause.get(row["cause"], set()), {*row["needs"]}) for row in rows if len(row["needs"]) > 1]
+    consistent = sum(bool(bugs) and bugs <= needs for bugs, needs in several)
+    contradictory = sum(not bugs <= needs for bugs, needs in several)
     indices = [f"{adjusted_rand_index(labels, found):.2f}" for found in (types, causes, merged)]
-    counts = [len(study["rows"]), *(len({*found}) for found in (labels, types, causes))]
-    cells = [study["scenario"], study["bugs"], *counts, *indices, f"{alone:.2f} ({len(single)})"]
-    return f"| {' | '.join(map(str, cells))} | {hidden[0]}; by cause {hidden[1]} |"
+    hidden = [", ".join(sorted({*labels} - _kept(rows, key))) or "none" for key in ("type", "cause")]
+    cells = [study["scenario"], study["bugs"], len(study["rows"]), len(single), len({*labels}), *indices, len(several)]
+    return f"| {' | '.join(map(str, [*cells, consistent, contradictory]))} | {hidden[0]}; by cause {hidden[1]} |"
 
 
 def _kept(rows: list[dict[str, Any]], key: str) -> set[str]:
-    """Return the labels of the crashes that are kept: the shortest few of each type, or of each type and cause."""
+    """Return the bugs of the crashes that are kept: the shortest few of each type, or of each type and cause."""
     kept: set[str] = set()
     for name in {(row["type"], row[key]) for row in rows}:
         those = sorted((row for row in rows if (row["type"], row[key]) == name), key=lambda row: row["steps"])
-        kept |= {row["label"] for row in those[:_KEEP]}
+        kept |= {bug for row in those[:_KEEP] for bug in row["needs"]}
     return kept
 
 

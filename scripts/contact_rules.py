@@ -113,8 +113,8 @@ def contradictions(
 def _against_manner(
     manner: str, turn: float, hit: Collision, collider: Party, victim: Party, jumped: bool
 ) -> Iterator[str]:
-    if is_person(hit.agent) or is_person(hit.other):
-        return
+    if not manner or is_person(hit.agent) or is_person(hit.other):
+        return  # the outlines contradict the simulator's report, and the type says nothing
     low, high = {"head-on": (135, 180), "rear end": (0, 45), "side swipe": (0, 45)}.get(manner, (45, 135))
     if not math.radians(low) - _ANGLE <= turn <= math.radians(high) + _ANGLE:
         yield f"{manner.split(' from')[0]} at an angle of another type"
@@ -318,6 +318,8 @@ def compare(folder: Path, *, again: bool = False, every: int = 1) -> int:
             manners[signature.manner] += 1
             verdicts[fault.verdict] += 1
             roles[hit.role] += 1
+            if record.is_disputed and (signature.manner or fault.findings):
+                wrong["the outlines contradict the report, and there is a type or a fault"] += 1
             if fault.verdict == "nobody can tell" and signature.manner == "rear end":
                 silent[f"{step} s, {'first' if record.touch.share < 0.5 else 'second'} half"] += 1
             elif signature.manner == "rear end":

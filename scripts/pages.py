@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parents[1]
 GUIDE = Path("crashhunt/guide")
-MAX_WORDS = {"start": 900, "tutorials": 900, "howto": 600}  # by folder: a page answers one question
+MAX_WORDS = {"start": 900, "tutorials": 900, "howto": 600, "concepts": 600}  # by folder: a page answers one question
 MAX_README_LINES = 150
 OVER: dict[str, int] = {}
 SPELLED = ("README.md", "CITATION.cff", "crashhunt", "scenarios", "scripts", ".github")

@@ -1,4 +1,4 @@
-"""A lane-changing agent with planted bugs; it prints each step in which a bug changed its action, which labels a crash.
+"""A lane-changing agent with planted bugs; it prints each step in which a bug changed its action.
 
 Without a bug it follows by the Intelligent Driver Model, and changes lanes every few seconds into generous gaps.
 """

@@ -6,6 +6,7 @@ Where a digest differs, the first different step and field are printed. A hunt t
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import subprocess
 import sys
@@ -32,6 +33,7 @@ def main() -> bool:
     parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help=".sumocfg file, or folder with such files")
     parser.add_argument("--trials", type=int, default=12, help="trials per configuration (default: 12)")
     parser.add_argument("--seconds", type=float, default=60.0, help="of simulation per trial (default: 60)")
+    parser.add_argument("--step-lengths", nargs="+", type=float, metavar="S", help="in s, each with its own hunt")
     parser.add_argument("--out", type=Path, default=Path("reruns"), help="folder for the hunts (default: reruns)")
     parser.add_argument(
         "--permute", action="store_true", help="run again with another order of addresses in each trial"
@@ -42,10 +44,13 @@ def main() -> bool:
     failed = False
     print("| configuration | step length, s | outcomes | run again | different |\n| --- | --- | --- | --- | --- |")
     configs = {file for path in given.paths for file in ([path] if path.is_file() else path.rglob("*.sumocfg"))}
-    for config in sorted(configs):
+    for config, wanted_s in itertools.product(sorted(configs), given.step_lengths or [None]):
+        hunt = given.out / f"{config.parent.name}-{config.stem}"
+        if wanted_s is not None:
+            hunt = hunt.with_name(f"{hunt.name}-{wanted_s:g}s")
+            config = _write_configuration(config, wanted_s, hunt.with_name(f"{hunt.name}.sumocfg"))
         found = ET.parse(config).find(".//step-length")
         step_length_s = float(found.get("value", "1")) if found is not None else 1.0
-        hunt = given.out / f"{config.parent.name}-{config.stem}"
         command = [sys.executable, "-m", "crashhunt", "run", str(hunt), "1", str(given.trials)]
         command += [str(round(given.seconds / step_length_s)), "--scenario", str(config), "--seed", "1", "--keep-going"]
         done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
@@ -60,6 +65,21 @@ def main() -> bool:
         print("\n".join((row, *different)), flush=True)
         failed |= bool(different)
     return failed
+
+
+def _write_configuration(config: Path, step_length_s: float, to: Path) -> Path:
+    """Write a copy of a configuration that has another step length and absolute paths; return its path."""
+    tree = ET.parse(config)
+    for element in tree.iter():
+        files = [config.parent.resolve() / name.strip() for name in element.get("value", "").split(",")]
+        if all(file.is_file() for file in files):
+            element.set("value", ",".join(map(str, files)))
+    for parent in tree.iter():
+        for element in parent.findall("step-length"):
+            parent.remove(element)
+    ET.SubElement(ET.SubElement(tree.getroot(), "time"), "step-length", value=f"{step_length_s:g}")
+    tree.write(to)
+    return to
 
 
 def _run_again(hunt: Path, *, permute: bool) -> tuple[Counter[str], int, list[str]]:

@@ -24,7 +24,7 @@ from typing import IO, TYPE_CHECKING, Any, NoReturn
 from warm import OF_THE_GROUP, Process, Warm, ask, at_start, leave_after, path_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Container, Mapping, Sequence
 
 CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 # What `run` and `replay` import; the rest of a command's modules is imported by its fork.
@@ -73,13 +73,13 @@ class Commands:
 
     def begin(
         self, words: Sequence[str], folder: Path, environment: Mapping[str, str], *, terminal: int | None = None,
-        start_new_session: bool = False, typed: str = "",
+        streams: Container[int] = (2,), start_new_session: bool = False, typed: str = "",
     ) -> Begun:  # fmt: skip
-        """Begin a command; its standard error is the terminal, where one is given, and then not returned."""
+        """Begin a command; these of its streams are the terminal, where one is given, and then not returned."""
         request = {
             "words": words, "folder": str(folder), "environment": dict(environment), "apart": start_new_session,
         }  # fmt: skip
-        return Begun(self._control, request, terminal, typed)
+        return Begun(self._control, request, terminal, typed, streams)
 
     def run(
         self,
@@ -89,13 +89,14 @@ class Commands:
         timeout_s: float,
         *,
         terminal: int | None = None,
+        streams: Container[int] = (2,),
     ) -> tuple[int, str, str]:
         """Run a command to its end; return its exit code, or minus its signal, and what it has printed.
 
         Raises:
             subprocess.TimeoutExpired: it took too long, and was killed.
         """
-        begun = self.begin(words, folder, environment, terminal=terminal)
+        begun = self.begin(words, folder, environment, terminal=terminal, streams=streams)
         try:
             return begun.wait(timeout_s), *begun.communicate()
         except BaseException:
@@ -119,7 +120,12 @@ class Begun(Process):
     """A command that has begun."""
 
     def __init__(
-        self, control: socket.socket, request: Mapping[str, Any], terminal: int | None = None, typed: str = ""
+        self,
+        control: socket.socket,
+        request: Mapping[str, Any],
+        terminal: int | None = None,
+        typed: str = "",
+        streams: Container[int] = (2,),
     ) -> None:
         self._files = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - closed when they are read
         self._printed: tuple[str, str] | None = None
@@ -128,8 +134,9 @@ class Begun(Process):
         with theirs, tempfile.TemporaryFile() as file:
             file.write(typed.encode())
             file.seek(0)
-            files = [theirs.fileno(), file.fileno(), out, terminal or err]
-            ask(control, request, files, reply)
+            usual = enumerate((file.fileno(), out, err))
+            files = [terminal if terminal and number in streams else one for number, one in usual]
+            ask(control, request, [theirs.fileno(), *files], reply)
         super().__init__(["crashhunt", *request["words"]], reply)
 
     def communicate(self, timeout: float | None = None) -> tuple[str, str]:

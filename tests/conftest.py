@@ -28,6 +28,7 @@ from commands import CRASHHUNT, Begun, Commands
 
 from crashhunt.base.integrity import describe_files, digest_of_data
 from crashhunt.native import _core
+from crashhunt.snapshots import _take
 from crashhunt.snapshots._snapshot import code_of_manifest
 
 if TYPE_CHECKING:
@@ -73,12 +74,18 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
     if signal.getsignal(number) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
         signal.signal(number, handler)
 
+
 # A loaded machine takes longer than Hypothesis' 200 ms now and then, and nothing is wrong.
 # The examples are others at every run, so that many runs see what few examples do not; but what CI says of a change is
 # about that change, and must not depend on luck.
+def examples(count: int) -> int:
+    """Return how many examples a property is tried with: so many at night, and two of five of them by day."""
+    return count if os.environ.get("CRASHHUNT_TEST_EXAMPLES") == "all" else count * 2 // 5
+
+
 hypothesis.settings.register_profile(
     "crashhunt",
-    max_examples=50,
+    max_examples=examples(50),
     deadline=None,
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
     derandomize=bool(os.environ.get("CI")),
@@ -87,6 +94,7 @@ hypothesis.settings.load_profile("crashhunt")
 
 _TIMEOUT_S = 400.0
 collect_ignore = ["e2e/frozen"]  # in which a case of a corpus is a test to whoever has crashhunt's plugin
+_REPOSITORY = f"{Path(__file__).parents[1]}{os.sep}"
 FAULTY = Path(__file__).parent / "e2e" / "faulty.py"
 
 
@@ -117,16 +125,19 @@ class Shell:
         """The environment without what measures coverage, where that would be in the way of what is tested."""
         return {name: value for name, value in self.environment.items() if not name.startswith("COVERAGE")}
 
-    def crashhunt(self, *words: str, expect: int | None = 0, terminal: int | None = None) -> Done:
+    def crashhunt(
+        self, *words: str, expect: int | None = 0, terminal: int | None = None, streams: Container[int] = (2,)
+    ) -> Done:
         """Run a command to its end: in a fork of a process that has imported what it needs, where that is the same.
 
-        Standard error goes to the terminal, where one is given by its descriptor.
+        Standard error goes to the terminal, where one is given by its descriptor; ``streams`` names others instead.
         """
         commands = _commands()
         if not commands.fits(self.environment):
             assert terminal is None, "cannot be a fork"
             return self.process(*words, expect=expect)
-        done = Done(*commands.run(words, self.folder, self.environment, _TIMEOUT_S, terminal=terminal))
+        ended = commands.run(words, self.folder, self.environment, _TIMEOUT_S, terminal=terminal, streams=streams)
+        done = Done(*ended)
         return _ended(words, done, expect)
 
     def process(self, *words: str, expect: int | None = 0) -> Done:
@@ -195,16 +206,25 @@ def _commands_end() -> Iterator[None]:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with what takes longest, in every worker of pytest-xdist: else one of them is alone with it in the end."""
+    """Begin with what takes longest, in every worker of pytest-xdist: else one of them is alone with it in the end.
+
+    All tests in a browser go to the first worker, since a browser takes seconds to start.
+    """
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    long, others = ([item for item in items if (item.get_closest_marker("long") is None) == short] for short in (0, 1))
+    browser, long, others = ([item for item in items if _group(item) == group] for group in ("browser", "long", ""))
     each = len(items) // workers  # which is how they are handed out at first
-    items.clear()
+    items[:] = browser
     for worker in range(workers):
         items += long[worker::workers]
         rest = each * (worker + 1) - len(items) if worker + 1 < workers else len(others)
         items += others[: max(rest, 0)]
         del others[: max(rest, 0)]
+
+
+def _group(item: pytest.Item) -> str:
+    if "chromium" in getattr(item, "fixturenames", ()):
+        return "browser"
+    return "long" if item.get_closest_marker("long") else ""
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -238,6 +258,17 @@ def _modules_of_its_own() -> Iterator[None]:
     for name in sys.modules.keys() - modules:
         if (getattr(sys.modules[name], "__file__", None) or "").startswith(tempfile.gettempdir() + os.sep):
             del sys.modules[name]
+
+
+@pytest.fixture(autouse=True)
+def _no_tests_in_snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep test modules, and with them the whole repository, out of the snapshots of hunts in this process."""
+    modules = _take._top_level_modules
+    monkeypatch.setattr(_take, "_top_level_modules", lambda: {name for name in modules() if not _is_ours(name)})
+
+
+def _is_ours(name: str) -> bool:
+    return (getattr(sys.modules.get(name), "__file__", None) or "").startswith(_REPOSITORY)
 
 
 @pytest.fixture(autouse=True)

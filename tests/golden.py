@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from crashhunt.base.integrity import digest_of_data
+from crashhunt.snapshots import environment
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "golden"
@@ -93,11 +94,13 @@ def need_versions(name: str, *packages: str) -> dict[str, str]:
     """Return the versions behind a golden file of trials; skip the test where the installed ones are others.
 
     Another SUMO, highway-env or numpy may compute other traffic: then the digests of the file say nothing. So may
-    another kind of processor, because numpy's sines, which highway-env uses, round differently on some of them.
+    another kind of processor, because numpy's sines, which highway-env uses, round differently on some of them, also
+    where the extensions are the same.
     """
     found = {package: version(package) for package in packages} | {"machine": platform.machine()}
     if Path(name).stem in _ROUNDED_BY_PROCESSOR:
         found["simd"] = np.show_config(mode="dicts")["SIMD Extensions"]["found"][-1]
+        found["processor"] = environment()["cpu"]
     path = GOLDEN / name
     if not WRITE and path.exists():
         expected = json.loads(path.read_text(encoding="utf-8"))["versions"]

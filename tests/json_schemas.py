@@ -16,9 +16,8 @@ FOLDER = Path(crashhunt.__file__).parent / "guide" / "reference" / "schemas"
 
 @functools.cache
 def validator(name: str) -> Any:
-    """The validator of a schema file; None where a command has none."""
-    file = FOLDER / f"{name}.json"
-    return jsonschema.Draft202012Validator(json.loads(file.read_text())) if file.exists() else None
+    """The validator of a schema file."""
+    return jsonschema.Draft202012Validator(json.loads((FOLDER / f"{name}.json").read_text()))
 
 
 def schema_of(words: tuple[str, ...]) -> str:
@@ -32,6 +31,5 @@ def check_output(words: tuple[str, ...], out: str) -> None:
         return
     found = json.loads(out)
     checks = validator("error" if "error" in found else schema_of(words))
-    if checks is not None:
-        problems = [f"{error.json_path}: {error.message[:200]}" for error in checks.iter_errors(found)]
-        assert not problems, f"{words}: {problems}"
+    problems = [f"{error.json_path}: {error.message[:200]}" for error in checks.iter_errors(found)]
+    assert not problems, f"{words}: {problems}"

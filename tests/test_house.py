@@ -55,7 +55,7 @@ def test_nothing_private_is_imported_from_outside_its_package():
 
 
 # What other libraries have in one version and not in another, or in one of their classes.
-_OTHERS = ("recording/_mcap.py", "accelerator/", "simulators/highway/")
+_OTHERS = ("recording/_foxglove.py", "accelerator/", "simulators/highway/")
 
 
 def asked_by_name(file: Path) -> list[str]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 from functools import cache
+from itertools import product
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -24,7 +25,7 @@ __all__ = ["CompiledNetwork", "Snapshot", "Traffic", "kernel", "why_not"]
 
 
 _MODULE = "_crashhunt_highway"
-_INTERFACE = 2
+_INTERFACE = 3
 
 
 class Traffic(Protocol):
@@ -44,6 +45,19 @@ class Traffic(Protocol):
 
     def collide(self, dt: float, /) -> None:
         """Do what `Road.step` does after the movement: check all pairs for collisions."""
+
+    def conflicts(self, predicted: dict[int, bytes], /) -> list[tuple[int, int, bool]] | None:
+        """Return the pairs of `RegulatedRoad.is_conflict_possible`, each with whether that is certain.
+
+        Args:
+            predicted: The paths of vehicles that the kernel cannot predict, by row.
+
+        Returns:
+            None if highway-env must decide.
+        """
+
+    def fill_times(self, *given: object) -> None:
+        """Fill the grid of `compute_ttc_grid`."""
 
     def completed(self) -> int:
         """Return the number of complete sub-steps of the last `run`, which may have raised an error."""
@@ -92,17 +106,18 @@ def _found() -> tuple[_Module | None, str]:
     functions = [np.sin, np.cos, np.tan, np.arcsin, np.arctan, np.arctan2, np.power]
     if not all(type(function) is np.ufunc for function in functions):
         return None, "a function of NumPy has been replaced"
-    # NumPy's BLAS rounds a scalar product once or twice, and NumPy squares or raises to the power of 2: find out.
+    # NumPy's BLAS rounds a product of vectors or of matrices once or twice, and NumPy squares or raises to the power
+    # of 2: find out.
+    objects = (np.float64, np.int64, np.float32, np.ndarray, np.zeros, _slide)
     wrong = ""
-    for fused in (False, True):
-        for step in (0, 8):
-            try:
-                module.bind(np.float64, np.int64, np.ndarray, np.zeros, _slide, functions, fused, step)
-            except OSError as error:
-                return None, str(error)
-            wrong = _differs(module)
-            if not wrong:
-                return module, ""
+    for fused, product_fused, step in product((True, False), (True, False), (0, 8)):
+        try:
+            module.bind(*objects, functions, fused, product_fused, step)
+        except OSError as error:
+            return None, str(error)
+        wrong = _differs(module)
+        if not wrong:
+            return module, ""
     return None, f"on this processor, it computes {wrong} otherwise than NumPy"
 
 
@@ -126,13 +141,14 @@ def why_not() -> str:
 
 
 def _differs(module: _Module) -> str:
-    """Return the name of a function whose result has other bits than NumPy's; empty if there is none."""
+    """Return the name of a function whose result is not bit-identical to NumPy's; empty if there is none."""
     rng = np.random.default_rng(1)
     count = 600  # where two ways of rounding differ at all, they do so for about one number in twenty
     numbers = (rng.normal(size=count) * 10.0 ** rng.integers(-9, 4, count)).tolist()
     others = (rng.normal(size=count) * 10.0 ** rng.integers(-9, 4, count)).tolist()
     inside = np.clip(numbers, -1, 1).tolist()
     positive = [abs(x) for x in numbers]
+    fours = list(zip(numbers, others, reversed(numbers), rng.permutation(others).tolist(), strict=True))
     checks: list[_Check] = [
         ("sin", np.sin, [(x,) for x in numbers]),
         ("cos", np.cos, [(x,) for x in numbers]),
@@ -147,12 +163,14 @@ def _differs(module: _Module) -> str:
         (
             "dot",
             lambda a, b, c, d: np.dot(np.array([a, b]), np.array([c, d])),
-            list(zip(numbers, others, reversed(numbers), rng.permutation(others).tolist(), strict=True)),
+            fours,
         ),
     ]
     triples = [tuple(row) for row in rng.permutation(numbers * 6).reshape(-1, 6).tolist()]
     checks += [
         ("dot3", lambda a, b, c, *others: np.dot([a, b, c], np.array(others)), triples),
+        ("product", lambda a, b, c, d: (np.array([[a, b], [-b, a]]) @ np.full((4, 2), (c, d)).T)[0, 1], fours),
+        ("product", lambda a, b, c, d: (np.array([[-b, a], [a, b]]) @ np.full((4, 2), (c, d)).T)[1, 2], fours),
         ("square", lambda x: x**2, [(x,) for x in numbers]),
         ("square", lambda x: np.float64(x) ** 2, [(x,) for x in numbers]),
     ]

@@ -15,6 +15,9 @@ from crashhunt.accelerator._frames import are_plain
 from crashhunt.accelerator._versions import are_numbers, kind_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from highway_env.envs.common.abstract import AbstractEnv
     from highway_env.envs.common.observation import (
         ExitObservation,
         KinematicObservation,
@@ -22,20 +25,25 @@ if TYPE_CHECKING:
         OccupancyGridObservation,
     )
     from highway_env.road.road import Road
+    from highway_env.vehicle.controller import MDPVehicle
     from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
 
     from crashhunt.accelerator._frames import Frame
     from crashhunt.accelerator._network import Network
+    from crashhunt.accelerator._roads import State
 
 
-__all__ = ["close_objects", "fill_lanes", "observe", "observe_exit", "observe_goal", "observe_grid"]
+__all__ = ["close_objects", "fill_lanes", "fill_times", "observe", "observe_exit", "observe_goal", "observe_grid"]
 
 
-_KNOWN = frozenset(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))
-_ALL = sorted(_KNOWN)
-_ALL_OF_FRAMES = frozenset(("cos_d", "sin_d", "long_off", "lat_off", "ang_off"))  # columns that are not computed here
-_OF_OBJECTS = _KNOWN - {"heading"}
+_BASIC = frozenset(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))
+_OF_LANES = ("long_off", "lat_off", "ang_off")
+_OF_DESTINATIONS = ("cos_d", "sin_d")
+_LATE = frozenset((*_OF_LANES, *_OF_DESTINATIONS))  # highway-env's own code computes them, if they are shown
+_KNOWN = _BASIC | _LATE
+_ALL = sorted(_BASIC)
+_OF_OBJECTS = _BASIC - {"heading"}
 
 
 def close_objects(
@@ -123,13 +131,16 @@ def _show(
     close = close[-kinematic.vehicles_count + 1 :]
     if not all(_is_plain(thing, features) and _arrives(thing, frame.network) for thing in (vehicle, *close)):
         return None
-    own = _values(vehicle)
+    late = _LATE.intersection(features)
+    own = _values(vehicle, late)
     rows = [own | replaced]
     for thing in close:
-        values = _values(thing)
+        values = _values(thing, late)
         if not kinematic.absolute:
             for name in ("x", "y", "vx", "vy"):
                 values[name] -= own[name]
+        if not kinematic.observe_intentions:
+            values |= dict.fromkeys(_OF_DESTINATIONS, 0.0)
         rows.append(values)
     shown = np.zeros((max(len(rows), kinematic.vehicles_count), len(features)))
     for column, name in enumerate(features):
@@ -145,7 +156,7 @@ def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.f
     """Return the result of `KinematicsGoalObservation.observe`; None if highway-env's own code must run."""
     vehicle, features = kinematic.observer_vehicle, kinematic.features
     goal = getattr(vehicle, "goal", None)
-    if vehicle is None or goal is None or type(features) is not list or not _KNOWN.issuperset(features):
+    if vehicle is None or goal is None or type(features) is not list or not _BASIC.issuperset(features):
         return None
     things = [vehicle, goal]
     if not are_plain(things) or not all(_is_plain(thing, features) for thing in things):
@@ -167,7 +178,7 @@ def observe_grid(grid: OccupancyGridObservation, frame: Frame | None) -> NDArray
     """
     observer, features = grid.observer_vehicle, grid.features
     shown = [name for name in features if name != "on_road"] if type(features) is list else None
-    if frame is None or grid.absolute or shown is None or not _KNOWN.issuperset(shown):
+    if frame is None or grid.absolute or shown is None or not _BASIC.issuperset(shown):
         return None
     vehicles = grid.env.road.vehicles
     if observer is None or not vehicles or type(observer.position) is not np.ndarray:
@@ -182,7 +193,7 @@ def observe_grid(grid: OccupancyGridObservation, frame: Frame | None) -> NDArray
         "vx": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
         "vy": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
     }
-    if type(ranges) is not dict or not _ALL_OF_FRAMES.isdisjoint(ranges):
+    if type(ranges) is not dict or not _LATE.isdisjoint(ranges):
         return None
     for name, limits in ranges.items():
         if name in columns:
@@ -251,6 +262,43 @@ def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, rea
     return True
 
 
+def fill_times(
+    env: AbstractEnv, state: State, vehicle: MDPVehicle, quantum: float, horizon: float
+) -> NDArray[np.float64] | None:
+    """Return the result of `compute_ttc_grid`; None if highway-env's own code must run.
+
+    Args:
+        env: The environment.
+        state: The current state of its road.
+        vehicle: The observer.
+        quantum: The time between two cells, in s.
+        horizon: The time of the last cell, in s.
+    """
+    network, things = state.owner.network, env.road.vehicles
+    kind, speeds = kind_of(type(vehicle)), getattr(vehicle, "target_speeds", None)
+    row = next((row for row, thing in enumerate(things) if thing is vehicle), None)
+    if row is None or not kind.is_of(vehicle) or not kind.chooses or type(speeds) is not np.ndarray:
+        return None
+    if speeds.ndim != 1 or speeds.dtype.kind not in "fi" or not np.isfinite(speeds).all():
+        return None
+    count = len(env.road.network.all_side_lanes(env.vehicle.lane_index))
+    own = len(env.road.network.all_side_lanes(vehicle.lane_index))
+    relations = bytearray(len(network.keys))
+    try:
+        for key in {thing.lane_index for thing in things}:
+            if env.road.network.is_connected_road(vehicle.lane_index, key, route=vehicle.route, depth=3):
+                relations[network.index[key]] = 1 if len(env.road.network.all_side_lanes(key)) == own else 2
+    except LookupError:  # highway-env may not get as far as an error in the route
+        return None
+    grid = np.zeros((speeds.size, count, int(horizon / quantum)))
+    lanes, times = grid.shape[1:]
+    try:
+        state.traffic.fill_times(grid, lanes, times, quantum, row, speeds.astype(float).tobytes(), bytes(relations))
+    except ValueError:  # an observer on a wider road than the agent
+        return None
+    return grid
+
+
 def _as_tuple(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
 
@@ -279,12 +327,17 @@ def _is_plain(thing: RoadObject, features: list[str]) -> bool:
     return isinstance(thing, Vehicle) or _OF_OBJECTS.issuperset(features)
 
 
-def _values(thing: RoadObject) -> dict[str, float]:
-    """Return the part of highway-env's `to_dict` that observations use."""
+def _values(thing: RoadObject, late: Iterable[str] = ()) -> dict[str, float]:
+    """Return the part of highway-env's `to_dict` that observations use.
+
+    Args:
+        thing: A vehicle or an object.
+        late: The features of its lane and its destination that are shown.
+    """
     x, y = thing.position.tolist()
     c, s = float(np.cos(thing.heading)), float(np.sin(thing.heading))
     vx, vy = (float(thing.speed) * c, float(thing.speed) * s) if isinstance(thing, Vehicle) else (0.0, 0.0)
-    return {
+    values = {
         "presence": 1.0,
         "x": x,
         "y": y,
@@ -294,6 +347,10 @@ def _values(thing: RoadObject) -> dict[str, float]:
         "cos_h": c,
         "sin_h": s,
     }
+    if late:
+        values |= zip(_OF_LANES, thing.lane_offset.tolist(), strict=True)
+        values |= zip(_OF_DESTINATIONS, thing.destination_direction.tolist(), strict=True)
+    return values
 
 
 def _normalize(kinematic: KinematicObservation, shown: NDArray[np.float64], rows: int) -> None:

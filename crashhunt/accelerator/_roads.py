@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Prepared",
+    "State",
     "forget",
     "frame_of",
     "is_known",
@@ -52,7 +53,7 @@ class Prepared:
         self.frame: Frame | None = None
         self.alone = False
         self._roster: Roster | None = None
-        self._traffic: Traffic | None = None
+        self._kept: State | None = None
 
     def roster(self) -> Roster | None:
         """Return all vehicles in the kernel, with their current state; None if the kernel does not know them."""
@@ -66,32 +67,41 @@ class Prepared:
         traffic = self._roster.traffic
         return self._roster if traffic is not None and traffic.read() else None
 
-    def keep(self, traffic: Traffic) -> None:
+    def keep(self, state: State) -> None:
         """Keep the state of all vehicles in the kernel until foreign code runs."""
-        self._traffic = traffic if self.alone else None
+        self._kept = state if self.alone else None
 
-    def trusted(self) -> Traffic | None:
+    def trusted(self) -> State | None:
         """Return the kept state and discard it; None if no state has been kept since the last call."""
-        traffic, self._traffic = self._traffic, None
-        return traffic
+        kept, self._kept = self._kept, None
+        return kept
 
     def distrust(self) -> None:
         """Prepare for foreign code: discard the kept state."""
-        self._traffic = None
+        self._kept = None
 
 
-def take(road: Road) -> tuple[Prepared, Traffic] | None:
+class State(NamedTuple):
+    """The current state of a road in the kernel."""
+
+    owner: Prepared
+    roster: Roster
+    traffic: Traffic
+
+
+def take(road: Road) -> State | None:
     """Return the kept state of a road; None if foreign code may have run since."""
     found = _roads.get(id(road))
-    traffic = found.trusted() if found is not None and found.road is road else None
-    return (found, traffic) if found is not None and traffic is not None else None
+    return found.trusted() if found is not None and found.road is road else None
 
 
-def look(road: Road) -> tuple[Prepared, Roster] | None:
+def look(road: Road) -> State | None:
     """Return the current state of a road; None if the kernel cannot be used for the road."""
-    found = prepared(road)
+    found = prepared(road) if is_known(road) else None
     roster = found.roster() if found is not None else None
-    return (found, roster) if found is not None and roster is not None else None
+    if found is None or roster is None or roster.traffic is None:
+        return None
+    return State(found, roster, roster.traffic)
 
 
 def forget() -> None:
@@ -101,9 +111,7 @@ def forget() -> None:
 
 
 def prepared(road: Road) -> Prepared | None:
-    """Return the cached data of a road; None if the road, its lanes or highway-env itself are unknown."""
-    if not is_known(road):
-        return None
+    """Return the cached data of a road that is known, or seen; None if its lanes are unknown."""
     found = _roads.get(id(road))
     if found is None or not found.network.is_of(road.network):
         found = _roads[id(road)] = Prepared(road)
@@ -113,12 +121,18 @@ def prepared(road: Road) -> Prepared | None:
 
 
 class _RoadKind:
-    """Properties of a class of roads: whether it overrides a method that the accelerator bypasses."""
+    """Properties of a class of roads.
+
+    Attributes:
+        is_seen: Whether the accelerator may search its vehicles and objects.
+        is_known: Whether, in addition, the class does not override a method that the accelerator bypasses.
+    """
 
     def __init__(self, kind: type[Road]) -> None:
         base = RegulatedRoad if issubclass(kind, RegulatedRoad) else Road
         self.own = Own(kind, base, _READ)
-        self.plain = self.own.plain and not any(map(self.own.has, _BYPASSED))
+        self.is_seen = self.own.plain
+        self.is_known = self.own.plain and not any(map(self.own.has, _BYPASSED))
 
 
 _READ = ("network", "vehicles", "objects", "np_random", "record_history", "neighbour_vehicles_connected_lanes")
@@ -129,28 +143,43 @@ _road_kinds: dict[type, _RoadKind] = {}
 
 
 def is_known(road: Road) -> bool:
-    """Whether a road has a known class, and no function of highway-env has been replaced."""
-    if not watches or not watches["roads"].intact:
-        return False
+    """Whether the kernel may decide for and move the vehicles of a road: its class and highway-env are unchanged."""
+    return _kind_of(road).is_known and _is_usual(road)
+
+
+def _is_seen(road: Road) -> bool:
+    """Whether the vehicles and objects of a road may be searched, maybe from a search of the road's own class."""
+    return _kind_of(road).is_seen and _is_usual(road)
+
+
+def _kind_of(road: Road) -> _RoadKind:
     kind = type(road)
-    if kind not in (Road, RegulatedRoad):
-        found = _road_kinds.get(kind)
-        if found is None or not found.own.current:
-            found = _road_kinds[kind] = _RoadKind(kind)
-        if not found.plain:
-            return False
-    return type(road.vehicles) is list and type(road.objects) is list and _ROAD_METHODS.isdisjoint(vars(road))
+    found = _road_kinds.get(kind)
+    if found is None or not found.own.current:
+        found = _road_kinds[kind] = _RoadKind(kind)
+    return found
+
+
+def _is_usual(road: Road) -> bool:
+    """Whether no function of highway-env has been replaced, nor a method of this road."""
+    return (
+        bool(watches)
+        and watches["roads"].intact
+        and type(road.vehicles) is list
+        and type(road.objects) is list
+        and _ROAD_METHODS.isdisjoint(vars(road))
+    )
 
 
 def network_of(road: Road) -> Network | None:
     """Return the lanes of a road; None if the road is unknown."""
-    found = prepared(road)
+    found = prepared(road) if _is_seen(road) else None
     return found.network if found is not None else None
 
 
 def frame_of(road: Road) -> Frame | None:
     """Return the current positions on a road; None if the road or an object is unknown."""
-    found = prepared(road)
+    found = prepared(road) if _is_seen(road) else None
     if found is None:
         return None
     if found.frame is None or not found.frame.is_of(road):

@@ -7,7 +7,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
-from highway_env.vehicle.objects import Landmark
+from highway_env.vehicle.objects import Landmark, Obstacle
 
 from crashhunt.accelerator._frames import are_plain
 from crashhunt.accelerator._kernel import kernel
@@ -60,15 +60,18 @@ class Roster:
         traffic: The vehicles in the kernel; None if it does not know them.
         decides: Whether the kernel knows how all vehicles decide.
         moves: Whether the kernel knows how all vehicles move.
+        predicts: Whether all vehicles predict their paths as highway-env's do.
+        kinds: The properties of the class of each vehicle and object.
     """
 
     def __init__(self, road: Road, things: list[RoadObject], kinds: list[Kind], network: Network) -> None:
         vehicles = kinds[: len(road.vehicles)]
         self._ids = list(map(id, things))
-        self._kinds = kinds
+        self.kinds = kinds
         self._looks_further = road.neighbour_vehicles_connected_lanes
         self.decides = all(kind.drives for kind in vehicles)
         self.moves = all(kind.moves for kind in vehicles)
+        self.predicts = all(kind.predicts for kind in vehicles)
         self._fixed = [kind.fixed for kind in kinds]
         self._is_shared = all(map(_is_disjoint, self._fixed, map(vars, things)))
         #: one thing of each class, for the parameters of the class
@@ -81,7 +84,7 @@ class Roster:
     def is_of(self, road: Road, things: list[RoadObject], kinds: list[Kind]) -> bool:
         """Whether the kernel still knows the vehicles and objects of a road, apart from their state."""
         return (
-            self._kinds == kinds
+            self.kinds == kinds
             and self._ids == list(map(id, things))
             and self._looks_further == road.neighbour_vehicles_connected_lanes
             and (self.traffic is None or self._is_current(road, things))
@@ -98,13 +101,13 @@ class Roster:
     def _read(self) -> tuple[list[Row], list[object]]:
         """Return the parameters of each class with their types, and the exponents of all drivers."""
         found: list[Row] = []
-        for thing, kind in zip(self._examples, dict.fromkeys(self._kinds), strict=True):
+        for thing, kind in zip(self._examples, dict.fromkeys(self.kinds), strict=True):
             numbers = _PARAMETERS_OF[kind.base](thing)
             found += [numbers, tuple(map(type, numbers))]
         return found, list(map(_DELTA, self._thinking))
 
     def _in_kernel(self, road: Road, things: list[RoadObject], network: Network) -> Traffic | None:
-        module, kinds = kernel(), self._kinds
+        module, kinds = kernel(), self.kinds
         if module is None or not all(kind.collides for kind in kinds) or not are_plain(things, kinds):
             return None
         count = len(road.vehicles)
@@ -122,7 +125,7 @@ class Roster:
 
 
 def _flags_of(thing: RoadObject, kind: Kind) -> int:
-    return isinstance(thing, Landmark) | 2 * kind.slides | 4 * kind.times
+    return isinstance(thing, Landmark) | 2 * kind.slides | 4 * kind.times | 8 * isinstance(thing, Obstacle)
 
 
 def _read_parameters(things: list[RoadObject], kinds: list[Kind]) -> bytes | None:
@@ -148,9 +151,10 @@ def _read_parameters(things: list[RoadObject], kinds: list[Kind]) -> bytes | Non
             rows.append((*row, *[math.nan] * (len(_PARAMETERS) - len(row)), delta))
     except AttributeError:  # a user's vehicle may lack a parameter that highway-env never reads
         return None
-    numbers = np.array(rows, float)
-    used = np.array([len(NUMBERS_OF[kind.base]) for kind in kinds])
-    times = np.array([kind.times for kind in kinds])
+    numbers = np.array(rows, float).reshape(len(rows), len(_PARAMETERS) + 1)
+    # With their types, as a road may have no object, and an empty list becomes floats.
+    used = np.array([len(NUMBERS_OF[kind.base]) for kind in kinds], int)
+    times = np.array([kind.times for kind in kinds], bool)
     if not _is_tame(numbers[times]):
         return None
     missing = np.isnan(numbers[:, :-1]) & (np.arange(len(_PARAMETERS)) < used[:, None])

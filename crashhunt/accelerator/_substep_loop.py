@@ -23,7 +23,7 @@ from highway_env.envs.parking_env import ParkingEnv
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from crashhunt.accelerator._roads import look, methods_of, prepared, watches
+from crashhunt.accelerator._roads import is_known, look, methods_of, prepared, watches
 from crashhunt.accelerator._rules import finish
 from crashhunt.accelerator._versions import Own, is_genuine, kinds_of, originals
 
@@ -91,7 +91,7 @@ def can_run_alone() -> bool:
     return all(is_genuine(name, function) for name, function in found.items())
 
 
-def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[type, str, object]]) -> None:
+def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[object, str, object]]) -> None:
     """Do what `AbstractEnv._simulate` does.
 
     Args:
@@ -100,7 +100,7 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[type, st
         replaced: The replacements that must be in place: the owner of a method, its name and its replacement.
     """
     road = env.road
-    found = prepared(road) if _runs_alone(env) and _are_in_place(replaced) else None
+    found = prepared(road) if _runs_alone(env) and _are_in_place(replaced) and is_known(road) else None
     if found is None:
         originals["AbstractEnv._simulate"](env, action)
         return
@@ -139,15 +139,15 @@ def _run(env: AbstractEnv, found: Prepared, count: int) -> int:
     """Let the kernel do several sub-steps; return how many it has done."""
     road = env.road
     state = look(road)
-    roster = state[1] if state is not None and state[0] is found else None
-    traffic = roster.traffic if roster is not None and roster.decides and roster.moves else None
     dt = 1 / env.config["simulation_frequency"]
-    if traffic is None or type(dt) is not float:
+    if state is None or state.owner is not found or type(dt) is not float:
+        return 0
+    if not state.roster.decides or not state.roster.moves:
         return 0
     try:
-        done, unfinished = traffic.run(count, dt)
+        done, unfinished = state.traffic.run(count, dt)
     except BaseException:
-        env.steps += traffic.completed()
+        env.steps += state.traffic.completed()
         raise
     if unfinished:
         finish(road, dt)
@@ -177,7 +177,7 @@ def _runs_alone(env: AbstractEnv) -> bool:
     return own.plain and not own.has("_automatic_rendering") and type(env.config) is dict
 
 
-def _are_in_place(replaced: Iterable[tuple[type, str, object]]) -> bool:
+def _are_in_place(replaced: Iterable[tuple[object, str, object]]) -> bool:
     """Whether no method that highway-env calls in a sub-step has been wrapped or replaced."""
     rendering = vars(AbstractEnv).get("_automatic_rendering")
     return rendering is originals["AbstractEnv._automatic_rendering"] and all(

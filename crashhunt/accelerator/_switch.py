@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Self
 
+from highway_env.envs.common import observation as highway_env_observation
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.observation import (
     ExitObservation,
@@ -18,14 +19,21 @@ from highway_env.envs.common.observation import (
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from crashhunt.accelerator._observe import close_objects, fill_lanes, observe, observe_exit, observe_goal, observe_grid
+from crashhunt.accelerator._observe import (
+    close_objects,
+    fill_lanes,
+    fill_times,
+    observe,
+    observe_exit,
+    observe_goal,
+    observe_grid,
+)
 from crashhunt.accelerator._roads import (
     forget,
     frame_of,
     look,
     methods_of,
     network_of,
-    prepared,
     take,
     watches,
 )
@@ -35,9 +43,10 @@ from crashhunt.accelerator._versions import Watch, left_alone, originals, reason
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
+    from types import ModuleType, TracebackType
 
     from highway_env.road.lane import LaneIndex
+    from highway_env.vehicle.controller import MDPVehicle
     from highway_env.vehicle.kinematics import Vehicle
 
 
@@ -80,8 +89,8 @@ def _restore() -> None:
             setattr(owner, name, originals[_name(owner, name)])
 
 
-def _name(owner: type, name: str) -> str:
-    return f"{owner.__qualname__}.{name}"
+def _name(owner: type | ModuleType, name: str) -> str:
+    return f"{owner.__qualname__ if isinstance(owner, type) else owner.__name__}.{name}"
 
 
 def is_on() -> bool:
@@ -99,16 +108,12 @@ def _act(self: Road) -> None:
         for vehicle in self.vehicles:
             vehicle.act()
         return
-    kept = take(self)
-    if kept is None:
-        found = look(self)
-        if found is None or not found[1].decides or found[1].traffic is None:
-            originals["Road.act"](self)
-            return
-        kept = found[0], found[1].traffic
-    owner, traffic = kept
-    traffic.act()
-    owner.keep(traffic)
+    state = take(self) or look(self)
+    if state is None or not state.roster.decides:
+        originals["Road.act"](self)
+        return
+    state.traffic.act()
+    state.owner.keep(state)
 
 
 def _step(self: Road, dt: float) -> None:
@@ -118,18 +123,11 @@ def _step(self: Road, dt: float) -> None:
         if len(self.vehicles) + len(self.objects) > 1:
             collide_one_by_one(self, dt)
         return
-    kept = take(self)
-    if kept is None:
-        found = look(self)
-        if found is None or not found[1].moves or found[1].traffic is None:
-            _step_one_by_one(self, dt)
-            return
-        kept = found[0], found[1].traffic
-    owner, traffic = kept
-    if type(dt) is not float:
+    state = take(self) or look(self)
+    if state is None or not state.roster.moves or type(dt) is not float:
         _step_one_by_one(self, dt)
-    elif traffic.step(dt):
-        owner.keep(traffic)
+    elif state.traffic.step(dt):
+        state.owner.keep(state)
     else:
         finish(self, dt)
 
@@ -138,9 +136,9 @@ def _step_one_by_one(road: Road, dt: float) -> None:
     """Do what `Road.step` does; the kernel checks the pairs if it knows the vehicles then."""
     for vehicle in road.vehicles:
         vehicle.step(dt)
-    found = look(road) if type(dt) is float else None
-    if found is not None and found[1].traffic is not None:
-        found[1].traffic.collide(dt)
+    state = look(road) if type(dt) is float else None
+    if state is not None:
+        state.traffic.collide(dt)
     else:
         collide_one_by_one(road, dt)
 
@@ -184,10 +182,11 @@ def _close_objects_to(
 
 def _enforce_road_rules(self: RegulatedRoad) -> None:
     kept = take(self)
-    if (kept is None and prepared(self) is None) or not enforce(self):
+    state = kept or look(self)
+    if state is None or not state.roster.predicts or not enforce(self, state.traffic, state.roster.kinds):
         originals["RegulatedRoad.enforce_road_rules"](self)
-    elif kept is not None and kept[1].read():
-        kept[0].keep(kept[1])
+    elif kept is not None and kept.traffic.read():
+        kept.owner.keep(kept)
 
 
 def _observe(self: KinematicObservation) -> object:
@@ -227,6 +226,20 @@ def _fill_road_layer_by_lanes(
         originals["OccupancyGridObservation.fill_road_layer_by_lanes"](self, layer_index, lane_perception_distance)
 
 
+def _compute_ttc_grid(
+    env: AbstractEnv, time_quantization: float, horizon: float, vehicle: MDPVehicle | None = None
+) -> object:
+    is_usual = watches and watches["observations"].intact and isinstance(env.road, Road)
+    state = look(env.road) if is_usual else None
+    if state is not None:
+        observer = vehicle if vehicle is not None else env.vehicle
+        found = fill_times(env, state, observer, time_quantization, horizon)
+        if found is not None:
+            return found
+    original = originals[_name(highway_env_observation, "compute_ttc_grid")]
+    return original(env, time_quantization, horizon, vehicle)
+
+
 def _is_plain(observation: KinematicObservation | OccupancyGridObservation, kind: Any) -> bool:
     """Whether an observation has a known class, observes a road, and has no replaced method."""
     return bool(
@@ -240,7 +253,7 @@ def _is_plain(observation: KinematicObservation | OccupancyGridObservation, kind
 
 _OBSERVATIONS = (KinematicObservation, ExitObservation, KinematicsGoalObservation, OccupancyGridObservation)
 _SHOWN = {kind: methods_of(kind) for kind in _OBSERVATIONS}
-_REPLACED: tuple[tuple[type, str, Callable[..., object]], ...] = (
+_REPLACED: tuple[tuple[type | ModuleType, str, Callable[..., object]], ...] = (
     (Road, "act", _act),
     (Road, "step", _step),
     (Road, "neighbour_vehicles", _neighbour_vehicles),
@@ -252,8 +265,9 @@ _REPLACED: tuple[tuple[type, str, Callable[..., object]], ...] = (
     (KinematicsGoalObservation, "observe", _observe_goal),
     (OccupancyGridObservation, "observe", _observe_grid),
     (OccupancyGridObservation, "fill_road_layer_by_lanes", _fill_road_layer_by_lanes),
+    (highway_env_observation, "compute_ttc_grid", _compute_ttc_grid),
 )
-_OF_ROADS = [replaced for replaced in _REPLACED if issubclass(replaced[0], Road)]
+_OF_ROADS = [replaced for replaced in _REPLACED if replaced[0] in (Road, RegulatedRoad)]
 
 
 # ``crashhunt.accelerate()`` accelerates highway-env in the user's process, such as a training of a policy.

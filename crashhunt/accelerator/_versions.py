@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import highway_env
 import numpy as np
 from highway_env import utils
-from highway_env.envs.common import abstract, observation
+from highway_env.envs.common import abstract, finite_mdp, observation
 from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, dynamics, kinematics, objects
 
@@ -91,7 +91,7 @@ class Watch:
         """Watch the classes of the accelerated observations."""
         kinds = ("", "Kinematic", "KinematicsGoal", "OccupancyGrid", "Exit", "MultiAgent")
         wanted = ("ObservationType", *[f"{kind}Observation" for kind in kinds])
-        places: list[tuple[str, Space]] = [(observation.__name__, vars(observation))]
+        places: list[tuple[str, Space]] = [(module.__name__, vars(module)) for module in (observation, finite_mdp)]
         return cls([*places, *(place for place in _classes(observation) if place[0] in wanted)], but)
 
     @property
@@ -226,7 +226,9 @@ NUMBERS_OF = {"": _OUTLINE, "nothing": _LIMITED, "controlled": _STEERED, "idm": 
 """Class attributes with the parameters of vehicles, by model of decision; a vehicle may override them."""
 _METHODS = frozenset((*_COLLIDES, *_MOVES, *_SLIDES, *_DRIVES, *_PREDICTS, *_DESCRIBES))
 _ORIGINALS = {
-    (owner, name): inspect.getattr_static(owner, name, None) for owner in _BASES for name in (*_METHODS, *_SPECIAL)
+    (owner, name): inspect.getattr_static(owner, name, None)
+    for owner in _BASES
+    for name in (*_METHODS, *_SPECIAL, "index_to_speed")
 }
 _OWN = frozenset(module.__name__ for module in MODULES) | {"abc", "builtins"}
 
@@ -285,6 +287,7 @@ class Kind:
         drives: The model of decision, ``idm``, ``linear``, ``controlled`` or ``nothing``; empty if not inherited.
         predicts: Whether the prediction of trajectories is inherited.
         describes: Whether ``to_dict`` and its parts are inherited.
+        chooses: Whether the choice between target speeds is inherited.
         base: The model of decision of the base class.
         methods: Names of methods, which an object of the class must not override.
         fixed: These names, and the names of the parameters that objects of the class usually share.
@@ -308,6 +311,7 @@ class Kind:
         self.drives = _BASES[base] if base is not None and self.collides and leaves(_DRIVES) else ""
         self.predicts = self.moves and leaves((*_PREDICTS, *_DRIVES))
         self.describes = self.collides and leaves(_DESCRIBES)
+        self.chooses = self.collides and issubclass(kind, controller.MDPVehicle) and leaves(("index_to_speed",))
         self.base = _BASES[base] if base is not None else ""
         self.methods = frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name, None)))
         self.fixed = self.methods | frozenset(NUMBERS_OF[self.base])
@@ -362,7 +366,7 @@ def reason_against() -> str:
     if version not in ACCELERATED:
         return f"highway-env {version} is not supported (supported: {', '.join(ACCELERATED)})"
     digest = hashlib.blake2b(digest_size=8)
-    for module in (*_MODULES, abstract):  # the accelerator replaces one function of `abstract`
+    for module in (*_MODULES, abstract, finite_mdp):  # the accelerator replaces one function of the last two
         digest.update(Path(str(module.__file__)).read_bytes())
     if digest.hexdigest() != ACCELERATED[version]:
         return f"the installed highway-env {version} is not the published one"
@@ -375,7 +379,7 @@ def reason_against() -> str:
     return f"the compiled kernel is not used: {why_not()}" if kernel() is None else ""
 
 
-_FILES = {str(module.__file__) for module in (*_MODULES, abstract)}
+_FILES = {str(module.__file__) for module in (*_MODULES, abstract, finite_mdp)}
 
 
 def is_genuine(name: str, function: Callable[..., object]) -> bool:

@@ -5,14 +5,13 @@
 // - It is compiled without contraction, because a fused multiply-add rounds once instead of twice.
 // - Sine, cosine and their like are the inner loops of NumPy's own functions, because NumPy has several versions of them
 //   for different processors. crashhunt/accelerator/_kernel.py compares all of them with NumPy when a process starts.
-// - What the kernel does not know, it refuses: `read` returns False, and highway-env does the work. For three events it
-//   calls highway-env's own methods: the end of a lane, a pair of vehicles that may touch, and a movement by the dynamic
-//   bicycle model.
+// - What the kernel does not know, it refuses: `read` returns False, and highway-env does the work. For two events it
+//   calls highway-env's own methods: the end of a lane, and a movement by the dynamic bicycle model.
 //
 // Its parts are kernel_numbers.hpp (arithmetic), kernel_lanes.hpp, kernel_actors.hpp (state), kernel_policies.hpp
-// (decisions) and kernel_movement.hpp. This file has what Python calls.
+// (decisions), kernel_movement.hpp, kernel_collisions.hpp and kernel_predictions.hpp. This file has what Python calls.
 
-#include "kernel_movement.hpp"
+#include "kernel_predictions.hpp"
 
 namespace {
 
@@ -60,6 +59,9 @@ PyObject *traffic_collide(Traffic *self, PyObject *dt) {
         return nullptr;
     }
     if (!collide_all(self, PyFloat_AS_DOUBLE(dt), dt)) {
+        return fail(self, false);
+    }
+    if (!publish_all(self, false)) {
         return nullptr;
     }
     Py_RETURN_NONE;
@@ -151,6 +153,7 @@ PyObject *traffic_new(PyTypeObject *type, PyObject *args, PyObject *) {
             actor.is_landmark = flag & 1;
             actor.slides = flag & 2;
             actor.changes_lanes = flag & 4;
+            actor.is_obstacle = flag & 8;
             const char *numbers = static_cast<const char *>(parameters.buf) + row * sizeof(Parameters);
             std::memcpy(&actor.parameters, numbers, sizeof(Parameters));
             actor.gap_root = 2 * std::sqrt(-actor.parameters.comfort_acc_max * actor.parameters.comfort_acc_min);
@@ -163,6 +166,73 @@ PyObject *traffic_new(PyTypeObject *type, PyObject *args, PyObject *) {
     return reinterpret_cast<PyObject *>(self);
 }
 
+// conflicts(predicted): the pairs of vehicles whose predicted outlines touch, each with whether that is certain; None if
+// highway-env must decide. `predicted` has the paths that the kernel cannot predict, by row.
+PyObject *traffic_conflicts(Traffic *self, PyObject *predicted) {
+    if (!PyDict_CheckExact(predicted)) {
+        PyErr_SetString(PyExc_TypeError, "the predicted paths must be a dictionary");
+        return nullptr;
+    }
+    const std::vector<Path> paths = predict_all(self, predicted);
+    if (PyErr_Occurred()) {
+        return nullptr;
+    }
+    if (paths.size() < self->vehicles) {
+        Py_RETURN_NONE;
+    }
+    PyObject *found = PyList_New(0);
+    for (size_t row = 0; found && row < paths.size(); row++) {
+        for (size_t other = row + 1; found && other < paths.size(); other++) {
+            const Answer answer = is_conflict_possible((*self->actors)[row], paths[row], (*self->actors)[other], paths[other]);
+            if (answer == NO) {
+                continue;
+            }
+            PyObject *pair = Py_BuildValue("nnO", row, other, answer == YES ? Py_True : Py_False);
+            if (!pair || PyList_Append(found, pair)) {
+                Py_CLEAR(found);
+            }
+            Py_XDECREF(pair);
+        }
+    }
+    return found;
+}
+
+// fill_times(grid, lanes, times, quantum, row, speeds, relations): fills the grid of a time-to-collision observation.
+// `relations` has a byte for each lane of the network.
+PyObject *traffic_fill_times(Traffic *self, PyObject *args) {
+    Py_buffer cells, speeds, relations;
+    TimeGrid grid;
+    Py_ssize_t row;
+    if (!PyArg_ParseTuple(args, "w*nndny*y*", &cells, &grid.lanes, &grid.times, &grid.quantum, &row, &speeds, &relations)) {
+        return nullptr;
+    }
+    const Py_ssize_t count = speeds.len / static_cast<Py_ssize_t>(sizeof(double)), width = grid.lanes * grid.times;
+    bool fits = grid.lanes >= 0 && grid.times >= 0 && 0 <= row && row < static_cast<Py_ssize_t>(self->vehicles) &&
+                cells.len == count * width * static_cast<Py_ssize_t>(sizeof(double)) &&
+                relations.len == static_cast<Py_ssize_t>(self->lanes) && grid.quantum > 0;
+    const char *relation_of = static_cast<const char *>(relations.buf);
+    for (size_t lane = 0; fits && lane < self->lanes; lane++) {
+        fits = relation_of[lane] != SAME_LANES || (*self->network->lanes)[lane].id < grid.lanes;
+    }
+    grid.cells = static_cast<double *>(cells.buf);
+    for (Py_ssize_t which = 0; fits && which < count; which++) {
+        double speed;
+        std::memcpy(&speed, static_cast<const char *>(speeds.buf) + which * static_cast<Py_ssize_t>(sizeof(double)), sizeof(double));
+        for (size_t other = 0; other < self->vehicles; other++) {
+            const int lane = (*self->actors)[other].lane;
+            fill_times(self, grid, static_cast<size_t>(row), other, which, speed, relation_of[lane]);
+        }
+    }
+    PyBuffer_Release(&cells);
+    PyBuffer_Release(&speeds);
+    PyBuffer_Release(&relations);
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "the grid has another size than its parts");
+        return nullptr;
+    }
+    Py_RETURN_NONE;
+}
+
 PyObject *traffic_completed(Traffic *self, PyObject *) { return PyLong_FromLong(self->completed); }
 
 PyMethodDef traffic_methods[] = {
@@ -172,6 +242,8 @@ PyMethodDef traffic_methods[] = {
     {"collide", reinterpret_cast<PyCFunction>(traffic_collide), METH_O, nullptr},
     {"completed", reinterpret_cast<PyCFunction>(traffic_completed), METH_NOARGS, nullptr},
     {"run", reinterpret_cast<PyCFunction>(traffic_run), METH_VARARGS, nullptr},
+    {"conflicts", reinterpret_cast<PyCFunction>(traffic_conflicts), METH_O, nullptr},
+    {"fill_times", reinterpret_cast<PyCFunction>(traffic_fill_times), METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 
@@ -465,14 +537,14 @@ PyType_Spec snapshot_spec = {"_crashhunt_highway.Snapshot", sizeof(Snapshot), 0,
 
 // ----------------------------------------------------------------------------------------------------------------- module
 
-// bind(float64, int64, ndarray, zeros, slide, [sin, cos, ...], fused, exponent_step): NumPy's types and functions, and
+// bind(float64, int64, float32, ndarray, zeros, slide, [sin, cos, ...], fused, product_fused, exponent_step): NumPy's types and functions, and
 // the function that moves a vehicle with the dynamic bicycle model.
 PyObject *bind(PyObject *, PyObject *args) {
-    PyObject *number, *whole, *array, *zeros, *slide_function, *ufuncs;
-    int is_fused;
+    PyObject *number, *whole, *short_number, *array, *zeros, *slide_function, *ufuncs;
+    int is_fused, is_product_fused;
     Py_ssize_t step;
-    if (!PyArg_ParseTuple(args, "OOOOOO!pn", &number, &whole, &array, &zeros, &slide_function, &PyList_Type, &ufuncs,
-                          &is_fused, &step)) {
+    if (!PyArg_ParseTuple(args, "OOOOOOO!ppn", &number, &whole, &short_number, &array, &zeros, &slide_function,
+                          &PyList_Type, &ufuncs, &is_fused, &is_product_fused, &step)) {
         return nullptr;
     }
     if (PyList_GET_SIZE(ufuncs) != FUNCTIONS) {
@@ -505,10 +577,12 @@ PyObject *bind(PyObject *, PyObject *args) {
     }
     Py_XSETREF(numpy_float, Py_NewRef(number));
     Py_XSETREF(numpy_int, Py_NewRef(whole));
+    Py_XSETREF(numpy_short, Py_NewRef(short_number));
     Py_XSETREF(numpy_array, Py_NewRef(array));
     Py_XSETREF(make_array, Py_NewRef(zeros));
     Py_XSETREF(slide, Py_NewRef(slide_function));
     fused = is_fused;
+    product_fused = is_product_fused;
     exponent_step = step;
     Py_RETURN_NONE;
 }
@@ -527,6 +601,9 @@ PyObject *compute(PyObject *, PyObject *args) {
     }
     if (!std::strcmp(name, "dot")) {
         return PyFloat_FromDouble(dot(a, b, c, d));
+    }
+    if (!std::strcmp(name, "product")) {
+        return PyFloat_FromDouble(product(a, b, c, d));
     }
     if (!std::strcmp(name, "dot3")) {
         const double one[3] = {a, b, c}, two[3] = {d, e, f};
@@ -579,6 +656,8 @@ bool intern_names() {
         {&s_steering_parameters, "STEERING_PARAMETERS"},
         {&s_collecting_data, "collecting_data"},
         {&s_data, "data"},
+        {&s_solid, "solid"},
+        {&s_hit, "hit"},
     };
     for (const auto &name : names) {
         *name.place = PyUnicode_InternFromString(name.text);

@@ -36,6 +36,7 @@ struct Actor {
     bool moves;              // a vehicle
     bool slides;             // moves by the dynamic bicycle model, which is highway-env's
     bool is_landmark;        // not a neighbour
+    bool is_obstacle;        // is not pushed by a collision
     bool has_target;         // has a target lane
     bool changes_lanes;      // has a timer, and the MOBIL model
     Parameters parameters;
@@ -47,9 +48,10 @@ struct Actor {
     bool has_target_speed, reset_timer;
     int lane, target;        // numbers of lanes; -1 for none
     bool changed_target;
-    bool crashed, new_crash;
+    bool is_solid, crashed;
     bool has_impact;
     double impact_x, impact_y;
+    bool new_crash, new_impact, new_hit; // since they were written
     Number steering, acceleration;
     bool new_action, changed_action, moved; // since they were written
     bool enable_lane_change;
@@ -64,9 +66,10 @@ struct Actor {
 PyObject *s_position, *s_heading, *s_speed, *s_lane, *s_lane_index, *s_target_lane_index, *s_target_speed, *s_timer,
     *s_crashed, *s_impact, *s_action, *s_steering, *s_acceleration, *s_route, *s_enable_lane_change, *s_check_collisions,
     *s_collidable, *s_diagonal, *s_follow_road, *s_handle_collisions, *s_acceleration_parameters,
-    *s_steering_parameters, *s_collecting_data, *s_data;
+    *s_steering_parameters, *s_collecting_data, *s_data, *s_solid, *s_hit;
 PyObject *numpy_float; // the type np.float64
 PyObject *numpy_int;   // the type np.int64
+PyObject *numpy_short; // the type np.float32
 PyObject *numpy_array; // the type np.ndarray
 PyObject *make_array;  // the function np.zeros
 PyObject *slide;       // the function that moves a vehicle with the dynamic bicycle model
@@ -244,6 +247,15 @@ bool read_impact(Actor &actor) {
     return read;
 }
 
+// Reads a part of an action, which may also be a number of an action space of float32: a movement makes it a Python float.
+bool read_action_value(PyObject *value, Number &number) {
+    if (!has_type(value, numpy_short)) {
+        return read_value(value, number);
+    }
+    number = {PyFloat_AsDouble(value), true, false};
+    return true;
+}
+
 // Reads an action, and adds the address of its dictionary to a list.
 bool read_action(Actor &actor, std::vector<const void *> &actions) {
     PyObject *action = attribute(actor.object, s_action);
@@ -252,8 +264,8 @@ bool read_action(Actor &actor, std::vector<const void *> &actions) {
         PyObject *steering = PyDict_GetItemWithError(action, s_steering);
         PyObject *acceleration = PyDict_GetItemWithError(action, s_acceleration);
         PyErr_Clear();
-        read = steering && acceleration && read_value(steering, actor.steering) &&
-               read_value(acceleration, actor.acceleration);
+        read = steering && acceleration && read_action_value(steering, actor.steering) &&
+               read_action_value(acceleration, actor.acceleration);
         actions.push_back(action);
     }
     Py_XDECREF(action);
@@ -336,7 +348,7 @@ bool read_linear(Actor &actor) {
 
 bool read_vehicle(const Network *network, Actor &actor, std::vector<const void *> &actions) {
     PyObject *object = actor.object;
-    actor.new_crash = actor.changed_target = actor.reset_timer = actor.moved = false;
+    actor.changed_target = actor.reset_timer = actor.moved = false;
     actor.target = -1;
     if (!read_own_lane(network, actor) || !read_bool(object, s_crashed, actor.crashed) || !read_impact(actor) ||
         !read_action(actor, actions) || !read_target_speed(actor)) {
@@ -363,9 +375,10 @@ bool read_all(Traffic *self) {
     std::vector<const void *> positions, actions; // a change of one that two actors share would change both
     for (Actor &actor : *self->actors) {
         if (!read_pose(actor) || !read_bool(actor.object, s_check_collisions, actor.checks) ||
-            !read_bool(actor.object, s_collidable, actor.collides)) {
+            !read_bool(actor.object, s_collidable, actor.collides) || !read_bool(actor.object, s_solid, actor.is_solid)) {
             return false;
         }
+        actor.new_crash = actor.new_impact = actor.new_hit = false;
         positions.push_back(actor.position.buf);
         if (actor.moves && !read_vehicle(self->network, actor, actions)) {
             return false;
@@ -392,6 +405,20 @@ PyObject *as_python(double value, bool as_numpy) {
     PyObject *found = PyObject_CallOneArg(numpy_float, number);
     Py_DECREF(number);
     return found;
+}
+
+// A new array of NumPy.
+PyObject *as_array(const double *numbers, Py_ssize_t count) {
+    PyObject *array = PyObject_CallFunction(make_array, "n", count);
+    Py_buffer view;
+    if (array && PyObject_GetBuffer(array, &view, PyBUF_WRITABLE)) {
+        Py_CLEAR(array);
+    }
+    if (array) {
+        std::memcpy(view.buf, numbers, static_cast<size_t>(count) * sizeof(double));
+        PyBuffer_Release(&view);
+    }
+    return array;
 }
 
 PyObject *as_python(const Number &number) { return as_python(number.value, number.is_numpy); }
@@ -448,18 +475,33 @@ bool publish_movement(Traffic *self, Actor &actor) {
     if (actor.changes_lanes && !set(object, s_timer, as_python(actor.timer))) {
         return false;
     }
-    if (actor.new_crash) {
-        actor.new_crash = false;
-        if (PyObject_SetAttr(object, s_crashed, Py_True) || PyObject_SetAttr(object, s_impact, Py_None)) {
-            return false;
-        }
+    return true;
+}
+
+// Writes the results of collisions.
+bool publish_contact(Actor &actor) {
+    if (actor.new_crash && PyObject_SetAttr(actor.object, s_crashed, Py_True)) {
+        return false;
     }
+    if (actor.new_hit && PyObject_SetAttr(actor.object, s_hit, Py_True)) {
+        return false;
+    }
+    const double impact[2] = {actor.impact_x, actor.impact_y};
+    if (actor.new_impact && !set(actor.object, s_impact, actor.has_impact ? as_array(impact, 2) : Py_NewRef(Py_None))) {
+        return false;
+    }
+    actor.new_crash = actor.new_hit = actor.new_impact = false;
     return true;
 }
 
 bool publish_all(Traffic *self, bool moved) {
-    for (size_t row = 0; row < self->vehicles; row++) {
-        Actor &actor = (*self->actors)[row];
+    for (Actor &actor : *self->actors) {
+        if (!publish_contact(actor)) {
+            return false;
+        }
+        if (!actor.moves) {
+            continue;
+        }
         actor.reset_timer = actor.reset_timer && !moved; // a movement has increased the timer since
         if (!publish_decision(self, actor) || (moved && !publish_movement(self, actor))) {
             return false;

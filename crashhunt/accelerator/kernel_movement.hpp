@@ -1,4 +1,4 @@
-// How vehicles move, and which of them may touch. A part of kernel.cpp.
+// How vehicles move. A part of kernel.cpp.
 
 #pragma once
 
@@ -7,8 +7,6 @@
 #include <limits>
 
 namespace {
-
-// --------------------------------------------------------------------------------------------------------------- movement
 
 void clip_actions(Actor &actor) {
     double speed = actor.speed.value;
@@ -57,6 +55,9 @@ int closest_lane(Traffic *self, size_t row) {
 
 // Lets highway-env move a vehicle with the dynamic bicycle model. False: an error.
 bool slide_vehicle(Traffic *self, Actor &actor, PyObject *dt) {
+    if (!publish_contact(actor)) {
+        return false;
+    }
     PyObject *done = PyObject_CallFunctionObjArgs(slide, actor.object, dt, nullptr);
     if (!done) {
         return false;
@@ -90,6 +91,7 @@ void move(Actor &actor, double dt) {
         actor.y += actor.impact_y;
         actor.crashed = actor.new_crash = true;
         actor.has_impact = false;
+        actor.new_impact = true;
     }
     actor.heading += speed * call(SIN, slip) / (actor.parameters.length / 2) * dt;
     actor.speed = {speed + actor.acceleration.value * dt, actor.speed.is_numpy || actor.acceleration.is_numpy, false};
@@ -116,107 +118,6 @@ Moved move_all(Traffic *self, double dt, PyObject *as_object) {
         actor.lane = closest_lane(self, moved);
     }
     return row < self->vehicles ? FAILED : finite ? FINITE : NOT_FINITE;
-}
-
-// ------------------------------------------------------------------------------------------------------------- collisions
-
-// Whether an axis separates the outlines of two actors with certainty, now and during the sub-step.
-bool stay_apart(const Actor &one, const Actor &two, double dt) {
-    const double margin = 1e-6;
-    double dx = two.x - one.x, dy = two.y - one.y;
-    double c1 = one.cosine, s1 = one.sine, c2 = two.cosine, s2 = two.sine;
-    double vx = (one.speed.value * c1 - two.speed.value * c2) * dt;
-    double vy = (one.speed.value * s1 - two.speed.value * s2) * dt;
-    double along = std::fabs(c1 * c2 + s1 * s2), across = std::fabs(c1 * s2 - s1 * c2);
-    double length = one.parameters.length / 2, width = one.parameters.width / 2;
-    double other_length = two.parameters.length / 2, other_width = two.parameters.width / 2;
-    const double axes[4][3] = {{-s1, c1, width + other_length * across + other_width * along},
-                               {c1, s1, length + other_length * along + other_width * across},
-                               {-s2, c2, other_width + length * across + width * along},
-                               {c2, s2, other_length + length * along + width * across}};
-    for (const double *axis : axes) {
-        double place = dx * axis[0] + dy * axis[1], towards = vx * axis[0] + vy * axis[1];
-        if (place < 0) {
-            place = -place;
-            towards = -towards;
-        }
-        if (place - axis[2] - (towards > 0 ? towards : 0.0) > margin) {
-            return true;
-        }
-    }
-    return false;
-}
-
-bool may_touch(const Actor &one, const Actor &two, double dt) {
-    if (!(one.checks || two.checks) || !(one.collides && two.collides)) {
-        return false;
-    }
-    double dx = two.x - one.x, dy = two.y - one.y;
-    double reach = one.radius + two.radius + one.speed.value * dt;
-    reach = (reach > 0 ? reach : 0.0) + 1e-6;
-    return dx * dx + dy * dy <= reach * reach && !stay_apart(one, two, dt);
-}
-
-// Lets highway-env check a pair that may touch. False: it has raised an error, or set something unusual.
-bool handle_collision(Traffic *self, size_t row, size_t other, PyObject *dt) {
-    for (size_t which : {row, other}) {
-        Actor &actor = (*self->actors)[which];
-        if (actor.moves && (!publish_decision(self, actor) || !publish_movement(self, actor))) {
-            return false;
-        }
-    }
-    Actor &one = (*self->actors)[row], &two = (*self->actors)[other];
-    PyObject *done = PyObject_CallMethodObjArgs(one.object, s_handle_collisions, two.object, dt, nullptr);
-    if (!done) {
-        return false;
-    }
-    Py_DECREF(done);
-    for (Actor *actor : {&one, &two}) {
-        if (actor->moves && (!read_bool(actor->object, s_crashed, actor->crashed) || !read_impact(*actor))) {
-            PyErr_SetString(PyExc_RuntimeError, "highway-env's handle_collisions set an unknown value");
-            return false;
-        }
-    }
-    return true;
-}
-
-// Finds the pairs that may touch, in the order in which highway-env checks them. Only pairs near each other along x are
-// compared: the search sorts by x.
-std::vector<std::pair<size_t, size_t>> find_pairs(Traffic *self, double dt) {
-    const std::vector<Actor> &actors = *self->actors;
-    std::vector<std::pair<double, size_t>> sorted;
-    double radius = 0, speed = 0;
-    for (size_t row = 0; row < actors.size(); row++) {
-        sorted.emplace_back(actors[row].x, row);
-        radius = std::max(radius, actors[row].radius);
-        speed = std::max(speed, std::fabs(actors[row].speed.value));
-    }
-    std::sort(sorted.begin(), sorted.end());
-    const double reach = 2 * radius + speed * std::fabs(dt) + 1e-5;
-    std::vector<std::pair<size_t, size_t>> pairs;
-    for (size_t first = 0; first < sorted.size(); first++) {
-        for (size_t second = first + 1; second < sorted.size(); second++) {
-            if (sorted[second].first - sorted[first].first > reach) {
-                break;
-            }
-            size_t row = std::min(sorted[first].second, sorted[second].second);
-            size_t other = std::max(sorted[first].second, sorted[second].second);
-            if (row < self->vehicles && may_touch(actors[row], actors[other], dt)) {
-                pairs.emplace_back(row, other);
-            }
-        }
-    }
-    std::sort(pairs.begin(), pairs.end());
-    return pairs;
-}
-
-bool collide_all(Traffic *self, double dt, PyObject *as_object) {
-    for (const auto &[row, other] : find_pairs(self, dt)) { // a collision changes no position and no speed
-        if (!handle_collision(self, row, other, as_object)) {
-            return false;
-        }
-    }
-    return true;
 }
 
 bool act_all(Traffic *self) {

@@ -31,6 +31,7 @@ const char *const NAMES[FUNCTIONS] = {"sin", "cos", "tan", "arcsin", "arctan", "
 
 Function functions[FUNCTIONS];
 bool fused = false;           // whether NumPy's scalar product of two vectors uses fused multiply-adds
+bool product_fused = false;   // whether NumPy's product of two matrices does
 Py_ssize_t exponent_step = 0; // the stride with which NumPy passes the exponent of a power of two numbers
 
 const double PI = 3.14159265358979323846;
@@ -54,13 +55,19 @@ double call(int number, double x, double y) {
     return z;
 }
 
-// np.dot of two vectors of two numbers: BLAS begins with 0, which decides the sign of a zero result.
-double dot(double ax, double ay, double bx, double by) {
-    if (fused) {
+// BLAS begins a sum of products with 0, which decides the sign of a zero result.
+double sum_of_products(bool is_fused, double ax, double ay, double bx, double by) {
+    if (is_fused) {
         return std::fma(ay, by, std::fma(ax, bx, 0.0));
     }
     return (0.0 + ax * bx) + ay * by;
 }
+
+// np.dot of two vectors of two numbers.
+double dot(double ax, double ay, double bx, double by) { return sum_of_products(fused, ax, ay, bx, by); }
+
+// An element of the product of two matrices: of a row with two numbers and a column with two numbers.
+double product(double ax, double ay, double bx, double by) { return sum_of_products(product_fused, ax, ay, bx, by); }
 
 // The same for vectors of three numbers.
 double dot(const double *a, const double *b) {

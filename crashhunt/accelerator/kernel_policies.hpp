@@ -291,15 +291,9 @@ bool append_data(PyObject *data, const char *name, const double *features, Py_ss
         }
         return false;
     }
-    PyObject *zeros = PyObject_CallFunction(make_array, "n", count), *number = as_python(output, true);
-    Py_buffer view;
-    bool done = zeros && number && PyObject_GetBuffer(zeros, &view, PyBUF_WRITABLE) == 0;
-    if (done) {
-        std::memcpy(view.buf, features, static_cast<size_t>(count) * sizeof(double));
-        PyBuffer_Release(&view);
-        done = PyList_Append(all, zeros) == 0 && PyList_Append(outputs, number) == 0;
-    }
-    Py_XDECREF(zeros);
+    PyObject *array = as_array(features, count), *number = as_python(output, true);
+    bool done = array && number && PyList_Append(all, array) == 0 && PyList_Append(outputs, number) == 0;
+    Py_XDECREF(array);
     Py_XDECREF(number);
     return done;
 }

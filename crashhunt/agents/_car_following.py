@@ -70,16 +70,16 @@ def actors(observation: NDArray[np.float32]) -> Iterator[list[float]]:
 
 
 def off_path(row: Sequence[float], *, lateral: float, curvature: float) -> float:
-    """Return how far an actor is from a path, in m; 0 where it may well be on it.
+    """Return how far an actor is from a path, in m; 0 if it may well be on it.
 
     A bend begins or ends somewhere between here and there, and an observation does not say where. The path of
     constant curvature is one extreme, the arc that ends in the actor's own heading is the other. An actor in between
     counts as on the path, because braking for it is safe.
 
     Args:
-        row: of the actor.
+        row: row of the actor.
         lateral: how far to the right of the vehicle the path runs, in m.
-        curvature: of the path here, positive to the right, in 1/m.
+        curvature: curvature of the path here, positive to the right, in 1/m.
     """
     ahead, right = row[X], row[Y] - lateral
     low = high = curvature * ahead * ahead / 2
@@ -97,10 +97,10 @@ def find_leader(
     Oncoming traffic is never a leader: it keeps to its own side.
 
     Args:
-        observation: in the default layout.
+        observation: observation in the default layout.
         lateral: how far to the right of the vehicle the path runs, in m.
-        curvature: of the path here, positive to the right, in 1/m.
-        half_width: in m.
+        curvature: curvature of the path here, positive to the right, in 1/m.
+        half_width: half width in m.
     """
     nearest: Leader | None = None
     for row in actors(observation):
@@ -116,7 +116,7 @@ class PathCurvature:
     """Estimates the curvature of the own path from how the heading changes: a radar's path prediction.
 
     Args:
-        step_length_s: between two observations, in s.
+        step_length_s: step length between two observations, in s.
     """
 
     def __init__(self, step_length_s: float) -> None:
@@ -156,9 +156,9 @@ def idm_acceleration(
     Args:
         speed: own, in m/s.
         leader: the vehicle ahead; None on a free road.
-        desired_speed: on a free road, in m/s.
+        desired_speed: desired speed on a free road, in m/s.
         headway_s: time gap, in s.
-        standstill_gap: in m; leaves room for the half of a truck that is longer than that of a car.
+        standstill_gap: standstill gap in m; leaves room for the half of a truck that is longer than that of a car.
         comfort: both the largest acceleration and the comfortable deceleration, in m/s².
     """
     free = 1 - (speed / max(desired_speed, 0.1)) ** 4
@@ -170,7 +170,7 @@ def idm_acceleration(
 
 
 class CarFollowing:
-    """Follows the vehicle in front by the Intelligent Driver Model, on what it saw a moment ago.
+    """Follows the vehicle in front by the Intelligent Driver Model, with a delayed observation.
 
     It is safe for most of its arguments. A long delay together with a short headway and weak brakes is not.
 
@@ -178,10 +178,10 @@ class CarFollowing:
         delay_s: how old the observation is that it acts on, in s.
         headway_s: the time gap that it keeps, in s.
         max_brake: the hardest that it brakes, in m/s².
-        desired_speed: with a free road, in m/s.
-        step_length_s: of the simulation, in s; turns the delay into steps.
-        observation_space: of the vehicle.
-        action_space: of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
+        desired_speed: desired speed with a free road, in m/s.
+        step_length_s: step length of the simulation, in s; turns the delay into steps.
+        observation_space: observation space of the vehicle.
+        action_space: action space of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
 
     Raises:
         ValueError: an argument makes no sense, or the observation has other columns than the default ones.

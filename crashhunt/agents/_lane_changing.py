@@ -48,10 +48,10 @@ class LaneChanger:
     Args:
         blind_spot_m: how far back from its own centre a vehicle in the next lane goes unnoticed, in m.
         patience_s: how long it follows before it overtakes, in s.
-        desired_speed: in m/s.
-        step_length_s: of the simulation, in s.
-        observation_space: of the vehicle.
-        action_space: of the vehicle; (target speed, lane change), or discrete meta-actions.
+        desired_speed: desired speed in m/s.
+        step_length_s: step length of the simulation, in s.
+        observation_space: observation space of the vehicle.
+        action_space: action space of the vehicle; (target speed, lane change), or discrete meta-actions.
 
     Raises:
         ValueError: an argument makes no sense, or the observation has other columns than the default ones.
@@ -160,14 +160,14 @@ class IntelligentDriver(LaneChanger):
     Research Record 1999 (2007), 86, equations 2 and 4 (symmetric rules).
 
     Args:
-        desired_speed: in m/s.
+        desired_speed: desired speed in m/s.
         headway_s: time gap, in s.
         politeness: how much the others' acceleration counts, against the own.
         gain: the least advantage for which it changes lanes, in m/s².
         patience_s: the time from one decision about lanes to the next, in s.
-        step_length_s: of the simulation, in s.
-        observation_space: of the vehicle.
-        action_space: of the vehicle.
+        step_length_s: step length of the simulation, in s.
+        observation_space: observation space of the vehicle.
+        action_space: action space of the vehicle.
 
     Raises:
         ValueError: an argument makes no sense, or the observation has other columns than the default ones.

@@ -37,8 +37,8 @@ class StableBaselines3:
         path: what ``model.save`` wrote, with its ``.zip``.
         algorithm: the class of the model, or ``module:Class`` such as ``sb3_contrib:TQC``.
         deterministic: take the most probable action; otherwise draw one.
-        observation_space: of the vehicle.
-        action_space: of the vehicle.
+        observation_space: observation space of the vehicle.
+        action_space: action space of the vehicle.
 
     Raises:
         ValueError: there is no such file or algorithm, the file is no model of that algorithm, or the model was trained
@@ -67,15 +67,17 @@ class StableBaselines3:
         except Exception as error:
             why = f"{type(error).__name__}: {_line(error)}"
             raise ValueError(
-                f"{path!r} is no model of {name}, or of another version of its libraries ({why})"
+                f"{path!r} is not a model of {name}, or was saved with another version of its libraries ({why})"
             ) from error
         self._deterministic = deterministic
         trained = self._model.observation_space
         if observation_space is not None and _shape(trained) != _shape(observation_space):
-            raise ValueError(f"the model was trained on {trained}, and the vehicle is shown {observation_space}")
+            raise ValueError(f"the model was trained on {trained}, but the vehicle observes {observation_space}")
         decides = self._model.action_space
         if action_space is not None and _choices(decides) != _choices(action_space):
-            raise ValueError(f"the model was trained to act in {decides}, and the vehicle's actions are {action_space}")
+            raise ValueError(
+                f"the model was trained with actions in {decides}, but the vehicle's actions are in {action_space}"
+            )
 
     def reset(self, seed: int) -> None:
         """Forget the hidden state, and seed the model."""
@@ -160,10 +162,10 @@ class TorchPolicy(_Network):
     greatest is taken; of a continuous one the action, which is clipped to the space.
 
     Args:
-        path: of the module.
+        path: path of the module.
         flatten: whether it expects observations as one row of numbers.
-        action_space: of the vehicle.
-        observation_space: of the vehicle.
+        action_space: action space of the vehicle.
+        observation_space: observation space of the vehicle.
 
     Raises:
         ValueError: there is no such file, or it takes other observations or answers with another number of values.
@@ -197,10 +199,10 @@ class OnnxPolicy(_Network):
     """Drives by an ONNX model with one input and one output, with the same meaning as for `TorchPolicy`.
 
     Args:
-        path: of the model.
+        path: path of the model.
         flatten: whether it expects observations as one row of numbers.
-        action_space: of the vehicle.
-        observation_space: of the vehicle.
+        action_space: action space of the vehicle.
+        observation_space: observation space of the vehicle.
 
     Raises:
         ValueError: there is no such file, or it takes other observations or answers with another number of values.
@@ -289,10 +291,10 @@ class NumpyPolicy:
     Where actions are (target speed, lane change), FASTER and SLOWER step through the target speeds.
 
     Args:
-        path: of the weights.
-        step_length_s: of the simulation, in s.
-        observation_space: of the vehicle.
-        action_space: of the vehicle.
+        path: path of the weights.
+        step_length_s: step length of the simulation, in s.
+        observation_space: observation space of the vehicle.
+        action_space: action space of the vehicle.
 
     Raises:
         ValueError: the file has no such weights, or the observation has other columns than the default ones.
@@ -318,7 +320,7 @@ class NumpyPolicy:
             self._hold = max(1, round(float(data["period_s"]) / step_length_s))
             values = self.evaluate(np.zeros(self._rows * len(self._columns), np.float32))
             if values.shape != (len(_MEANINGS),):
-                raise ValueError(f"they give values of the shape {values.shape}, not ({len(_MEANINGS)},)")
+                raise ValueError(f"the weights give values of the shape {values.shape}, not ({len(_MEANINGS)},)")
         except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
             raise ValueError(f"{path!r} has no weights of a policy: {error}") from error
         self.reset(0)

@@ -35,12 +35,12 @@ class Agent(Protocol):
         """Return an action inside the vehicle's action space.
 
         Args:
-            observation: inside its observation space. Never written to again by anybody else.
+            observation: inside its observation space. No other process writes to it again.
         """
 
 
 class DrawsPanels(Protocol):
-    """An agent that shows what it thinks."""
+    """An agent that shows its internal state."""
 
     def panels(self) -> object:
         """Return panels in a nest of mappings and sequences, whose keys are their labels.
@@ -71,13 +71,13 @@ _FASTER, _SLOWER = 0.5, -0.75  # m/s²
 
 
 def meta_actions(space: Space[object] | None) -> Mapping[str, int] | None:
-    """Return the numbers of the meta-actions; None where actions are (target speed, lane change).
+    """Return the numbers of the meta-actions; None if actions are (target speed, lane change).
 
     What a space does not have, such as a lane change where only the speed is controlled, is IDLE.
 
     Args:
-        space: of the vehicle; the meanings of its numbers are its ``meanings``, or those of highway-env where there
-            are five.
+        space: space of the vehicle; the meanings of its numbers are its ``meanings``, or those of highway-env where
+            there are five.
 
     Raises:
         ValueError: its actions are neither.
@@ -93,7 +93,7 @@ def meta_actions(space: Space[object] | None) -> Mapping[str, int] | None:
         meanings = space.meanings if supports(space, HasMeanings) else _ALL if space.n == len(_ALL) else ()
     numbers = {name: number for number, name in enumerate(meanings)}
     if "IDLE" not in numbers:
-        raise ValueError(f"drives by (target speed, lane change) or meta-actions, not by {space}")
+        raise ValueError(f"needs actions (target speed, lane change) or meta-actions, not {space}")
     return {name: numbers.get(name, numbers["IDLE"]) for name in _ALL}
 
 

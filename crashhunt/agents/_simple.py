@@ -19,8 +19,8 @@ class KeepLaneWithSpeed:
     """Keeps its lane at a constant speed, whatever is in front of it.
 
     Args:
-        speed: in m/s.
-        action_space: of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
+        speed: speed in m/s.
+        action_space: action space of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
 
     Raises:
         ValueError: it has other actions.
@@ -54,8 +54,8 @@ class RandomAgent:
     """Draws an action from the action space and holds it for a while.
 
     Args:
-        hold_steps: for how many steps it holds each action.
-        action_space: of the vehicle.
+        hold_steps: number of steps for which it holds each action.
+        action_space: action space of the vehicle.
     """
 
     def __init__(
@@ -116,6 +116,6 @@ class Recorded:
             IndexError: the log is exhausted; it never drives on silently.
         """
         if self._next >= len(self._actions):
-            raise IndexError(f"the log has {len(self._actions)} actions, and the episode asks for one more")
+            raise IndexError(f"the log has {len(self._actions)} actions, but the episode needs one more")
         self._next += 1
         return self._actions[self._next - 1]

@@ -1,4 +1,4 @@
-"""Foundations of every other package: errors, plugin names, files, processes and text. It knows nothing of traffic.
+"""Foundations of every other package: errors, plugin names, files, processes and text.
 
 Its modules are independent, so import each by its own name. Every other package offers its names in its ``__init__``.
 """

@@ -1,4 +1,4 @@
-"""The boundaries of crashhunt: calls of foreign code in an episode, by the party whose code is called.
+"""The boundaries of crashhunt: calls of foreign code in an episode, by the party that wrote the code.
 
 Every call of foreign code stands alone inside a boundary. An exception that comes out of the call is wrapped, and the
 wrapper says whose code raised it. Therefore an exception without a wrapper is crashhunt's own.
@@ -22,7 +22,7 @@ R = TypeVar("R")
 
 
 class Party(StrEnum):
-    """Whose code runs in an episode."""
+    """The parties whose code runs in an episode."""
 
     AGENT = "agent"
     ENVIRONMENT = "environment"
@@ -35,7 +35,7 @@ class ForeignError(SimulatorError):
     """An exception of foreign code; its cause is the exception itself.
 
     Args:
-        party: Whose code raised it.
+        party: The party whose code raised the exception.
         place: What the code was called for, such as ``step``.
         error: The exception.
     """
@@ -51,7 +51,7 @@ class Boundary:
     """Surrounds calls of one party's code for one purpose: ``with boundary: call()``.
 
     Args:
-        party: Whose code is called.
+        party: The party whose code is called.
         place: What it is called for, such as ``step``.
     """
 

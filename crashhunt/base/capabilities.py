@@ -1,4 +1,4 @@
-"""Optional capabilities of an object beyond its protocol; each capability is a protocol of its own."""
+"""Optional capabilities of an object beyond its protocol; each capability is its own protocol."""
 
 from __future__ import annotations
 

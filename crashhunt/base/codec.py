@@ -4,7 +4,7 @@ The annotations of a dataclass say how each field is converted, so that every sh
 differs from the annotations is declared in the metadata of the field: `OMIT_DEFAULT`, `null_is`, `written_if`.
 
 Invariants: keys are written in the order of `Serializable.json_keys`, which is part of the file formats. A missing key
-means the default of its field. A key that this version does not know is ignored; `crashhunt.base.tolerance` keeps it
+means the default of its field. A key that this version does not know is ignored; `crashhunt.base.codec` keeps it
 where a file is written again.
 
 Why not a library: cattrs and pydantic support all of this, and add 30 and 60 ms to the start of every command. msgspec
@@ -24,17 +24,48 @@ from math import isfinite
 from operator import methodcaller
 from pathlib import Path
 from types import UnionType
-from typing import Any, ClassVar, Self, TypeAlias, TypeVar, Union, cast, get_args, get_origin
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Self,
+    TypeAlias,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from crashhunt.base.integrity import typed
+from crashhunt.base.text import did_you_mean
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from crashhunt.base.json_types import Plain
+
 
 __all__ = [
+    "ESSENTIAL",
     "OMIT_DEFAULT",
     "JsonObject",
     "Serializable",
+    "essentials",
     "from_plain",
+    "known_part",
+    "known_values",
+    "merged",
+    "not_understood",
     "null_is",
     "plain_types",
     "prepare",
+    "required_in",
+    "required_of",
+    "slip",
     "to_plain",
+    "typed_where_there",
     "written_if",
 ]
 
@@ -49,7 +80,7 @@ OMIT_DEFAULT: Mapping[str, object] = {"omit_default": True}
 
 
 def null_is(value: float | None) -> Mapping[str, object]:
-    """Return the metadata of a number that is written as null where it is not finite; null is read as ``value``."""
+    """Return the metadata of a number that is written as null if it is not finite; null is read as ``value``."""
     return {"null": value}
 
 
@@ -186,7 +217,7 @@ def _finite(value: float) -> float | None:
 
 
 def _writer(hint: Any) -> _Convert | None:
-    """Return the function that makes a value of a type plain; None where it is plain already."""
+    """Return the function that makes a value of a type plain; None if it is plain already."""
     kind, inner = _kind_of(hint)
     of_item = _writer(inner[-1 if issubclass(kind, Mapping) else 0]) if inner else None
     if issubclass(kind, Mapping):
@@ -230,7 +261,7 @@ def _optional(convert: _Convert, *, falsy: bool) -> _Convert:
 
 
 def _reader(hint: Any) -> _Convert | None:
-    """Return the function that makes a value of a type from a plain one; None where that is the same."""
+    """Return the function that makes a value of a type from a plain one; None if that is the same."""
     kind, inner = _kind_of(hint)
     if issubclass(kind, Serializable):
         return lambda held: kind.from_json(held or {})
@@ -252,3 +283,129 @@ def _kind_of(hint: Any) -> tuple[type, tuple[Any, ...]]:
         return _kind_of(choices[0]) if len(choices) == 1 else (object, ())
     kind = hint if origin is None else origin
     return (kind, inner) if isinstance(kind, type) else (object, ())
+
+
+# Tolerant reading of data from other versions of crashhunt: unknown keys are kept aside, known ones are checked.
+
+ESSENTIAL: Plain = {"essential": True}
+"""Metadata of a field that another version must know where it is not at its default, or refuse: without it, what
+crosses to that version would mean something else."""
+
+
+def known_values(kind: type, data: Plain) -> dict[str, Any]:
+    """Return the values for which a dataclass has fields, without those that a later version has added.
+
+    Args:
+        kind: the dataclass.
+        data: keys and values as they were read.
+    """
+    known = {item.name for item in fields(kind)}
+    return {name: value for name, value in data.items() if name in known}
+
+
+def known_part(kind: Any, data: object) -> tuple[Any, Any]:
+    """Split plain data into the part for which a dataclass has fields, at any depth, and the rest with the same layout.
+
+    Unknown keys of items of a list are dropped; every other unknown key is in the rest. The rest is an empty dict if
+    everything is known.
+    """
+    if is_dataclass(kind) and isinstance(data, dict):
+        hints = _hints_of(cast(Any, kind))
+        return _split({name: hints[name] for name in data if name in hints}, data)
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is dict and isinstance(data, dict):
+        return _split(dict.fromkeys(data, inner[1]), data)
+    if origin in (Union, UnionType):
+        others = [other for other in inner if other is not type(None)]
+        return known_part(others[0], data) if len(others) == 1 else (data, {})
+    if origin in (list, tuple) and isinstance(data, list) and inner:
+        return [known_part(inner[0], item)[0] for item in data], {}
+    return data, {}
+
+
+@cache
+def _hints_of(kind: Any) -> dict[str, object]:
+    try:
+        return get_type_hints(kind)
+    except NameError:  # of a type that is imported for the checker only, and so is no table of a file
+        return dict.fromkeys((item.name for item in fields(kind)), Any)
+
+
+def _split(kinds: Plain, data: Plain) -> tuple[dict[str, object], dict[str, object]]:
+    known: dict[str, object] = {}
+    rest = {name: value for name, value in data.items() if name not in kinds}
+    for name, kind in kinds.items():
+        known[name], more = known_part(kind, data[name])
+        if more:
+            rest[name] = more
+    return known, rest
+
+
+def merged(data: Plain, rest: Plain) -> dict[str, object]:
+    """Return plain data with what was left aside of it, where nothing else has taken its place."""
+    found = dict(data)
+    for name, value in rest.items():
+        if name not in found:
+            found[name] = value
+        elif isinstance(value, dict) and isinstance(there := found[name], dict):
+            found[name] = merged(there, value)
+    return found
+
+
+def slip(rest: Plain, known: Plain, kind: type) -> str:
+    """Return an unknown key that resembles a missing one (a typing error or damage); otherwise an empty string.
+
+    Args:
+        rest: the unknown part, of `known_part`.
+        known: the known part.
+        kind: the dataclass.
+    """
+    missing = [item.name for item in fields(kind) if item.name not in known]
+    return next((name for name in rest if name not in known and did_you_mean(name, missing)), "")
+
+
+def typed_where_there(data: Plain, types: Plain) -> None:
+    """See of which types the values of some keys are, of those that are there.
+
+    Raises:
+        ValueError: with the key, its value and the type.
+    """
+    typed(data, {key: kind for key, kind in types.items() if key in data})
+
+
+def essentials(*kinds: Any) -> frozenset[str]:
+    """Return the names of all essential fields of some dataclasses, and of those inside them."""
+    found: set[str] = set()
+    for kind in kinds:
+        if is_dataclass(kind):
+            found |= {item.name for item in fields(kind) if "essential" in item.metadata}
+            found |= essentials(*_hints_of(cast(Any, kind)).values())
+        found |= essentials(*get_args(kind))
+    return frozenset(found)
+
+
+def not_understood(needed: Iterable[str], *kinds: object) -> list[str]:
+    """Return what plain data says that its reader must know (``requires``), and none of some dataclasses has."""
+    return sorted(set(needed) - essentials(*kinds)) if needed else []
+
+
+def required_of(value: object) -> list[str]:
+    """Return the names of the essential fields of an object that are not at their default; not of those inside it."""
+    return [name for name, default in _essential(cast(Any, type(value))) if getattr(value, name) != default]
+
+
+def required_in(value: object) -> list[str]:
+    """Return the same of an object and of all those inside it."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        return sorted({name for inner in value for name in required_in(inner)})
+    if not is_dataclass(value):
+        return []
+    inside = (getattr(value, item.name) for item in fields(value))
+    return sorted({*required_of(value), *(name for inner in inside for name in required_in(inner))})
+
+
+@cache
+def _essential(kind: Any) -> list[tuple[str, object]]:
+    return [(item.name, item.default) for item in fields(kind) if "essential" in item.metadata]

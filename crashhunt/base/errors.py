@@ -69,7 +69,7 @@ class CrashhuntError(Exception):
     Args:
         message: what is wrong, with the offending value.
         fix: what to do about it, as an imperative.
-        where: the file, key or option that is meant.
+        where: the file, key or option with the problem.
     """
 
     exit_code = 2

@@ -74,7 +74,7 @@ def format_error(error: BaseException) -> str:
 
     The text has at most `MAX_TRACEBACK_CHARACTERS` characters and a line for each cut. Long tracebacks, messages,
     chains and groups of exceptions are cut before they are formatted: Python needs 13 s for a million frames. The text
-    is empty where it cannot be made.
+    is empty if it cannot be made.
     """
     try:
         text = "".join(traceback.format_exception(error)) if _is_small(error) else "".join(_formatted_chain(error))
@@ -261,7 +261,7 @@ def is_users(filename: str) -> bool:
     return not filename.startswith((_OURS, *_OTHERS, *_NOBODYS))
 
 
-def blamed(what: str, error: Exception, *, fix: str = "mend it") -> PluginError:
+def blamed(what: str, error: Exception, *, fix: str = "correct the code") -> PluginError:
     """Return the error for user code that fails: the failed action, the reason and the place.
 
     Args:
@@ -273,7 +273,7 @@ def blamed(what: str, error: Exception, *, fix: str = "mend it") -> PluginError:
 
 
 def place_of(error: BaseException) -> str:
-    """Return ``FILE, line N``; empty where no line of a file is to blame.
+    """Return ``FILE, line N``; empty if no line of a file is to blame.
 
     The place is the last traceback line in user code. If there is none, it is the last line in an installed library.
     """
@@ -288,7 +288,7 @@ def place_of(error: BaseException) -> str:
 
 
 def shown_path(name: str) -> str:
-    """Return a path as short as it is from the current directory."""
+    """Return a path relative to the current directory, if that is shorter."""
     path = Path(name)
     try:
         return str(path.resolve().relative_to(Path.cwd()))

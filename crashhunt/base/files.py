@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import FULL, HuntDirectoryError
@@ -12,7 +13,6 @@ from crashhunt.base.temporary import remove_tree, temporary_beside, temporary_na
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 __all__ = ["cannot_write", "exchange", "is_empty_folder", "put_in_place", "sync_folder", "sync_tree", "whole_file"]
 
@@ -25,7 +25,7 @@ def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Itera
     """Yield a temporary name in the folder of a file; the result replaces the file at the end, or is removed on error.
 
     Args:
-        path: of the file.
+        path: path of the file.
         lasting: whether content and name are synced to the disk before this returns. Set it to False for files that
             are useless after a crash of the process or a power failure.
         noted: whether the next command removes the temporary file if this process is killed. Set it to False inside
@@ -34,6 +34,7 @@ def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Itera
     Raises:
         HuntDirectoryError: it cannot be written.
     """
+    _refuse_device(path)
     name = temporary_name(path)
     with temporary_beside(path, name=name) if noted else nullcontext(path.with_name(name)) as temporary:
         try:
@@ -47,6 +48,13 @@ def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Itera
             raise cannot_write(path, error) from error
         finally:
             remove_tree(temporary)
+
+
+def _refuse_device(path: Path) -> None:
+    """Raise an error where a file would replace a device or a pipe, or a link to one: root could replace /dev/null."""
+    is_special = path.exists() and not (path.is_file() or path.is_dir())
+    if is_special or path.absolute().parent == Path("/dev"):
+        raise HuntDirectoryError("is a device or a pipe, and cannot be replaced", fix="give a file", where=str(path))
 
 
 def put_in_place(made: Path, final: Path) -> None:

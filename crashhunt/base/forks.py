@@ -30,6 +30,7 @@ import select
 import signal
 import stat
 import sys
+import threading
 import time
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -77,6 +78,7 @@ __all__ = [
 
 _ENDS_S = 1.0  # wall time within which a process with a closed pipe ends
 _LOOK_EVERY_S = 0.002  # between two checks of whether a process has ended
+_CHECK_EVERY_S = 0.2  # the same, of one whose answer is awaited
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,11 +219,13 @@ class Held:
         files: descriptor to its target.
         children: process ids.
         shared: names of memory that is shared with other processes; None to skip this check, which takes milliseconds.
+        threads: ids of threads.
     """
 
     files: Mapping[int, str] = field(default_factory=dict)
     children: frozenset[int] = frozenset()
     shared: frozenset[str] | None = frozenset()
+    threads: frozenset[str] = frozenset()
 
 
 def held(shared: frozenset[str] | None = None) -> Held:
@@ -290,7 +294,7 @@ class Copy:
             os.close(theirs)
 
     def answer(self, timeout_s: float) -> Plain | None:
-        """Wait for the answer, then end the fork; return None where the work raised, died or exceeded the time limit.
+        """Wait for the answer, then end the fork; return None if the work raised, died or exceeded the time limit.
 
         Args:
             timeout_s: time limit in s of wall time.
@@ -298,12 +302,18 @@ class Copy:
         received, deadline = bytearray(), time.monotonic() + timeout_s
         try:
             while not received.endswith(b"\n"):
-                ready, _, _ = select.select([self._end], [], [], max(0.0, deadline - time.monotonic()))
+                left_s = deadline - time.monotonic()
+                ready, _, _ = select.select([self._end], [], [], max(0.0, min(left_s, _CHECK_EVERY_S)))
                 data = os.read(self._end, _RECEIVED) if ready else b""
-                if not data:
-                    self.no_answer = explain_silence(self.pid) if ready else took_longer(timeout_s)
-                    return None
                 received += data
+                if ready and not data:
+                    self.no_answer = explain_silence(self.pid)
+                elif not ready and left_s <= 0:
+                    self.no_answer = took_longer(timeout_s)
+                elif not ready and _has_ended(self.pid) and not select.select([self._end], [], [], 0)[0]:
+                    self.no_answer = explain_silence(self.pid)  # a process that it has started keeps the pipe open
+                if self.no_answer is not None:
+                    return None
             answer, self.raised, self.no_answer = parse_answer(received)
             return answer
         finally:
@@ -322,6 +332,13 @@ class Copy:
         ends.discard(self._end)
         os.close(self._end)
         self._end = -1
+
+
+def _has_ended(pid: int) -> bool:
+    try:
+        return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None
+    except ChildProcessError:
+        return True
 
 
 def end_orphans(children: frozenset[int]) -> None:
@@ -356,7 +373,7 @@ def fork(work: Callable[[], object], known: Held | None = None, *, keeps: Collec
     """
     global _copying
     if sys.platform != "linux":
-        raise CannotForkError("processes are copied on Linux only")
+        raise CannotForkError("forks need Linux")
     parent = os.getpid()
     with watchdog.paused():
         replaced, drawn = _replacements(known or Held(), keeps), random.getstate()
@@ -404,16 +421,17 @@ def _replacements(known: Held, keeps: Collection[int]) -> list[tuple[int, int, i
     Raises:
         CannotForkError: a descriptor, a thread, a child or shared memory cannot be copied.
     """
-    others = len(threads() - watchdog.threads) - 1
+    own = {str(threading.get_native_id())}
+    others = len(threads() - watchdog.threads - known.threads - own)
     if others > 0:
-        raise CannotForkError(f"threads have no copy, and {others} run{'s' * (others == 1)} besides the first")
+        raise CannotForkError(f"a fork copies no threads, and {others} run{'s' * (others == 1)} besides the first")
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():
-        raise CannotForkError("a graphics card has no copy, and PyTorch uses one")
+        raise CannotForkError("a fork copies no state of a graphics card, and PyTorch uses one")
     if children_now() - known.children - _alive:
-        raise CannotForkError("a process that was started has no copy")
+        raise CannotForkError("a fork copies no child processes")
     for name in shared_memory() - known.shared if known.shared is not None else ():
-        raise CannotForkError(f"memory that is shared with others has no copy: {name}")
+        raise CannotForkError(f"a fork copies no memory that is shared with other processes: {name}")
     return [
         (descriptor, *_replacement(descriptor, what, known))
         for descriptor, what in _open().items()
@@ -434,14 +452,16 @@ def _replacement(descriptor: int, what: str, known: Held) -> tuple[int, int]:
         if flags == os.O_WRONLY or ours or MEMORY in what:
             return _NOTHING, 0
         if os.fstat(descriptor).st_size > _LARGEST:
-            raise CannotForkError(f"a file that is written and read has no copy when it is so large: {what}")
+            raise CannotForkError(
+                f"a fork cannot copy a file that is open for writing and reading and is so large: {what}"
+            )
         return _OWN, place
     if stat.S_ISDIR(mode) or what.startswith(_HARMLESS):
         return _READ if stat.S_ISDIR(mode) else _NOTHING, 0
     if ours:
         return _NOTHING if descriptor == 0 else _CLOSE, 0
     kind = "a device" if stat.S_ISCHR(mode) or stat.S_ISBLK(mode) else "a connection to others"
-    raise CannotForkError(f"{kind} has no copy: {what}")
+    raise CannotForkError(f"a fork cannot copy {kind}: {what}")
 
 
 def _replace(replaced: list[tuple[int, int, int]]) -> None:
@@ -486,7 +506,7 @@ _loads, _write = json.loads, os.write
 
 
 class SuspendedFork:
-    """A suspended fork; it runs each job in a fork of its own, so its state never changes.
+    """A suspended fork; it runs each job in its own fork, so its state never changes.
 
     Args:
         work: computes the answer to a job; both must be expressible as JSON.
@@ -519,7 +539,7 @@ class SuspendedFork:
             os.close(answers)
 
     def ask(self, job: Plain, timeout_s: float) -> Plain | None:
-        """Return the answer to a job; None where the work raised, died or exceeded the time limit (see `no_answer`).
+        """Return the answer to a job; None if the work raised, died or exceeded the time limit (see `no_answer`).
 
         Args:
             job: the input of the work.

@@ -52,7 +52,7 @@ class FileEntry(TypedDict):
     """The recorded size and digest of a file.
 
     Args:
-        size: in bytes.
+        size: size in bytes.
         blake2b: the digest of its content, in hexadecimal.
     """
 
@@ -121,7 +121,7 @@ def read_object(path: Path, shape: type[T]) -> T:
     """Read a JSON object.
 
     Args:
-        path: of the file.
+        path: path of the file.
         shape: the `TypedDict` that the caller expects; the caller checks the keys it needs with `typed`.
 
     Raises:
@@ -135,7 +135,7 @@ def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the ty
     """Parse a text as a JSON object.
 
     Args:
-        text: in UTF-8.
+        text: text in UTF-8.
         shape: as for `read_object`.
 
     Raises:
@@ -144,9 +144,9 @@ def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the ty
     try:
         found = json.loads(text)
     except RecursionError:
-        raise ValueError("it is nested too deeply") from None
+        raise ValueError("the data are nested too deeply") from None
     if not isinstance(found, dict):
-        raise ValueError(f"it holds {type(found).__name__}, not an object")
+        raise ValueError(f"the file holds {type(found).__name__}, not an object")
     return cast(T, found)
 
 
@@ -225,7 +225,7 @@ def is_authentic(purpose: str, statement: Mapping[str, object], code: object) ->
 def user_key() -> bytes:
     """Return the secret key of this user on this machine; the first call creates it.
 
-    Where no folder can keep it, each process has a key of its own, so that nothing counts as made here later.
+    Where no folder can keep it, each process has its own key, so that nothing counts as made here later.
     """
     for folder in state_folders():
         key = _kept_key(folder / layout.ARCHIVE_KEY)
@@ -258,7 +258,7 @@ def state_folders() -> Iterator[Path]:
 
 
 def _kept_key(file: Path) -> bytes | None:
-    """Return the key of a file, which is created where it is missing; None where neither is possible."""
+    """Return the key of a file, which is created where it is missing; None if neither is possible."""
     with suppress(OSError):
         key = file.read_bytes()
         # Everybody can compute codes with a key that is cut off: replace the file.

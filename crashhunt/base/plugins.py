@@ -25,6 +25,8 @@ __all__ = [
     "Group",
     "distributions",
     "import_module",
+    "is_foreign",
+    "is_foreign_module",
     "load_attribute",
     "load_object",
     "locate",
@@ -95,6 +97,17 @@ def locate(group: Group, name: str) -> Any:
     return load_object(target, shown=name)
 
 
+def is_foreign(group: Group, name: str) -> bool:
+    """Whether `locate` would run code that is not crashhunt's, and that this process has not run yet."""
+    points = registered(group)
+    return is_foreign_module((points[name].value if name in points else name).partition(":")[0])
+
+
+def is_foreign_module(name: str) -> bool:
+    """Whether importing a module would run code that is not crashhunt's, and that this process has not run yet."""
+    return name.partition(".")[0] != "crashhunt" and name not in sys.modules
+
+
 def load_object(target: str, *, shown: str = "") -> Any:
     """Import the class or function that a ``module:attribute`` names.
 
@@ -132,7 +145,7 @@ def load_attribute(target: str, *, shown: str = "") -> Any:
             public = [name for name in vars(found) if not name.startswith("_")] if hasattr(found, "__dict__") else []
             raise PluginError(
                 f"{name!r}: {module_name} has no attribute {attribute!r}",
-                fix=did_you_mean(part, public) or "mend the name",
+                fix=did_you_mean(part, public) or "correct the name",
             )
         found = getattr(found, part)
     return found
@@ -142,8 +155,8 @@ def import_module(name: str, *, shown: str = "") -> types.ModuleType:
     """Import a module, which may lie in the current directory.
 
     Args:
-        name: of the module.
-        shown: how errors name what is asked for.
+        name: name of the module.
+        shown: name of the value in errors.
 
     Raises:
         PluginError: importing it failed.
@@ -166,9 +179,9 @@ def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
     missing = error.name or "" if isinstance(error, ModuleNotFoundError) else ""
     if missing and f"{name}.".startswith(f"{missing}."):  # the module itself, or a package that it is said to be in
         hint = did_you_mean(missing.rpartition(".")[2], _sibling_modules(missing))
-        fix = f"{hint} run from the folder that holds the module, install it, or mend the name".lstrip()
+        fix = f"{hint} run from the folder that holds the module, install it, or correct the name".lstrip()
         return PluginError(f"{shown!r} cannot be imported: No module named {missing!r}", fix=fix)
-    fix = f"install {missing.partition('.')[0]!r}, or mend the import" if missing else "mend it"
+    fix = f"install {missing.partition('.')[0]!r}, or correct the import" if missing else "correct the module"
     return PluginError(f"{said}, which keeps {shown!r} from being imported", fix=fix, where=place_of(error))
 
 

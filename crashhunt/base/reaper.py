@@ -40,7 +40,7 @@ class Kept:
         arguments: command-line arguments of the module.
         environment: environment variables of the process.
         inherited: file descriptors that the process receives.
-        apart: whether the process has a session of its own, without signals of this terminal and group.
+        apart: whether the process has its own session, without signals of this terminal and group.
         stdin: as for `subprocess.Popen`.
         stdout: the same.
         stderr: the same.

@@ -16,7 +16,7 @@ _NO_MEMORY = ("can't start new thread", "failed to map segment", "cannot allocat
 
 
 def limit_behind(error: BaseException) -> str:
-    """Return the limit that an error came from and how to raise it, in words; empty where no limit is set.
+    """Return the limit that an error came from and how to raise it, in words; empty if no limit is set.
 
     A limit on memory (``RLIMIT_AS``) shows as one of many errors: of Python, of a thread or of a library that does not
     load. A limit on the size of files (``RLIMIT_FSIZE``) is an `OSError`, since Python ignores its signal.

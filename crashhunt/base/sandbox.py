@@ -37,14 +37,14 @@ _SYSTEM = """
 
 
 def landlock_version() -> int:
-    """Return the version of the kernel's interface; 0 where there is none."""
+    """Return the version of the kernel's interface; 0 if there is none."""
     if sys.platform != "linux":
         return 0
     return max(0, int(ctypes.CDLL(None, use_errno=True).syscall(_CREATE_RULESET, None, 0, _VERSION_ONLY)))
 
 
 def confine(folder: Path, readable: Iterable[Path | str] = ()) -> bool:
-    """Have this process, and all that it starts, write below one folder only, for good.
+    """Restrict this process and its children to write below one folder only. This cannot be undone.
 
     It reads what is installed, that folder and what is named; it opens no port, and sends no other process a signal,
     as far as the kernel knows these.

@@ -42,7 +42,7 @@ def json_schema(kind: Any, title: str, names: Mapping[str, Any] = _ABSTRACT) -> 
 
     Args:
         kind: a `TypedDict`, a `Serializable` dataclass, or a type made of these.
-        title: of the schema.
+        title: title of the schema.
         names: what annotations name that their modules import for the type checker only.
 
     Raises:

@@ -53,13 +53,13 @@ class _Mapping:
 
 
 class SharedState:
-    """What this process would share with its forks. Each fork calls `separate` before anything else.
+    """What this process would share with its forks. Each fork first calls `separate`.
 
     Args:
-        known: descriptors to leave as they are.
+        known: descriptors that stay open.
 
     Attributes:
-        remaining: what is too large to be copied, in words; empty where nothing is.
+        remaining: description of files that are too large to copy; empty if there are none.
     """
 
     def __init__(self, known: Collection[int] = ()) -> None:

@@ -1,4 +1,4 @@
-"""Everything temporary that a process makes, so that nothing of it outlives the process, however the process ends.
+"""Temporary files and folders of a process. All are removed, however the process ends.
 
 Each process has one folder for temporary things, ``crashhunt-temporary-UID/TOKEN`` in the system's folder for temporary
 files (``TMPDIR``, else ``/tmp``). `Owner` says what the token is. The folder holds
@@ -121,7 +121,7 @@ def _owner(pid: int) -> Owner:
 
 
 def _namespace(kind: str) -> str:
-    """Return what names a namespace of this process; nothing where the kernel is too old to have any of that kind."""
+    """Return what names a namespace of this process; nothing if the kernel is too old to have any of that kind."""
     try:
         return str(Path(_NAMESPACES, kind).readlink())
     except FileNotFoundError:
@@ -129,7 +129,7 @@ def _namespace(kind: str) -> str:
 
 
 def owner_in(name: str) -> Owner | None:
-    """Return the owner that a file name gives; None where the name gives none, or several."""
+    """Return the owner that a file name gives; None if the name gives none, or several."""
     found = set(_TOKEN.findall(name))
     if len(found) != 1:  # a user's file name may have such a token as well
         return None
@@ -152,7 +152,7 @@ def start_time(pid: int) -> int:
     """Return when a process started, in clock ticks since the machine booted.
 
     Returns:
-        0 where there is no such process, or only a zombie is left of it; -1 where the system does not report it.
+        0 if there is no such process, or only a zombie is left of it; -1 where the system does not report it.
     """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
@@ -289,7 +289,7 @@ def temporary_folder(purpose: str) -> Iterator[Path]:
 
 @contextmanager
 def temporary_beside(path: Path, *, name: str = "") -> Iterator[Path]:
-    """Yield a path in the same folder for something temporary, and remove what is there at the end.
+    """Yield a temporary path in the same folder, and remove it at the end.
 
     The caller makes a file or a folder there, and renames it where it is to stay.
 
@@ -316,7 +316,7 @@ def temporary_name(path: Path, suffix: str = "") -> str:
     """Return a hidden name with the token of this process, for something temporary in the folder of a path.
 
     Args:
-        path: of what is being made.
+        path: path of what is being made.
         suffix: end of the name; by default that of the path, because some libraries choose the format by it.
     """
     stem, suffix = (path.name, suffix) if suffix else (path.stem, path.suffix)
@@ -369,7 +369,7 @@ def remove_scratch(path: Path) -> None:
 def remove_tree(path: Path) -> None:
     """Remove a file or a folder with everything in it, also where its permissions are in the way.
 
-    Errors are ignored. A symbolic link is removed, and not what it points to.
+    Errors are ignored. A symbolic link is removed, not its target.
     """
     with suppress(OSError):
         if not stat.S_ISDIR(path.lstat().st_mode):
@@ -386,7 +386,7 @@ def remove_tree(path: Path) -> None:
 
 
 class _Things:
-    """What this process has that is temporary: its folder, which is there as long as anything is in it."""
+    """The temporary files of this process: its folder exists while it has content."""
 
     def __init__(self) -> None:
         self.swept = False
@@ -428,7 +428,7 @@ class _Things:
         """Remove something that was made, and the folder with the last.
 
         Args:
-            path: of it.
+            path: path of it.
             removed: whether the file or folder is gone; otherwise it stays, and the next command tries again.
         """
         with self._lock:

@@ -61,7 +61,7 @@ _SHOWN = 20  # a hunt may have thousands of crashes, and the answer is one line
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return ``did you mean 'NAME'?`` for what was most likely meant; empty where nothing is near."""
+    """Return ``did you mean 'NAME'?`` for the most similar name; empty if no name is similar."""
     spelled = {_plain(other): str(other) for other in reversed(list(known))}  # of two that look alike, the first
     close = difflib.get_close_matches(_plain(name), spelled, 1)
     return f"did you mean {spelled[close[0]]!r}?" if close else ""
@@ -72,7 +72,7 @@ def near_path(path: Path, *endings: str) -> str:
 
     Args:
         path: that is not there.
-        endings: of the files that would do as well.
+        endings: endings of the files that would do as well.
     """
     try:
         siblings = sorted(path.parent.iterdir())
@@ -95,7 +95,7 @@ def listed(known: Iterable[str], *, none: str = "none") -> str:
 
 
 def one_of(name: str, known: Iterable[str], *, give: str = "give one of", none: str = "none") -> str:
-    """Return the fix for an unknown name: what was most likely meant, and everything that there is.
+    """Return the fix for an unknown name: the most similar name, and all names.
 
     Args:
         name: the one that is not known.

@@ -8,7 +8,9 @@ import io
 import json
 import os
 import select
+import shutil
 import sys
+import textwrap
 import traceback
 from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
@@ -48,11 +50,11 @@ from crashhunt.cli._trust import add_trust_command
 from crashhunt.cli._whatif import add_whatif
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Generator, Sequence
 
 __all__ = ["main", "make_parser"]
 
-_DESCRIPTION = "Hunts for the crashes of a driving agent, and hands them over so that they can be fixed."
+_DESCRIPTION = "Hunt for the crashes of a driving agent, and save each crash so that it can be replayed and fixed."
 _EPILOG = """\
 examples:
   crashhunt run crash 2 300 1500
@@ -70,9 +72,22 @@ exit codes: 0 done, 1 the answer is no, 2 bad usage or input, 3 not one valid tr
 """
 
 
+_COMMANDS = {
+    "find crashes": (add_run, add_init, add_suite, add_rerun),
+    "see what happened": (add_replay, add_show, add_report, add_dashboard, add_export),
+    "find out why": (add_judge, add_whatif, add_shrink, add_crashes, add_bisect),
+    "keep them fixed": (add_corpus, add_gate, add_split),
+    "measure": (add_rate, add_compare, add_trials),
+    "manage hunts": (add_status, add_logs, add_check, add_trust_command),
+    "look things up": (add_guide, add_lists, add_completion),
+}
+
+
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and exit."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if sys.stdout is None:  # closed before the start; a file opened later must not take its descriptor
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - open until the process ends
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # not every terminal knows every letter; as on stderr
     try:
@@ -142,8 +157,7 @@ def _explained(error: Exception) -> CrashhuntError:
 
 
 def _flush() -> None:
-    if sys.stdout is not None:
-        sys.stdout.flush()
+    sys.stdout.flush()
 
 
 def _is_output_closed() -> bool:
@@ -170,16 +184,30 @@ def _check_names(words: Sequence[str]) -> None:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
-    parser = Parser(
-        "crashhunt", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("crashhunt", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=_ByPurpose)
     parser.add_argument("--version", action="version", version=f"crashhunt {__version__}")
     parser.set_defaults(parser=parser)  # `guide` describes all of it
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (
-        add_run, add_init, add_replay, add_show, add_report, add_dashboard, add_export, add_suite, add_status, add_logs,
-        add_rerun, add_trials, add_crashes, add_judge, add_whatif, add_shrink, add_corpus, add_bisect,
-        add_trust_command, add_check, add_split, add_compare, add_gate, add_rate, add_lists, add_guide, add_completion,
-    ):  # fmt: skip
-        add(commands)
+    commands = parser.add_subparsers(
+        title="commands", metavar="COMMAND", required=True, help="crashhunt COMMAND --help describes each"
+    )
+    for purpose, adders in _COMMANDS.items():
+        known = len(commands._choices_actions)
+        for add in adders:
+            add(commands)
+        added = commands._choices_actions[known:]
+        parser.add_argument_group(purpose, "\n".join(_listed(one.dest, str(one.help)) for one in added))
     return parser
+
+
+class _ByPurpose(argparse.RawDescriptionHelpFormatter):
+    """Omits argparse's own list of the commands, one long block; groups by purpose list them."""
+
+    def _iter_indented_subactions(self, action: argparse.Action) -> Generator[argparse.Action, None, None]:
+        yield from ()
+
+
+def _listed(name: str, text: str) -> str:
+    """Return the lines that list a command in the help, wrapped at the width of argparse."""
+    width = shutil.get_terminal_size().columns - 2 - 2  # argparse indents them, and keeps off the edge
+    first = f"{name:<12}" if len(name) < 12 else f"{name}\n{'':12}"
+    return first + textwrap.fill(text, max(20, width - 12)).replace("\n", f"\n{'':12}")

@@ -24,16 +24,17 @@ def add_bisect(commands: Commands) -> None:
     bisect = commands.add_parser(
         "bisect",
         help="find the commit with which a crash came",
-        description="Find the commit of the agent's repository with which a crash came: git bisect, with the crash as "
-        "the test. Revisions are checked out in a work tree of their own; yours is left alone. Revisions that cannot "
-        "run, or crash in another way, are skipped. Exits with 1 where these are in the way of an answer.",
+        description="Find the commit of the agent's repository that introduced a crash: git bisect, with the crash "
+        "as the test. Revisions are checked out in a separate work tree; your own work tree does not change. "
+        "Revisions that "
+        "cannot run, or crash in another way, are skipped. Exits with 1 if the skipped revisions prevent an answer.",
     )
     add_crash(bisect)
     bisect.add_argument("--good", metavar="REV", required=True, help="a revision in which it does not crash")
-    bisect.add_argument("--bad", metavar="REV", default="HEAD", help="one in which it does; default: HEAD")
+    bisect.add_argument("--bad", metavar="REV", default="HEAD", help="a revision in which it crashes; default: HEAD")
     bisect.add_argument(
         "--from", metavar="FOLDER", type=Path, dest="folder",
-        help="of the repository, from which the agent is imported; default: the current one",
+        help="folder of the repository from which the agent is imported; default: the current folder",
     )  # fmt: skip
     add_trust(bisect)
     add_json(bisect)

@@ -23,13 +23,13 @@ def add_check(commands: Commands) -> None:
     check = commands.add_parser(
         "check",
         help="see that everything on disk is what was written, and what can be saved",
-        description="See that everything on disk is what was written: every trial of the ledger, every crash with its "
-        "log, every snapshot of code; and that they belong together. Nothing is changed, and no code is run. Exits "
-        "with 1 where something is damaged, and says what is lost and what gets the rest.",
+        description="Check that everything on disk is as it was written: every trial of the ledger, every crash with "
+        "its log, and every snapshot of code. Check that they belong together. The command changes nothing and "
+        "runs no code. Exits with 1 if something is damaged, and reports what is lost and how to recover the rest.",
     )
     check.add_argument(
         "directory", metavar="DIR", type=Path,
-        help="of a hunt, a suite or one crash, or a file that crashhunt export wrote",
+        help="directory of a hunt, a suite or a crash, or a file that crashhunt export wrote",
     )  # fmt: skip
     check.add_argument(
         "--salvage", metavar="TO", type=Path,
@@ -45,7 +45,7 @@ def _check(options: argparse.Namespace, _words: list[str]) -> int:
 
     found = check(options.directory)
     if options.salvage is not None and len(found) != 1:
-        raise UsageError(f"--salvage takes one hunt, and there are {len(found)}", fix="give the directory of one")
+        raise UsageError(f"--salvage takes one hunt, but there are {len(found)}", fix="give the directory of one hunt")
     for each in found:
         say(_describe(each), as_json=options.json)
     saved = None

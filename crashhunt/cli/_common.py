@@ -63,7 +63,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 
 
 class Parser(argparse.ArgumentParser):
-    """Reports mistakes as every other error is reported, and says what was probably meant."""
+    """Reports errors in one line, with the most similar name."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Refuse unknown options first: argparse would take the value of one for an argument, and complain of that.
@@ -103,25 +103,30 @@ class Parser(argparse.ArgumentParser):
 
 def add_json(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
     """Add ``--json``, the same for every command."""
-    parser.add_argument("--json", action="store_true", help="print one JSON object; what is for people goes to stderr")
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON object to stdout; all other text goes to stderr"
+    )
 
 
 def add_crash(parser: argparse.ArgumentParser) -> None:
     """Add what chooses a crash."""
     parser.add_argument(
-        "directory", metavar="DIR", type=Path, help="of the hunt, of one crash, or a file that crashhunt export wrote"
+        "directory",
+        metavar="DIR",
+        type=Path,
+        help="directory of a hunt or of one crash, or a file that crashhunt export wrote",
     )
     parser.add_argument(
         "--crash",
         metavar="ID",
         default="",
-        help="its id, or its trial's number; default: the one with the fewest steps",
+        help="id of the crash, or number of its trial; default: the crash with the fewest steps",
     )
 
 
 @contextmanager
 def opened_crash(directory: Path, crash: str) -> Iterator[tuple[Bundle, Archive | None]]:
-    """Yield the crash that is meant, unpacked for so long where it was exported into a file.
+    """Yield the chosen crash; an exported crash is unpacked until the context ends.
 
     Raises:
         BundleError: there is no such crash.
@@ -139,7 +144,7 @@ def opened_crash(directory: Path, crash: str) -> Iterator[tuple[Bundle, Archive 
 
 @contextmanager
 def opened_hunt(directory: Path) -> Iterator[tuple[Path, bool]]:
-    """Yield the directory of a hunt, and whether it was exported into a file and is only unpacked for so long.
+    """Yield the directory of a hunt, and whether it is an exported hunt that is unpacked until the context ends.
 
     Raises:
         HuntDirectoryError: it is not the directory of a hunt.
@@ -161,7 +166,7 @@ def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
     """Return the hunts of a directory, with their names in it.
 
     Args:
-        directory: of a hunt or a suite.
+        directory: directory of a hunt or a suite.
         runs: ``ID/N``, or ``ID`` for all runs of it; empty for every hunt.
 
     Raises:
@@ -178,7 +183,7 @@ def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
 
 
 def say(text: str, *, as_json: bool) -> None:
-    """Print what is for people."""
+    """Print a text for the user."""
     print(visible(text), file=sys.stderr if as_json else sys.stdout)
 
 
@@ -221,7 +226,7 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     """Add ``--trust``, the same for every command that runs code of a crash."""
     parser.add_argument(
         "--trust", action="store_true",
-        help="run the code even if you did not make it on this machine; crashhunt trust DIR remembers it",
+        help="run the code although it was not made on this machine; crashhunt trust DIR does this permanently",
     )  # fmt: skip
 
 
@@ -236,7 +241,7 @@ def run_trusted(
     """Run what runs the code of a crash; where that is not trusted, ask the user at the terminal, once per origin.
 
     Args:
-        run: called with True where the code is trusted; else with None, to find out. It raises `UntrustedError` before
+        run: called with True if the code is trusted; else with None, to find out. It raises `UntrustedError` before
             anything runs.
         bundle: the crash.
         archive: which the crash was in, if any.
@@ -244,7 +249,7 @@ def run_trusted(
         path: what the user named; ``directory`` by default.
 
     Raises:
-        UntrustedError: the code is not trusted, and no terminal is there to ask at, or the user says no.
+        UntrustedError: the code is not trusted, and there is no terminal for a question, or the user declines.
     """
     from crashhunt.crashes import refuse_untrusted, snapshot_of, trust_snapshot
 
@@ -332,7 +337,7 @@ def add_ci_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--annotate",
         action="store_true",
-        help="print annotations as well, ten at most, which GitHub shows next to the code",
+        help="also print up to ten annotations, which GitHub shows next to the code",
     )
 
 
@@ -360,8 +365,8 @@ def add_options(groups: Mapping[str, argparse._ArgumentGroup], names: Collection
     """Add every option that has a flag to its group of the help.
 
     Args:
-        groups: of the help, by name.
-        names: of the options, where not all are for this command.
+        groups: groups of the help, by name.
+        names: names of the options, where not all are for this command.
     """
     for option in _options(names):
         _add(groups[option.about.group], option)

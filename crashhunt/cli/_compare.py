@@ -23,10 +23,13 @@ def add_compare(commands: Commands) -> None:
     compare = commands.add_parser(
         "compare",
         help="say which of several hunts crashes less",
-        description="Compare hunts: crash rates with their confidence intervals, and over trials with the same seeds "
-        "whether one crashes less than the first. Run two versions of an agent with the same --seed and --keep-going.",
+        description="Compare the crash rates of hunts, with confidence intervals. For trials with the same seeds, "
+        "report whether a hunt crashes less than the first one. Run two versions of an agent with the same "
+        "--seed and --keep-going.",
     )
-    compare.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of two hunts or more, or of suites")
+    compare.add_argument(
+        "directories", metavar="DIR", type=Path, nargs="+", help="directories of at least two hunts, or of suites"
+    )
     compare.add_argument("--csv", action="store_true", help="print a line per hunt as CSV")
     compare.add_argument("--html", metavar="FILE", type=Path, help="write a page with plots")
     add_json(compare)

@@ -34,8 +34,8 @@ def add_completion(commands: Commands) -> None:
     completion = commands.add_parser(
         "completion",
         help="print a script that has the tab key complete commands, options, names and crashes",
-        description="Print a script that has the tab key of a shell complete commands, options, scenarios, agents, "
-        "samplers, arguments, outcomes, directories and the crashes in them.",
+        description="Print a script for a shell, in which the tab key then completes commands, options, scenarios, "
+        "agents, samplers, arguments, outcomes, directories and crashes.",
         epilog=_HOW,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

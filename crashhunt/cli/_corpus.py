@@ -38,7 +38,7 @@ def add_corpus(commands: Commands) -> None:
     corpus = commands.add_parser(
         "corpus",
         help="keep crashes in a repository, and see that they stay mended",
-        description="Keep crashes in a repository of yours, each with what is expected of today's code.",
+        description="Keep crashes in your repository, each with the result that you expect from today's code.",
     )
     inner = corpus.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_add(inner)
@@ -63,9 +63,9 @@ def _add_add(commands: Commands) -> None:
     add.add_argument("--to", metavar="CORPUS", type=Path, required=True, help="the folder of the corpus")
     add.add_argument(
         "--expect", choices=("still", "fixed"),
-        help="what is expected from now on: still, while it is known to crash (the default), or fixed",
+        help="the expected result: still, which means that the crash reproduces (the default), or fixed",
     )  # fmt: skip
-    add.add_argument("--note", metavar="TEXT", help="what people should know of it")
+    add.add_argument("--note", metavar="TEXT", help="a note on the crash, for readers of the corpus")
     add_trust(add)
     add_json(add)
     add.set_defaults(command=_add)
@@ -75,13 +75,13 @@ def _add_run(commands: Commands) -> None:
     run = commands.add_parser(
         "run",
         help="run every case again with today's code",
-        description="Run every case again with today's code: crashes it still, is it fixed, or has it changed into "
-        "another crash? Exits with 1 where an expectation is not met.",
+        description="Run every case again with today's code, and report whether it still crashes, is fixed, or is "
+        "now another crash. Exits with 1 if a result is not the expected one.",
     )
     _add_places(run)
     run.add_argument(
         "--keep", metavar="DIR", type=Path,
-        help="keep what crashes there, each as the directory of a hunt, for crashhunt show, replay and report",
+        help="save every crash in this folder, each as the directory of a hunt, for crashhunt show, replay and report",
     )  # fmt: skip
     run.add_argument("--parallel", metavar="N", type=integer, default=0, help="cases at a time; default: one per core")
     add_trust(run)

@@ -39,10 +39,11 @@ def add_crashes(commands: Commands) -> None:
     crashes = commands.add_parser(
         "crashes",
         help="list the different crash types",
-        description="Group the crashes of hunts by crash type: the same kind of encounter with the agent in the same "
-        "role, or an exception in the same function. Prints one line for each type, the most frequent first.",
+        description="Group the crashes of hunts by crash type: crashes of one type share the kind of encounter and "
+        "the role of the agent, or the function that raised the exception. Prints one line for each type, the "
+        "most frequent first.",
     )
-    crashes.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of hunts or suites")
+    crashes.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="directories of hunts or suites")
     crashes.add_argument(
         "--known", metavar="CORPUS", type=Path,
         help="show which crash types a corpus already contains, as cases that are expected to reproduce",
@@ -52,8 +53,8 @@ def add_crashes(commands: Commands) -> None:
     )
     crashes.add_argument(
         "--by-cause", metavar="N", type=integer, nargs="?", const=_DEFAULT_RUNS, default=None,
-        help="divide each type by cause: run up to N of its crashes again, as judge does; the others have the cause of "
-        "the nearest one; default: 8",
+        help="divide each type by cause: analyse up to N of its crashes as crashhunt judge does, and give the others "
+            "the cause of the most similar crash; default: 8",
     )  # fmt: skip
     add_trust(crashes)
     add_ci_options(crashes)
@@ -116,7 +117,7 @@ def _divided(options: argparse.Namespace, groups: Sequence[Group]) -> tuple[list
 
 
 def _cases(corpus: Path | None) -> list[Case] | None:
-    """Return the cases of a corpus; None where no corpus was given."""
+    """Return the cases of a corpus; None if no corpus was given."""
     from crashhunt.corpus import find_cases, read_case
 
     if corpus is None:
@@ -127,7 +128,7 @@ def _cases(corpus: Path | None) -> list[Case] | None:
 
 
 def _known(groups: Sequence[Group], cases: list[Case] | None) -> dict[Signature, str] | None:
-    """Return crash type to the case of the corpus; None where no corpus was given."""
+    """Return crash type to the case of the corpus; None if no corpus was given."""
     from crashhunt.corpus import known_kinds
 
     if cases is None:

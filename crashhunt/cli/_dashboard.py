@@ -24,22 +24,27 @@ def add_dashboard(commands: Commands) -> None:
     dashboard = commands.add_parser(
         "dashboard",
         help="show hunts live in the browser",
-        description="Show hunts live in the browser: all of them in a table, each with its curves, arguments and crash "
-        "types, and each crash as an animation. Prints the address and runs until Ctrl-C. Without --allow-control it "
-        "only reads: it writes nothing into the folders of hunts, and runs no code of a bundle.",
+        description="Show hunts live in the browser: a table of all hunts, a page per hunt with curves, arguments "
+        "and crash types, and an animation of each crash. Prints the address and runs until Ctrl-C. Without "
+        "--allow-control, the dashboard writes nothing into the folders of hunts and runs no code of a bundle.",
     )
     dashboard.add_argument(
         "paths", metavar="PATH", type=Path, nargs="*",
         help="hunts, suites, folders with hunts below them, or files that crashhunt export wrote; default: the current "
         "folder",
     )  # fmt: skip
-    dashboard.add_argument("--port", metavar="N", type=integer, default=8642, help="default: 8642; 0: any free one")
+    dashboard.add_argument(
+        "--port", metavar="N", type=integer, default=8642, help="port to listen on; 0: any free port; default: 8642"
+    )
     dashboard.add_argument(
         "--host", metavar="HOST", default="127.0.0.1",
-        help="to listen on; any but a loopback address needs a token; default: 127.0.0.1",
+        help="address to listen on; an address that other machines reach needs a token; default: 127.0.0.1",
     )  # fmt: skip
     dashboard.add_argument(
-        "--token", metavar="TEXT", default="", help="that each reader needs; default: a random one where it is needed"
+        "--token",
+        metavar="TEXT",
+        default="",
+        help="token that each reader must send; default: a random token if --host needs one",
     )
     dashboard.add_argument("--no-browser", action="store_true", help="do not open a browser")
     dashboard.add_argument(

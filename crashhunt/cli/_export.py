@@ -25,23 +25,23 @@ def add_export(commands: Commands) -> None:
     export = commands.add_parser(
         "export",
         help="write a crash into one file, for another machine or another tool",
-        description="Write a crash with its snapshot into one zip file. crashhunt replay, show and report take the "
-        "file wherever they take a DIR. With --as, write what was recorded as a scenario that tools of others run.",
+        description="Write a crash with its snapshot into one zip file. crashhunt replay, show and report accept the "
+        "file in place of a DIR. With --as, write the recorded crash as a scenario for other tools.",
     )
     add_crash(export)
-    export.add_argument("file", metavar="FILE", type=Path, help="the file to write: zip, or as --as says")
+    export.add_argument("file", metavar="FILE", type=Path, help="the file to write: a zip file, or the format of --as")
     export.add_argument(
         "--as",
         dest="form",
         choices=_FORMATS,
-        help="commonroad: a CommonRoad scenario (2020a), FILE.xml: the others as they drove, the agent as planning "
-        "problem; openscenario: FILE.xosc (OpenSCENARIO 1.0) with FILE.xodr (OpenDRIVE): the others as they drove, the "
-        "agent where it began",
+        help="commonroad: a CommonRoad scenario (2020a), FILE.xml: the other actors as recorded, the agent as "
+        "planning problem; openscenario: FILE.xosc (OpenSCENARIO 1.0) with FILE.xodr (OpenDRIVE): the other "
+        "actors as recorded, the agent at its start",
     )
     export.add_argument(
         "--recorded-agent",
         action="store_true",
-        help="with --as: the way that the agent drove is there, too: as an obstacle, or as what it follows",
+        help="with --as: also write the recorded path of the agent, as an obstacle or as the path that it follows",
     )
     add_json(export)
     export.set_defaults(command=_export)
@@ -51,7 +51,7 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
     if options.form:
         return _hand_on(options)
     if options.recorded_agent:
-        raise UsageError("--recorded-agent is for another format", fix=f"add --as {' or '.join(_FORMATS)}")
+        raise UsageError("--recorded-agent needs another format", fix=f"add --as {' or '.join(_FORMATS)}")
     from crashhunt.crashes import export_crash
 
     with (

@@ -52,43 +52,50 @@ def add_gate(commands: Commands) -> None:
     gate = commands.add_parser(
         "gate",
         help="give a verdict on a change: better, worse, no difference or undecided",
-        description="Compare HEAD with BASE in the same traffic, trial by trial, until the verdict is certain. Both "
-        "are commits of the repository around this folder, or agents. Exit code 0: HEAD is better, or there is no "
+        description="Compare HEAD with BASE in the same traffic, trial by trial, until the verdict is certain. BASE "
+        "and HEAD are commits of the repository that contains this folder, or agents. Exit code 0: HEAD is "
+        "better, or there is no "
         "difference above --margin; 1: HEAD is worse; 3: undecided.",
     )
     gate.add_argument("base", metavar="BASE", help="a commit, or an agent as [ID=]MODULE:ATTR or by its name")
-    gate.add_argument("head", metavar="HEAD", help="the same for the version with the change")
+    gate.add_argument("head", metavar="HEAD", help="the version with the change, in the same form")
     what = gate.add_argument_group("what is compared")
     what.add_argument(
         "--suite", metavar="FILE", type=Path, help="compare in every hunt of a suite.toml, instead of --scenario"
     )
     what.add_argument(
         "--corpus", metavar="CORPUS", type=Path,
-        help="run the crashes of this corpus of HEAD first: HEAD is worse where a fixed one comes back; default: "
-        "crashes, if HEAD is a commit that has such a folder",
+        help="first run the crashes of this corpus of HEAD; HEAD is worse if a fixed crash reproduces; default: "
+            "crashes, if HEAD is a commit with such a folder",
     )  # fmt: skip
     how = gate.add_argument_group("how it is compared")
     how.add_argument(
-        "--most", metavar="N", type=integer, default=_MOST, help=f"pairs of trials at most; default: {_MOST}"
+        "--most", metavar="N", type=integer, default=_MOST, help=f"the most pairs of trials to run; default: {_MOST}"
     )
-    how.add_argument("--for", metavar="TIME", dest="duration", default="", help="end after this time, such as 30m")
+    how.add_argument("--for", metavar="TIME", dest="duration", default="", help="stop after this time, such as 30m")
     how.add_argument(
         "--max-steps", metavar="N", type=integer, default=None,
-        help=f"the bound on each trial, in steps; default: {_MAX_STEPS}, or as the suite says",
+        help=f"the most steps of a trial; default: {_MAX_STEPS}, or as the suite says",
     )  # fmt: skip
     how.add_argument(
         "--margin", metavar="SHARE", default=str(_MARGIN),
-        help="the greatest difference in crashes per trial that counts as none, such as 0.01 or 1%%; 0: give no such "
-        f"verdict; default: {_MARGIN}",
+        help="the greatest difference in crashes per trial that counts as no difference, such as 0.01 or 1%%; 0: "
+            f"never report that verdict; default: {_MARGIN}",
     )  # fmt: skip
-    how.add_argument("--confidence", metavar="PERCENT", type=number, default=95.0, help="of the verdict; default: 95")
+    how.add_argument(
+        "--confidence",
+        metavar="PERCENT",
+        type=number,
+        default=95.0,
+        help="confidence of the verdict, in percent; default: 95",
+    )
     how.add_argument(
         "--parallel", metavar="N", type=integer, default=0,
-        help="trials at a time, of both together, at least 2; default: one per core",
+        help="trials at a time, BASE and HEAD together, at least 2; default: one per core",
     )  # fmt: skip
     how.add_argument(
         "--keep", metavar="DIR", type=Path,
-        help="keep both hunts there, for crashhunt compare, rate and report; the same command resumes them",
+        help="keep both hunts in this folder, for crashhunt compare, rate and report; the same command resumes them",
     )  # fmt: skip
     add_options(defaultdict(lambda: how, what=what), _OPTIONS)
     add_trust(gate)
@@ -123,8 +130,11 @@ def _gate(options: argparse.Namespace, words: list[str]) -> int:
         trusted=options.trust,
         machine={"executor": options.executor} if options.suite is None or "--executor" in _flags(words) else None,
     )
+    cautions = list(gate.cautions())
     with _watched(as_json=options.json) as watch:
         found = gate.run(options.keep, watch)
+    for caution in cautions:
+        print(f"crashhunt: {caution}", file=sys.stderr)
     say(describe_gate(found), as_json=options.json)
     summary = gate_summary(found)
     if options.markdown is not None:

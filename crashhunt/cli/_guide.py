@@ -23,10 +23,12 @@ def add_guide(commands: Commands) -> None:
     guide = commands.add_parser(
         "guide",
         help="read the guide: tutorials, how to, reference, troubleshooting",
-        description="Read the guide in the terminal: tutorials, how to do what, reference, troubleshooting. Without a "
-        "TOPIC, list what there is.",
+        description="Read the guide in the terminal: tutorials, how-to pages, concepts, reference, troubleshooting. "
+        "Without a TOPIC, list all pages.",
     )
-    guide.add_argument("topic", metavar="TOPIC", nargs="?", default="", help="a page; without it, they are listed")
+    guide.add_argument(
+        "topic", metavar="TOPIC", nargs="?", default="", help="the page to show; default: list all pages"
+    )
     add_json(guide)
     guide.set_defaults(command=_guide)
 

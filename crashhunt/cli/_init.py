@@ -27,10 +27,11 @@ def add_init(commands: Commands) -> None:
     init = commands.add_parser(
         "init",
         help="make a scenario from a map",
-        description="Make a scenario from a map: the network, traffic that flows, a starting agent, and a README with "
-        "the next commands. It tries the scenario before it writes DIR. Needs: pip install 'crashhunt[maps]'.",
+        description="Make a scenario from a map: the network, traffic that does not jam, a first agent, and a README "
+        "with the next commands. The command tries the scenario before it writes DIR. Needs: pip install "
+        "'crashhunt[maps]'.",
     )
-    init.add_argument("directory", metavar="DIR", type=Path, help="of the scenario; must be new or empty")
+    init.add_argument("directory", metavar="DIR", type=Path, help="folder of the scenario; must be new or empty")
     maps = init.add_argument_group("the map (exactly one)").add_mutually_exclusive_group(required=True)
     maps.add_argument("--osm", metavar="FILE", type=Path, help="OpenStreetMap: .osm, .osm.gz, .pbf")
     maps.add_argument("--opendrive", metavar="FILE", type=Path, help="OpenDRIVE: .xodr")
@@ -43,12 +44,12 @@ def add_init(commands: Commands) -> None:
     )
     how.add_argument(
         "--demand", metavar="LOW:HIGH", default="0.2:1.5",
-        help="range of the factor on the traffic (default: %(default)s); the traffic flows at HIGH",
+        help="range of the factor that scales the traffic (default: %(default)s); the traffic does not jam at HIGH",
     )  # fmt: skip
     how.add_argument("--people", action="store_true", help="add persons on foot, on sidewalks and crossings")
     how.add_argument("--bicycles", action="store_true", help="add cyclists, and lanes for bicycles")
     how.add_argument("--lefthand", action="store_true", help="traffic keeps to the left")
-    how.add_argument("--agent", metavar="NAME", default="", help="who drives (default: car-following)")
+    how.add_argument("--agent", metavar="NAME", default="", help="the agent that drives (default: car-following)")
     how.add_argument("--workflow", choices=["github"], default="", help="add a workflow for this CI")
     add_json(how)
     init.set_defaults(command=_init)

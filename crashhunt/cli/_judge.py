@@ -37,27 +37,27 @@ def add_judge(commands: Commands) -> None:
     judge = commands.add_parser(
         "judge",
         help="find out until when a collision could have been avoided, and what a crash hangs on, by running it",
-        description="Find the last avoidable step and the causes of a crash. First run a collision repeatedly, with "
-        "the agent overruled from another step on: full braking, or a lane change and braking. Other "
-        "vehicles react. Report the last step from which that avoids the collision. Then run the crash "
+        description="Find the last avoidable step and the causes of a crash. First run the collision many times, "
+        "each time with the agent overruled from another step: full braking, or a lane change and braking. Other "
+        "vehicles react. Report the last step from which such a maneuver avoids the collision. Then run the crash "
         "with one thing removed at a time: a decision of the agent, a maneuver of another vehicle, the "
         "value of an argument. Report the causes. Crashes other than collisions get the second analysis "
-        "only. The result is added to crash.json, and shown by show.",
+        "only. The result is written to crash.json, and crashhunt show prints it.",
     )
     add_crash(judge)
     judge.add_argument(
-        "--all", action="store_true", help="all crashes of the hunt that have not been judged yet, but for hangs"
+        "--all", action="store_true", help="analyse all crashes of the hunt that have not been analysed, except hangs"
     )
     judge.add_argument(
         "--runs", metavar="N", type=integer, default=60, help="the most trials to run for one collision; default: 60"
     )
     judge.add_argument(
         "--why", metavar="N", type=integer, default=80,
-        help="the most trials to run for what one crash hangs on; 0: none; default: 80",
+        help="the most trials to run for the causes of one crash; 0: none; default: 80",
     )  # fmt: skip
     judge.add_argument(
         "--reference", metavar="N", type=integer, default=20,
-        help="the most trials to run with a reference driver, which finds what the agent omitted; 0: none; default: 20",
+        help="the most trials to run with a reference driver, to find what the agent omitted; 0: none; default: 20",
     )  # fmt: skip
     judge.add_argument(
         "--parallel", metavar="N", type=integer, default=0, help="trials at a time; default: one per core"
@@ -79,7 +79,7 @@ def _judge(options: argparse.Namespace, _words: list[str]) -> int:
     if options.parallel < 0:
         raise UsageError(f"--parallel is {options.parallel}", fix="give at least 0 (0: one per core)")
     if options.all and options.crash:
-        raise UsageError(f"--all and --crash {options.crash} contradict each other", fix="leave one of them out")
+        raise UsageError(f"--all and --crash {options.crash} contradict each other", fix="omit one of them")
     answers: list[dict[str, object]] = []
     with stop_requests() as stops:
         if options.all:
@@ -106,7 +106,7 @@ def _unjudged(options: argparse.Namespace) -> list[Bundle]:
     from crashhunt.trial import Outcome
 
     if options.directory.is_file():
-        raise UsageError("--all is for the directory of a hunt", fix="leave it out", where=str(options.directory))
+        raise UsageError("--all needs the directory of a hunt", fix="omit it", where=str(options.directory))
     bundles = [bundle for hunt in find_hunts(options.directory) for bundle in list_bundles(hunt)]
     return [
         bundle

@@ -24,10 +24,10 @@ def add_logs(commands: Commands) -> None:
     logs = commands.add_parser(
         "logs",
         help="show what hunts and trials have printed, and their errors",
-        description="Show what hunts and trials have printed (run), why they failed (error), and when a hunt got into "
-        "which state (state). Of trials there are the crashes, and those that were kept.",
+        description="Show the output of hunts and trials (run), why they failed (error), and when the state of a "
+        "hunt changed (state). Only crashes and kept trials have logs.",
     )
-    logs.add_argument("directory", metavar="DIR", type=Path, help="of a hunt or a suite")
+    logs.add_argument("directory", metavar="DIR", type=Path, help="directory of a hunt or a suite")
     logs.add_argument("--run", metavar="ID", default="", help="of a suite: only this run, such as town/0")
     logs.add_argument("--trial", metavar="N", type=integer, help="only this trial")
     logs.add_argument("--type", choices=("run", "error", "state"), help="default: all")

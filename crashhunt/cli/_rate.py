@@ -27,18 +27,23 @@ def add_rate(commands: Commands) -> None:
         "rate",
         help="report how often an agent crashes, with a guarantee",
         description="Report how often an agent crashes: per trial, per hour and per 1,000 km in its traffic. "
-        "The interval is valid whenever you look, also of a hunt that runs, was killed or stopped at its first crash.",
+        "The interval is valid at any time, also for a hunt that is running, was killed, or stopped at its first "
+        "crash.",
     )
-    rate.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of hunts or suites")
+    rate.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="directories of hunts or suites")
     rate.add_argument(
         "--per", metavar="UNIT", choices=RATE_PERS, help="trial, hour or 1000km; default: all three, or that of --bar"
     )
     rate.add_argument(
-        "--confidence", metavar="PERCENT", type=number, default=95.0, help="of the intervals; default: 95"
+        "--confidence",
+        metavar="PERCENT",
+        type=number,
+        default=95.0,
+        help="confidence of the intervals, in percent; default: 95",
     )
     rate.add_argument(
         "--by", metavar="PART", default="",
-        help="divide the rate by kind, fault, disturbance or ARG[:BINS], an argument in so many bins (default: 4)",
+        help="divide the rate by kind, fault, disturbance or ARG[:BINS], an argument in BINS bins (default: 4)",
     )  # fmt: skip
     rate.add_argument(
         "--bar", metavar="RATE", default="",

@@ -68,21 +68,33 @@ def add_film_options(parser: argparse.ArgumentParser) -> None:
     film.add_argument("--video", metavar="FILE", type=Path, help="write an MP4 file")
     film.add_argument("--gif", metavar="FILE", type=Path, help="write an animated GIF")
     film.add_argument("--frames", metavar="DIR", type=Path, help="write a folder of PNG files")
-    film.add_argument("--fps", metavar="N", type=number, default=0.0, help="pictures a second; default: one a step")
-    film.add_argument("--size", metavar="WxH", default="960x540", help="of the scene, in pixels; default: 960x540")
+    film.add_argument(
+        "--fps", metavar="N", type=number, default=0.0, help="pictures per second; default: one picture per step"
+    )
+    film.add_argument("--size", metavar="WxH", default="960x540", help="size of the scene, in pixels; default: 960x540")
     film.add_argument(
         "--last-seconds", metavar="S", type=number, default=0.0,
-        help="only the end of it; of a near miss, around the moment when it was nearest (default of one: 10)",
+        help="only the last S seconds; for a near miss, the S seconds around its closest moment (default: 10)",
     )  # fmt: skip
     film.add_argument(
-        "--last-step-repeats", metavar="N", type=integer, default=10, help="of the last picture; default: 10"
+        "--last-step-repeats",
+        metavar="N",
+        type=integer,
+        default=10,
+        help="number of repeats of the last picture; default: 10",
     )
-    film.add_argument("--blank-frames", metavar="N", type=integer, default=10, help="between two crashes; default: 10")
+    film.add_argument(
+        "--blank-frames",
+        metavar="N",
+        type=integer,
+        default=10,
+        help="number of blank pictures between two crashes; default: 10",
+    )
     film.add_argument("--no-panels", action="store_true", help="show the scene alone")
 
 
 def film_options(options: argparse.Namespace) -> FilmOptions | None:
-    """Return what a film shall look like; None where none is wanted.
+    """Return what a film shall look like; None if none is wanted.
 
     Raises:
         UsageError: an option cannot be meant, or Pillow is not installed.
@@ -108,7 +120,7 @@ def film_options(options: argparse.Namespace) -> FilmOptions | None:
 
 
 def look_at_all(bundle: Bundle, *, to_stderr: bool = False) -> Look | None:
-    """Return how to look at a whole crash; None where nothing of it can be looked at."""
+    """Return how to look at a whole crash; None if nothing of it can be looked at."""
     from crashhunt.replays import Look
 
     # The process that is looked at is not watched over: it stops before what ended the one of the hunt.
@@ -150,12 +162,12 @@ def replayed_shot(report: ReplayReport, chosen: ReplayOptions) -> Shot:
 
 
 def recorded_shot(bundle: Bundle) -> Shot:
-    """Return what was recorded, to be filmed."""
+    """Return the recording, for a film."""
     return _shot(bundle, bundle.recording(), bundle.result, {}, crashed=not bundle.is_near_miss)
 
 
 def write_films(options: argparse.Namespace, shots: list[Shot], film: FilmOptions) -> dict[str, int]:
-    """Write what was asked for; return file to number of pictures.
+    """Write the requested films; return file to number of pictures.
 
     Raises:
         CrashhuntError: a file cannot be written, or what writes it is not installed.
@@ -215,13 +227,13 @@ def add_replay(commands: Commands) -> None:
         "replay",
         help="run a saved crash again and say whether it is the same",
         description="Run a saved crash again in a fresh process, from its bundle alone, and compare every observation, "
-        "action and scene with the log. Exits with 1 where the verdict is not the expected one.",
+        "action and scene with the log. Exits with 1 if the verdict is not the expected one.",
     )
     add_crash(replay)
     who = replay.add_mutually_exclusive_group()
     who.add_argument(
         "--code", choices=("snapshot", "current"), default="snapshot",
-        help="drive with the code of the snapshot (the default), or with today's, to see whether a fix works",
+        help="drive with the code of the snapshot (the default), or with today's code, to see whether a fix works",
     )  # fmt: skip
     who.add_argument(
         "--from-log", action="store_true", help="drive with the recorded actions, without the agent's code"
@@ -232,14 +244,14 @@ def add_replay(commands: Commands) -> None:
     )  # fmt: skip
     replay.add_argument(
         "--scenario", metavar="NAME|PATH", default="",
-        help="have the same agents, arguments and seed drive in another scenario, which may be another simulator's, to "
-        "see whether they crash there as well",
+        help="run the same agents, arguments and seed in another scenario, also of another simulator, to see whether "
+            "they crash there as well",
     )  # fmt: skip
     replay.add_argument(
         "--no-accelerate", action="store_true", help="run the simulator as it is, without the accelerator"
     )
     replay.add_argument(
-        "--times", metavar="N", type=integer, default=1, help="how often, to see whether all agree; default: 1"
+        "--times", metavar="N", type=integer, default=1, help="number of replays, to see whether all agree; default: 1"
     )
     replay.add_argument(
         "--expect", choices=("reproduced", "fixed"), default="reproduced",
@@ -252,16 +264,21 @@ def add_replay(commands: Commands) -> None:
     stop = look.add_mutually_exclusive_group()
     stop.add_argument("--until", metavar="STEP", type=integer, help="stop after this step")
     stop.add_argument(
-        "--before", metavar="N", type=integer, help="stop N steps before the crash, or before a near miss was nearest"
+        "--before",
+        metavar="N",
+        type=integer,
+        help="stop N steps before the crash, or before the closest moment of a near miss",
     )
     look.add_argument(
         "--pdb", action="store_true",
-        help="drop into the agent's act in the last step, with agent, observation, scene and step at hand",
+        help="start the debugger in the agent's act in the last step; agent, observation, scene and step are local "
+            "variables",
     )  # fmt: skip
     look.add_argument(
         "--print", metavar="FIELD,…", default="", dest="fields",
         help="print a table of the steps: x, y, heading, speed, reward, time_to_collision_s, gap_m and "
-        "required_deceleration (to the nearest), gap_to_other_m, time_to_other_s, closing_speed, action or its parts, "
+        "required_deceleration (to the nearest actor), gap_to_other_m, time_to_other_s, closing_speed, action or its "
+        "parts, "
         "observation[ROW,NAME]",
     )  # fmt: skip
     look.add_argument(
@@ -276,7 +293,7 @@ def add_replay(commands: Commands) -> None:
     add_trust(replay)
     replay.add_argument(
         "--force", action="store_true",
-        help="replay even from a snapshot that is damaged; with --trust, or with --from-log, which runs none of it",
+        help="replay even from a damaged snapshot; needs --trust, or --from-log, which runs no code of it",
     )  # fmt: skip
     add_json(replay)
     replay.set_defaults(command=_replay)
@@ -325,7 +342,7 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions | None) -> None:
-    """Refuse options that contradict each other rather than leave one of them out."""
+    """Refuse options that contradict each other rather than omit one of them."""
     look = {
         "--gui": options.gui,
         "--pdb": options.pdb,
@@ -336,18 +353,18 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
         for name in [
             name for name, given in {**look, "--print": options.fields, "a film": film is not None}.items() if given
         ]:
-            raise UsageError(f"--scenario: {name} is for the scenario of the crash", fix="leave one of the two out")
+            raise UsageError(f"--scenario: {name} applies to the scenario of the crash only", fix="omit one of the two")
     if film is not None and options.from_log:
         look |= {"--print": options.fields, "--set": options.sets, "--times": options.times != 1}
         for name in [name for name, given in look.items() if given]:
             raise UsageError(
-                f"{name} cannot be used with --from-log, which simulates nothing", fix=f"leave {name} or --from-log out"
+                f"{name} cannot be used with --from-log, which simulates nothing", fix=f"omit {name} or --from-log"
             )
     if options.times != 1:
         if film is not None:
             look |= {"a film": True}
         for name in [name for name, given in look.items() if given]:
-            raise UsageError(f"--times {options.times}: {name} looks at one run", fix="leave one of the two out")
+            raise UsageError(f"--times {options.times}: {name} examines one run", fix="omit one of the two")
 
 
 def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions) -> tuple[ReplayReport, JsonObject]:
@@ -375,16 +392,14 @@ def _look(options: argparse.Namespace, bundle: Bundle) -> Look | None:
     from crashhunt.replays import Look
 
     if options.json and options.pdb:
-        raise UsageError("--pdb needs the terminal, and --json is for programs", fix="leave one of them out")
+        raise UsageError("--pdb needs a terminal, and --json is for programs", fix="omit one of them")
     if options.sleep is not None and not (options.gui and 0 <= options.sleep < math.inf):
         raise UsageError(f"--sleep is {options.sleep:g}", fix="give at least 0, and --gui, which it slows down")
     until = _last_step(options, bundle)
     if options.gui:
         whole = look_at_all(bundle)
         if whole is None:
-            raise UsageError(
-                f"{bundle.id} ended before its first step, and there is nothing to see", fix="leave --gui out"
-            )
+            raise UsageError(f"{bundle.id} ended before its first step, so there is nothing to show", fix="omit --gui")
         real_time = bundle.recording().prologue.step_length_s
         return replace(
             whole,
@@ -397,7 +412,7 @@ def _look(options: argparse.Namespace, bundle: Bundle) -> Look | None:
 
 
 def _last_step(options: argparse.Namespace, bundle: Bundle) -> int:
-    """Where to stop; 0 where that was not asked for."""
+    """Where to stop; 0 if that was not asked for."""
     crash, what = bundle.result.steps, "the crash is"
     if bundle.is_near_miss and (options.before is not None or options.pdb):
         from crashhunt.crashes import most_dangerous
@@ -406,7 +421,7 @@ def _last_step(options: argparse.Namespace, bundle: Bundle) -> int:
         crash, what = (near.step, "it was nearest") if near is not None and near.step else (crash, "it ended")
     if options.before is not None:
         if not 0 <= options.before < crash:
-            fix = f"give 0 to {crash - 1}" if crash else "leave it out"
+            fix = f"give 0 to {crash - 1}" if crash else "omit the option"
             raise UsageError(f"--before is {options.before}, and {what} at step {crash}", fix=fix)
         return crash - int(options.before)
     if options.until is not None:

@@ -26,8 +26,8 @@ def add_report(commands: Commands) -> None:
     report = commands.add_parser(
         "report",
         help="write one HTML file that shows a hunt and animates its crashes",
-        description="Write one HTML file that needs no network and no other file: the hunt in numbers, what was tried "
-        "against how it went, and an animated replay of each crash. Runs no code of the bundle.",
+        description="Write one HTML file that needs no network and no other file. It has the numbers of the hunt, "
+        "plots of arguments against outcomes, and an animated replay of each crash. Runs no code of the bundle.",
     )
     add_crash(report)
     report.add_argument("--output", "-o", metavar="FILE", type=Path, help="the file; default: DIR/report.html")
@@ -36,7 +36,7 @@ def add_report(commands: Commands) -> None:
         metavar="N",
         type=integer,
         default=20,
-        help="how many to animate, and as many near misses; default: 20",
+        help="the most crashes to animate, and the most near misses; default: 20",
     )
     add_json(report)
     report.set_defaults(command=_report)
@@ -87,7 +87,7 @@ def _report(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _which(found: FoundCrashes, shown: Sequence[Bundle]) -> str:
-    """Return in words which of the crashes are shown; empty where all are, or where the user has named one."""
+    """Return in words which of the crashes are shown; empty if all are, or where the user has named one."""
     if not found.shown:
         return ""
     chosen = ": the shortest of each type, then the shortest of all" if len(shown) < found.saved else ""

@@ -13,6 +13,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from crashhunt.base.apart import OWN_THREAD
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.cli._common import (
     DONE,
@@ -94,10 +95,10 @@ def add_run(commands: Commands) -> None:
     hidden: dict[str, Any] = {"nargs": 0, "default": argparse.SUPPRESS}
     run.add_argument("-h", "--help", action=_ShortHelp, **hidden, help="show the most used options")
     run.add_argument("--help-all", action="help", help="show all options")
-    run.add_argument("directory", metavar="DIR", type=Path, help="where everything is kept; made if it is not there")
+    run.add_argument("directory", metavar="DIR", type=Path, help="directory of the hunt; created if it does not exist")
     run.add_argument("parallel", metavar="PARALLEL", type=integer, help="trials at a time; 0: one per core")
-    run.add_argument("trials", metavar="TRIALS", type=integer, help="how many trials at most; 0: no limit, with --for")
-    run.add_argument("max_steps", metavar="MAX_STEPS", type=integer, help="the bound on each trial, in steps")
+    run.add_argument("trials", metavar="TRIALS", type=integer, help="the most trials to run; 0: no limit (needs --for)")
+    run.add_argument("max_steps", metavar="MAX_STEPS", type=integer, help="the most steps of a trial")
     groups = {name: run.add_argument_group(title) for name, title in _GROUPS.items()}
     add_options(groups)
     groups["kept"].add_argument(
@@ -168,6 +169,7 @@ def _tell_of_the_wait(options: argparse.Namespace) -> threading.Timer:
             print(waiting, file=sys.stderr, flush=True)
 
     timer = threading.Timer(_LONG_WAIT_S, tell)
+    timer.name = OWN_THREAD
     timer.daemon = True
     if options.ego in (None, "", "any"):
         timer.start()

@@ -28,12 +28,13 @@ def add_show(commands: Commands) -> None:
         "crash, which the hunt determined by simulation. Runs no code of the bundle.",
     )
     add_crash(show)
-    show.add_argument("--last-seconds", metavar="S", type=number, default=5.0, help="how much of it; default: 5")
+    show.add_argument("--last-seconds", metavar="S", type=number, default=5.0, help="seconds to describe; default: 5")
     show.add_argument(
         "--braking",
         metavar="A",
         type=number,
-        help="calculate until when braking at so many m/s² would have helped, had the other one moved as it did",
+        help="calculate the last step from which braking with A m/s² avoids the crash, if the other vehicle moves as "
+        "recorded",
     )
     add_json(show)
     show.set_defaults(command=_show)

@@ -39,7 +39,7 @@ def add_shrink(commands: Commands) -> None:
         help="make a crash smaller while it stays the same kind of crash",
         description="Minimize a crash while its crash type stays the same: remove other actors, drop disturbances, "
         "and set arguments to their defaults and to round numbers. If the crash needs many other actors, "
-        "move them along their recorded ways, remove the unnecessary ones, and cut off the beginning. "
+        "move them along their recorded paths, remove the unnecessary ones, and cut off the beginning. "
         "Each candidate is run with the code of the snapshot. The result is a new crash next to the "
         "first, ID.small. If you interrupt the command, it keeps the best result, and the same command "
         "resumes. Exits with 1 if the crash does not reproduce.",
@@ -47,18 +47,20 @@ def add_shrink(commands: Commands) -> None:
     add_crash(shrink)
     shrink.add_argument(
         "--budget", metavar="TRIALS", type=integer, default=_BUDGET,
-        help=f"how many trials may be run; default: {_BUDGET}",
+        help=f"the most trials to run; default: {_BUDGET}",
     )  # fmt: skip
     shrink.add_argument(
         "--for", metavar="TIME", dest="time", default="",
-        help="how long that may take, such as 1m or 90s; two runs that confirm what is left come on top",
+        help="time limit, such as 1m or 90s; two runs that confirm the result are additional",
     )  # fmt: skip
     shrink.add_argument(
         "--form", choices=("either", "traffic", "scripted"), default="either",
-        help="whether other actors keep driving (traffic), or are moved along their recorded ways (scripted); default: "
-        "either, traffic where that leaves few of them",
+        help="whether other actors keep driving (traffic), or are moved along their recorded paths (scripted); "
+            "default: traffic if few actors remain, else scripted",
     )  # fmt: skip
-    shrink.add_argument("--parallel", metavar="N", type=integer, default=0, help="at a time; default: one per core")
+    shrink.add_argument(
+        "--parallel", metavar="N", type=integer, default=0, help="trials at a time; default: one per core"
+    )
     add_trust(shrink)
     add_json(shrink)
     shrink.set_defaults(command=_shrink)

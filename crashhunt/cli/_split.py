@@ -27,7 +27,7 @@ def add_split(commands: Commands) -> None:
         "seed of each traffic. The environment crashhunt/Crashes-v0 trains on the training part only, and compare and "
         "gate count only the test part.",
     )
-    split.add_argument("places", metavar="DIR", type=Path, nargs="+", help="of hunts, corpora or crashes")
+    split.add_argument("places", metavar="DIR", type=Path, nargs="+", help="folders of hunts, corpora or crashes")
     split.add_argument(
         "--test", metavar="SHARE", type=float, default=0.5, help="share of the traffics in the test part (%(default)s)"
     )

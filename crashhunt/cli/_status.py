@@ -33,7 +33,7 @@ def add_status(commands: Commands) -> None:
         help="show the progress of hunts",
         description="Show the progress and results of hunts: running, finished, interrupted or killed ones.",
     )
-    status.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of a hunt or a suite")
+    status.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="directory of a hunt or a suite")
     status.add_argument("--watch", action="store_true", help="refresh every second, until all have ended")
     add_json(status)
     status.set_defaults(command=_status)
@@ -150,12 +150,12 @@ def _confirmed(sums: ProbeSums | BranchSums) -> str:
 
 def _crashes(state: HuntState) -> str:
     """Return the number of crashes and crash types and, if the hunt runs, the age of the last new type."""
-    from crashhunt.report import format_seconds
+    from crashhunt.report import describe_types, format_seconds
 
     said = [] if state.crashes_saved is None else [f"{state.crashes_saved} saved"]
     said += [] if state.disturbed is None else [f"{state.disturbed} disturbed"]
     if state.kinds:
-        said.append(f"{len(state.kinds)} {'type' if len(state.kinds) == 1 else 'types'}")
+        said.append(describe_types(len(state.kinds), state.types_by_cause))
         if state.state == "running" and state.newest_kind_s is not None:
             said.append(f"last new {format_seconds(state.newest_kind_s)} ago")
     return str(state.crashes) + (f" ({', '.join(said)})" if said else "")

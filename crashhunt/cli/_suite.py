@@ -39,17 +39,17 @@ def add_suite(commands: Commands) -> None:
     suite = commands.add_parser(
         "suite",
         help="run many hunts from one file",
-        description="Run many hunts from one file, each several times with a seed of its own.",
+        description="Run many hunts from one file, each several times with its own seeds.",
     )
     verbs = suite.add_subparsers(title="commands", metavar="COMMAND", required=True)
     run = verbs.add_parser(
         "run",
         help="run what has not ended",
-        description="Plan every run as a folder of DIR, and run those that have not ended, even if "
-        "others fail. The same command resumes the suite. Exits with 1 where a hunt could not run.",
+        description="Plan every run as a folder of DIR, and run all that have not ended, even if some fail. The same "
+        "command resumes the suite. Exits with 1 if a hunt could not run.",
     )
     run.add_argument("file", metavar="FILE", type=Path, help="a suite.toml")
-    run.add_argument("directory", metavar="DIR", type=Path, help="made if it is not there")
+    run.add_argument("directory", metavar="DIR", type=Path, help="directory of the suite; created if it does not exist")
     run.add_argument("parallel", metavar="PARALLEL", type=integer, nargs="?", default=0,
                      help="trials at a time, of all hunts together; default: one per core")  # fmt: skip
     add_options_of_machine(run)
@@ -69,16 +69,17 @@ def add_rerun(commands: Commands) -> None:
     rerun = commands.add_parser(
         "rerun",
         help="run again what failed, or a hunt with other settings elsewhere",
-        description="Run again what failed: restart hunts that ended in an error, resume those that were interrupted "
-        "or killed, and repeat trials whose setup failed. Replaced files are kept next to the new ones. With --to, run "
-        "one hunt with other settings in another directory.",
+        description="Run again what failed: restart hunts that ended in an error, resume interrupted and killed "
+        "hunts, and repeat trials with a failed setup. The command keeps replaced files next to the new ones. "
+        "With --to, "
+        "run one hunt with other settings in another directory.",
     )
-    rerun.add_argument("directory", metavar="DIR", type=Path, help="of a hunt or a suite")
+    rerun.add_argument("directory", metavar="DIR", type=Path, help="directory of a hunt or a suite")
     rerun.add_argument("--run", metavar="ID", action="append", default=[],
-                       help="of a suite: only this run, such as town/0, or those of town; may be repeated")  # fmt: skip
+                       help="in a suite: only this run, such as town/0, or all of town; may be repeated")  # fmt: skip
     which = rerun.add_mutually_exclusive_group()
     which.add_argument("--failed", action="store_true", help="only what failed (the default)")
-    which.add_argument("--all", action="store_true", help="everything, from the start")
+    which.add_argument("--all", action="store_true", help="run all hunts again from the start")
     rerun.add_argument("--set", metavar="NAME=SPEC", action="append", default=[], dest="sets",
                        help="with --to or --all: another specification for an argument (ID.NAME for one of several "
                        "agents), or for trials, max_steps or seed")  # fmt: skip
@@ -86,8 +87,8 @@ def add_rerun(commands: Commands) -> None:
         "--to",
         metavar="DIR",
         type=Path,
-        help="leave DIR as it is, and run there: a new directory, or one in which the "
-        "same command was interrupted or killed",
+        help="keep DIR as it is, and run in this directory: a new one, or one in which the same command was "
+        "interrupted or killed",
     )
     rerun.add_argument("--parallel", metavar="N", type=integer, default=0,
                        help="trials at a time, of all hunts together; default: one per core")  # fmt: skip
@@ -153,7 +154,7 @@ def _asking(run: Callable[[bool], T], options: argparse.Namespace) -> T:
     """Run hunts; ask at the terminal for each that is not trusted, before the first one runs.
 
     Raises:
-        UntrustedError: a hunt is not trusted, and no terminal is there to ask at, or the user says no.
+        UntrustedError: a hunt is not trusted, and there is no terminal for a question, or the user declines.
     """
     from crashhunt.suites import trust_hunt
 

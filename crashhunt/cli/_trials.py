@@ -25,17 +25,20 @@ def add_trials(commands: Commands) -> None:
     trials = commands.add_parser(
         "trials",
         help="write the trials of a hunt as a table",
-        description="Write the trials of a hunt as a table, a row each: number, seed, outcome, steps, how near it "
-        "came, and every argument.",
+        description="Write a table of the trials of a hunt, one row per trial: number, seed, outcome, steps, closest "
+        "approach, and every argument.",
     )
-    trials.add_argument("directory", metavar="DIR", type=Path, help="of the hunt")
+    trials.add_argument("directory", metavar="DIR", type=Path, help="directory of the hunt")
     trials.add_argument(
         "--format", choices=("csv", "json", "jsonl", "parquet"), default="csv",
         help="default: csv; parquet needs --out and pip install 'crashhunt[parquet]'",
     )  # fmt: skip
-    trials.add_argument("--out", metavar="FILE", type=Path, help="where; default: standard output")
+    trials.add_argument("--out", metavar="FILE", type=Path, help="file to write; default: standard output")
     trials.add_argument(
-        "--outcome", metavar="KIND,…", default="", help=f"only these: {', '.join(str(kind) for kind in Outcome)}"
+        "--outcome",
+        metavar="KIND,…",
+        default="",
+        help=f"only trials with these outcomes: {', '.join(str(kind) for kind in Outcome)}",
     )
     trials.set_defaults(command=_trials)
 
@@ -52,11 +55,11 @@ def _trials(options: argparse.Namespace, _words: list[str]) -> int:
     known = in_order([*Outcome, *brought])
     for name in outcomes:
         if name not in known:
-            raise UsageError(f"--outcome {name!r} is none", fix=one_of(name, known, give="give some of"))
+            raise UsageError(f"--outcome {name!r} does not exist", fix=one_of(name, known, give="give some of"))
     hunt = HuntResults(options.directory)
     if options.out is None:
         if options.format == "parquet":
-            raise UsageError("--format parquet is nothing for a terminal", fix="give --out FILE")
+            raise UsageError("--format parquet cannot be printed on a terminal", fix="give --out FILE")
         if not sys.stdout.isatty():
             write_text(hunt, sys.stdout, options.format, outcomes=outcomes)
             return 0

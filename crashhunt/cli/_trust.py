@@ -27,17 +27,17 @@ def add_trust_command(commands: Commands) -> None:
         "trust",
         help="trust the code of hunts and crashes that you did not make on this machine",
         description="Trust the code of hunts, crashes and corpora that you did not make on this machine, such as "
-        "folders from your other machine or hunts of an earlier version of crashhunt. Commands that run code of them "
-        "then run it without asking. Prints what is trusted: which agent, which crashhunt, from which snapshot. A "
-        "change to the code ends the trust. Runs no code. Without DIR, lists everything that you trust.",
+        "folders from your other machine or hunts of an earlier version of crashhunt. Commands then run this code "
+        "without asking. Prints for each origin the agent, the version of crashhunt, and the snapshot. If the code "
+        "changes, it is no longer trusted. Runs no code. Without DIR, lists everything that you trust.",
     )
     trust.add_argument(
         "places", metavar="DIR", type=Path, nargs="*",
-        help="of a hunt, a suite, a crash or a corpus, or a file that crashhunt export wrote",
+        help="directory of a hunt, a suite, a crash or a corpus, or a file that crashhunt export wrote",
     )  # fmt: skip
     trust.add_argument(
         "--remove", metavar="ORIGIN", action="append", default=[],
-        help="trust an origin no longer: its fingerprint as listed, or the DIR; may be repeated",
+        help="stop trusting an origin, given by its fingerprint or its DIR; may be repeated",
     )  # fmt: skip
     add_json(trust)
     trust.set_defaults(command=_trust)
@@ -74,7 +74,7 @@ def _trust_place(place: Path) -> list[TrustedOrigin]:
     """Trust everything that a user has named.
 
     Raises:
-        BundleError: there is nothing whose code could run, or it is damaged.
+        BundleError: the place has no code to run, or is damaged.
     """
     from crashhunt.corpus import find_cases
     from crashhunt.crashes import open_archive

@@ -44,45 +44,55 @@ def add_whatif(commands: Commands) -> None:
     add_crash(whatif)
     whatif.add_argument(
         "--set", metavar="NAME=VALUE", action="append", default=[], dest="sets",
-        help="another value for an argument, as of replay; with --from-step or --before, for the agent from then on",
+        help="another value for an argument, as with crashhunt replay; with --from-step or --before, only for the "
+            "agent and only from that step",
     )  # fmt: skip
     moment = whatif.add_mutually_exclusive_group()
     moment.add_argument(
         "--from-step", metavar="K", type=integer, help="the first K steps stay as recorded, and the change follows"
     )
     moment.add_argument(
-        "--before", metavar="SECONDS", type=number, help="the same, so long before the crash, in simulation time"
+        "--before",
+        metavar="SECONDS",
+        type=number,
+        help="the step this many seconds of simulation before the crash, in place of --from-step",
     )
     whatif.add_argument(
         "--agent", metavar="MODULE:NAME", default="",
-        help="an agent that takes over after step K: up to K the recorded actions are played, then it is reset and is "
-        "shown its first observation; ID=MODULE:NAME for one of several vehicles; without --from-step, after step 0",
+        help="an agent that takes over after step K, where it is reset. Up to step K the recorded actions are "
+            "played. ID=MODULE:NAME for one of several vehicles; without --from-step, K is 0",
     )  # fmt: skip
     whatif.add_argument(
-        "--arg", metavar="NAME=VALUE", action="append", default=[], help="an argument of that agent; may be repeated"
+        "--arg",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="an argument of the agent of --agent; may be repeated",
     )
     whatif.add_argument(
         "--futures", action="store_true",
-        help="give the simulator's random generators another seed after step K, a different one in each run",
+        help="give the simulator's random generators a new seed after step K, different in each run",
     )  # fmt: skip
     whatif.add_argument(
         "--overrule", metavar="HOW", choices=get_args(Manoeuvre), default="",
-        help="from step K on, have the vehicle brake, change lanes and brake, keep its lane or its speed, or have a "
-        "reference driver correct its speed, its lane changes, or both, where they are not safe",
+        help="from step K on, override the vehicle: brake, change lanes and brake, keep its lane or its speed. Or "
+            "let a reference driver correct its unsafe speed, lane changes, or both",
     )  # fmt: skip
-    whatif.add_argument("--leave-out", metavar="ID,…", default="", help="actors that do not take part, from the start")
+    whatif.add_argument("--leave-out", metavar="ID,…", default="", help="actors to remove from the start")
     whatif.add_argument(
         "--code", choices=("snapshot", "current"), default=None,
-        help="drive with the code of the snapshot or with today's; default: current with --agent, else snapshot. With "
-        "--code current and a step, today's code takes over after it",
+        help="drive with the code of the snapshot or with today's code; default: current with --agent, else "
+            "snapshot. With --code current and a step, today's code takes over after it",
     )  # fmt: skip
     whatif.add_argument(
-        "--times", metavar="N", type=integer, default=0, help="how many runs; default: 50 with --futures, else 1"
+        "--times", metavar="N", type=integer, default=0, help="number of runs; default: 50 with --futures, else 1"
     )
-    whatif.add_argument("--parallel", metavar="N", type=integer, default=0, help="at a time; default: one per core")
+    whatif.add_argument(
+        "--parallel", metavar="N", type=integer, default=0, help="runs at a time; default: one per core"
+    )
     whatif.add_argument(
         "--for", metavar="TIME", default="", dest="time",
-        help="stop after this time; the runs before the first unfinished one count",
+        help="stop after this time; only runs before the first unfinished run count",
     )  # fmt: skip
     add_trust(whatif)
     add_json(whatif)

@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.git import checked_out, commit_of, git, import_environment, run_to_end, top_of
 from crashhunt.base.temporary import temporary_folder
-from crashhunt.base.work_trees import checked_out, commit_of, git, import_environment, run_to_end, top_of
 from crashhunt.corpus._cases import add_case
+from crashhunt.corpus._run import Got
 from crashhunt.plans import read_settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from crashhunt.base.codec import JsonObject
-    from crashhunt.corpus._run import Got
     from crashhunt.crashes import Bundle
 
 __all__ = ["Bisected", "bisect"]
@@ -31,29 +31,20 @@ _ORIGIN = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1
 
 
 @dataclass(frozen=True, slots=True)
-class Bisected:
+class Bisected(Serializable):
     """The result of a bisection.
 
     Args:
-        commit: The first commit with the crash; empty if revisions that cannot run make it ambiguous.
+        commit: The first commit with the crash; None if revisions that cannot run make it ambiguous.
         subject: The subject of the commit message.
         candidates: The commits among which the first one is, if it is ambiguous.
         tried: The tried revisions, each with the status of the crash.
     """
 
-    commit: str
+    commit: str | None
     subject: str
     candidates: tuple[str, ...]
     tried: dict[str, Got]
-
-    def to_json(self) -> JsonObject:
-        """Return the shape that ``bisect --json`` prints."""
-        return {
-            "commit": self.commit or None,
-            "subject": self.subject,
-            "candidates": list(self.candidates),
-            "tried": self.tried,
-        }
 
 
 def bisect(
@@ -116,7 +107,7 @@ def bisect(
                 tried=tried,
             )
         return Bisected(
-            commit="",
+            commit=None,
             subject="",
             candidates=tuple(re.findall(r"^[0-9a-f]{40,64}$", said, re.MULTILINE)),
             tried=tried,
@@ -144,7 +135,7 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
         origin = found.stdout.strip()
         if found.returncode == 0 and not Path(origin).resolve().is_relative_to(tree):
             raise UsageError(
-                f"{module!r} comes from {origin}, whatever revision is checked out",
+                f"{module!r} is imported from {origin}, independent of the revision",
                 fix="run it from the folder of the repository in which the module is (--from)",
             )
         if found.returncode != 0:
@@ -154,5 +145,7 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
     try:
         got: Got = json.loads(done.stdout)["cases"][0]["got"]
     except (ValueError, KeyError, IndexError):
-        raise CrashhuntError(f"the case could not be run: {done.stderr.strip()[-300:]}", fix="see why") from None
+        raise CrashhuntError(
+            f"the case could not be run: {done.stderr.strip()[-300:]}", fix="run crashhunt corpus run on it"
+        ) from None
     return got

@@ -13,11 +13,11 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
+from crashhunt.base.codec import known_part
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.files import cannot_write, sync_folder, sync_tree, whole_file
 from crashhunt.base.temporary import remove_ended, temporary_beside
 from crashhunt.base.text import near_path
-from crashhunt.base.tolerance import known_part
 from crashhunt.base.validation import validate
 from crashhunt.crashes import Bundle, authenticate_bundle, fault_of, list_bundles, signature_of
 from crashhunt.recording import write_log
@@ -151,9 +151,9 @@ def read_case(path: Path) -> Case:
     try:
         data = tomllib.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise BundleError(f"not valid TOML: {error}", fix="mend the file", where=str(file)) from None
+        raise BundleError(f"not valid TOML: {error}", fix="correct the file", where=str(file)) from None
     except OSError as error:
-        raise BundleError(f"cannot be read: {error.strerror}", fix="see to the file", where=str(file)) from None
+        raise BundleError(f"cannot be read: {error.strerror}", fix="check its permissions", where=str(file)) from None
     said = validate(_File, known_part(_File, data)[0], where=str(file), error=BundleError)
     return Case(path=path, expect=said.expect, note=said.note, crash=said.crash, signature=said.signature)
 

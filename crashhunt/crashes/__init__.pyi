@@ -37,6 +37,7 @@ from ._encounter import (
 )
 from ._escape import (
     Ending as Ending,
+    changes_of as changes_of,
     ending_of as ending_of,
     find_escape as find_escape,
     overruled_trial as overruled_trial,
@@ -56,7 +57,7 @@ from ._judgement import (
     wilson as wilson,
     with_judgement as with_judgement,
 )
-from ._lanes import LaneMap as LaneMap
+from ._lanes import Borders as Borders, LaneMap as LaneMap
 from ._omission import Omission as Omission, Reference as Reference, ReferenceRun as ReferenceRun, Without as Without
 from ._signature import (
     SIGNATURE_VERSION as SIGNATURE_VERSION,

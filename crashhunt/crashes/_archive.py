@@ -46,7 +46,7 @@ class Archive:
 
     Args:
         directory: where its hunt is now.
-        made_by: who made it, as it says itself.
+        made_by: name of the tool that made it, according to the file.
         made_at: when, as it says itself.
         made_here: whether this user made it on this machine, which its signature proves.
     """
@@ -62,7 +62,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
 
     Args:
         bundle: the crash.
-        target: the file; one that is there is replaced.
+        target: the file; an existing one is replaced.
         watch: called after each file with how many are done, and how many there are.
 
     Returns:
@@ -140,7 +140,7 @@ def _read_index(archive: zipfile.ZipFile, path: Path) -> ArchiveIndex:
         typed(index, {"schema": int})
         if index["schema"] != SCHEMA:
             raise BundleError(
-                f"schema {index['schema']} is not {SCHEMA}", fix="use the version that wrote it", where=str(path)
+                f"schema {index['schema']} is not {SCHEMA}", fix="use the version that wrote the trial", where=str(path)
             )
         typed(index, {"files": FILES})
         for entry in index["files"].values():

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base import layout
+from crashhunt.base.codec import known_part, merged, typed_where_there
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree, whole_file
 from crashhunt.base.integrity import (
@@ -24,7 +25,6 @@ from crashhunt.base.integrity import (
 )
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.text import listed, near_path, one_of
-from crashhunt.base.tolerance import known_part, merged, typed_where_there
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.snapshots import Snapshot, versions
 from crashhunt.trial import (
@@ -160,7 +160,7 @@ class ArchiveIndex(TypedDict):
 
 
 def refuse_damaged(data: Protected) -> None:
-    """See that what says what it was is what was written.
+    """Check that the description of a crash is unchanged.
 
     Raises:
         ValueError: it is not.
@@ -168,7 +168,7 @@ def refuse_damaged(data: Protected) -> None:
     typed(data, {"integrity": str, "files": FILES})
     said = data.pop("integrity")
     if digest_of_data(data) != said:
-        raise ValueError("it has changed since it was written")
+        raise ValueError("the file has changed since it was written")
     for name, entry in data["files"].items():
         typed(entry, {"size": int, "blake2b": str})
         if "/" in name or name in ("", ".", ".."):
@@ -195,7 +195,7 @@ def describe_other_files(folder: Path) -> dict[str, FileEntry]:
 
 
 def read_params(folder: Path) -> list[str]:
-    """Return what of a trial that was kept is not as it was written."""
+    """Return the saved files of a trial that have changed since they were written."""
     try:
         data = read_object(folder / layout.PARAMS, Protected)
         if "integrity" in data:  # which earlier versions did not write
@@ -254,9 +254,9 @@ class Bundle:
     """A crash on disk.
 
     Args:
-        path: of its folder.
+        path: path of its folder.
         result: the crash.
-        hunt_seed: of the hunt that found it.
+        hunt_seed: seed of the hunt that found it.
         snapshot: the digest of the code that it ran.
         confirmed: Whether a replay in a new process was bit-identical; None if no replay has run to its end.
         divergence: Where the replay deviated, if it did.
@@ -310,13 +310,13 @@ class Bundle:
         log = self.path / layout.LOG
         if not log.exists() and (self.hunt / layout.CASE).is_file():
             raise BundleError(
-                "the case has no log, because an earlier crashhunt left it out",
+                "the case has no log, because an earlier crashhunt did not save it",
                 fix=f"crashhunt corpus run {self.hunt} --keep out runs it, and out/{self.hunt.name} has a log",
                 where=str(self.path),
             )
         found = read_log(log)
         if found.digest != self.result.digest:
-            raise BundleError("the log does not have the digest that crash.json says", fix=_UNDAMAGED, where=str(log))
+            raise BundleError("the digest of the log differs from that in crash.json", fix=_UNDAMAGED, where=str(log))
         # The views for people, which have no part in the digest of the trial.
         wrong = changed_file(log, self.files[log.name]) if log.name in self.files else ""
         if wrong:
@@ -436,7 +436,9 @@ def read_bundle(path: Path) -> Bundle:
         typed(data, {"schema": int})
         if not 1 <= data["schema"] <= SCHEMA:
             raise BundleError(
-                f"schema {data['schema']} is above {SCHEMA}", fix="use the version that wrote it", where=str(file)
+                f"schema {data['schema']} is above {SCHEMA}",
+                fix="use the version that wrote the trial",
+                where=str(file),
             )
         if data["schema"] >= _PROTECTED or "integrity" in data:
             refuse_damaged(data)
@@ -444,12 +446,12 @@ def read_bundle(path: Path) -> Bundle:
     except OSError as error:
         raise BundleError(
             f"no crash bundle here: {error.strerror}",
-            fix="give another folder, or see with crashhunt check what can be saved",
+            fix="give another folder, or run crashhunt check to see what can be recovered",
             where=str(file),
         ) from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-        raise BundleError(f"not an undamaged crash.json: {reason}", fix=_UNDAMAGED, where=str(file)) from None
+        raise BundleError(f"crash.json is damaged: {reason}", fix=_UNDAMAGED, where=str(file)) from None
 
 
 def _bundle(path: Path, data: CrashData) -> Bundle:
@@ -462,9 +464,9 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         check_disturbances(disturbances)
     typed({"events": data.get("events")}, {"events": dict[str, int] | None})
     if not 0 <= data["seed"] < 2**31 or min(data["trial"], data["step"]) < 0 or data["max_steps"] < 1:
-        raise ValueError("trial, seed, step or max_steps is out of its range")
+        raise ValueError("trial, seed, step or max_steps is out of range")
     if not re.fullmatch(r"\w+", data["snapshot"]):
-        raise ValueError(f"snapshot {data['snapshot']!r} is no name of one")
+        raise ValueError(f"snapshot {data['snapshot']!r} is not the name of a snapshot")
     spec = TrialSpec(
         number=data["trial"],
         seed=data["seed"],
@@ -528,7 +530,7 @@ def snapshot_of(bundle: Bundle) -> Snapshot:
 
 
 def authenticate_bundle(bundle: Bundle) -> str:
-    """Return the authentication code of a bundle that this process makes; empty where its code is not of this user.
+    """Return the authentication code of a bundle that this process makes; empty if its code is not of this user.
 
     Without that condition, a crash that was minimized or confirmed in a stranger's hunt would pass for one made here.
     """
@@ -581,13 +583,13 @@ def write_bundle(
     """Make the bundle of a crash, or of a near miss, from what its trial left behind.
 
     Args:
-        directory: of the hunt.
+        directory: directory of the hunt.
         result: the crash.
         scratch: the trial's scratch folder; it is emptied.
-        hunt_seed: of the hunt.
+        hunt_seed: seed of the hunt.
         snapshot: the digest of the code that ran.
         lanes: The lanes of the map, for viewers of the log.
-        name: of its folder, where that is not made of the trial's number and the outcome.
+        name: name of its folder, where that is not made of the trial's number and the outcome.
         place: the folder of the directory that it goes into.
         confirmed: whether a fresh process did the same, where that is known already.
         authenticate: whether to write down the proof that this user made it; only where the snapshot is this user's.
@@ -653,7 +655,7 @@ def crash_folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
     """Return the folders of crashes, also of one that has lost its ``crash.json``; not of those that were made smaller.
 
     Args:
-        directory: of the hunt.
+        directory: directory of the hunt.
         place: the folder there that has them.
     """
     folders = (directory / place).glob(layout.SHOWN)
@@ -668,7 +670,7 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
     minimized crash, as in an exported file.
 
     Args:
-        directory: of the hunt, or of the bundle itself.
+        directory: directory of the hunt, or of the bundle itself.
         crash: The id of a crash, of a near miss, or of a crash that probes or branches have found. The beginning of an
             id suffices, or the number of the trial. A minimized crash needs its whole id.
 
@@ -748,6 +750,6 @@ def _named(bundles: Sequence[Bundle], crash: str, directory: Path) -> Bundle:
             return meant[0]
         if meant:
             fix = f"give one of {listed(bundle.id for bundle in meant)}"
-            raise BundleError(f"{crash!r} may be several crashes", fix=fix, where=str(directory))
+            raise BundleError(f"{crash!r} matches several crashes", fix=fix, where=str(directory))
     fix = one_of(crash, (bundle.id for bundle in bundles))
     raise BundleError(f"there is no crash {crash!r}", fix=fix, where=str(directory))

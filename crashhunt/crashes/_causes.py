@@ -59,7 +59,7 @@ class CauseGroup:
     """Crashes of one crash type with one cause.
 
     Args:
-        cause: of all of them.
+        cause: cause of all of them.
         members: the crashes, the first one found first.
         judged: those of them whose cause was found by runs; the others have the cause of the nearest of all such.
     """
@@ -90,7 +90,7 @@ def cause_of(bundle: Bundle, judgement: Judgement | None) -> Cause:
 
     Args:
         bundle: the crash.
-        judgement: what its runs have shown; None where it has not been judged.
+        judgement: what its runs have shown; None if it has not been judged.
     """
     if bundle.result.outcome.is_software_fault:
         return Cause("software fault")
@@ -132,7 +132,7 @@ def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[flo
 
     Args:
         bundle: the crash.
-        recording: of it, where it has been read already.
+        recording: recording of it, where it has been read already.
 
     Raises:
         BundleError: its log is missing or damaged.
@@ -179,13 +179,13 @@ class Division:
 
         Args:
             number: identifies it.
-            steps: of its trial.
+            steps: steps of its trial.
             features: as `features_of` returns them.
         """
         self._steps[number], self._features[number] = steps, features
 
     def choose(self) -> int | None:
-        """Return the number of the next crash to judge; None where enough are chosen, or all."""
+        """Return the number of the next crash to judge; None if enough are chosen, or all."""
         left = [number for number in self._features if number not in self._chosen]
         if not left or len(self._chosen) >= self._most:
             return None
@@ -201,8 +201,8 @@ class Division:
         """Note the cause of a crash.
 
         Args:
-            number: of the crash.
-            cause: according to its runs; None where it cannot be run again. Then the nearest judged crash decides.
+            number: number of the crash.
+            cause: according to its runs; None if it cannot be run again. Then the nearest judged crash decides.
         """
         self._open.discard(number)
         if number not in self._chosen:

@@ -16,7 +16,7 @@ import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.crashes._lanes import LaneMap
-from crashhunt.world import STANDS_MPS, contact_at, is_person, lane_jump, poses_between
+from crashhunt.world import MAX_CONTACT_GAP_M, STANDS_MPS, contact_at, is_person, lane_jump, poses_between
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -57,8 +57,8 @@ class Way:
         points: x and y of its front bumper, shape (n, 2), in m.
         headings: shape (n,), in rad.
         speeds: shape (n,), in m/s.
-        length: in m.
-        width: in m.
+        length: length in m.
+        width: width in m.
     """
 
     id: str
@@ -81,14 +81,15 @@ class ContactRecord:
     Args:
         agent: the controlled vehicle.
         other: The collision partner.
-        scenes: to the end of the step in which they touched.
-        time_s: of the first contact.
+        scenes: scenes to the end of the step in which they touched.
+        time_s: time of the first contact.
         began_s: when the episode began.
-        lanes: around the place.
-        events: of the last seconds, each with its simulation time.
-        right_of_way: of the map, where it says.
+        lanes: lanes around the place.
+        events: events of the last seconds, each with its simulation time.
+        right_of_way: right of way of the map, where it says.
         lane: The lane of the agent at the contact; empty if it is unknown.
         swept: whether actors drive from scene to scene, and change lanes in an instant, as in `Scene`.
+        reported_collider: The collider according to the result of the trial; empty if it is unknown.
     """
 
     agent: str
@@ -101,6 +102,7 @@ class ContactRecord:
     right_of_way: RightOfWay | None = None
     lane: str = ""
     swept: bool = True
+    reported_collider: str = ""
 
     @cached_property
     def before(self) -> list[Scene]:
@@ -201,7 +203,7 @@ class ContactRecord:
         return found
 
     def partner(self, actor: str) -> str:
-        """Return the other one of the two."""
+        """Return the other actor of the two."""
         return self.other if actor == self.agent else self.agent
 
     @cached_property
@@ -218,6 +220,15 @@ class ContactRecord:
         return self.agent if self.touch.drives_into else self.other
 
     @property
+    def is_disputed(self) -> bool:
+        """Whether the simulator reported a collision that the outlines contradict.
+
+        They did not touch, and by their positions the other actor would be the collider. No rule can decide then.
+        """
+        apart = self.touch.gap_m >= MAX_CONTACT_GAP_M
+        return apart and self.reported_collider not in ("", self.collider)
+
+    @property
     def jumpers(self) -> tuple[str, ...]:
         """The actors whose instantaneous lane change made the contact."""
         jumps = ((self.agent, self.touch.jumps), (self.other, self.touch.other_jumps))
@@ -232,6 +243,8 @@ class ContactRecord:
         """The manner of the collision, as in `Signature`."""
         if is_person(self.agent) or is_person(self.other):
             return "pedestrian"
+        if self.is_disputed:
+            return ""
         turn = self.touch.turn
         if abs(turn) > _OPPOSITE:
             return "head-on"
@@ -250,7 +263,7 @@ class ContactRecord:
         return self.turn < SAME_WAY
 
     def turned(self, since_s: float) -> float:
-        """The greatest angle between their headings from so many s before the contact on, in rad."""
+        """The greatest angle between the headings of both actors in the last seconds before the contact, in rad."""
         own, other = self.way(self.agent), self.way(self.other)
         turns = np.abs((own.headings - other.headings + math.pi) % math.tau - math.pi)
         return float(turns[self.times <= since_s + 1e-6].max(initial=self.turn))
@@ -275,7 +288,7 @@ class ContactRecord:
     @cached_property
     def follower(self) -> str:
         """The actor whose front touched the other's rear, in the same direction; empty if there was none."""
-        if not self.same_way or self.touch.is_sideways:
+        if not self.same_way or self.touch.is_sideways or self.is_disputed:
             return ""
         faces = self.touch.face, self.touch.other_face
         return self.agent if faces == ("front", "rear") else self.other if faces == ("rear", "front") else ""
@@ -297,7 +310,7 @@ class ContactRecord:
     def turns_off_s(self, leader: str) -> float | None:
         """How long before the contact a leader left the way of a follower that drove straight on; None if it did not.
 
-        It had been in its way before, as long as is known.
+        The actor had been in the way in all recorded steps before.
         """
         lead, follow = self.way(leader), self.way(self.partner(leader))
         headings = np.unwrap(np.append(follow.headings, self._at_contact(follow.id)[1]))
@@ -389,7 +402,7 @@ class ContactRecord:
         )
 
     def was_in_junction(self, actor: str, before_s: float) -> bool:
-        """Whether an actor was in a junction of SUMO's so many s before the contact."""
+        """Whether an actor was in a junction of SUMO a given time before the contact."""
         lanes = [
             scene.lanes[scene.roster.index[actor]]
             for scene in self.scenes
@@ -401,7 +414,7 @@ class ContactRecord:
         """Whether the actor of an event at a junction had already left the junction.
 
         Args:
-            event: on the first of the junction's lanes.
+            event: the event on the first of the junction's lanes.
             time_s: when.
         """
         after = [scene for scene in self.scenes if scene.time_s >= time_s and event.agent in scene.roster.index]
@@ -418,11 +431,11 @@ class ContactRecord:
         return len(junctions) > 1
 
     def speed_mps(self, actor: str, before_s: float) -> float:
-        """How fast an actor was so many s before the contact, or as long before as is known."""
+        """Speed of an actor a given time before the contact, or at its first recorded step."""
         return float(self.way(actor).speeds[int(np.argmin(np.abs(self.times - before_s)))])
 
     def stood_s(self, actor: str) -> float:
-        """For how long an actor had stood until the contact, in s; 0 where it moved when they touched."""
+        """For how long an actor had stood until the contact, in s; 0 if it moved when they touched."""
         if self.speed_at_contact(actor) >= STANDS_MPS:
             return 0.0
         found, place = 0.0, None
@@ -443,7 +456,7 @@ class ContactRecord:
         return found
 
     def slowed(self, actor: str, since_s: float) -> float:
-        """How hard an actor braked on average, from so many s before the contact on, in m/s²."""
+        """Average deceleration of an actor in the last seconds before the contact, in m/s²."""
         way = self.way(actor)
         back = int(np.argmin(np.abs(self.times - since_s)))
         took = float(self.times[back] - self.times[-1])
@@ -470,7 +483,7 @@ class ContactRecord:
 
 
 def record_in(scenes: Sequence[Scene], hit: Collision) -> ContactRecord | None:
-    """Return the record of a contact at the end of some scenes, without a map; None where an actor is missing there."""
+    """Return the record of a contact at the end of some scenes, without a map; None if an actor is missing there."""
     agent, other = hit.agent, hit.other
     if not scenes or not all(name in scenes[-1].roster.index for name in (agent, other)):
         return None
@@ -484,6 +497,7 @@ def record_in(scenes: Sequence[Scene], hit: Collision) -> ContactRecord | None:
         began_s=scenes[0].time_s,
         lanes=lanes,
         swept=hit.kind != _NOT_SWEPT,
+        reported_collider=hit.collider,
     )
 
 
@@ -492,10 +506,10 @@ def contact_record(bundle: Bundle, recording: Recording | None = None) -> Contac
 
     Args:
         bundle: the crash.
-        recording: of it, where it has been read already.
+        recording: recording of it, where it has been read already.
 
     Returns:
-        None where there was no contact, or where the last scene lacks one of the two.
+        None if there was no contact, or where the last scene lacks one of the two.
 
     Raises:
         BundleError: the log is missing or damaged.
@@ -526,6 +540,7 @@ def contact_record(bundle: Bundle, recording: Recording | None = None) -> Contac
         events=events,
         # Earlier versions wrote the lane of SUMO's report, which may be the other actor's.
         swept=hit.kind != _NOT_SWEPT,
+        reported_collider=hit.collider,
         lane=(last.lanes[last.roster.index[hit.agent]] if last.lanes else "") or hit.lane,
     )
 

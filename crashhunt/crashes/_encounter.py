@@ -55,16 +55,16 @@ Manner = Literal["ahead", "behind", "oncoming", "crossing from the left", "cross
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """How the other one stands to the agent after one step.
+    """How the other actor stands to the agent after one step.
 
     Args:
         step: of the episode.
         time_s: simulation time.
-        speed: of the agent, in m/s.
-        other_speed: in m/s.
-        gap_m: between the outlines.
-        closing_speed: at which their centres come nearer, in m/s; negative when they part.
-        time_to_collision_s: at constant velocities; infinite where they would miss each other.
+        speed: speed of the agent, in m/s.
+        other_speed: speed of the other actor, in m/s.
+        gap_m: gap between the outlines.
+        closing_speed: speed at which their centres approach each other, in m/s; negative when they part.
+        time_to_collision_s: time to collision at constant velocities; infinite if they would miss each other.
         required_deceleration: that the agent would need, v / (2 TTC) with v the relative speed, in m/s².
     """
 
@@ -80,10 +80,10 @@ class Moment:
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where the other one is, as seen from the agent.
+    """Where the other actor is, as seen from the agent.
 
     Args:
-        place: on which side of it.
+        place: place on which side of it.
         turn: its heading less the agent's, in rad, within -pi and pi.
     """
 
@@ -104,7 +104,7 @@ class Encounter:
     """The steps of a recording in which two actors were both there.
 
     Args:
-        recording: of the episode.
+        recording: recording of the episode.
         agent: one of them.
         other: the other.
     """
@@ -120,7 +120,7 @@ class Encounter:
         self.moments = self._measure()
 
     def position(self, step: int) -> Position | None:
-        """Where the other one was after a step, as seen from the agent; None where one of them was not there."""
+        """Where the other actor was after a step, as seen from the agent; None if one of them was not there."""
         scene = next((scene for number, scene in self._scenes if number == step), None)
         if scene is None:
             return None
@@ -141,7 +141,7 @@ class Encounter:
         return Position("ahead" if ahead > 0 else "behind", turn)
 
     def manner(self, step: int) -> Manner | None:
-        """How they came together, as of a step; None where one of them was not there."""
+        """How they came together, as of a step; None if one of them was not there."""
         found = self.position(step)
         if found is None:
             return None
@@ -212,13 +212,13 @@ def last_escape(recording: Recording, agent: str, other: str, *, braking: float)
     estimate. `crashhunt.escape` runs the trial again.
 
     Args:
-        recording: of the crash.
+        recording: recording of the crash.
         agent: The agent that brakes.
         other: The collision partner.
         braking: deceleration, in m/s².
 
     Returns:
-        None where there was no such step, or where the calculation does not collide without braking either, so that
+        None if there was no such step, or where the calculation does not collide without braking either, so that
         it says nothing.
     """
     model = _Model(recording, agent, other)
@@ -230,7 +230,7 @@ def last_escape(recording: Recording, agent: str, other: str, *, braking: float)
 
 
 class _Model:
-    """The two of a crash, the other one moving as it did, the agent along the path that it drove."""
+    """The two of a crash, the other actor moving as it did, the agent along the path that it drove."""
 
     def __init__(self, recording: Recording, agent: str, other: str) -> None:
         found = Encounter(recording, agent, other)._scenes
@@ -341,7 +341,7 @@ _UNKNOWN_S = 4.0  # before the end, a criticality of 0 is unknown: later actors 
 class DangerCourse:
     """The danger of a recorded trial over time, measured after the fact.
 
-    The criticality is NaN in steps without the agent. It is also NaN where it would be 0 within the last 4 s, because
+    The criticality is NaN in steps without the agent. It is also NaN if it would be 0 within the last 4 s, because
     it depends on later steps, which were not recorded.
 
     Args:
@@ -350,8 +350,8 @@ class DangerCourse:
         own: The criticality in each of them towards actors ahead of the agent or crossing its path.
         behind: The rear criticality in each of them: by actors that approach the agent from behind.
         greatest: the moment of the greatest own danger.
-        greatest_behind: likewise of those behind; ``other`` is who.
-        nearest: the actor that came nearest to the agent, the gap in m, and the step; None where none came within 50 m.
+        greatest_behind: the greatest criticality caused by an actor behind; ``other`` is this actor.
+        nearest: the actor that came nearest to the agent, the gap in m, and the step; None if none came within 50 m.
         own_total: the integral over the trial, from 0 to below 1: for a trial without a crash and with one agent that
             is what trials are ranked by.
         behind_total: likewise.
@@ -368,7 +368,7 @@ class DangerCourse:
     nearest: tuple[str, float, int] | None = None
 
     def of_step(self, step: int) -> tuple[float, float] | None:
-        """The own danger of a step and that by those behind; None where it has no scene."""
+        """The own danger of a step and that by those behind; None if it has no scene."""
         if step not in self.steps:
             return None
         place = self.steps.index(step)
@@ -442,7 +442,7 @@ def _ahead_m(scene: Scene, row: int, other: int) -> float:
 
 
 def _behind_in_its_way(scene: Scene, row: int) -> list[int]:
-    """Return the actors behind an actor that drive in the same direction, and whose way leads over its place."""
+    """Return the actors behind an actor that drive in its direction, and whose path leads over its position."""
     half = np.array(scene.roster.half_sizes)
     c, s = math.cos(scene.headings[row]), math.sin(scene.headings[row])
     dx, dy = (scene.centers - scene.centers[row]).T
@@ -494,11 +494,11 @@ def closest_actors(recording: Recording, agent: str) -> list[tuple[str, str]]:
     """Return for each scene the actors with the least time to collision and with the least gap to an agent.
 
     Args:
-        recording: of the episode.
+        recording: recording of the episode.
         agent: the controlled vehicle.
 
     Returns:
-        Two identifiers for each scene. An identifier is empty where `approaches` finds no such actor, or where several
+        Two identifiers for each scene. An identifier is empty if `approaches` finds no such actor, or where several
         are equally close.
     """
     scenes = recording.scenes()
@@ -528,7 +528,7 @@ def _to_all(scene: Scene, row: int) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def _only(scene: Scene, measured: NDArray[np.float64], least: float) -> str:
-    """Return the only actor with a measured value; empty where none or several have it."""
+    """Return the only actor with a measured value; empty if none or several have it."""
     if not math.isfinite(least):
         return ""
     rows = np.flatnonzero(np.abs(measured - least) <= _SAME_MEASURE)
@@ -546,7 +546,7 @@ def _outline_gap(one: Rectangle, two: Rectangle) -> float:
 
 
 def most_dangerous(recording: Recording) -> DangerousMoment | None:
-    """Return when which of the controlled vehicles was in the greatest danger; None where none ever was in any."""
+    """Return when which of the controlled vehicles was in the greatest danger; None if none ever was in any."""
     steps = [step.step for step in recording.all_steps if step.scene is not None]
     frames = [scene.frame for scene in recording.scenes()]
     if not frames:
@@ -568,7 +568,7 @@ def visible_from(recording: Recording, agent: str, other: str) -> int | None:
     to the right, in m. If a row matches no actor, as with noise or delays, the step is unknown.
 
     Args:
-        recording: of the episode.
+        recording: recording of the episode.
         agent: The agent whose observations are examined.
         other: The actor to look for.
     """

@@ -10,17 +10,19 @@ from typing import TYPE_CHECKING, Literal
 
 from crashhunt.crashes._contact import record_in
 from crashhunt.crashes._encounter import Encounter, last_escape
+from crashhunt.crashes._lanes import LaneMap
 from crashhunt.recording import has_same_scenes
 from crashhunt.trial import Escape, Outcome, Overruled
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
+    from crashhunt.crashes._lanes import Borders
     from crashhunt.recording import Recording
     from crashhunt.simulators import FullBraking
     from crashhunt.trial import Collision, TrialResult, TrialSpec
 
-__all__ = ["Ending", "ending_of", "find_escape", "overruled_trial", "partner", "slowing"]
+__all__ = ["Ending", "changes_of", "ending_of", "find_escape", "overruled_trial", "partner", "slowing"]
 
 _RUNS = 12  # enough to bisect a thousand steps
 _BEFORE_S = 10.0  # earlier braking is not examined
@@ -45,7 +47,7 @@ override. The last is no crash, but the simulator stopped the vehicle harder tha
 
 
 def partner(result: TrialResult) -> str:
-    """Return the other one of a collision; empty where there was none."""
+    """Return the other actor of a collision; empty if there was none."""
     return result.collision.other if result.collision is not None else ""
 
 
@@ -54,6 +56,7 @@ def find_escape(
     recording: Recording,
     braking: FullBraking | None,
     run: Callable[[TrialSpec], tuple[TrialResult, Recording]],
+    borders: Callable[[], Iterable[Borders]] = tuple,
 ) -> Escape | None:
     """Return until when braking would have avoided a collision of two actors, or why that is unknown.
 
@@ -62,13 +65,14 @@ def find_escape(
     the second in the same one. Where another vehicle drove into the agent from behind, nothing is run.
 
     Args:
-        result: of the trial.
-        recording: of it.
+        result: result of the trial.
+        recording: recording of it.
         braking: how the vehicle brakes; None if it is unknown.
         run: runs a trial in the same way.
+        borders: returns those of the map's lanes, as `LaneMap` takes them; by them a run shows what else it changes.
 
     Returns:
-        None where it was no collision of two actors.
+        None if it was no collision of two actors.
     """
     hit = result.collision
     if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
@@ -82,7 +86,12 @@ def find_escape(
     if found is None:
         return Escape(why_not=search.why_not)
     deceleration = max(search.decelerations, default=0.0)
-    return Escape(*found, deceleration if deceleration > _STANDS else None, search.how(deceleration))
+    return Escape(
+        *found,
+        deceleration if deceleration > _STANDS else None,
+        search.how(deceleration),
+        changed=search.changed(LaneMap(borders(), (hit.x, hit.y))) if found[0] is not None else (),
+    )
 
 
 def _is_from_behind(recording: Recording, hit: Collision) -> bool:
@@ -99,6 +108,7 @@ class _Search:
     run: Callable[[TrialSpec], tuple[TrialResult, Recording]]
     endings: dict[int, Ending] = field(default_factory=dict)
     decelerations: list[float] = field(default_factory=list)
+    latest: tuple[int, Recording] | None = None  # the run from the last step that helps
     began: float = field(default_factory=time.monotonic)
     why_not: str = ""
 
@@ -146,6 +156,14 @@ class _Search:
             return self.braking.how
         return f"at {said:.3g} m/s², {self.braking.how}," if abs(said - deceleration) < 0.01 * said else _AS_IT_CAN
 
+    def changed(self, lanes: LaneMap) -> tuple[str, ...]:
+        """Return what else the agent does otherwise in the run from the last step that helps."""
+        if self.latest is None:
+            return ()
+        assert self.result.collision is not None
+        after, recording = self.latest
+        return changes_of(self.recording, recording, self.result.collision.agent, lanes, after)
+
     @property
     def _other(self) -> str:
         return partner(self.result)
@@ -174,17 +192,19 @@ class _Search:
         if found in ("avoided", "hit"):
             assert self.result.collision is not None
             self.decelerations.append(slowing(self.result.collision.agent, after, result, recording))
+        if found == "avoided" and (self.latest is None or after > self.latest[0]):
+            self.latest = after, recording
         return found
 
 
 def overruled_trial(
     result: TrialResult, recording: Recording, after: int, deceleration: float | None, manoeuvre: str = "brake"
 ) -> TrialSpec:
-    """Return the trial of a collision with its agent overruled after a step, long enough to see what comes of it.
+    """Return the trial of a collision with its agent overruled after a step, long enough to see the result.
 
     Args:
-        result: of the trial.
-        recording: of it.
+        result: result of the trial.
+        recording: recording of it.
         after: the step.
         deceleration: The deceleration with which the vehicle stops, in m/s²; None if it is unknown.
         manoeuvre: as in `Overruled`.
@@ -209,12 +229,12 @@ def ending_of(
     """Return what became of a collision in a run with its agent overruled after a step.
 
     Args:
-        result: of the trial.
-        recording: of it.
+        result: result of the trial.
+        recording: recording of it.
         after: the step.
         rerun: what the run came to.
-        rerun_recording: of the run.
-        deceleration: with which the vehicle can brake, in m/s²; None if it is unknown.
+        rerun_recording: recording of the run.
+        deceleration: deceleration with which the vehicle can brake, in m/s²; None if it is unknown.
     """
     hit = result.collision
     assert hit is not None
@@ -241,6 +261,24 @@ def _is_over(recording: Recording, agent: str, other: str) -> bool:
     if row is None or other not in scene.roster.index or scene.speeds[row] < _STANDS:
         return True
     return math.isinf(Encounter(recording, agent, other).moments[-1].time_to_collision_s)
+
+
+def changes_of(recorded: Recording, rerun: Recording, agent: str, lanes: LaneMap, step: int) -> tuple[str, ...]:
+    """Return what else an agent does otherwise in a run: lane changes that are dropped or added after a step.
+
+    Args:
+        recorded: the recorded crash.
+        rerun: the recording of the run.
+        agent: identifier of the agent.
+        lanes: around the place of the crash.
+        step: the last step that both have in common.
+    """
+    if not lanes:
+        return ()
+    was, now = (lanes.change_began(one.scenes()[step:], agent) is not None for one in (recorded, rerun))
+    if was and not now:
+        return (f"{agent} does not change lanes",)
+    return (f"{agent} changes lanes",) if now and not was else ()
 
 
 def slowing(agent: str, after: int, result: TrialResult, recording: Recording) -> float:

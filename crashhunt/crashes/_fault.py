@@ -102,7 +102,7 @@ def _red_light(case: ContactRecord) -> Finding | None:
 
 
 def _wrong_way(case: ContactRecord) -> Finding | None:
-    """Who drove against the direction of its lane."""
+    """The vehicle that drove against the direction of its lane."""
     for time_s, event in reversed(case.events):
         if event.kind == "wrong_way" and event.agent in (case.agent, case.other) and case.time_s - time_s <= _RED_S:
             return Finding(
@@ -115,7 +115,7 @@ def _wrong_way(case: ContactRecord) -> Finding | None:
 
 
 def _lane_change(case: ContactRecord) -> Finding | None:
-    """Who changed lanes into a gap that was taken, or too short for who came behind."""
+    """A vehicle changed lanes into an occupied gap, or into a gap too short for the vehicle behind."""
     if not case.lanes or not case.same_way:
         return None
     changed = {actor: case.changed_s(actor) for actor in (case.agent, case.other)}
@@ -139,7 +139,7 @@ def _lane_change(case: ContactRecord) -> Finding | None:
     if not case.follower:
         if not case.meets_sideways(changer):
             return None
-        words = f"{changer} moved sideways into {other}, which was beside it and stayed in its lane"
+        words = f"{changer} moved sideways into {other}, which was next to it and stayed in its lane"
         return Finding(rule="lane change", blames=_who(case, changer), words=words, source=source)
     if case.follower == changer:
         if case.hardest_braking(other) > _IMPOSSIBLE or case.way(other).speeds[-1] < -STANDS_MPS:
@@ -267,7 +267,7 @@ def _standing(case: ContactRecord) -> Finding | None:
 
 
 def _right_of_way(case: ContactRecord) -> Finding | None:
-    """Who had to give way, as the map says it, where no traffic light decides."""
+    """The vehicle that had to give way according to the map, at junctions without traffic lights."""
     rights = case.right_of_way
     if rights is None or case.turn < _MERGES or not case.before:
         return None
@@ -311,7 +311,7 @@ _FIRST = ("red light", "wrong way")
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Whose fault a crash was.
+    """The vehicle at fault for a crash.
 
     Args:
         verdict: ``ego`` is the controlled vehicle that it happened to.
@@ -338,12 +338,12 @@ class Fault:
 
 
 def fault_of(bundle: Bundle, recording: Recording | None = None, record: ContactRecord | None = None) -> Fault:
-    """Return whose fault a crash was; no code of the bundle is run.
+    """Return the vehicle at fault for a crash; no code of the bundle is run.
 
     Args:
         bundle: the crash.
-        recording: of it, where it has been read already.
-        record: of its contact, where that has been made already.
+        recording: recording of it, where it has been read already.
+        record: record of its contact, where that has been made already.
 
     Raises:
         BundleError: its log is missing or damaged.
@@ -373,6 +373,8 @@ def fault_in(case: ContactRecord) -> Fault:
     """Return what the rules say of a collision."""
     if case.time_s - case.began_s < 1.0 or len(case.before) < 2:
         return Fault("nobody can tell")  # it was put there
+    if case.is_disputed:
+        return Fault("nobody can tell")
     findings = tuple(finding for rule in RULES if (finding := rule(case)) is not None)
     return Fault(_verdict(findings), findings)
 

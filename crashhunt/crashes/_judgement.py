@@ -62,12 +62,12 @@ class Factor(Serializable):
 
     Args:
         kind: ``argument``, ``seed``, ``disturbance``, ``other`` (a manoeuvre of another actor) or ``agent``.
-        name: of the argument, or who.
+        name: name of the argument or actor.
         what: of an argument ``default`` or ``drawn``; of a disturbance its kind; of the others ``braked``, ``sped up``,
             ``changed lanes``, and ``there`` for that it was there at all.
         step: after which it did that, or at which the disturbance began; None of arguments and seeds.
         was: the value of an argument or a seed; the speed in m/s to which a vehicle was held; None for nothing.
-        runs: without it.
+        runs: runs without it.
     """
 
     kind: str
@@ -96,7 +96,7 @@ class Factor(Serializable):
 
     @property
     def needed(self) -> bool | None:
-        """True where no run crashed without it, False where all did; None where that differs, or none says it."""
+        """True if no run crashed without it, False if all did; None if that differs, or none says it."""
         if not self.clear:
             return None
         return True if self.crashed == 0 else False if self.crashed == self.clear else None
@@ -109,13 +109,13 @@ class Factor(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Why(Serializable):
-    """What has been found out.
+    """The results of an analysis.
 
     Args:
-        factors: in the order in which they were looked at.
-        steps: after how many a run ended that did not crash; of those with other arguments or seeds.
+        factors: factors in the order in which they were looked at.
+        steps: number of steps after which a run ended that did not crash; of those with other arguments or seeds.
         left: how many runs more there would have been.
-        why_not: why there is no answer, or not a whole one; empty where there is.
+        why_not: why there is no answer, or not a whole one; empty if there is.
     """
 
     factors: tuple[Factor, ...] = ()
@@ -127,7 +127,7 @@ class Why(Serializable):
 
     @property
     def runs(self) -> int:
-        """How many trials were run for it, besides the one that must be as it was."""
+        """Number of trials that were run, without the unchanged one."""
         return sum(len(factor.runs) for factor in self.factors)
 
 
@@ -195,7 +195,7 @@ class Attempt:
         manoeuvre: as in `Overruled`.
         end: the step of the crash.
         endings: step to what became of it where the agent was overruled after that step.
-        deceleration: the greatest in the runs that avoided the crash, in m/s²; None where it never slowed down.
+        deceleration: the greatest in the runs that avoided the crash, in m/s²; None if it never slowed down.
         changed: What else the agent does otherwise in the run from the last step that avoids the crash.
     """
 
@@ -207,7 +207,7 @@ class Attempt:
 
     @property
     def last_step(self) -> int | None:
-        """The last step after which a run avoided it; None where none did."""
+        """The last step after which a run avoided it; None if none did."""
         return max((step for step, ending in self.endings.items() if ending == "avoided"), default=None)
 
     @property
@@ -247,7 +247,7 @@ class Judgement:
 
     Args:
         attempts: a manoeuvre each.
-        why_not: why there is no answer, or not a whole one; empty where there is.
+        why_not: why there is no answer, or not a whole one; empty if there is.
         why: The causes of the collision; None if they were not examined.
         visible_step: The step after which an observation first had the collision partner; None if it is unknown.
         reference: What runs with a reference driver have shown; None if there were none.
@@ -279,7 +279,7 @@ class Judgement:
 
     @property
     def runs(self) -> int:
-        """How many trials were run for it."""
+        """Number of trials that were run."""
         return sum(len(attempt.endings) for attempt in self.attempts)
 
     @property
@@ -318,7 +318,7 @@ class Judgement:
 
 
 def judgement_of(bundle: Bundle) -> Judgement | None:
-    """Return what `judge` has written into a bundle; None where there is nothing, or nothing that can be read."""
+    """Return what `judge` has written into a bundle; None if there is nothing, or nothing that can be read."""
     data: Any = bundle.added.get(_KEY)
     try:
         attempts = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 
-__all__ = ["LaneMap"]
+__all__ = ["Borders", "LaneMap"]
+
+Borders: TypeAlias = "tuple[NDArray[np.float64], NDArray[np.float64]]"
+"""The right and the left border of a lane, shape (n, 2) each, in m."""
 
 
 _NEAR_M = 60.0  # around where it happens; a town has thousands of lanes further away
@@ -71,14 +74,12 @@ class LaneMap:
     """The lanes around a place.
 
     Args:
-        borders: of each lane of the map, right and left, shape (n, 2) each, in m; as `crashhunt.recording.read_lanes`
-            returns them.
+        borders: borders of each lane of the map, right and left, shape (n, 2) each, in m; as
+            `crashhunt.recording.read_lanes` returns them.
         around: x and y of the place, in m.
     """
 
-    def __init__(
-        self, borders: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], around: tuple[float, float]
-    ) -> None:
+    def __init__(self, borders: Iterable[Borders], around: tuple[float, float]) -> None:
         center = np.array(around)
         self._lanes = []
         for right, left in borders:
@@ -126,7 +127,7 @@ class LaneMap:
         )
 
     def change_began(self, scenes: Sequence[Scene], actor: str) -> int | None:
-        """Return the place of the scene after which an actor began its last lane change; None where it made none.
+        """Return the place of the scene after which an actor began its last lane change; None if it made none.
 
         One that is not complete in the end counts as well.
         """

@@ -35,15 +35,15 @@ class Omission(Serializable):
     """What an agent omitted. Without the omission there is no crash, in every run.
 
     Args:
-        faculty: with which a reference driver avoids the crash: ``longitudinal``, ``lateral`` or ``both``.
+        faculty: faculty with which a reference driver avoids the crash: ``longitudinal``, ``lateral`` or ``both``.
         kind: what the agent disregarded. On its path: ``vehicle``, ``red light`` or ``crossing``, an actor whose path
             crosses. In a lane change: ``ahead``, ``behind``, ``alongside`` or ``no lane``, followed by the side.
         actor: the actor that it disregarded; empty for a red light and a missing lane.
         step: the step after which the omission began.
         instead: what the agent did: ``sped up``, ``kept its speed``, ``braked too little`` or ``changed lanes``.
-        speed_mps: of the agent after that step, in m/s.
-        actor_speed_mps: of the actor, in m/s; None without an actor.
-        gap_m: between them, in m; negative alongside each other; None without an actor or a stop line.
+        speed_mps: speed of the agent after that step, in m/s.
+        actor_speed_mps: actor speed of the actor, in m/s; None without an actor.
+        gap_m: gap between them, in m; negative alongside each other; None without an actor or a stop line.
         safe: the safe speed for that gap in m/s; in a lane change the safe gap in m; None for a missing lane.
         visible_step: the step after which an observation first had the actor; None if that is unknown.
     """
@@ -65,9 +65,9 @@ class Reference(Serializable):
     """What the runs with a reference driver have shown.
 
     Args:
-        omission: the cause; None where no run says so.
+        omission: the cause; None if no run says so.
         runs: all runs with a reference driver that acts.
-        why_not: why there is no answer, or not a whole one; empty where there is.
+        why_not: why there is no answer, or not a whole one; empty if there is.
     """
 
     omission: Omission | None = None

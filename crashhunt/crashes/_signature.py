@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SIGNATURE_VERSION", "Frame", "Signature", "own_frames", "signature_of", "signature_of_fault"]
 
-SIGNATURE_VERSION = 1
+SIGNATURE_VERSION = 2
 """Version of these rules. Raise it with each change by which a crash gets another type: types that an earlier version
 has noted in a ledger are then determined again."""
 
@@ -44,9 +44,9 @@ class Frame:
     """A call.
 
     Args:
-        file: in which it is.
-        line: of it, from 1.
-        function: in which it is.
+        file: file in which it is.
+        line: line of it, from 1.
+        function: function in which it is.
     """
 
     file: PurePath
@@ -93,13 +93,13 @@ class Signature(Serializable):
 
     Args:
         outcome: how the trial ended.
-        role: the agent's: ``collider``, ``victim``, ``alone``; empty where it is no collision.
+        role: the agent's: ``collider``, ``victim``, ``alone``; empty if it is no collision.
         manner: The manner of a collision: ``rear end``, ``side swipe``, ``crossing from the left`` (the side of the
             collision partner), ``crossing from the right``, ``head-on``, ``pedestrian`` or ``off road``. Of a Gymnasium
             environment, the kind that it names, or its crash rule. For a traffic event, its type. For a software fault,
             the exception, signal or exit code.
-        lane_change: who was changing lanes: ``agent``, ``other``, ``both`` or empty.
-        place: ``crossing`` where lanes of different directions lie over each other, ``road`` elsewhere; empty where
+        lane_change: the actors that were changing lanes: ``agent``, ``other``, ``both`` or empty.
+        place: ``crossing`` where lanes of different directions lie over each other, ``road`` elsewhere; empty if
             the map is not known, or it is no matter of place.
         where: of a software fault, the innermost functions of the agent's, or what is said where there are none.
         disturbed: whether disturbances took place before it; in undisturbed traffic it is another crash.
@@ -127,8 +127,8 @@ def signature_of(bundle: Bundle, recording: Recording | None = None, record: Con
 
     Args:
         bundle: the crash.
-        recording: of it, where it has been read already.
-        record: of its contact, where that has been made already.
+        recording: recording of it, where it has been read already.
+        record: record of its contact, where that has been made already.
 
     Raises:
         BundleError: its log is missing or damaged.

@@ -86,7 +86,7 @@ def add_trusted(fingerprint: str, *, path: str, runs: str) -> TrustedOrigin:
     """Trust code from now on, and return the entry.
 
     Args:
-        fingerprint: of the code.
+        fingerprint: fingerprint of the code.
         path: where it is now.
         runs: what would run, in words.
 
@@ -106,7 +106,8 @@ def add_trusted(fingerprint: str, *, path: str, runs: str) -> TrustedOrigin:
             continue
         return origin
     raise HuntDirectoryError(
-        f"no folder can keep what is trusted: {error}", fix="set XDG_STATE_HOME to a folder that can be written"
+        f"the list of trusted origins cannot be saved: {error}",
+        fix="set XDG_STATE_HOME to a folder that can be written",
     )
 
 
@@ -133,7 +134,7 @@ def remove_trusted(names: Sequence[str]) -> list[TrustedOrigin]:
     """Trust some origins no longer, and return them.
 
     Args:
-        names: of each the beginning of its fingerprint, or the path that it was trusted at.
+        names: for each, the beginning of its fingerprint, or the path that it was trusted at.
 
     Raises:
         UsageError: a name is none of a trusted origin, or may be several; then nothing is removed.
@@ -147,7 +148,7 @@ def remove_trusted(names: Sequence[str]) -> list[TrustedOrigin]:
         if not found and len(name) >= _SHORTEST:
             found = [origin for origin in known if origin.fingerprint.startswith(name.lower())]
             if len(found) > 1:
-                raise UsageError(f"--remove {name!r} may be {len(found)} origins", fix="give more of the fingerprint")
+                raise UsageError(f"--remove {name!r} matches {len(found)} origins", fix="give more of the fingerprint")
         if not found:
             raise UsageError(f"--remove {name!r}: no such origin is trusted", fix="crashhunt trust lists them")
         chosen |= {origin.fingerprint: origin for origin in found}
@@ -224,7 +225,7 @@ def trust_snapshot(snapshot: Snapshot, path: Path) -> TrustedOrigin:
     """Trust the code of a snapshot from now on, and return the entry.
 
     Args:
-        snapshot: of a hunt or a corpus.
+        snapshot: snapshot of a hunt or a corpus.
         path: what the user named.
 
     Raises:
@@ -255,7 +256,7 @@ def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> U
     Args:
         bundle: the crash.
         where: what the user named; the folder of the crash where it is empty.
-        made_by: who made it, as it says itself.
+        made_by: name of the tool that made it, according to the file.
     """
     place = where or str(bundle.path)
     fix = f"if you trust that code, run crashhunt trust {shlex.quote(place)} once, or add --trust"
@@ -285,7 +286,7 @@ def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> U
 
 
 def _first_change(settings: HuntSettings, snapshot: Snapshot) -> str:
-    """What of a bundle is not as the snapshot says, in words; empty where everything is."""
+    """What of a bundle is not as the snapshot says, in words; empty if everything is."""
     faults = snapshot.faults()
     if faults:
         return f"the snapshot is damaged: {faults[0]}"
@@ -377,20 +378,20 @@ def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapp
     """Refuse a scenario with known side effects, and a scenario whose side effects are unknown.
 
     Args:
-        scenario: of the crash.
-        settings: of its hunt.
-        values: of the scenario's arguments in the trial.
+        scenario: scenario of the crash.
+        settings: settings of its hunt.
+        values: values of the scenario's arguments in the trial.
 
     Raises:
-        UsageError: with what it would do.
+        UsageError: the scenario has side effects; the message names them.
     """
     names: list[tuple[Group, str]] = [("simulators", scenario.simulator)]
     names += [("oracles", oracle_name(text)) for text in settings.oracles]
     for group, name in names:
         if name not in registered(group):
-            raise _refusal(f"it would import {name!r}")
+            raise _refusal(f"the configuration imports {name!r}")
     for module in scenario.modules():
-        raise _refusal(f"it would import {module!r}")
+        raise _refusal(f"the configuration imports {module!r}")
     backend = backend_of(scenario.simulator)
     if backend is None or backend.side_effect is None:
         raise _refusal(f"the side effects of the simulator {scenario.simulator!r} are unknown")

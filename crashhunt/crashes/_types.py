@@ -28,10 +28,10 @@ class Group:
     """Crashes with one signature.
 
     Args:
-        signature: of all of them.
-        bundles: in the order in which they were given; at least one.
-        faults: whose fault each of these was; empty where that was not asked.
-        dropped: how many more there were, whose bundles were deleted (``--keep``).
+        signature: signature of all of them.
+        bundles: bundles in the order in which they were given; at least one.
+        faults: vehicle at fault in each of these; empty if that was not requested.
+        dropped: number of further crashes, whose bundles were deleted (``--keep``).
     """
 
     signature: Signature
@@ -46,13 +46,13 @@ class Group:
 
     @property
     def fault(self) -> str:
-        """Whose fault those with a bundle were: one of `Verdict`, or ``mixed``; empty where that was not asked."""
+        """The vehicle at fault in the crashes with a bundle: a `Verdict`, or ``mixed``; empty if not requested."""
         said = set(self.faults)
         return "mixed" if len(said) > 1 else next(iter(said), "")
 
     @property
     def avoidable(self) -> bool | None:
-        """Whether runs have avoided all of them, or none; None where that differs, or is not known of all."""
+        """Whether runs have avoided all of them, or none; None if that differs, or is not known of all."""
         if self.dropped:
             return None
         said = {_avoidable(bundle) for bundle in self.bundles}
@@ -87,7 +87,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Groups:
-    """What came of grouping crashes.
+    """The result of grouping crashes.
 
     Args:
         groups: the largest first.
@@ -104,9 +104,9 @@ def group_crashes(
     """Group crashes by their signatures.
 
     Args:
-        bundles: of one hunt or several; the log of each is read.
-        dropped: of each kind, in words, how many more there were.
-        faults: whether to find whose fault each crash was.
+        bundles: bundles of one hunt or several; the log of each is read.
+        dropped: for each crash type, in words, how many more there were.
+        faults: whether to find the vehicle at fault for each crash.
     """
     signed, unsigned = [], []
     verdicts: dict[Path, Verdict] = {}
@@ -134,7 +134,7 @@ def group_crashes(
 
 
 def _avoidable(bundle: Bundle) -> bool | None:
-    """What was run of one: by `judge`, or by the hunt that found it."""
+    """The runs of a crash: by `judge`, or by the hunt that found it."""
     judgement, escape = judgement_of(bundle), bundle.result.escape
     if judgement is not None and judgement.avoidable is not None:
         return judgement.avoidable
@@ -148,7 +148,7 @@ def groups_of(
 
     Args:
         signed: the crashes.
-        dropped: of each kind, in words, how many more there were.
+        dropped: for each crash type, in words, how many more there were.
     """
     found: dict[Signature, list[Bundle]] = {}
     for signature, bundle in signed:

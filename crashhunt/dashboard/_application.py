@@ -23,10 +23,9 @@ from starlette.routing import Route
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.base.version import __version__
 from crashhunt.crashes import export_crash, read_bundle
-from crashhunt.dashboard._compared import Compared
 from crashhunt.dashboard._control import Jobs, stop_hunt
 from crashhunt.dashboard._crashes import CrashList
-from crashhunt.dashboard._details import detail_of, importance_of_points
+from crashhunt.dashboard._details import Compared, detail_of, importance_of_points
 from crashhunt.dashboard._hunt import HuntView
 from crashhunt.dashboard._security import Guard
 from crashhunt.report import argument_units, player_parts
@@ -57,7 +56,7 @@ class Application(NamedTuple):
 
     Args:
         asgi: the ASGI application.
-        close: ends what it has started.
+        close: ends all processes that it has started.
     """
 
     asgi: ASGIApp
@@ -68,7 +67,7 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
     """Return the application, guarded.
 
     Args:
-        catalog: of the hunts that it shows.
+        catalog: catalog of the hunts that it shows.
         host: that it listens on.
         token: that requests need; empty for none.
         allow_control: whether requests may stop hunts and start commands.
@@ -243,7 +242,7 @@ class _Shown:
     """The views of all hunts, kept between requests.
 
     Args:
-        catalog: of the hunts.
+        catalog: catalog of the hunts.
     """
 
     def __init__(self, catalog: Catalog) -> None:
@@ -256,7 +255,7 @@ class _Shown:
         self.compared = Compared()
 
     def view(self, identifier: str) -> HuntView | None:
-        """Return a hunt by its identifier; None where it is unknown or gone."""
+        """Return a hunt by its identifier; None if it is unknown or gone."""
         found = self._catalog.find(identifier)
         return None if found is None else self._view(found)
 
@@ -268,7 +267,7 @@ class _Shown:
             return view
 
     def crashes(self, identifier: str) -> CrashList | None:
-        """Return the crashes of a hunt; None where it is unknown or gone."""
+        """Return the crashes of a hunt; None if it is unknown or gone."""
         found = self._catalog.find(identifier)
         if found is None:
             return None

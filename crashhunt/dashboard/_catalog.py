@@ -39,7 +39,7 @@ class Found:
 
     Args:
         id: of it in links: 16 hexadecimal digits that depend on its path only.
-        path: of its folder, resolved.
+        path: path of its folder, resolved.
         root: the named folder that it lies in.
         name: its path below that folder, or the folder's own name.
         suite: the folder that it shares with other hunts, below the named one; empty for none.
@@ -81,7 +81,7 @@ class Catalog:
             return self._found
 
     def find(self, identifier: str) -> Found | None:
-        """Return a hunt by its identifier; None where it is unknown, or its folder is gone."""
+        """Return a hunt by its identifier; None if it is unknown, or its folder is gone."""
         found = self._found.get(identifier) or self.hunts().get(identifier)
         return found if found is not None and found.path.is_dir() else None
 
@@ -138,7 +138,7 @@ def outside_link(folder: Path, root: Path, names: Sequence[str] = _OWN_FILES) ->
     Args:
         folder: whose files are checked.
         root: that they must lie in.
-        names: of the files; those of a hunt by default.
+        names: names of the files; those of a hunt by default.
     """
     for name in names:
         path = folder / name

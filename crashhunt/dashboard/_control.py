@@ -1,6 +1,6 @@
 """What the page may start or stop with ``--allow-control``: an interrupt of a hunt, and commands for a crash.
 
-Commands run one after the other, each in a process of its own, as if the user had started it. A command without a
+Commands run one after the other, each in its own process, as if the user had started it. A command without a
 terminal cannot ask whether to trust code, so it refuses the code of a stranger.
 """
 
@@ -48,7 +48,9 @@ def stop_hunt(view: HuntView) -> None:
     state = view.refresh()
     owner = view.facts.get("owner")
     if state.state != "running" or owner is None:
-        raise UsageError(f"the hunt does not run: its state is {state.state}", fix="only a running hunt can be stopped")
+        raise UsageError(
+            f"the hunt is not running: its state is {state.state}", fix="only a running hunt can be stopped"
+        )
     if owner["host"] != socket.gethostname():
         raise UsageError(f"the hunt runs on {owner['host']}", fix=f"stop it there: kill -INT {owner['pid']}")
     # The state is "running" only if the process is the one that the ledger names, and not a later one of its number.
@@ -90,9 +92,9 @@ class Jobs:
 
         Args:
             hunt: identifier of the hunt.
-            path: of its folder.
+            path: path of its folder.
             crash: identifier of the crash, which is there.
-            name: of the command, one of `COMMANDS`.
+            name: name of the command, one of `COMMANDS`.
 
         Raises:
             UsageError: there is no such command, or too many jobs wait.

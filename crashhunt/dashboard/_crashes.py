@@ -58,7 +58,7 @@ class CrashList:
         self._thread: threading.Thread | None = None
 
     def folder(self, crash: str) -> Path | None:
-        """Return the folder of a crash, near miss or minimized crash by its identifier; None where it is missing."""
+        """Return the folder of a crash, near miss or minimized crash by its identifier; None if it is missing."""
         folders = self._folders()
         if crash in folders:
             return folders[crash]
@@ -66,7 +66,7 @@ class CrashList:
 
     @staticmethod
     def _minimized(folder: Path | None) -> Path | None:
-        """Return the folder of the minimized crash of a crash; None where there is none."""
+        """Return the folder of the minimized crash of a crash; None if there is none."""
         if folder is None:
             return None
         found = folder.with_name(f"{folder.name}{layout.SMALL}")
@@ -82,7 +82,7 @@ class CrashList:
     def rows(self) -> JsonObject:
         """Return ``crashes``, one entry each, and ``pending``, how many are still being analysed.
 
-        Reading the log of a crash takes 50 ms and more, so a thread of its own does it.
+        Reading the log of a crash takes 50 ms and more, so its own thread does it.
         """
         with self._lock:
             folders = self._folders()
@@ -144,7 +144,7 @@ class CrashList:
                 self._analysed[name] = written, said
 
     def detail(self, crash: str) -> JsonObject | None:
-        """Return a crash for its page: the player's data, words, table, and commands; None where there is none.
+        """Return a crash for its page: the player's data, words, table, and commands; None if there is none.
 
         Raises:
             BundleError: it is damaged.
@@ -194,7 +194,7 @@ class CrashList:
         return found
 
     def log(self, crash: str) -> Path | None:
-        """Return the file of a crash's log, inside of the hunt; None where there is none."""
+        """Return the file of a crash's log, inside of the hunt; None if there is none."""
         folder = self.folder(crash)
         if folder is None:
             return None

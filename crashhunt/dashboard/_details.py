@@ -1,14 +1,18 @@
-"""What the page of one hunt shows besides its trials: settings, command, logs, workers and events."""
+"""What pages show besides trials: settings, command, logs, workers and events of a hunt; a comparison of hunts."""
 
 from __future__ import annotations
 
 import re
 import socket
+import threading
 import time
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError
 from crashhunt.dashboard._hunt import read_tail
+from crashhunt.estimation import compare
+from crashhunt.ledger import leave_untouched
 from crashhunt.recording import Phase, read_header
 from crashhunt.report import UNCHOSEN, importance_of
 
@@ -19,10 +23,12 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.dashboard._hunt import HuntView
     from crashhunt.dashboard._trials import Point
+    from crashhunt.estimation import Comparison
     from crashhunt.plans import HuntSettings
     from crashhunt.trial import Value
 
-__all__ = ["detail_of", "importance_of_points"]
+
+__all__ = ["Compared", "detail_of", "importance_of_points"]
 
 _MAX_WORKERS = 256
 _MAX_EVENTS = 50
@@ -73,7 +79,7 @@ def _settings(settings: HuntSettings) -> JsonObject:
         "branch": settings.branch,
         "seeds": settings.seeds,
         "keep going": settings.run.keep_going,
-        "crash types wanted": settings.run.distinct,
+        f"crash types{' by cause' if settings.run.by_cause else ''} wanted": settings.run.distinct,
     }
     return {name: value for name, value in found.items() if value not in ("", None, False, 0)}
 
@@ -88,7 +94,7 @@ def _columns(settings: HuntSettings) -> list[str]:
 
 
 def _command(path: Path) -> str:
-    """Return the command line in the first line of ``hunt.toml``; empty where there is none."""
+    """Return the command line in the first line of ``hunt.toml``; empty if there is none."""
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             first = file.readline(20_000)
@@ -125,3 +131,71 @@ def importance_of_points(points: Sequence[Point]) -> list[JsonObject]:
             assert isinstance(values, dict)
             trials.append((values, danger))
     return [dict(found) for found in importance_of(trials)]
+
+
+# Several hunts next to each other, with the numbers of ``crashhunt compare``.
+
+_SHARE_OF_TIME = 0.05  # that comparisons may take: each reads all trials
+_MAX_TRIALS = 200_000  # of all hunts together
+
+
+class Compared:
+    """Compares hunts, and keeps the last comparison."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._found: tuple[object, JsonObject] | None = None
+        self._paths: tuple[str, ...] = ()
+        self._due = 0.0
+
+    def compare(self, views: Sequence[HuntView]) -> JsonObject:
+        """Return ``hunts``, each a row with its curve and ``figures``, and ``pairs``, the first against each other.
+
+        Args:
+            views: views of the hunts.
+        """
+        with self._lock:
+            rows = []
+            for view in views:
+                row = view.row()
+                rows.append({**row, "curve": view.counts.curve() if view.counts is not None else []})
+            figures = self._figures(views, rows)
+            return {
+                "hunts": [
+                    {**row, "figures": figures["hunts"].get(row["dir"]), "problem": figures["problem"]} for row in rows
+                ],
+                "pairs": figures["pairs"],
+            }
+
+    def _figures(self, views: Sequence[HuntView], rows: Sequence[JsonObject]) -> JsonObject:
+        if not views:
+            return {"hunts": {}, "pairs": [], "problem": ""}
+        paths, key = tuple(str(view.path) for view in views), [(row["dir"], row["trials_run"]) for row in rows]
+        began = time.monotonic()
+        known = self._found
+        if known is not None and paths == self._paths and (known[0] == key or began < self._due):
+            return known[1]
+        trials = sum(row["trials_run"] for row in rows)
+        if trials > _MAX_TRIALS:
+            why = f"a comparison reads all trials, of which there are more than {_MAX_TRIALS:,}"
+            return {"hunts": {}, "pairs": [], "problem": f"{why}; run: crashhunt compare"}
+        try:
+            with leave_untouched():
+                found = _plain(compare(*(view.path for view in views)), rows)
+        except CrashhuntError as error:
+            found = {"hunts": {}, "pairs": [], "problem": str(error)}
+        ended = time.monotonic()
+        self._found, self._paths, self._due = (key, found), paths, ended + (ended - began) / _SHARE_OF_TIME
+        return found
+
+
+def _plain(found: Comparison, rows: Sequence[JsonObject]) -> JsonObject:
+    data: JsonObject = found.to_json()
+    names = {row["dir"]: row["name"] for row in rows}
+    pairs = []
+    for pair in found.pairs:
+        verdict = pair.verdict
+        for path in sorted(names, key=len, reverse=True):  # one may begin with another
+            verdict = verdict.replace(path, names[path])
+        pairs.append({"verdict": verdict, "caution": pair.caution})
+    return {"hunts": {hunt["dir"]: hunt for hunt in data["hunts"]}, "pairs": pairs, "problem": ""}

@@ -1,4 +1,4 @@
-"""One hunt as the dashboard shows it. It is read again when its files have changed, and only what is new."""
+"""One hunt as the dashboard shows it. When its files change, only new data are read."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _Key = tuple[object, ...]
 
 
 class HuntView:
-    """What is known of a hunt, kept between requests.
+    """The known state of a hunt, kept between requests.
 
     Args:
         found: the hunt.
@@ -104,7 +104,9 @@ class HuntView:
             self._forget()
             return HuntState(str(self.path), "finished") if self.found.exported else hunt_state(self.path)
         if self.settings is None:
-            raise HuntDirectoryError(f"it has no {layout.HUNT}", fix=f"crashhunt check {self.path} says what is left")
+            raise HuntDirectoryError(
+                f"it has no {layout.HUNT}", fix=f"run crashhunt check {self.path} to see what is left"
+            )
         key = (_sign(ledger), _sign(ledger.with_name(f"{ledger.name}-wal")))
         if key != self._key or self.counts is None or (points and self.sample is None):
             self._read(ledger, points=points)
@@ -203,7 +205,7 @@ class HuntView:
             return row
 
     def kinds(self) -> list[KindData] | None:
-        """Return the crash types that the hunt has noted; None where the first crash ends it."""
+        """Return the crash types that the hunt has noted; None if the first crash ends it."""
         return self.facts.get("kinds") if self.counts is not None else None
 
     def kind_firsts(self) -> list[int]:
@@ -216,7 +218,7 @@ class HuntView:
         return sorted(found)
 
     def active_at(self) -> float:
-        """Return when something happened last, in s since the epoch; 0 where that is unknown."""
+        """Return when something happened last, in s since the epoch; 0 if that is unknown."""
         times = [self._last or 0.0, self.facts.get("heartbeat", 0.0), self.facts.get("began", 0.0)]
         if self.counts is None:
             with suppress(OSError):
@@ -224,7 +226,7 @@ class HuntView:
         return max(times)
 
     def rate(self, state: HuntState) -> JsonObject | None:
-        """Return the rate per trial as ``rate --json`` does; None where there is no trial, or it is not known yet."""
+        """Return the rate per trial as ``rate --json`` does; None if there is no trial, or it is not known yet."""
         settings, counts = self.settings, self.counts
         if settings is None or counts is None or not counts.trials:
             return None
@@ -274,10 +276,10 @@ def _sign(path: Path) -> tuple[int, int, int]:
 
 
 def read_tail(path: Path, root: Path, most: int = _TAIL) -> str:
-    """Return the end of a text file, from the beginning of a line; empty where it is missing or outside of a folder.
+    """Return the end of a text file, from the beginning of a line; empty if it is missing or outside of a folder.
 
     Args:
-        path: of the file.
+        path: path of the file.
         root: that it must lie in, after links are resolved.
         most: bytes.
     """

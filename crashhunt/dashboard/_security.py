@@ -72,7 +72,7 @@ def names_of(host: str) -> frozenset[str]:
     """Return the names that a request may call this machine by, besides any IP address.
 
     Args:
-        host: to listen on.
+        host: host to listen on.
     """
     names = {"localhost", host.lower()}
     if not is_loopback(host):
@@ -172,7 +172,7 @@ class Guard:
         return scope["method"] == "POST" and headers.only("x-crashhunt") != "1"
 
     def _without_token(self, scope: Scope, headers: _Headers) -> Response | None:
-        """Return the answer to a request without the token; None where the request has it."""
+        """Return the answer to a request without the token; None if the request has it."""
         query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True, max_num_fields=100)
         given = [value for name, value in query if name == "token"]
         if given and self._fits(given[-1]) and scope["method"] in ("GET", "HEAD"):
@@ -194,7 +194,7 @@ class Guard:
 
 
 class _Headers:
-    """The headers of a request, of which none counts that is there twice."""
+    """The headers of a request. Headers that occur twice are ignored."""
 
     def __init__(self, raw: Iterable[tuple[bytes, bytes]]) -> None:
         self._found: dict[str, list[str]] = {}
@@ -204,7 +204,7 @@ class _Headers:
             self._found.setdefault(name.decode("latin-1").lower(), []).append(value.decode("latin-1"))
 
     def only(self, name: str) -> str | None:
-        """Return the value of a header; None where it is missing or there twice."""
+        """Return the value of a header; None if it is missing or there twice."""
         values = self._found.get(name, ())
         return values[0] if len(values) == 1 else None
 
@@ -222,7 +222,7 @@ def _is_small(length: str) -> bool:
 
 
 def _bounded(receive: Receive) -> Receive:
-    """Return what ends a body that is longer than it may be, also where its length is not given."""
+    """Return a function that stops reading a body above the limit, also if its length is unknown."""
     taken = 0
 
     async def bounded() -> Message:

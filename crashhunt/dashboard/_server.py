@@ -64,8 +64,8 @@ def serve(
 
     Args:
         paths: hunts, suites, folders with hunts below them, or files that ``crashhunt export`` wrote.
-        host: to listen on.
-        port: likewise; 0 for any that is free.
+        host: host to listen on.
+        port: port to listen on; 0 for any free port.
         token: that requests need; a random one where it is empty and the host is no loopback address.
         browser: whether to open a browser where there is one.
         allow_control: whether the page may stop hunts and start commands.
@@ -84,7 +84,7 @@ def serve(
     if token and (len(token) < MIN_TOKEN or not (token.isascii() and token.isprintable() and " " not in token)):
         raise UsageError(
             f"--token has {len(token)} characters (allowed: at least {MIN_TOKEN}, printable ASCII without spaces)",
-            fix="give a longer one, or none for a random one",
+            fix="give a longer token, or omit --token for a random one",
         )
     if not token and not is_loopback(host):
         token = secrets.token_urlsafe(24)
@@ -98,7 +98,7 @@ def serve(
 
 
 def has_dashboard() -> bool:
-    """Whether what the dashboard needs is installed; imports nothing of it."""
+    """Whether the packages of the dashboard are installed; imports none of them."""
     return not _missing()
 
 
@@ -179,7 +179,7 @@ def _bound(family: int, target: tuple[object, ...]) -> socket.socket:
 
 
 def _next_free(family: int, target: tuple[object, ...]) -> int:
-    """Return the next port above that is free; 0 where none is near."""
+    """Return the next port above that is free; 0 if none is near."""
     host, port, *rest = target
     assert isinstance(port, int)
     for number in range(port + 1, min(port + _TRIED_PORTS, 65536)):

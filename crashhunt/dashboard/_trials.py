@@ -51,8 +51,8 @@ class Prefix(NamedTuple):
     Args:
         valid: how many of them count.
         invalid: how many do not.
-        crashes: of the valid ones.
-        steps: of the valid ones.
+        crashes: crashes of the valid ones.
+        steps: steps of the valid ones.
         excluded: how many trials have ended after them.
     """
 
@@ -64,7 +64,7 @@ class Prefix(NamedTuple):
 
 
 class _Part:
-    """What came of the trials of one part."""
+    """The results of the trials of one part."""
 
     __slots__ = ("outcomes", "steps")
 
@@ -275,12 +275,12 @@ class Sample:
         self._crashes = 0
 
     def begin(self, ledger: Ledger, last: int, crashes: int) -> None:
-        """Read the sample of a hunt that is there already.
+        """Read the existing sample of a hunt.
 
         Args:
-            ledger: of the hunt.
+            ledger: ledger of the hunt.
             last: the greatest number of a trial.
-            crashes: how many there are.
+            crashes: number of crashes.
         """
         while (last + 1) * self.share > MAX_POINTS:
             self.share /= 2
@@ -296,7 +296,7 @@ class Sample:
         """Read those of new trials that belong to the sample.
 
         Args:
-            ledger: of the hunt.
+            ledger: ledger of the hunt.
             trials: number and outcome of each new trial.
         """
         self._take(

@@ -43,8 +43,8 @@ class Choices:
     Args:
         what: the kind.
         who: places in the grid around the agent, each with its weight.
-        how_strong: likewise, in the unit of the kind.
-        how_long: likewise, in s.
+        how_strong: strength, in the unit of the kind.
+        how_long: duration, in s.
     """
 
     what: str

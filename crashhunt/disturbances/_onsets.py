@@ -25,11 +25,11 @@ Order within a step: disturbances of the agent first, because the agent notices 
 around it in the next step are not known. Models later in this order are drawn as ever in the step of the onset. Models
 before it are drawn on the condition that they are not effective.
 
-Second onsets: a copy after its first onset is a root again. It has either no further effective onset before it ends,
-or a second one, with the same closed form from the next step on. So a copy may run without later disturbances, and
-copies of it begin with one forced second onset each. The copy itself then counts with the probability of no second
-onset. Which copies do so does not depend on what becomes of them, so there is no bias. Forcing says for which first
-onsets it pays. In addition one copy of each root does it, because the hunt learns from that where it pays.
+Second onsets: a copy after its first onset is a root again. It has either no further effective onset before it ends, or
+a second one, with the same closed form from the next step on. So a copy may run without later disturbances, and copies
+of it begin with one forced second onset each. The copy itself then counts with the probability of no second onset. The
+choice of these copies does not depend on their results, so there is no bias. Forcing says for which first onsets it
+pays. In addition one copy of each root does it, because the hunt learns from that where it pays.
 
 Source: stratified importance sampling (Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 and 9).
 Cost: per step of the root one look at each place around the agent at which a model may find a vehicle.
@@ -37,6 +37,7 @@ Cost: per step of the root one look at each place around the agent at which a mo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -88,7 +89,7 @@ class Onset:
         step: in which it begins.
         planned: the onset and all later disturbances of the copy, in turn.
         alone: the same without those of later steps, for a copy on which second onsets are forced.
-        number: of the onset in its root.
+        number: number of the onset in its root.
     """
 
     cell: str
@@ -119,7 +120,7 @@ class _Place:
 
 
 def cell_of(name: str, how_strong: float | None = None) -> str:
-    """Return the key of a cell; without a strength of a model that cannot list what it draws."""
+    """Return the key of a cell. For a model that cannot list its draws, the key has no strength."""
     return name if how_strong is None else f"{name}={how_strong!r}"
 
 
@@ -127,13 +128,13 @@ def first_forcing(sampler: DisturbanceSampler, last: int) -> Forcing:
     """Return the forcing of the first roots: the law itself, and the spacing for eight copies at most.
 
     Args:
-        sampler: of the hunt.
+        sampler: sampler of the hunt.
         last: the last step of a trial.
     """
-    none = 1.0
-    for name in sampler.models:
-        none *= (1.0 - sampler.chance(name)) ** (len(sampler.agents) * max(0, last - FIRST_STEP + 1))
-    any_onset = max(1.0 - none, np.finfo(float).tiny * COPIES_PER_ROOT)
+    draws = len(sampler.agents) * max(0, last - FIRST_STEP + 1)
+    log_none = draws * math.fsum(math.log1p(-sampler.chance(name)) for name in sampler.models)
+    # 1 - exp() would lose the digits of small chances, and a spacing that is too small makes millions of copies.
+    any_onset = max(-math.expm1(log_none), np.finfo(float).tiny * COPIES_PER_ROOT)
     return Forcing(any_onset / COPIES_PER_ROOT, second_spacing=any_onset / SECONDS_PER_COPY)
 
 
@@ -141,16 +142,16 @@ class FirstOnsets:
     """Proposes the first onsets of one root while it runs.
 
     Args:
-        sampler: of the hunt, without disturbances that are fixed.
-        forcing: of the root.
-        seed: of the root.
+        sampler: sampler of the hunt, without disturbances that are fixed.
+        forcing: forcing of the root.
+        seed: seed of the root.
         last: the last step of the root.
         first: the first step in which an onset is forced.
         stream: numbers that separate the draws from others with the same seed.
 
     Attributes:
         survival: probability that no onset was effective so far.
-        masses: by cell, the probability that the first onset is of this cell and begins so far.
+        masses: masses by cell, the probability that the first onset is of this cell and begins so far.
     """
 
     def __init__(
@@ -203,7 +204,7 @@ class FirstOnsets:
         return found
 
     def following(self, onset: Onset) -> FirstOnsets | None:
-        """Return what proposes the second onsets in the copy of an onset; None where none are forced on it.
+        """Return what proposes the second onsets in the copy of an onset; None if none are forced on it.
 
         It has to be called after every step of the copy, from the one before the onset on.
         """
@@ -260,12 +261,12 @@ class FirstOnsets:
         """Return an onset with all later disturbances.
 
         Args:
-            place: of the onset.
-            cell: of the onset.
+            place: place of the onset.
+            cell: cell of the onset.
             step: in which it begins.
             in_step: the other places from which a disturbance may begin in the same step, each with the draws that are
                 excluded because they are effective; None to draw as ever.
-            number: of the onset in the root.
+            number: number of the onset in the root.
         """
         rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(_LATER, number, *self._stream)))
         sampler, last = self._sampler, self._last

@@ -19,8 +19,8 @@ class Drawn:
 
     Args:
         who: the place in the grid around the agent, one of `crashhunt.trial.CELLS`.
-        how_strong: in the unit of the kind.
-        how_long: in s.
+        how_strong: strength in the unit of the kind.
+        how_long: duration in s.
     """
 
     who: str
@@ -45,7 +45,7 @@ class DisturbanceModel(Protocol):
         """The kind: what the simulator is asked to do, such as ``brake``."""
 
     def draw(self, rng: np.random.Generator) -> Drawn:
-        """Return one, drawn by a generator of its own."""
+        """Return one, drawn by its own generator."""
 
     def log_likelihood(self, drawn: Drawn) -> float:
         """Return the natural logarithm of the probability that one that happens is this; -inf where it never is."""

@@ -36,7 +36,7 @@ _FIX = f"write {FORM}, such as brake@124=ahead:4:2 for 4 m/s² and 2 s from step
 
 
 def is_fixed(word: str) -> bool:
-    """Whether a word is about a disturbance in a step of its own, and says no rate."""
+    """Whether a word is about a disturbance in its own step, and says no rate."""
     return "@" in word
 
 
@@ -44,7 +44,7 @@ def parse_fixed(words: Iterable[str], agents: Sequence[str], *, shown: str = "--
     """Return the disturbances that words fix, ``[AGENT.]KIND@STEP=WHO:HOW_STRONG:HOW_LONG``, in the order of steps.
 
     Args:
-        words: as they are given; words with a rate are ignored.
+        words: the words of the option; words with a rate are ignored.
         agents: the controlled vehicles, around which they are.
         shown: the option or key that has the words, for the error.
 
@@ -62,7 +62,7 @@ def parse_fixed(words: Iterable[str], agents: Sequence[str], *, shown: str = "--
 
 
 def word_of(one: Disturbance, agents: Sequence[str]) -> str:
-    """Return the word that fixes a disturbance; whose it is only where there are several agents."""
+    """Return the word that fixes a disturbance; it names the agent only if there are several."""
     whose = f"{one.agent}." if len(agents) > 1 else ""
     place = one.who.replace(" ", "_")  # so that no shell needs quotes
     return f"{whose}{one.what}@{one.step}={place}:{one.how_strong!r}:{one.how_long!r}"
@@ -74,10 +74,10 @@ def _parsed(word: str, agents: Sequence[str], shown: str) -> Disturbance:
     parts = [part.strip() for part in text.split(":")]
     agent, what = _whose(kind, agents, f"{shown} {word}")
     if not (equals and what and len(parts) == 3 and step.isascii() and step.isdecimal() and int(step) > 0):
-        raise UsageError(f"{shown} {word!r} is no disturbance", fix=_FIX)
+        raise UsageError(f"{shown} {word!r} is not a disturbance", fix=_FIX)
     who = parts[0].replace("_", " ")
     if who not in CELLS:
-        raise UsageError(f"{shown} {word}: {parts[0]!r} is no place around an agent", fix=one_of(who, CELLS))
+        raise UsageError(f"{shown} {word}: {parts[0]!r} is not a place around an agent", fix=one_of(who, CELLS))
     one = Disturbance(
         step=int(step), who=who, what=what, how_strong=_number(parts[1]), how_long=_number(parts[2]), agent=agent
     )
@@ -93,7 +93,7 @@ def _whose(name: str, agents: Sequence[str], shown: str) -> tuple[str, str]:
         raise UsageError(f"{shown}: there is no controlled vehicle {agent!r}", fix=one_of(agent, agents))
     if not dot and len(agents) > 1:
         fix = f"write {agents[0]}.{name}@…"
-        raise UsageError(f"{shown} does not say around whom, and there are {', '.join(agents)}", fix=fix)
+        raise UsageError(f"{shown} names no agent, but there are several: {', '.join(agents)}", fix=fix)
     return agent or agents[0], what
 
 
@@ -117,7 +117,7 @@ def parse_rates(words: Iterable[str]) -> dict[str, float]:
     """Return the rate of each disturbance in 1/s, from ``NAME=RATE``; rates of 0 are excluded.
 
     Args:
-        words: as they are given; ``none`` alone for nothing. Those that fix a disturbance are left aside.
+        words: the words of the option; ``none`` for no disturbances. Those that fix a disturbance are left aside.
 
     Raises:
         UsageError: a word says no rate, or a name comes twice.
@@ -127,14 +127,14 @@ def parse_rates(words: Iterable[str]) -> dict[str, float]:
     for word in given:
         if word == NONE:
             if len(given) > 1:
-                raise UsageError(f"{_SHOWN} {','.join(given)}: none stands alone", fix="leave it or the others out")
+                raise UsageError(f"{_SHOWN} {','.join(given)}: none excludes all others", fix="omit it or the others")
             continue
         if is_fixed(word):
             continue
         name, equals, text = word.rpartition("=")
         if not equals or not name:
             fix = f"write NAME=RATE with a rate per second, such as brake=0.02, or {FORM}"
-            raise UsageError(f"{_SHOWN} {word!r} says no rate", fix=fix)
+            raise UsageError(f"{_SHOWN} {word!r} has no rate", fix=fix)
         if name in rates:
             raise UsageError(f"{_SHOWN} gives {name!r} twice", fix="give it once")
         rates[name] = _rate(name, text)
@@ -148,7 +148,7 @@ def _rate(name: str, text: str) -> float:
         rate = math.nan
     if not 0 <= rate < math.inf:
         fix = "give how often it happens a second, from 0 on, such as 0.02"
-        raise UsageError(f"{_SHOWN} {name}={text}: {text!r} is no rate", fix=fix)
+        raise UsageError(f"{_SHOWN} {name}={text}: {text!r} is not a rate", fix=fix)
     return rate
 
 
@@ -161,7 +161,7 @@ def disturber_of(
     Args:
         rates: name of a model to how often it happens a second, around each agent.
         agents: the controlled vehicles.
-        step_length_s: in s.
+        step_length_s: step length in s.
         known: the kinds that the simulator supports; None if that is unknown.
         simulator: its name in messages.
         fixed: what every trial has besides.
@@ -175,7 +175,7 @@ def disturber_of(
         model: DisturbanceModel = locate_model(name)
         if rate * step_length_s > 1:
             fix = f"give at most {1 / step_length_s:g} a second"
-            raise UsageError(f"{_SHOWN} {name}={rate:g}: more than one a step of {step_length_s:g} s", fix=fix)
+            raise UsageError(f"{_SHOWN} {name}={rate:g}: more than one per step of {step_length_s:g} s", fix=fix)
         _refuse_what_it_cannot(name, model.what, known, simulator)
         twin = next((other for other, made in models.items() if made.what == model.what), None)
         if twin is not None:
@@ -199,7 +199,7 @@ def _refuse_what_it_cannot(name: str, what: str, known: Sequence[str] | None, si
         return
     able = sorted(point for point in registered("disturbances") if point in (*known, *OF_AGENT))
     message = f"{_SHOWN} {name}: {simulator} cannot do {what!r}"
-    raise UsageError(message, fix=f"it can do {', '.join(able)}" if able else "leave it out")
+    raise UsageError(message, fix=f"it can do {', '.join(able)}" if able else "omit the option")
 
 
 def locate_model(name: str) -> DisturbanceModel:
@@ -216,10 +216,10 @@ def locate_model(name: str) -> DisturbanceModel:
     except CrashhuntError:
         raise
     except Exception as error:  # of user code
-        raise blamed(f"the disturbance {name!r} cannot be made", error) from error
+        raise blamed(f"the disturbance {name!r} cannot be created", error) from error
     for part in ("what", "draw", "log_likelihood"):
         if not hasattr(made, part):
-            raise PluginError(f"{name!r} is no model of disturbances: it has no {part}", fix="see crashhunt.testing")
+            raise PluginError(f"{name!r} is not a disturbance model: it has no {part}", fix="see crashhunt.testing")
     return made
 
 
@@ -231,7 +231,7 @@ def _drawn(name: str, model: DisturbanceModel, rng: np.random.Generator) -> Draw
         raise blamed(f"the disturbance {name!r} cannot be drawn", error) from error
     if not fine:
         fix = f"draw one of {', '.join(CELLS)}, a finite strength, and a length above 0 s"
-        raise PluginError(f"the disturbance {name!r} has drawn {drawn}, which is none", fix=fix)
+        raise PluginError(f"the disturbance {name!r} has drawn {drawn}, which is not a disturbance", fix=fix)
     return drawn
 
 
@@ -243,10 +243,10 @@ class DisturbanceSampler:
     is going on.
 
     Args:
-        models: by name.
-        rates: of each, in 1/s.
+        models: models by name.
+        rates: rates of each, in 1/s.
         agents: the controlled vehicles.
-        step_length_s: in s.
+        step_length_s: step length in s.
         fixed: what every trial has besides, whatever is drawn.
     """
 
@@ -260,7 +260,7 @@ class DisturbanceSampler:
         """Return the disturbances of a trial, in order; those of a longer one begin with these.
 
         Args:
-            seed: of the trial.
+            seed: seed of the trial.
             max_steps: the bound on its length, in steps.
         """
         found: list[Disturbance] = []
@@ -275,7 +275,7 @@ class DisturbanceSampler:
         """Return what else might begin after a step of a trial: at least one disturbance soon, others as ever.
 
         Args:
-            seed: of the trial.
+            seed: seed of the trial.
             number: which of several draws.
             after: the step.
             soon: the first one begins within so many steps.
@@ -293,7 +293,7 @@ class DisturbanceSampler:
         """Return how strongly each model may disturb each agent soon: of many draws, the strongest first.
 
         Args:
-            seed: of the trial.
+            seed: seed of the trial.
             number: which of several draws.
             after: the step.
             soon: all begin within so many steps after it.
@@ -322,7 +322,7 @@ class DisturbanceSampler:
         Args:
             after: the first step is the next one.
             last: the last step.
-            name: of the model.
+            name: name of the model.
             agent: identifier of the controlled vehicle.
             rng: draws steps and disturbances.
         """
@@ -347,11 +347,11 @@ class DisturbanceSampler:
     def log_likelihood(self, disturbances: Iterable[Disturbance], steps: int) -> float:
         """Return the natural logarithm of the probability that just these begin in so many steps.
 
-        What is fixed begins anyway, whatever a model draws for that step.
+        Fixed disturbances always begin, independent of the draws of models in that step.
 
         Args:
-            disturbances: as they were drawn; later ones are ignored.
-            steps: how many there were.
+            disturbances: the drawn disturbances; later ones are ignored.
+            steps: number of steps.
         """
         given = {_key(one) for one in self.fixed if one.step <= steps}
         begun = [one for one in disturbances if one.step <= steps and _key(one) not in given]
@@ -372,7 +372,7 @@ class DisturbanceSampler:
         """Return the logarithm of the probability that just what took place in a trial begins in its steps.
 
         A draw without an actor to disturb has no effect: a trial without it is the same, and likelier. None
-        where nothing is drawn at all.
+        if nothing is drawn at all.
         """
         if not self.models:
             return None

@@ -144,7 +144,7 @@ class Episodes:
             raise SimulatorError("no episode is running, so there is nothing to branch", fix="call reset")
         _raise_error(self._episode)
         if reseeded and self._simulator.why_no_reseeding:
-            raise UsageError(f"branch cannot re-seed: {self._simulator.why_no_reseeding}", fix="leave seed out")
+            raise UsageError(f"branch cannot re-seed: {self._simulator.why_no_reseeding}", fix="omit seed")
 
     def reseed(self, seed: int) -> None:
         """Give SUMO's random generators another seed from the next step on."""
@@ -210,7 +210,7 @@ class _Trail(Observer):
 def _disturber(scenario: Scenario, agent: str, disturb: Sequence[str], max_steps: int) -> DisturbanceSampler | None:
     made = disturber(scenario, disturb, (agent,))
     if made is not None and max_steps < 1:
-        raise UsageError("disturb needs a limit of the episode's length", fix="give max_steps")
+        raise UsageError("disturb needs a limit on the length of an episode", fix="give max_steps")
     return made
 
 

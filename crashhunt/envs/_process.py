@@ -1,7 +1,7 @@
-"""Episodes in a process of their own: libsumo has one simulation per process.
+"""Episodes in a their own process: libsumo has one simulation per process.
 
 Such a process can be forked between two steps (`RemoteEpisodes.branch`). SUMO's `loadState` does not continue as the
-original run did, and a fork does: it has all of SUMO's memory. The copy serves a connection of its own, so that the
+original run did, and a fork does: it has all of SUMO's memory. The copy serves its own connection, so that the
 user's program steps it as it steps the original. The user's program itself is never forked: it may have threads, which
 have no copy.
 
@@ -91,7 +91,8 @@ class RemoteEpisodes:
         """Return copies of the running episode, each in a fork of its process.
 
         Args:
-            seeds: for each copy, that of SUMO's random generators from its next step on; None to keep their state.
+            seeds: seeds for each copy, that of SUMO's random generators from its next step on; None to keep their
+                state.
 
         Raises:
             SimulatorError: no episode is running, or the process cannot be forked.
@@ -157,7 +158,7 @@ class _Fork:
     """A fork that another process has made, as far as a `subprocess.Popen` is used here.
 
     Args:
-        pid: of the fork, which is alive.
+        pid: pid of the fork, which is alive.
     """
 
     returncode: int | None = None  # only its parent learns that
@@ -238,9 +239,9 @@ def _fork(pipe: Ours, episodes: Episodes, seed: int | None, owner: int) -> tuple
     """Fork this process; return the id of the fork, and why there is none.
 
     Args:
-        pipe: from which the connection of the fork is received.
-        episodes: with the episode.
-        seed: of the random generators in the fork; None to keep their state.
+        pipe: pipe from which the connection of the fork is received.
+        episodes: the episode.
+        seed: seed of the random generators in the fork; None to keep their state.
         owner: the process of the user's program.
     """
     end = recv_handle(pipe)

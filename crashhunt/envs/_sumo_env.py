@@ -43,9 +43,9 @@ class SumoEnv(gymnasium.Env[Any, Any]):
             default is the scenario's own choice.
         max_steps: The longest episode in steps; None for no limit.
         render_mode: None, or ``rgb_array``: `render` returns the scene from above, uint8, shape (540, 960, 3).
-        process: Whether the environment runs in a process of its own, which costs up to a millisecond per step. libsumo
+        process: Whether the environment runs in its own process, which costs up to a millisecond per step. libsumo
             has one simulation per process. So by default the first environment runs in the caller's process, and each
-            further environment in a process of its own.
+            further environment in its own process.
         disturb: Rates of disturbances per second, as in ``--disturb``: ``brake=0.02,cut_in=0.01``. Disturbances need
             ``max_steps``, and the seed of the episode determines them. ``info["disturbances"]`` describes the
             disturbances that began in the step, and those that begin with the returned observation.
@@ -129,7 +129,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
 
         Args:
             n: how many, at least 1.
-            seed: from which each copy gets another seed for SUMO's random generators, so that drivers behave
+            seed: seed from which each copy gets another seed for SUMO's random generators, so that drivers behave
                 differently; when vehicles depart stays as planned. None to keep the state of the generators.
 
         Raises:

@@ -1,6 +1,7 @@
 from ._action_override import (
     Braking as Braking,
     Keeping as Keeping,
+    ReferenceDriver as ReferenceDriver,
     TakingOver as TakingOver,
     overruled_agent as overruled_agent,
 )
@@ -12,6 +13,7 @@ from ._failures import (
     is_tampered as is_tampered,
     message_of_error as message_of_error,
 )
+from ._fast_path import FastEpisode as FastEpisode
 from ._forced_onsets import OnsetForcer as OnsetForcer
 from ._observers import (
     Nearness as Nearness,
@@ -29,7 +31,6 @@ from ._probes import (
     Prober as Prober,
 )
 from ._questions import FirstCopy as FirstCopy
-from ._reference_driver import ReferenceDriver as ReferenceDriver
 from ._run import (
     Parts as Parts,
     generators as generators,

@@ -1,26 +1,28 @@
-"""An agent that is overruled from a step on, or that takes over from a recording at a step.
+"""Drivers that override an agent from a step on, and an agent that takes over from a recording at a step.
 
 An overruled agent brakes, changes lanes and brakes, keeps its lane or its speed, or has a reference driver.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.agents import Closes, Recorded
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.episode._reference_driver import ReferenceDriver
-from crashhunt.simulators import BrakesFully, HasMeanings
+from crashhunt.simulators import BrakesFully, HasMeanings, SeesSurroundings
+from crashhunt.world import Neighbor, safe_distance, safe_speed, time_to_drive
 
 if TYPE_CHECKING:
     from crashhunt.agents import Agent
+    from crashhunt.base.codec import JsonObject
     from crashhunt.simulators import ActionForm, Simulator
     from crashhunt.trial import Handover, Overruled
+    from crashhunt.world import Crossing, Side, Surroundings
 
 
-__all__ = ["Braking", "Keeping", "TakingOver", "overruled_agent"]
-
+__all__ = ["Braking", "Keeping", "ReferenceDriver", "TakingOver", "overruled_agent"]
 
 _LANES = ("LANE_LEFT", "LANE_RIGHT")
 _SPEEDS = ("FASTER", "SLOWER")
@@ -30,7 +32,7 @@ def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -
     """Return an agent that drives as another one up to a step.
 
     Args:
-        driver: the other one.
+        driver: the other actor.
         simulator: which has been reset.
         overruled: how, and from when on.
 
@@ -45,7 +47,7 @@ def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -
 
 
 class Braking:
-    """Lets an agent drive up to a step, and from then on brakes as hard as the vehicle can, perhaps changing lanes.
+    """Lets an agent drive up to a step. From then on, the vehicle brakes as hard as it can, or changes lanes.
 
     Args:
         driver: the agent.
@@ -103,7 +105,9 @@ class Keeping:
         form = simulator.actions[agent]
         self._idle = _idle(form)
         if self._idle is None and tuple(form.names) != ("target_speed", "lane_change"):
-            raise InvalidEpisodeError(f"{agent} cannot be held: its actions have no known lanes and speeds")
+            raise InvalidEpisodeError(
+                f"the speed of {agent} cannot be held: its actions have no known lanes and speeds"
+            )
         self._driver, self._simulator, self._agent, self._form = driver, simulator, agent, form
         self._after, self._stays = after, keeps == "lane"
         self._step, self._speed = 0, 0.0
@@ -114,7 +118,7 @@ class Keeping:
         self._driver.reset(seed)
 
     def act(self, observation: object) -> object:
-        """Return the driver's action, without what it is kept from."""
+        """Return the driver's action, without the overridden parts."""
         step, self._step = self._step, self._step + 1
         if step == self._after:
             scene = self._simulator.scene()
@@ -142,8 +146,8 @@ class TakingOver:
     """Plays the recorded actions of a vehicle up to a step, and asks its agent from that step on.
 
     The agent is made before the first step, as in every trial. It is reset after the last recorded action, with the
-    seed of the trial, and the first observation that it is shown is that after the step. It has seen nothing of the
-    steps before.
+    seed of the trial, and the first observation that it is shown is that after the step. The new agent has no
+    observation of earlier steps.
 
     Args:
         driver: the agent.
@@ -176,7 +180,7 @@ class TakingOver:
 
 
 def _idle(form: ActionForm) -> int | None:
-    """The action of doing nothing; None where there is none."""
+    """The action of doing nothing; None if there is none."""
     space = form.space
     return tuple(space.meanings).index("IDLE") if supports(space, HasMeanings) and "IDLE" in space.meanings else None
 
@@ -196,3 +200,240 @@ def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
     raise InvalidEpisodeError(
         f"{agent} cannot be made to change to the {side} lane: its actions have no known lane change"
     )
+
+
+# A reference driver that takes one faculty of an agent over: its speed, its lane changes, or both.
+#
+# The agent still runs and sees everything. Its action stands wherever it is safe. Where it is not, the reference driver
+# answers as Responsibility-Sensitive Safety (RSS) asks: it does not exceed the speed for which the gap is safe, and it
+# refuses a lane change into a gap that is not safe. Source: Shalev-Shwartz, Shammah, Shashua, 2017, arXiv:1708.06374.
+#
+# A reference driver without a faculty changes nothing, and reports where it would have answered.
+
+RESPONSE_S = 0.5  # RSS leaves the response time to the user; half a second is what it assumes of an automated vehicle
+MAX_PLANNED_BRAKING_MPS2 = 4.5  # a careful driver does not plan with emergency braking; SUMO's usual decel
+_TOLERANCE_MPS = 0.1  # by which a speed may exceed the safe one, so that rounding is no response
+_PAUSE_S = 0.5  # a shorter interruption does not end a response
+_STOP_MARGIN_M = 1.0  # from the area that another actor crosses
+_STANDS_MPS = 0.1
+_LANE_OFFSETS = {"LANE_LEFT": 1, "LANE_RIGHT": -1}
+
+
+@dataclass(slots=True)
+class _Response:
+    """A period in which the reference driver answers in the same way to the same actor."""
+
+    faculty: str
+    kind: str
+    actor: str
+    first: int
+    last: int
+    values: dict[str, float]
+
+    def to_json(self) -> JsonObject:
+        return {
+            "faculty": self.faculty, "kind": self.kind, "actor": self.actor, "first": self.first, "last": self.last,
+            **self.values,
+        }  # fmt: skip
+
+
+class ReferenceDriver:
+    """Lets an agent drive, and from a step on answers for one of its faculties where its action is not safe.
+
+    Args:
+        driver: the agent.
+        simulator: which knows the surroundings of the vehicle.
+        overruled: the vehicle, the step, and the faculty.
+
+    Raises:
+        InvalidEpisodeError: the simulator does not know the surroundings, or the actions have no known speeds.
+    """
+
+    def __init__(self, driver: Agent, simulator: Simulator, overruled: Overruled) -> None:
+        if not supports(simulator, SeesSurroundings):
+            raise InvalidEpisodeError(
+                f"{overruled.agent} has no reference driver: its simulator reports no surroundings"
+            )
+        form = simulator.actions[overruled.agent]
+        self._meanings = tuple(form.space.meanings) if supports(form.space, HasMeanings) else ()
+        if tuple(form.names) != ("target_speed", "lane_change") and not {"IDLE", "SLOWER"} <= {*self._meanings}:
+            raise InvalidEpisodeError(
+                f"{overruled.agent} has no reference driver: its actions have no known lanes and speeds"
+            )
+        self._driver, self._form, self._agent = driver, form, overruled.agent
+        self._see = simulator.surroundings
+        self._step_s = simulator.step_length_s
+        self._response_s = max(RESPONSE_S, self._step_s)
+        self._after = overruled.after
+        self._speed = overruled.reference in ("longitudinal", "both")
+        self._lane = overruled.reference in ("lateral", "both")
+        self._step = 0
+        self._responses: list[_Response] = []
+
+    @property
+    def responses(self) -> list[JsonObject]:
+        """The periods in which the reference driver answered, or would have, as plain data, in the order of steps."""
+        return [one.to_json() for one in self._responses]
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode."""
+        self._step = 0
+        self._responses.clear()
+        self._driver.reset(seed)
+
+    def act(self, observation: object) -> object:
+        """Return the agent's action where it is safe, and otherwise the answer of the reference driver."""
+        step, self._step = self._step, self._step + 1
+        action = self._driver.act(observation)
+        if step < self._after:
+            return action
+        encoded = self._form.encode(action)
+        around = self._see(self._agent)
+        if self._meanings:
+            return self._meta(step, action, self._meanings[int(encoded[0])], around)
+        target, change = encoded.tolist()
+        allowed = self._allowed_change(step, int(change), around)
+        limit = self._limit(step, float(target), self._reached(float(target), around), around)
+        if self._lane and not allowed:
+            change = 0
+        if self._speed and limit is not None:
+            target = max(0.0, limit, around.speed_mps - around.braking_mps2 * self._step_s)
+        if (target, change) == tuple(encoded.tolist()):
+            return action
+        return float(target), int(change)
+
+    def close(self) -> None:
+        """Close the agent."""
+        if supports(self._driver, Closes):
+            self._driver.close()
+
+    def _meta(self, step: int, action: object, word: str, around: Surroundings) -> object:
+        speed = around.speed_mps
+        reached = speed + (around.acceleration_mps2 * self._step_s if word == "FASTER" else 0.0)
+        reached -= around.braking_mps2 * self._step_s if word == "SLOWER" else 0.0
+        allowed = self._allowed_change(step, _LANE_OFFSETS.get(word, 0), around)
+        limit = self._limit(step, reached, reached, around)
+        if self._speed and limit is not None:
+            return self._meanings.index("SLOWER" if speed > limit else "IDLE")
+        if self._lane and not allowed:
+            return self._meanings.index("IDLE")
+        return action
+
+    def _reached(self, target: float, around: Surroundings) -> float:
+        """Return the speed after the step with a target speed, in m/s."""
+        speed = around.speed_mps
+        highest = speed + around.acceleration_mps2 * self._step_s
+        return max(min(target, highest), speed - around.braking_mps2 * self._step_s)
+
+    def _limit(self, step: int, target: float, reached: float, around: Surroundings) -> float | None:
+        """Return the safe speed where the vehicle would be faster after the step, in m/s; None if it is safe."""
+        neighbors = [*around.ahead]
+        neighbors += [stop for one in around.crossing if (stop := self._stop_before(one, target, around)) is not None]
+        limit, why = min(((self._safe_speed(one, around), one) for one in neighbors), key=_first, default=(None, None))
+        if limit is None or why is None or reached <= limit + _TOLERANCE_MPS:
+            return None
+        values = {"gap_m": why.gap_m, "speed_mps": around.speed_mps, "actor_speed_mps": why.speed_mps, "safe": limit}
+        self._note(step, "longitudinal", why.kind, why.actor, values)
+        return limit
+
+    def _safe_speed(self, neighbor: Neighbor, around: Surroundings) -> float:
+        return safe_speed(
+            neighbor.gap_m,
+            neighbor.speed_mps,
+            response_s=self._response_s,
+            acceleration_mps2=around.acceleration_mps2,
+            **_brakings(around.braking_mps2, neighbor.braking_mps2),
+        )
+
+    def _stop_before(self, crossing: Crossing, target: float, around: Surroundings) -> Neighbor | None:
+        """Return the place where the agent must stop for an actor that crosses; None if both can pass.
+
+        Both have a time window in the conflict area: the agent accelerates to its target speed, the actor keeps its
+        speed. RSS: right of way is given, not taken, so the agent also stops for an actor that can no longer yield.
+        """
+        if crossing.distance_m <= 0 or (crossing.speed_mps < _STANDS_MPS and crossing.actor_distance_m > 0):
+            return None  # it is in the area already and clears it, or the actor waits
+        speed, acceleration = around.speed_mps, around.acceleration_mps2
+        enters_s = time_to_drive(crossing.distance_m, speed, acceleration, target)
+        leaves_s = time_to_drive(crossing.exit_m, speed, acceleration, target)
+        actor_enters_s = time_to_drive(crossing.actor_distance_m, crossing.speed_mps, 0.0, 0.0)
+        actor_leaves_s = time_to_drive(crossing.actor_exit_m, crossing.speed_mps, 0.0, 0.0)
+        margin_s = self._response_s
+        if not crossing.has_right_of_way:
+            stops_m = crossing.speed_mps**2 / (2 * crossing.braking_mps2)
+            if stops_m <= crossing.actor_distance_m:
+                return None
+        if enters_s >= actor_leaves_s + margin_s or leaves_s + margin_s <= actor_enters_s:
+            return None
+        return Neighbor(
+            actor=crossing.actor,
+            gap_m=crossing.distance_m - _STOP_MARGIN_M,
+            speed_mps=0.0,
+            braking_mps2=crossing.braking_mps2,
+            kind="crossing",
+        )
+
+    def _allowed_change(self, step: int, change: int, around: Surroundings) -> bool:
+        """Return whether a lane change is safe: both gaps of the target lane are."""
+        side = around.sides.get(change) if change else None
+        if side is None:
+            return True
+        found = self._unsafe_neighbors(side, around)
+        for kind, neighbor, needed in found:
+            values = {"speed_mps": around.speed_mps}
+            if neighbor is not None:
+                values |= {"gap_m": neighbor.gap_m, "actor_speed_mps": neighbor.speed_mps, "safe": needed}
+            word = "left" if change > 0 else "right"
+            self._note(step, "lateral", f"{kind} {word}", neighbor.actor if neighbor is not None else "", values)
+        return not found
+
+    def _unsafe_neighbors(self, side: Side, around: Surroundings) -> list[tuple[str, Neighbor | None, float]]:
+        """Return each reason why a lane change is not safe: the word, the vehicle, and the gap that it needs, in m.
+
+        All reasons count. The collision partner need not be the vehicle whose gap is the least safe.
+        """
+        if not side.exists:
+            return [("no lane", None, 0.0)]
+        found: list[tuple[str, Neighbor | None, float]] = []
+        for word, neighbor, is_ahead in (("ahead", side.ahead, True), ("behind", side.behind, False)):
+            if neighbor is None:
+                continue
+            needed = self._needed_m(neighbor, around, is_ahead=is_ahead)
+            if neighbor.gap_m < needed:
+                found.append(("alongside" if neighbor.gap_m < 0 else word, neighbor, needed))
+        return found
+
+    def _needed_m(self, neighbor: Neighbor, around: Surroundings, *, is_ahead: bool) -> float:
+        """Return the gap that is safe between the vehicle and a neighbor of the target lane, in m."""
+        rear, front = (around, neighbor) if is_ahead else (neighbor, around)
+        return safe_distance(
+            rear.speed_mps,
+            front.speed_mps,
+            response_s=self._response_s,
+            acceleration_mps2=rear.acceleration_mps2,
+            **_brakings(rear.braking_mps2, front.braking_mps2),
+        )
+
+    def _note(self, step: int, faculty: str, kind: str, actor: str, values: dict[str, float]) -> None:
+        pause = max(1, round(_PAUSE_S / self._step_s))
+        for one in reversed(self._responses):
+            if one.last < step - pause:
+                break
+            if (one.faculty, one.kind, one.actor) == (faculty, kind, actor):
+                one.last = step
+                return
+        self._responses.append(_Response(faculty=faculty, kind=kind, actor=actor, first=step, last=step, values=values))
+
+
+def _brakings(rear_mps2: float, front_mps2: float) -> dict[str, float]:
+    """Return the decelerations of a safe distance.
+
+    RSS compares the stopping distances only, so it holds where the front vehicle brakes at least as hard as the rear
+    one. A rear vehicle that brakes harder would otherwise be allowed to drive through a slower one.
+    """
+    planned = min(rear_mps2, MAX_PLANNED_BRAKING_MPS2)
+    return {"braking_mps2": planned, "front_braking_mps2": max(front_mps2, planned)}
+
+
+def _first(pair: tuple[float, Any]) -> float:
+    return pair[0]

@@ -51,7 +51,7 @@ class Blame:
 
     Args:
         error: The exception itself, without its wrapper.
-        party: Whose code raised it.
+        party: The party whose code raised the exception.
         place: What that code was called for; empty if it is not known.
         is_resource: Whether memory or files ran out in crashhunt's own code, so that the party is not known.
     """
@@ -63,12 +63,12 @@ class Blame:
 
 
 def party_of_simulator(simulator: Simulator) -> Party:
-    """Return whose code a simulator runs: that of an environment, or of a simulator."""
+    """Return the party whose code a simulator runs: an environment or a simulator."""
     return simulator.party if supports(simulator, RunsForeignCode) else Party.SIMULATOR
 
 
 def blame(error: BaseException, simulator: Simulator, place: str = "") -> Blame:
-    """Return whose code an exception comes from that is not an agent's.
+    """Return the party that wrote the code of an exception, if it is not an agent.
 
     The wrapper of a boundary says it. Without a wrapper the exception is crashhunt's own. Two kinds are not: an error
     that an adapter raises on purpose (`SimulatorError`), and an error that has come through `foreign_packages`.

@@ -71,9 +71,9 @@ class _Crashed:
     """A branch that crashed.
 
     Args:
-        took_place: of its disturbances.
-        branched: after which step.
-        outcome: of it.
+        took_place: those of its disturbances that took place.
+        branched: step after which it was branched.
+        outcome: outcome of it.
         step: at which it ended.
         log_likelihood: as `Branch` has it.
     """
@@ -121,7 +121,7 @@ class Brancher(Observer):
 
     @property
     def why_not(self) -> str:
-        """Why there are no branches any more, in words; empty where there are."""
+        """Why there are no branches any more, in words; empty if there are."""
         return self._questions.why_not
 
     def stop(self, why_not: str) -> None:
@@ -191,7 +191,7 @@ class Brancher(Observer):
             self._asleep.pop().copy.end()
 
     def result(self, result: TrialResult) -> TrialResult:
-        """Return the result of the trial with what has been found out."""
+        """Return the result of the trial with the results of its copies."""
         if not self._any:
             return result  # no branch could run, so there is no result
         if str(result.outcome) in self._crashes:
@@ -213,7 +213,7 @@ class Brancher(Observer):
         return self._disturber
 
     def _is_near(self, episode: Episode) -> bool:
-        """Whether anybody is near enough for a disturbance to matter soon: within 50 m, or on a collision course."""
+        """Whether a disturbance may have an effect soon: an actor is within 50 m, or on a collision course."""
         frames = [self._frames[-1]]
         found = (approaches(frames, name)[:2] for name in episode.names)
         return any(math.isfinite(float(measured[-1])) for both in found for measured in both)
@@ -297,7 +297,7 @@ class Brancher(Observer):
         """Run a branch with other disturbances: of each choice, the first one with a target vehicle.
 
         Returns:
-            None where it has not crashed, or no copy has answered.
+            None if it has not crashed, or no copy has answered.
         """
         job: Plain = {"choices": [[one.to_json() for one in some] for some in choices], "until": until}
 

@@ -92,7 +92,8 @@ class DisturbanceInjector:
         odd = next((one.what for one in spec.disturbances if one.what not in able), None)
         if odd is not None:
             raise InvalidEpisodeError(
-                f"the simulator cannot do the disturbance {odd!r}", fix=f"it can do {', '.join((*known, *OF_AGENT))}"
+                f"the simulator does not support the disturbance {odd!r}",
+                fix=f"it can do {', '.join((*known, *OF_AGENT))}",
             )
         # Of each sort, those that are still to come, the next one last.
         waiting = sorted(spec.disturbances, key=lambda one: one.step, reverse=True)

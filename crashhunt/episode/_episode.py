@@ -14,9 +14,7 @@ from crashhunt.base.forks import Copy, Held, SuspendedFork, held, shared_memory
 from crashhunt.episode._blame import guarded_check, guarded_reset, guarded_scene, guarded_step
 from crashhunt.episode._disturbance_injection import DisturbanceInjector
 from crashhunt.episode._failures import Ending, close_agent
-from crashhunt.episode._fast_path import make_fast_path
 from crashhunt.episode._observers import agent_seed, callbacks_for, observation_restorers, options_of
-from crashhunt.native import ANSWERED, ASK, DONE, SIMULATED
 from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
 from crashhunt.simulators import CountsSetUp, HasMap, Reseeds
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec, in_turn
@@ -30,64 +28,13 @@ if TYPE_CHECKING:
 
     from crashhunt.agents import Agent
     from crashhunt.base.json_types import Plain
-    from crashhunt.episode._fast_path import FastPath
     from crashhunt.episode._observers import Observer
     from crashhunt.simulators import Info, Observations, Simulator, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Scene
 
 
-__all__ = ["Episode", "Forkable", "MakeAgent", "Reset", "Whereabouts"]
-
-
-# The state between two steps of an episode, for steps of Python and of the compiled core.
-
-
-class Whereabouts:
-    """The part of an `Episode` with its current state; reads the state from the core if the core has run steps."""
-
-    simulator: Simulator
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._observations: Observations = {}
-        self._rewards: Mapping[str, float] = {}
-        self._terminations: Mapping[str, bool] = {}
-        self._scene: Scene | None = None
-        self._ahead: FastPath | None = None
-        self._take: Callable[[Mapping[str, Agent]], int] | None = None
-        self._is_behind = False  # the core has run steps whose state is not read yet
-
-    @property
-    def observations(self) -> Observations:
-        """What the agents will be shown in the next step, by name."""
-        self._catch_up()
-        return self._observations
-
-    @property
-    def rewards(self) -> Mapping[str, float]:
-        """Those of the last step, by name, of those that acted in it."""
-        self._catch_up()
-        return self._rewards
-
-    @property
-    def terminations(self) -> Mapping[str, bool]:
-        """Whether those that acted in the last step have arrived or crashed."""
-        self._catch_up()
-        return self._terminations
-
-    @property
-    def scene(self) -> Scene | None:
-        """After the last step; None before the start."""
-        self._catch_up()
-        return self._scene
-
-    def _catch_up(self) -> None:
-        """Read the state of the core."""
-        if self._is_behind and self._ahead is not None:
-            self._is_behind = False
-            self._observations, self._rewards, self._terminations, *_ = self._ahead.at_once.catch_up()
-            self._scene = self.simulator.scene()
+__all__ = ["ASK_ALL", "Episode", "MakeAgent", "Reset"]
 
 
 # Forks of a running episode, which are forks of its process.
@@ -157,10 +104,10 @@ Reset = Callable[..., "tuple[Observations, Info]"]
 
 _FORM = Boundary(Party.SIMULATOR, "action conversion")
 _MAP = Boundary(Party.ORACLE, "see_map")
-_ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # never written to
+ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # never written to
 
 
-class Episode(Forkable, Ending, Whereabouts):
+class Episode(Forkable, Ending):
     """One trial, a step at a time; between two steps, everything about it can be looked at.
 
     Whatever agent, simulator, oracles or observers raise ends the episode, and is in its result. Of a simulator that
@@ -179,14 +126,14 @@ class Episode(Forkable, Ending, Whereabouts):
     Attributes:
         spec: which trial.
         simulator: where.
-        names: everybody who takes part, in the order of their numbers; empty before the start.
-        agents: by name; one that is replaced between two steps is asked from the next one on.
+        names: all actors, in the order of their numbers; empty before the start.
+        agents: agents by name; one that is replaced between two steps is asked from the next one on.
         acting: the numbers of those that act in the next step.
         steps: how many are complete.
         result: The result; None while the episode runs.
         error: the exception that ended it, where one did; until it is closed.
         setup_s: wall time that `start` took, in s.
-        setup_steps: how many steps were simulated before the first one; None where the simulator does not say.
+        setup_steps: how many steps were simulated before the first one; None if the simulator does not say.
     """
 
     def __init__(
@@ -212,6 +159,10 @@ class Episode(Forkable, Ending, Whereabouts):
         self.error: BaseException | None = None
         self.setup_s = 0.0
         self.setup_steps: int | None = None
+        self._observations: Observations = {}
+        self._rewards: Mapping[str, float] = {}
+        self._terminations: Mapping[str, bool] = {}
+        self._scene: Scene | None = None
         self._make_agent = make_agent
         self._crash_on = frozenset(crash_on)
         self._oracles = tuple(oracles)
@@ -241,11 +192,31 @@ class Episode(Forkable, Ending, Whereabouts):
             self._look = guarded_scene(simulator.scene)
         self._observers = tuple(observers)
 
+    @property
+    def observations(self) -> Observations:
+        """The observations of the next step, by agent."""
+        return self._observations
+
+    @property
+    def rewards(self) -> Mapping[str, float]:
+        """The rewards of the last step, of the agents that acted in it."""
+        return self._rewards
+
+    @property
+    def terminations(self) -> Mapping[str, bool]:
+        """Whether the agents that acted in the last step have arrived or crashed."""
+        return self._terminations
+
+    @property
+    def scene(self) -> Scene | None:
+        """The scene after the last step; None before the start."""
+        return self._scene
+
     def start(self) -> TrialResult | None:
         """Reset the simulator and make the agents.
 
         Returns:
-            None where the first step can be taken, the result where not.
+            None if the first step can be taken, the result where not.
 
         Raises:
             RecorderError: the disk is full.
@@ -258,88 +229,75 @@ class Episode(Forkable, Ending, Whereabouts):
         self.setup_s = time.monotonic() - began
         return self.result
 
-    def step(self, given: Mapping[str, NDArray[np.generic]] = _ASK_ALL) -> TrialResult | None:
-        """Ask the agents, advance the simulator by one step, and judge what has come of it.
+    def step(self, given: Mapping[str, NDArray[np.generic]] = ASK_ALL) -> TrialResult | None:
+        """Get the actions of the agents, advance the simulator by one step, and check the result with the oracles.
 
         Args:
             given: by name, the encoded actions of agents that are not asked in this step.
 
         Returns:
-            None where the next step can be taken, the result where not.
+            None if the next step can be taken, the result where not.
 
         Raises:
             RecorderError: the disk is full.
             RuntimeError: it is over, or has not been started.
         """
-        if self._take is None or given:
-            return self._step(given)
-        try:
-            come = self._take(self.agents)
-        except BaseException as error:
-            return self._fail_at_once(error)
-        if come:
-            return self._finish_core_step(come)
-        self._is_behind = True
-        self.steps += 1
-        return None
-
-    def _step(
-        self,
-        given: Mapping[str, NDArray[np.generic]],
-        actions: dict[str, NDArray[np.generic]] | None = None,
-        advance: Callable[[Mapping[str, NDArray[np.generic]]], StepResult] | None = None,
-        *,
-        untold: bool = False,
-    ) -> TrialResult | None:
-        """Take a step one thing after the other.
-
-        Args:
-            given: as of `step`.
-            actions: where agents have been asked already, what they answered.
-            advance: what is left for the simulator to do with that; None where it is all of it.
-            untold: Whether observers have not been called for these actions yet.
-        """
-        self._catch_up()
         if self.result is not None or self._scene is None:
             raise RuntimeError("the episode is over" if self.result is not None else "the episode has not been started")
-        # This runs a million times a hunt: it is one function, looks up little, and does nothing twice.
         try:
-            names, agents, observations, restore = self.names, self.agents, self._observations, self._restore
-            asked, actions = (self.acting, {}) if actions is None else ((), actions)
-            for tell in self._on_action if untold else ():
-                tell(0, actions[names[0]])
-            for number in asked:
-                name = names[number]
-                observation: Any = observations[name]
-                for show in self._on_observation:
-                    show(number, observation)
-                if name in given:
-                    action = given[name]
-                else:
-                    if name in restore:
-                        observation = restore[name](observation)
-                    try:
-                        answer = agents[name].act(observation)
-                    except BaseException as error:
-                        return self._fail(Outcome.AGENT_ERROR, error, name, place="act")
-                    try:
-                        action = self._encoders[number](answer)
-                    except BaseException as error:
-                        return self._fail_in_conversion(error, name)
-                for tell in self._on_action:
-                    tell(number, action)
-                actions[name] = action
+            actions = self._act(given)
+        except BaseException as error:
+            return self._break(error)
+        return self.result if actions is None else self._complete(actions, self._advance)
+
+    # The next two run a million times a hunt: each is one function, looks up little, and does nothing twice.
+
+    def _act(self, given: Mapping[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]] | None:
+        """Return the encoded actions of the agents; None if an agent has ended the episode."""
+        agents, observations, restore = self.agents, self._observations, self._restore
+        actions: dict[str, NDArray[np.generic]] = {}
+        for number in self.acting:
+            name = self.names[number]
+            observation: Any = observations[name]
+            for show in self._on_observation:
+                show(number, observation)
+            if name in given:
+                action = given[name]
+            else:
+                if name in restore:
+                    observation = restore[name](observation)
+                try:
+                    answer = agents[name].act(observation)
+                except BaseException as error:
+                    self._fail(Outcome.AGENT_ERROR, error, name, place="act")
+                    return None
+                try:
+                    action = self._encoders[number](answer)
+                except BaseException as error:
+                    self._fail_in_conversion(error, name)
+                    return None
+            for tell in self._on_action:
+                tell(number, action)
+            actions[name] = action
+        return actions
+
+    def _complete(
+        self,
+        actions: dict[str, NDArray[np.generic]],
+        advance: Callable[[Mapping[str, NDArray[np.generic]]], StepResult],
+    ) -> TrialResult | None:
+        """Advance the simulator with the actions of a step; return the result if the step is the last one."""
+        try:
             simulator = self.simulator
             try:
-                taken = self._advance(actions) if advance is None else advance(actions)
-                self._observations, rewards, self._terminations, truncations, _ = taken
+                self._observations, rewards, self._terminations, truncations, _ = advance(actions)
                 scene = simulator.scene() if self._look is None else self._look()
             except BaseException as error:  # an environment of a user's may exit as well as an agent
                 return self._fail_in_simulator(error)
             scene.follow(self._scene)
             self._scene = scene
             self._rewards = rewards
-            step, each = self.steps + 1, tuple(map(rewards.get, names, self._nothing))
+            step, each = self.steps + 1, tuple(map(rewards.get, self.names, self._nothing))
             for show_scene in self._on_scene:
                 show_scene(step, scene, each)
                 self.steps = step  # whatever fails from here on, the step is recorded
@@ -353,35 +311,6 @@ class Episode(Forkable, Ending, Whereabouts):
             ):
                 return None
             return self._judge(finding, actions, truncations)
-        except BaseException as error:
-            return self._break(error)
-
-    def _finish_core_step(self, come: int) -> TrialResult | None:
-        """Complete a step that the core has left because of an event."""
-        ahead = self._ahead
-        assert ahead is not None
-        try:
-            come, actions = ahead.resume_after(come, self.agents)
-        except BaseException as error:
-            return self._fail_at_once(error)
-        if come not in (DONE, ASK):
-            advance = ahead.at_once.finish if come == SIMULATED else None
-            return self._step(_ASK_ALL, actions, advance, untold=come == ANSWERED)
-        self._is_behind = True
-        self.steps += 1
-        return self._look_into() if come == ASK else None
-
-    def _look_into(self) -> TrialResult | None:
-        """Tell and ask everybody about a step that the core has recorded."""
-        try:
-            scene = self.scene
-            assert scene is not None
-            for show in self._on_scene[1:]:
-                show(self.steps, scene, tuple(self._rewards.values()))
-            finding = self._find(scene)
-            if finding is None and self.steps < self._max_steps:
-                return None
-            return self._judge(finding, self._rewards, {})
         except BaseException as error:
             return self._break(error)
 
@@ -416,7 +345,7 @@ class Episode(Forkable, Ending, Whereabouts):
         """Give the simulator's generators another seed from the next step on.
 
         Returns:
-            None where the next step can be taken, the result where not.
+            None if the next step can be taken, the result where not.
         """
         try:
             assert supports(self.simulator, Reseeds)  # looked at when it was set up
@@ -434,7 +363,6 @@ class Episode(Forkable, Ending, Whereabouts):
 
     def _look_away(self) -> None:
         """Stop calling observers."""
-        self._take = None
         callbacks = (self._on_begin, self._on_observation, self._on_action, self._on_scene, self._on_disturbance)
         for listening in (*callbacks, self._on_copied, self._on_end):
             listening.clear()
@@ -494,9 +422,6 @@ class Episode(Forkable, Ending, Whereabouts):
         forms = [simulator.actions[name] for name in self.names]
         self._encoders = [form.encode if is_ours(form) else _FORM.around(form.encode) for form in forms]
         self._restore = observation_restorers(simulator)
-        if self._disturbed is None:
-            self._ahead = make_fast_path(simulator, self._observers, self._oracles, self._max_steps, self._encoders)
-            self._take = None if self._ahead is None else self._ahead.at_once.core.take
         return self._end(Outcome.SURVIVED) if spec.max_steps < 1 else None
 
     def _make(self, number: int, agent: str) -> TrialResult | None:

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from typing import Final
 
     from crashhunt.agents import Agent
-    from crashhunt.episode._fast_path import FastPath
     from crashhunt.episode._observers import Observer
     from crashhunt.oracles import Oracle
     from crashhunt.simulators import Simulator
@@ -65,7 +64,7 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str 
         error: The exception. A long message or traceback is cut, with a note.
         agent: The agent whose code failed; empty if it was no agent's code.
         cause: Why the exception was raised, as a clause; empty if its message says so.
-        party: Whose code failed; empty if it is not known.
+        party: The party whose code failed; empty if unknown.
         place: What that code was called for; empty if it is not known.
     """
     with blocked_signals(), _deep_enough():
@@ -78,7 +77,7 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str 
     if limit := limit_behind(error):
         message = f"{message} ({limit})" if message else limit
     if not cause and is_emptied():
-        cause = "somebody has emptied sys.modules"
+        cause = "the code has emptied sys.modules"
     return Failure(
         kind=kind,
         message=f"{cause}, upon which this fails: {message}" if cause else message,
@@ -154,8 +153,8 @@ class Attribution:
     """An exception that comes from an agent.
 
     Args:
-        agent: identifier of the agent; empty where it is one of several.
-        cause: what an agent has done to make another part fail, as a clause; empty where its own code raised.
+        agent: identifier of the agent; empty if it is one of several.
+        cause: what an agent has done to make another part fail, as a clause; empty if its own code raised.
     """
 
     agent: str
@@ -253,7 +252,7 @@ def _packages_of_simulators() -> frozenset[str]:
 def attribute_error(
     error: BaseException, agents: Mapping[str, object], simulator: object, observing: Sequence[object] = ()
 ) -> Attribution | None:
-    """Return which agent an exception comes from; None where it comes from another part, or that is not known.
+    """Return which agent an exception comes from; None if it comes from another part, or that is not known.
 
     It is an agent's where
 
@@ -264,7 +263,7 @@ def attribute_error(
 
     Args:
         error: the exception, with its traceback.
-        agents: by identifier; those made so far.
+        agents: agents by identifier; those made so far.
         simulator: the simulator.
         observing: oracles and observers of the episode.
     """
@@ -308,7 +307,7 @@ def _agent_on_stack(
     classes: Mapping[str, set[tuple[str, str]]],
     others: set[str],
 ) -> str | None:
-    """Return the agent whose code is the innermost on a stack; empty where several share it, None where none is."""
+    """Return the agent whose code is the innermost on a stack; empty if several share it, None if none is."""
     own = {name: {module for module, _ in found} - others for name, found in classes.items()}
     helpers = {name: _with_helpers(found) - others for name, found in own.items()}
     for frame in frames:
@@ -473,8 +472,6 @@ class Ending:
     result: TrialResult | None
     error: BaseException | None
     _on_end: list[Callable[[TrialResult], TrialResult]]
-    _ahead: FastPath | None
-    _take: Callable[[Mapping[str, Agent]], int] | None
     _scene: Scene | None
     _oracles: tuple[Oracle, ...]
     _observers: tuple[Observer, ...]
@@ -536,7 +533,7 @@ class Ending:
         return self._break(error)
 
     def _blame(self, error: BaseException, place: str = "") -> tuple[Blame, Attribution | None]:
-        """Return whose code an exception comes from, and the agent if it is an agent's.
+        """Return the party that wrote the code of an exception, and the agent if it is an agent.
 
         Raises:
             RecorderError: the disk is full.
@@ -555,7 +552,7 @@ class Ending:
         """End with an exception that an agent's code has raised between two steps, as a signal handler may.
 
         Returns:
-            The result; None where the exception does not come from an agent.
+            The result; None if the exception does not come from an agent.
         """
         if self.result is not None:
             return self.result
@@ -563,16 +560,15 @@ class Ending:
         return None if found is None else self._fail(Outcome.AGENT_ERROR, error, found.agent, found.cause)
 
     def _attribute(self, error: BaseException) -> Attribution | None:
-        """Return which agent has made something fail; None where none has, as far as is known."""
+        """Return which agent has made something fail; None if none has, as far as is known."""
         return attribute_error(error, self.agents, self.simulator, (*self._oracles, *self._observers))
 
     def _end(self, outcome: Outcome, **evidence: Any) -> TrialResult:
-        """End, and let everybody who has looked on add what they have found out."""
+        """End the episode, and let all observers add their results."""
         time_s = self.simulator.scene().time_s if self._scene is not None else 0.0
         return self._add(TrialResult(self.spec, outcome, steps=self.steps, sim_time_s=time_s, **evidence))
 
     def _add(self, result: TrialResult) -> TrialResult:
-        self._take = None
         for tell in self._on_end:
             result = tell(result)
         self.result = result
@@ -600,20 +596,3 @@ class Ending:
         with suppress(BaseException):
             self._add(self.result)
         return self.result
-
-    def _fail_at_once(self, error: BaseException) -> TrialResult:
-        """End with an exception that has come through the core.
-
-        Raises:
-            RecorderError: the disk is full.
-        """
-        assert self._ahead is not None
-        if self._ahead.cannot_record:
-            return self._break(error)
-        if self._ahead.is_resuming:
-            return self._fail_in_simulator(error)
-        if self._ahead.is_encoding:
-            return self._fail_in_conversion(error, self.names[0])
-        if not self._ahead.at_once.core.simulating:
-            return self._fail(Outcome.AGENT_ERROR, error, self.names[0], place="act")
-        return self._fail_in_simulator(error)

@@ -1,12 +1,25 @@
-"""Whether most steps of an episode can be taken in one call, by the compiled core."""
+"""Episodes on SUMO whose uneventful steps the compiled core runs, each in one call.
+
+`FastEpisode` is an `Episode` with the same results, bit by bit. It is the only class that knows the core: `Episode`
+runs each part of each step in Python. After a step of the core, the simulator and the attributes of the episode hold an
+older state. Every public attribute first brings them to the state of the core.
+
+The core leaves a step where an event needs Python code: an agent appears, a vehicle has an unknown property, a signal
+changes the action. `FastPath` then completes the step, or gives its rest to `Episode`. An observer, oracle or simulator
+that needs each part of each step gets an episode without the core (`make_fast_path`).
+
+Why: on the scenario ``loop``, trials of 600 steps take 1.20 times the processor time without the core's own steps
+(median of 7 pairs, in turns). A subclass in place of branches in `Episode` takes 1.02 times: no more than the noise.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from crashhunt.base.capabilities import supports
+from crashhunt.episode._episode import ASK_ALL, Episode
 from crashhunt.episode._observers import Nearness, Recorder, overrides_hook
-from crashhunt.native import ANSWERED, ASK, DONE, REFUSED
+from crashhunt.native import ANSWERED, ASK, DONE, REFUSED, SIMULATED
 from crashhunt.oracles import (
     HARDEST,
     OffRoad,
@@ -19,9 +32,10 @@ from crashhunt.oracles import (
     WrongWay,
 )
 from crashhunt.simulators import FlattensObservations, StepsAtOnce
+from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -29,10 +43,12 @@ if TYPE_CHECKING:
     from crashhunt.agents import Agent
     from crashhunt.episode._observers import Observer
     from crashhunt.oracles import Oracle
-    from crashhunt.simulators import AtOnce, Simulator
+    from crashhunt.simulators import AtOnce, Observations, Simulator
+    from crashhunt.trial import TrialResult
+    from crashhunt.world import Scene
 
 
-__all__ = ["FastPath", "make_fast_path"]
+__all__ = ["FastEpisode", "FastPath", "make_fast_path"]
 
 
 _FIND_NOTHING = (ReportedCollision, OffRoad, TrafficEvents, RedLight, WrongWay, OffRoute, Teleport)
@@ -44,7 +60,7 @@ class FastPath:
 
     Args:
         at_once: the simulator's.
-        recorder: of the episode.
+        recorder: recorder of the episode.
         agent: the only one of the episode.
         encode: encodes its actions.
 
@@ -95,7 +111,7 @@ class FastPath:
         return True
 
     def _record_roster(self) -> None:
-        """Have the core record steps of those who are in sight."""
+        """Have the core record steps of the visible actors."""
         self.cannot_record = True
         self._recorder.lend(self.at_once.core, self.at_once.roster)
         self.cannot_record = False
@@ -112,10 +128,10 @@ def make_fast_path(
 
     Args:
         simulator: which has been reset.
-        observers: of the episode.
-        oracles: of the episode.
-        max_steps: of the episode.
-        encoders: of the actions of each agent.
+        observers: observers of the episode.
+        oracles: oracles of the episode.
+        max_steps: largest number of steps of the episode.
+        encoders: encoders of the actions of each agent.
     """
     first = observers[0] if observers else None
     if not isinstance(first, Recorder) or type(first) is not Recorder or not supports(simulator, StepsAtOnce):
@@ -132,3 +148,124 @@ def make_fast_path(
     overlaps = any(type(one) is Overlap for one in oracles)
     simulator.at_once.core.judge(overlaps, HARDEST, always, max_steps, Nearness.EVERY)
     return FastPath(simulator.at_once, first, simulator.agents[0], encoders[0])
+
+
+class FastEpisode(Episode):
+    """An `Episode` whose uneventful steps the compiled core runs, where it can; results are bit-identical."""
+
+    _fast: FastPath | None = None
+    _take: Callable[[Mapping[str, Agent]], int] | None = None
+    """Runs a step in the core; None where steps run in Python."""
+    _is_behind = False
+    """Whether the core has run steps whose state is not read yet."""
+
+    @property
+    def observations(self) -> Observations:
+        self._catch_up()
+        return self._observations
+
+    @property
+    def rewards(self) -> Mapping[str, float]:
+        self._catch_up()
+        return self._rewards
+
+    @property
+    def terminations(self) -> Mapping[str, bool]:
+        self._catch_up()
+        return self._terminations
+
+    @property
+    def scene(self) -> Scene | None:
+        self._catch_up()
+        return self._scene
+
+    def step(self, given: Mapping[str, NDArray[np.generic]] = ASK_ALL) -> TrialResult | None:
+        """Run a step, in the core where it can; `Episode.step` says the rest."""
+        if self._take is None or given:
+            self._catch_up()
+            return super().step(given)
+        try:
+            come = self._take(self.agents)
+        except BaseException as error:
+            return self._fail_in_core(error)
+        if come:
+            return self._finish_step(come)
+        self._is_behind = True
+        self.steps += 1
+        return None
+
+    def _catch_up(self) -> None:
+        """Read the state of the core."""
+        if self._is_behind and self._fast is not None:
+            self._is_behind = False
+            self._observations, self._rewards, self._terminations, *_ = self._fast.at_once.catch_up()
+            self._scene = self.simulator.scene()
+
+    def _finish_step(self, come: int) -> TrialResult | None:
+        """Complete a step that the core has left because of an event."""
+        fast = self._fast
+        assert fast is not None
+        try:
+            come, actions = fast.resume_after(come, self.agents)
+        except BaseException as error:
+            return self._fail_in_core(error)
+        if come in (DONE, ASK):
+            self._is_behind = True
+            self.steps += 1
+            return self._show_step() if come == ASK else None
+        self._catch_up()
+        if actions is None:
+            return super().step()
+        try:
+            for tell in self._on_action if come == ANSWERED else ():
+                tell(0, actions[self.names[0]])
+        except BaseException as error:
+            return self._break(error)
+        return self._complete(actions, fast.at_once.finish if come == SIMULATED else self._advance)
+
+    def _show_step(self) -> TrialResult | None:
+        """Call observers and oracles for a step that the core has recorded."""
+        try:
+            scene = self.scene
+            assert scene is not None
+            for show in self._on_scene[1:]:
+                show(self.steps, scene, tuple(self._rewards.values()))
+            finding = self._find(scene)
+            if finding is None and self.steps < self._max_steps:
+                return None
+            return self._judge(finding, self._rewards, {})
+        except BaseException as error:
+            return self._break(error)
+
+    def _fail_in_core(self, error: BaseException) -> TrialResult:
+        """End with an exception that has come through the core.
+
+        Raises:
+            RecorderError: the disk is full.
+        """
+        fast = self._fast
+        assert fast is not None
+        if fast.cannot_record:
+            return self._break(error)
+        if fast.is_resuming:
+            return self._fail_in_simulator(error)
+        if fast.is_encoding:
+            return self._fail_in_conversion(error, self.names[0])
+        if not fast.at_once.core.simulating:
+            return self._fail(Outcome.AGENT_ERROR, error, self.names[0], place="act")
+        return self._fail_in_simulator(error)
+
+    def _set_up(self) -> TrialResult | None:
+        result = super()._set_up()
+        if result is None and self._disturbed is None:
+            self._fast = make_fast_path(self.simulator, self._observers, self._oracles, self._max_steps, self._encoders)
+            self._take = None if self._fast is None else self._fast.at_once.core.take
+        return result
+
+    def _add(self, result: TrialResult) -> TrialResult:
+        self._take = None
+        return super()._add(result)
+
+    def _look_away(self) -> None:
+        self._take = None
+        super()._look_away()

@@ -75,7 +75,7 @@ class OnsetForcer:
 
     @property
     def why_not(self) -> str:
-        """Why no copies can be made any more, in words; empty where they can."""
+        """Why no copies can be made any more, in words; empty if they can."""
         return self._questions.why_not
 
     def stop(self, why_not: str) -> None:

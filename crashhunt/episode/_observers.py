@@ -1,4 +1,4 @@
-"""Observers of an episode: their protocol, who is connected with what, and the two that every trial has.
+"""Observers of an episode: their protocol, their connections, and the two observers of every trial.
 
 One measures how near to a crash the episode comes, one records it in the black box.
 """
@@ -80,20 +80,20 @@ class Observer:
     """
 
     def begin(self, episode: Episode) -> None:
-        """The simulator has been reset, and `Episode.names` says who takes part; no agent has been made yet."""
+        """The simulator has been reset, and `Episode.names` has all actors; no agent exists yet."""
 
     def making(self, number: int) -> None:
         """An agent is about to be made and reset.
 
         Args:
-            number: of the agent, in `Episode.names`; -1 once every agent has been.
+            number: number of the agent, in `Episode.names`; -1 once every agent has been.
         """
 
     def observation(self, number: int, observation: NDArray[np.generic]) -> None:
         """An agent is about to be shown something.
 
         Args:
-            number: of the agent, in `Episode.names`.
+            number: number of the agent, in `Episode.names`.
             observation: as it is recorded: flattened, where the agent is shown something structured.
         """
 
@@ -101,7 +101,7 @@ class Observer:
         """An agent has answered.
 
         Args:
-            number: of the agent, in `Episode.names`.
+            number: number of the agent, in `Episode.names`.
             action: encoded.
         """
 
@@ -117,8 +117,8 @@ class Observer:
 
         Args:
             step: its number; 0 for the scene before the first step.
-            scene: as it is now.
-            rewards: of every agent, in the order of `Episode.names`; 0 of those that did not act.
+            scene: the current scene.
+            rewards: rewards of every agent, in the order of `Episode.names`; 0 of those that did not act.
         """
 
     def copied(self) -> None:
@@ -144,11 +144,11 @@ def options_of(spec: TrialSpec, simulator: Simulator) -> Options:
     options: Options = {"arguments": spec.scenario_arguments}
     if spec.only is not None:
         if not supports(simulator, LeavesOut):
-            raise InvalidEpisodeError("the simulator cannot leave anybody out")
+            raise InvalidEpisodeError("the simulator cannot remove actors")
         options["only"] = spec.only
     if spec.script is not None:
         if not supports(simulator, PlaysPaths):
-            raise InvalidEpisodeError("the simulator cannot move anybody along recorded paths")
+            raise InvalidEpisodeError("the simulator cannot move actors along recorded paths")
         options["script"] = spec.script
     return options
 
@@ -211,7 +211,7 @@ class Nearness(Observer):
         return self._meter.closest
 
     def begin(self, episode: Episode) -> None:
-        """Note who is controlled."""
+        """Register the controlled vehicles."""
         self._meter = ApproachMeter(episode.names)
         self._simulator = episode.simulator
         self._dangers = DangerMeter(episode.names, episode.simulator.step_length_s)
@@ -267,7 +267,7 @@ class Recorder(Observer):
 
     Args:
         box: what to write into; `BlackBox.begin` has been called.
-        simulator: whose episode it is.
+        simulator: simulator of the episode.
     """
 
     def __init__(self, box: BlackBox, simulator: Simulator) -> None:
@@ -283,13 +283,13 @@ class Recorder(Observer):
         self.action = box.action  # type: ignore[assignment, method-assign]
 
     def lend(self, steps: UsualSteps, roster: Roster) -> None:
-        """Have the core record steps of these actors, who are recorded here."""
+        """Have the core record steps of these actors."""
         if roster is not self._roster:
             self._note_roster(roster)
         self._box.lend(steps, roster)
 
     def begin(self, episode: Episode) -> None:
-        """Record who takes part."""
+        """Record the actors."""
         simulator = episode.simulator
         columns = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()
         channels = []
@@ -313,7 +313,7 @@ class Recorder(Observer):
         self._box.action(number, action)
 
     def disturbance(self, disturbance: Disturbance) -> None:
-        """Record what takes place, and who is meant."""
+        """Record the disturbance and its target."""
         self._box.append(Tag.DISTURBANCE, 0, encode_disturbance(disturbance))
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
@@ -357,7 +357,7 @@ class Recorder(Observer):
         self._box.copy()
 
     def end(self, result: TrialResult) -> TrialResult:
-        """Say so, and add the digest of what has been recorded."""
+        """Record the end, and add the digest of the recording."""
         self._box.mark(Phase.DONE)
         digest = digest_of(*self._box.evidence()) if result.outcome is not Outcome.INVALID else ""
         return replace(result, digest=digest, events=None if self._events is None else dict(self._events))

@@ -41,14 +41,14 @@ _BEGINS = 2  # steps on: what an agent sees late is noticed a step before
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """A kind of disturbance that copies are asked for, and what is milder or worse of it.
+    """A kind of disturbance that copies try, and the order of its strengths.
 
     Args:
         what: the kind.
-        who: the places in the grid around the agent, of which one after another is asked.
+        who: the places in the grid around the agent, tried in this order.
         most: the strongest that is plausible, in the unit of its kind.
         how_long: the longest, in s.
-        least: what is as good as nothing, in the unit of its kind.
+        least: greatest value without an effect, in the unit of its kind.
         grade: what is varied: its strength, its length, or nothing: then it happens, which counts as half, or not.
     """
 
@@ -81,7 +81,7 @@ class Probed:
 
         Args:
             share: how much of it, from 0 to 1.
-            who: which of the places.
+            who: the chosen place.
             agent: The agent at the centre of the grid.
             step: in which it begins.
         """
@@ -147,7 +147,7 @@ class Prober:
 
     @property
     def why_not(self) -> str:
-        """Why copies cannot be asked any more, in words; empty where they can."""
+        """Why copies cannot be asked any more, in words; empty if they can."""
         return self._questions.why_not
 
     def stop(self, why_not: str) -> None:
@@ -225,7 +225,7 @@ class Prober:
         return [one for one in every if one not in absent]
 
     def result(self, result: TrialResult) -> TrialResult:
-        """Return the result of the trial with what has been found out; the next one begins."""
+        """Return the result of the trial with the results of its copies, and begin the next one."""
         stress, self._stress, self._moment = self._stress, Stress(1.0), 0
         why, may_be_answered = self._questions.why_unanswered, self._questions.may_be_answered
         self._questions.begin_trial()
@@ -272,7 +272,7 @@ class Prober:
         return self._least > 1 / _SHARES
 
     def _copy(self, episode: Episode, disturbance: Disturbance | None) -> tuple[str, int]:
-        """Return how a copy crashed, and at which step; nothing where it did not, or did not answer."""
+        """Return how a copy crashed, and at which step; nothing if it did not, or did not answer."""
         horizon = _BEGINS + steps_of(_HORIZON_S, episode.simulator.step_length_s)
 
         def follow(copy: Episode) -> Plain:
@@ -295,7 +295,7 @@ class Prober:
         return (outcome, cast(int, answer["step"])) if crashed else ("", 0)
 
     def _in_copy(self, episode: Episode, work: Callable[[Episode], Plain]) -> Plain:
-        """Return what a copy answers; nothing where none does."""
+        """Return what a copy answers; nothing if none does."""
 
         def attempt() -> tuple[Plain | None, NoAnswer | None]:
             began = time.monotonic()

@@ -27,7 +27,7 @@ _MAX_REASON_LENGTH: Final = 200  # characters; an agent's exception may say anyt
 
 
 class Questions:
-    """Asks copies, and knows what has no answer.
+    """Runs the copies, and records the questions without an answer.
 
     A copy that something outside ended (the kernel's out-of-memory killer, an administrator) says nothing about the
     trial: another copy is asked. A copy that raised, crashed or hung by itself would do so again, and is not.
@@ -40,9 +40,9 @@ class Questions:
         tell: called with what people should know.
 
     Attributes:
-        why_not: why this process asks no copies any more, in words; empty where it does.
+        why_not: why this process asks no copies any more, in words; empty if it does.
         unanswered: how many questions of this trial have no answer.
-        why_unanswered: the reason for the first of them, in words; empty where all have an answer.
+        why_unanswered: the reason for the first of them, in words; empty if all have an answer.
         may_be_answered: whether a cause was outside, so that the same trial, run again, may have all answers.
         has_answer: whether the last question has an answer.
     """
@@ -73,7 +73,7 @@ class Questions:
         attempt: Callable[[], tuple[Plain | None, NoAnswer | None]],
         can_retry: Callable[[], bool] = lambda: True,
     ) -> Plain | None:
-        """Return the answer of a copy, or None where no copy answers, which is counted.
+        """Return the answer of a copy, or None if no copy answers, which is counted.
 
         Args:
             attempt: asks one copy; returns its answer, or None and the reason.
@@ -167,5 +167,5 @@ class FirstCopy:
         self._tried = True
 
     def result(self, result: TrialResult) -> TrialResult:
-        """Return it as it is."""
+        """Return the argument unchanged."""
         return result

@@ -22,8 +22,8 @@ from crashhunt.base.plugins import import_module, locate
 from crashhunt.base.sandbox import confine
 from crashhunt.base.temporary import record_shared_memory
 from crashhunt.episode._blame import internal_error
-from crashhunt.episode._episode import Episode
 from crashhunt.episode._failures import record_originals
+from crashhunt.episode._fast_path import FastEpisode
 from crashhunt.episode._observers import Nearness, Recorder
 from crashhunt.oracles import parse_oracle
 from crashhunt.simulators import FlattensObservations
@@ -102,7 +102,7 @@ def run_episode(
     asking = [one for one in (first_copy, prober, brancher, forcer) if one is not None]
     watching = [] if brancher is None else [brancher]
     try:
-        with Episode(
+        with FastEpisode(
             spec,
             simulator=simulator,
             make_agent=make_agent,
@@ -194,7 +194,7 @@ class Parts:
     """Makes the parts of trials in this process, from the code that the settings name.
 
     Args:
-        settings: of the hunt.
+        settings: settings of the hunt.
     """
 
     def __init__(self, settings: WorkerSettings) -> None:
@@ -305,7 +305,7 @@ def stage_of(scratch: Path, pid: int) -> Path:
 
 
 def seal(settings: WorkerSettings) -> None:
-    """Confine this process to its scratch folder, if what it runs is a stranger's; it works there from then on."""
+    """Confine this process to its scratch folder, and work there, if it runs untrusted code."""
     if settings.sealed is None:
         return
     home = settings.scratch / "home"

@@ -4,22 +4,30 @@ from __future__ import annotations
 
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
 from crashhunt.base import layout
+from crashhunt.base.codec import (
+    ESSENTIAL,
+    OMIT_DEFAULT,
+    Serializable,
+    from_plain,
+    merged,
+    not_understood,
+    required_in,
+    to_plain,
+)
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.tolerance import ESSENTIAL, merged, not_understood, required_in
 from crashhunt.base.version import __version__
-from crashhunt.scenario import as_in_file
+from crashhunt.scenario import Scenario, as_in_file
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult
 
 __all__ = ["WorkerSettings", "answer_file", "scratch_of"]
@@ -33,25 +41,25 @@ _SCHEMA = 1  # a replay starts the crashhunt of a snapshot, which may be another
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WorkerSettings:
+class WorkerSettings(Serializable):
     """Everything that a worker needs to run the trials of one hunt. It crosses process boundaries.
 
     Args:
         scenario: where the trials take place.
-        oracles: who looks for crashes, each as ``--oracle`` names it.
+        oracles: the oracles that detect crashes, each as in ``--oracle``.
         crash_on: the outcomes that end a trial as a crash.
         scratch: the folder in which workers keep black boxes and output while trials run.
         code: folders whose modules win over installed ones, the first one first: the snapshot. Empty for none.
         argument_files: The file of the snapshot for each argument value that names a file.
         timeout_s: wall-clock limit of a trial, in s.
         keep_trials: whether the scratch folder of every trial is kept, not of crashes only.
-        sealed: of a stranger's crash, what the process may read besides what is installed and its scratch folder,
-            where alone it may write; None where it may do everything.
+        sealed: of a stranger's crash, what the process may read besides what is installed and its scratch
+            folder, where alone it may write; None if it may do everything.
         find_escapes: whether it is found out until when braking would have avoided a collision, by running the trial a
             few times more; only in a fresh process.
         audit: the share of trials without a crash whose scratch folder is kept, because they are run again.
         hunt_seed: what decides which.
-        warm_copies: for how many traffics a worker of a pool keeps a warmed-up copy of itself; 0 for none.
+        warm_copies: number of traffics for which a worker of a pool keeps a warmed-up copy of itself; 0 for none.
         probe_s: how often copies of a trial are asked how little it would take for a crash, in s of simulation time; 0
             for never.
         branch: The rates of disturbances in branches, ``NAME=RATE`` each; empty for no branches.
@@ -70,10 +78,15 @@ class WorkerSettings:
     find_escapes: bool = False
     audit: float = 0.0
     hunt_seed: int = 0
-    warm_copies: int = 0
-    probe_s: float = 0.0
-    branch: tuple[str, ...] = ()
-    force: tuple[str, ...] = ()
+    warm_copies: int = field(default=0, metadata=OMIT_DEFAULT)
+    probe_s: float = field(default=0.0, metadata=OMIT_DEFAULT)
+    branch: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
+    force: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
+
+    json_keys: ClassVar[tuple[str, ...]] = (
+        "oracles", "crash_on", "scratch", "code", "argument_files", "timeout_s", "keep_trials", "sealed",
+        "find_escapes", "audit", "hunt_seed", "warm_copies", "probe_s", "branch", "force",
+    )  # fmt: skip
 
     def is_audited(self, result: TrialResult) -> bool:
         """Whether a trial belongs to the sample that is run again, which its number and the hunt's seed decide."""
@@ -88,43 +101,18 @@ class WorkerSettings:
         # what has come since is written only where it is asked for. For this the defaults may never change.
         scenario = as_in_file(_asked(replace(self.scenario, file=type(self.scenario).file, added={})))
         requires = required_in(self)
-        data: JsonObject = {
-            "schema": _SCHEMA,
-            "scenario": merged(
-                {**scenario, "schema": self.scenario.schema, "folder": str(self.scenario.folder)}, self.scenario.added
-            ),
-            "oracles": self.oracles,
-            "crash_on": [str(outcome) for outcome in self.crash_on],
-            "scratch": str(self.scratch),
-            "code": self.code,
-            "argument_files": self.argument_files,
-            "timeout_s": self.timeout_s,
-            "keep_trials": self.keep_trials,
-            "sealed": self.sealed,
-            "find_escapes": self.find_escapes,
-            "audit": self.audit,
-            "hunt_seed": self.hunt_seed,
-        }
-        if self.warm_copies:
-            data["warm_copies"] = self.warm_copies
-        if self.probe_s:
-            data["probe_s"] = self.probe_s
-        if self.branch:
-            data["branch"] = self.branch
-        if self.force:
-            data["force"] = self.force
-        if requires:
-            data["requires"] = requires
-        return data
+        whole = {**scenario, "schema": self.scenario.schema, "folder": str(self.scenario.folder)}
+        data = {"schema": _SCHEMA, "scenario": merged(whole, self.scenario.added), **to_plain(self)}
+        return {**data, "requires": requires} if requires else data
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> WorkerSettings:
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
         """Return the settings from the data of `to_json` of any version; unknown keys are ignored.
 
         Raises:
             CrashhuntError: a crashhunt of another version wrote it, and it needs what this one does not know.
         """
-        from crashhunt.scenario import Scenario, installed_backends, scenario_from_dict
+        from crashhunt.scenario import installed_backends, scenario_from_dict
 
         tables = [backend.table for _, backend in installed_backends()] if data.get("requires") else []
         unknown = not_understood(data.get("requires") or (), cls, Scenario, *tables)
@@ -135,26 +123,10 @@ class WorkerSettings:
                 f"{how}",
                 fix=f"pip install crashhunt=={__version__}, or replay with --code current",
             )
-        scenario, sealed = dict(data["scenario"]), data.get("sealed")
+        scenario = dict(data["scenario"])
         folder = Path(str(scenario.pop("folder")))
-        return cls(
-            scenario=scenario_from_dict(scenario, where="worker settings", folder=folder, tolerant=True),
-            oracles=tuple(data["oracles"]),
-            crash_on=tuple(Outcome(name) for name in data["crash_on"]),
-            scratch=Path(data["scratch"]),
-            code=tuple(data.get("code", ())),
-            argument_files=data.get("argument_files", {}),
-            timeout_s=data.get("timeout_s", _TIMEOUT_S),
-            keep_trials=data.get("keep_trials", False),
-            sealed=tuple(sealed) if sealed is not None else None,
-            find_escapes=data.get("find_escapes", False),
-            audit=data.get("audit", 0.0),
-            hunt_seed=data.get("hunt_seed", 0),
-            warm_copies=data.get("warm_copies", 0),
-            probe_s=data.get("probe_s", 0.0),
-            branch=tuple(data.get("branch", ())),
-            force=tuple(data.get("force", ())),
-        )
+        made = scenario_from_dict(scenario, where="worker settings", folder=folder, tolerant=True)
+        return from_plain(cls, {**data, "scenario": made})
 
 
 def _asked(value: object) -> Any:
@@ -177,5 +149,5 @@ def scratch_of(scratch: Path, number: int) -> Path:
 
 
 def answer_file(scratch: Path, number: int) -> Path:
-    """Return the file for what came of a trial, where its process has no other way to say so."""
+    """Return the file for the result of a trial whose process cannot report it otherwise."""
     return scratch / layout.numbered(number, layout.ANSWER)

@@ -49,19 +49,20 @@ class HuntFigures:
     Args:
         dir: its directory.
         state: where it stands.
-        agents: vehicle to who drives it.
+        agents: vehicle to its agent.
         trials: that count and are valid: up to the first number that has not ended.
-        crashes: of them.
-        crash_rate: of them, from 0 to 1; NaN where it would be biased, or there is no trial.
-        interval: of the rate, of 95 % confidence, valid whenever you look; None where the trials do not allow one.
+        crashes: crashes of them.
+        crash_rate: crash rate of the trials, from 0 to 1; NaN if it would be biased, or there is no trial.
+        interval: interval of the rate, of 95 % confidence, valid whenever you look; None if the trials do not allow
+            one.
         why_not: why there is no interval, or no rate.
-        median_steps_to_crash: NaN where there was no crash.
-        median_time_to_collision_s: of the trials without a crash, the least of each; infinite where most never were
-            on a collision course.
+        median_steps_to_crash: NaN if there was no crash.
+        median_time_to_collision_s: median time to collision of the trials without a crash, the least of each; infinite
+            if most never were on a collision course.
         outcomes: how many trials ended how, invalid ones too; of all trials.
         counted: the origin of the trials that all other figures are of, if the hunt guided the rest of its trials. Only
             unguided trials show a crash rate. Empty if all trials count.
-        disturbed: how many of the crashes had disturbances; None where the hunt has none.
+        disturbed: how many of the crashes had disturbances; None if the hunt has none.
         excluded: how many trials have ended, but not all of lower numbers; they do not count.
     """
 
@@ -92,18 +93,18 @@ class Pair:
         only_first: pairs in which only the first crashed; with ``--seeds``, traffics in which it crashed more often.
         only_second: likewise for the second.
         both: in which both did, equally often.
-        p_value: of McNemar's or Fisher's exact test; None where the number of trials was not fixed ahead.
+        p_value: *p* value of McNemar's or Fisher's exact test; None if the number of trials was not fixed ahead.
         caution: why the answer may mean something else; empty for nothing.
         test: what the verdict rests on: ``pairs``, the evidence of discordant pairs; ``intervals``, the certain
-            intervals of both; empty where there is none.
-        why_unpaired: why there are no pairs; empty where there are.
+            intervals of both; empty if there is none.
+        why_unpaired: why there are no pairs; empty if there are.
         counts: crashes and valid trials of the first and of the second.
         evidence: e-value that they do not crash equally often; 20 and more is 95 % confidence. None without pairs.
-        difference: interval of the difference in crashes per trial, second minus first; None where there is none.
+        difference: interval of the difference in crashes per trial, second minus first; None if there is none.
         units: independent pairs: of trials, or of traffics.
         excluded: how many trials of both do not count, for one of three reasons. A trial of a lower number has not
             ended. A trial is invalid in one hunt. An agent was trained on that part of the traffics.
-        answer: ``first`` or ``second``, which certainly crashes less; ``undecided``; empty where nothing can be said.
+        answer: ``first`` or ``second``, which certainly crashes less; ``undecided``; empty if nothing can be said.
     """
 
     first: str
@@ -170,7 +171,7 @@ class Comparison:
     """Several hunts side by side.
 
     Args:
-        hunts: in the order in which they were given.
+        hunts: hunts in the order in which they were given.
         pairs: the first against each other one.
     """
 
@@ -258,7 +259,7 @@ def _rate(hunt: HuntResults, confidence: float = 100 * _CONFIDENCE) -> CrashRate
 
 
 def _share(hunt: HuntResults, rate: CrashRate) -> float:
-    """Return the share of trials that crashed; NaN where the number of trials depends on the crashes."""
+    """Return the share of trials that crashed; NaN if the number of trials depends on the crashes."""
     if rate.estimate is not None:
         return rate.estimate
     run = hunt.settings.run
@@ -409,7 +410,7 @@ def _is_fixed_ahead(hunt: HuntResults) -> bool:
 
 
 def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, PairTest, int]:
-    """Return the pairs, what they say, and how many do not count because an agent was trained on their traffics."""
+    """Return the pairs, their evidence, and how many do not count because an agent was trained on their traffics."""
     hunts = first, second
     held_out = held_out_traffics(first.settings, [hunt.directory for hunt in hunts])
     trained_on = 0
@@ -452,7 +453,7 @@ def _text_of(arguments: dict[str, object]) -> str:
 
 
 def why_unpaired(one: HuntSettings, other: HuntSettings) -> str:
-    """Return why trials of two hunts with the same number are no pairs, as a clause; empty where they are."""
+    """Return why trials of two hunts with the same number are no pairs, as a clause; empty if they are."""
     if one.rare and other.rare:
         return "they are in rare mode, in which one of five trials is undisturbed; each hunt itself reports its rate"
     if one.rare != other.rare:

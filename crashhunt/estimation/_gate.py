@@ -40,7 +40,7 @@ class GateCase:
     """What became of a case of HEAD's corpus.
 
     Args:
-        name: of its folder.
+        name: name of its folder.
         expected: ``still`` or ``fixed``.
         got: ``still``, ``fixed``, ``changed`` or ``cannot_run``.
         now: the result in words.
@@ -62,10 +62,10 @@ class ScenarioCounts:
     """The pairs of one hunt of BASE and HEAD.
 
     Args:
-        name: of the hunt: its id and run in the suite, or the scenario.
+        name: name of the hunt: its id and run in the suite, or the scenario.
         pairs: that count.
-        only_base: of them, in which only BASE crashes.
-        only_head: in which only HEAD does.
+        only_base: number of the pairs in which only BASE crashes.
+        only_head: number of pairs in which only HEAD crashes.
         both: in which both do.
         invalid: pairs with an invalid trial, which leave both sides.
     """
@@ -94,20 +94,20 @@ class GateReport:
         base: what was compared: a commit, or an agent.
         head: likewise.
         pairs: that count.
-        only_base: of them, in which only BASE crashes.
-        only_head: in which only HEAD does.
+        only_base: number of the pairs in which only BASE crashes.
+        only_head: number of pairs in which only HEAD crashes.
         both: in which both crash.
         evidence: e-value that they do not crash equally often.
         difference: interval of the difference in crashes per trial, HEAD minus BASE; None without a pair.
         margin: the greatest difference that counts as none; 0 for no such verdict.
-        confidence: in percent, of the verdict and of the interval.
-        seed: of the hunts.
+        confidence: confidence in percent, of the verdict and of the interval.
+        seed: seed of the hunts.
         scenarios: the same counts for each hunt.
-        rates: of BASE and of HEAD, where there is one hunt of each that has begun.
-        corpus: the cases that were run; None where there is no corpus.
-        why: why the verdict is not that of the pairs, or why there is none; empty where nothing has to be said.
+        rates: rates of BASE and of HEAD, where there is one hunt of each that has begun.
+        corpus: the cases that were run; None if there is no corpus.
+        why: why the verdict is not that of the pairs, or why there is none; empty if nothing has to be said.
         is_interrupted: whether a request to stop came before the end.
-        dir: where the hunts are; empty where they are not kept.
+        dir: where the hunts are; empty if they are not kept.
         trained_on: how many pairs do not count, because an agent was trained on this part of the traffics.
     """
 
@@ -174,9 +174,9 @@ class PairedHunts:
     """The hunts of BASE and HEAD in one scenario, which other processes run.
 
     Args:
-        name: of the hunt.
+        name: name of the hunt.
         base: directory of BASE's hunt.
-        head: of HEAD's.
+        head: directory of HEAD's.
         pairs: how many trials each has at most.
 
     Attributes:
@@ -196,7 +196,7 @@ class PairedHunts:
         """Give the pairs that are complete by now to a watch, until one decides.
 
         Args:
-            watch: of all pairs of the gate.
+            watch: watch of all pairs of the gate.
             may_end: whether better and no difference are verdicts yet; worse always is one.
 
         Raises:
@@ -204,6 +204,9 @@ class PairedHunts:
         """
         sequence = self._sequence = self._sequence or self._begun()
         if sequence is None:
+            return
+        if self._held_out.is_empty:
+            self.trained_on = self.most
             return
         for pair in self._read(sequence):
             if watch.verdict != "undecided" or sequence.position > self.most:
@@ -231,12 +234,12 @@ class PairedHunts:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all pairs have been counted."""
-        return self._sequence is not None and self._sequence.position >= self.most
+        """Whether all pairs have been counted, or none can count."""
+        return self._held_out.is_empty or (self._sequence is not None and self._sequence.position >= self.most)
 
     @property
     def why_not(self) -> str:
-        """Why the pairs so far say nothing; empty where they do."""
+        """Why the pairs so far say nothing; empty if they do."""
         return "" if self._sequence is None else self._sequence.why_not
 
     @property
@@ -248,7 +251,7 @@ class PairedHunts:
         return self._sequence is not None and self._sequence.valid > 0 and self._sequence.is_hopeless
 
     def failure(self) -> tuple[str, str, str] | None:
-        """Return ``base`` or ``head``, the state in which its hunt failed, and why; None where both can run.
+        """Return ``base`` or ``head``, the state in which its hunt failed, and why; None if both can run.
 
         Failures of an earlier run of the gate do not count: this run may do better.
         """

@@ -21,7 +21,7 @@ from crashhunt.base.text import one_of
 from crashhunt.crashes import fault_of, signature_of
 from crashhunt.hunts import HuntResults, counting_rule, why_no_interval
 from crashhunt.ledger import Ledger
-from crashhunt.rates import PERS, RateCounter, RatePart, UnitSequence, facts_of_plain, make_rate
+from crashhunt.rates import PERS, RateCounter, RatePart, UnitSequence, check_confidence, facts_of_plain, make_rate
 from crashhunt.trial import Choice, Range
 
 if TYPE_CHECKING:
@@ -54,9 +54,9 @@ def measure_rates(
     """Return how often the agents of a hunt crash: per trial, per hour and per 1,000 km.
 
     Args:
-        directory: of the hunt.
+        directory: directory of the hunt.
         per: ``trial``, ``hour`` or ``1000km``: only that rate.
-        confidence: of the certain intervals, in percent.
+        confidence: confidence of the certain intervals, in percent.
         by: ``kind``, ``fault``, ``disturbance`` or an argument, perhaps with a number of bins, as in ``speed:5``: what
             divides the rate into parts.
         bar: a rate, to compare with; needs `per`.
@@ -65,8 +65,7 @@ def measure_rates(
         UsageError: a value is not allowed.
         HuntDirectoryError: it is not the directory of a hunt, or its ledger is damaged.
     """
-    if not 50 <= confidence < 100:
-        raise UsageError(f"--confidence is {confidence:g}", fix="give percent from 50 to below 100, such as 95")
+    check_confidence(confidence)
     hunt = HuntResults(directory)
     if hunt.state.damaged:
         raise HuntDirectoryError(hunt.state.detail)
@@ -120,15 +119,15 @@ def rate_of_counts(
     """Return the rate per trial that `measure_rates` returns, from counts; only where `counts_suffice`.
 
     Args:
-        directory: of the hunt.
-        settings: of the hunt.
-        facts: of its ledger.
+        directory: directory of the hunt.
+        settings: settings of the hunt.
+        facts: facts of its ledger.
         valid: how many of the first trials, up to the first that has not ended, were valid.
         invalid: how many of them were not.
-        crashes: of the valid ones.
+        crashes: crashes of the valid ones.
         steps: that the valid ones took.
         excluded: how many trials have ended after the first that has not.
-        confidence: of the certain interval, in percent.
+        confidence: confidence of the certain interval, in percent.
     """
     rule = counting_rule(settings, facts)
     sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")
@@ -148,11 +147,11 @@ def rate_of_trials(
     """Return the rate per trial that `measure_rates` returns, without parts, from trials that the caller reads.
 
     Args:
-        directory: of the hunt.
-        settings: of the hunt.
-        facts: of its ledger.
+        directory: directory of the hunt.
+        settings: settings of the hunt.
+        facts: facts of its ledger.
         trials: plain data of all trials, in the order of their numbers.
-        confidence: of the certain interval, in percent.
+        confidence: confidence of the certain interval, in percent.
     """
     rule = counting_rule(settings, facts)
     sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")
@@ -169,7 +168,7 @@ def rate_of_trials(
 
 
 def _why_no_estimate(settings: HuntSettings, sequence: UnitSequence, decided: int | None) -> str:
-    """Return why crashes by exposure would be biased; empty where the number of units does not depend on them."""
+    """Return why crashes by exposure would be biased; empty if the number of units does not depend on them."""
     run = settings.run
     if decided is not None:
         return ""
@@ -197,7 +196,7 @@ class _Division:
         by: in words.
         tag: returns the name of the part that a trial, or its crash, belongs to; of a ledger's plain data.
         of_crashes: whether crashes are divided, and not trials.
-        names: of the parts; empty where the crashes decide which there are.
+        names: names of the parts; empty if the crashes decide which there are.
     """
 
     by: str
@@ -252,6 +251,8 @@ def _by_argument(by: str, settings: HuntSettings) -> _Division:
     names = {f"{agent or 'scenario'}.{name}": (agent, name) for agent, name in space}
     short = {name: key for key, (_, name) in names.items() if sum(name == other for _, other in space) == 1}
     word, colon, count = by.partition(":")
+    if word in _OF_CRASHES:
+        raise UsageError(f"--by {by}: {word} has no bins", fix=f"give --by {word}")
     key = word if word in names else short.get(word, "")
     if not key:
         raise UsageError(f"--by: there is no argument {word!r}", fix=one_of(word, [*_OF_CRASHES, *short, *names]))

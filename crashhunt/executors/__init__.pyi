@@ -1,4 +1,3 @@
-from ._environment import snapshot_environment as snapshot_environment, worker_environment as worker_environment
 from ._fork_server import fork_zygote as fork_zygote
 from ._fresh import (
     FreshProcessExecutor as FreshProcessExecutor,
@@ -16,6 +15,8 @@ from ._protocol import (
     SizesItself as SizesItself,
     make_executor as make_executor,
     run_trials as run_trials,
+    snapshot_environment as snapshot_environment,
+    worker_environment as worker_environment,
 )
 from ._supervisor import Supervisor as Supervisor
 from ._trial_process import LEFT_OUT as LEFT_OUT

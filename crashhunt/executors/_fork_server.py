@@ -83,10 +83,10 @@ class _Server:
     """Starts supervisors, and reports how they ended.
 
     Args:
-        control: to the pool.
-        orders: to the template.
+        control: connection to the pool.
+        orders: connection to the template.
         template: its process.
-        settings: of the hunt.
+        settings: settings of the hunt.
     """
 
     def __init__(self, control: socket.socket, orders: socket.socket, template: int, settings: WorkerSettings) -> None:
@@ -147,6 +147,11 @@ class _Server:
         pool = socket.socket(fileno=descriptors[0])
         zygote, theirs = socket.socketpair()
         with pool, zygote, theirs:
+            try:
+                socket.send_fds(self._orders, [b"zygote"], [theirs.fileno()])
+            except ConnectionError:  # a supervisor without a zygote would lose its trial
+                self._hear_template()  # what it said before it ended
+                self._leave_as(os.waitstatus_to_exitcode(os.waitpid(self._template, 0)[1]))
             server, pid = os.getpid(), os.fork()
             if pid == 0:
                 for descriptor in self._ends.values():
@@ -158,8 +163,6 @@ class _Server:
                     signal.signal(number, signal.SIG_DFL)
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
                 be_supervisor(pool, zygote, self._settings, server)
-            with suppress(OSError):  # the template is gone, which is seen elsewhere
-                socket.send_fds(self._orders, [b"zygote"], [theirs.fileno()])
         self._slots[pid] = message["slot"]
         with suppress(AttributeError, OSError):
             self._ends[pid] = os.pidfd_open(pid)
@@ -256,7 +259,7 @@ def fork_zygote(settings: WorkerSettings, *, late: bool = False) -> socket.socke
     """Fork a zygote that imports what trials need; return a socket to it, with which it ends.
 
     Args:
-        settings: of the hunt.
+        settings: settings of the hunt.
         late: whether each trial imports its agents itself.
 
     Raises:

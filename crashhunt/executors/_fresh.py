@@ -23,11 +23,10 @@ from crashhunt.base.processes import children_of
 from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
-from crashhunt.executors._environment import has_fork_server, snapshot_environment
 from crashhunt.executors._fork_server import fork_zygote
 from crashhunt.executors._pool import PoolExecutor
 from crashhunt.executors._postmortem import Attempt, damaged, hung, result_of_death, where_it_is
-from crashhunt.executors._protocol import Notes, run_trials
+from crashhunt.executors._protocol import Notes, has_fork_server, run_trials, snapshot_environment
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError, with_escape
 from crashhunt.executors._time_limits import START_UP_S, ImportKilledError, has_hung, import_died
 from crashhunt.trial import TrialResult, TrialSpec
@@ -60,8 +59,8 @@ class FreshProcessExecutor:
     """Runs every trial in a fresh process, and with it the code that the settings name.
 
     Args:
-        settings: of the hunt.
-        parallel: how many processes at a time.
+        settings: settings of the hunt.
+        parallel: number of processes at a time.
         recycle_after: not used; a process is never used twice.
     """
 
@@ -170,11 +169,11 @@ class FreshProcessExecutor:
                 lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
                 raise WorkerError(
                     f"the process of trial {spec.number} could not start: {lines[-1] if lines else exit_code}",
-                    fix="read the whole message there",
+                    fix="read its log",
                     where=str(log),
                 ) from None
             if exit_code == _DAMAGED:
-                return damaged(spec, scratch, "the process could not report what came of it, as it is damaged")
+                return damaged(spec, scratch, "the process could not report the result, as it is damaged")
             return self._again(running, exit_code)
         # The answer is there, so that what was killed is the search for the escape: without it the answer is half.
         why_no_escape = ""
@@ -282,7 +281,7 @@ def snapshot_executor(settings: WorkerSettings, *, parallel: int = 1) -> Executo
 def run_alone(
     settings: WorkerSettings, spec: TrialSpec, stopped: Callable[[], bool] = lambda: False
 ) -> TrialResult | None:
-    """Run one trial in a new Python process; return what came of it, None where it was stopped.
+    """Run one trial in a new Python process; return the result, None if it was stopped.
 
     Raises:
         CrashhuntError: it cannot be run.
@@ -312,7 +311,7 @@ class SharedExecutors:
         """Run a trial.
 
         Returns:
-            What came of it, and the folder in which it was recorded; None where it was stopped.
+            What came of it, and the folder in which it was recorded; None if it was stopped.
 
         Raises:
             CrashhuntError: it cannot be run.

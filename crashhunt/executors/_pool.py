@@ -1,4 +1,4 @@
-"""A pool of slots: a supervisor each, which runs one trial after another, each in a process of its own."""
+"""A pool of slots: a supervisor each, which runs one trial after another, each in its own process."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.reaper import Kept
-from crashhunt.executors._environment import snapshot_environment, worker_environment
 from crashhunt.executors._postmortem import Attempt, result_of_death, signal_name, where_it_is
-from crashhunt.executors._protocol import Notes
+from crashhunt.executors._protocol import Notes, snapshot_environment, worker_environment
 from crashhunt.executors._time_limits import import_died
 from crashhunt.trial import TrialResult
 
@@ -50,7 +49,7 @@ class ForkServerLink:
     """A running fork server.
 
     Args:
-        settings: of the hunt.
+        settings: settings of the hunt.
         late: whether each trial imports its agents itself, because what has imported them cannot be forked.
         deaths: how often it was killed before.
         snapshot: whether crashhunt itself comes from the code of the settings.
@@ -102,7 +101,7 @@ class ForkServerLink:
             self.control.send(json.dumps({"kill": slot}).encode())
 
     def receive(self) -> list[FromForkServer] | None:
-        """Return which supervisors have ended, and how; None where the fork server itself is gone.
+        """Return which supervisors have ended, and how; None if the fork server itself is gone.
 
         Raises:
             CrashhuntError: what trials need cannot be imported.
@@ -174,12 +173,12 @@ class _Worker:
 
 
 class PoolExecutor:
-    """Runs every trial in a process of its own, a fork of one that has imported the agents and run nothing.
+    """Runs every trial in its own process, a fork of one that has imported the agents and run nothing.
 
     A thread hands trials out as soon as a slot is free, whatever the thread of the hunt is busy with.
 
     Args:
-        settings: of the hunt.
+        settings: settings of the hunt.
         parallel: how many slots.
         recycle_after: not used; no process runs two trials.
         snapshot: whether crashhunt itself comes from the code of the settings, in new Python processes.

@@ -61,12 +61,13 @@ class Attempt:
     """A trial that is to be run, and what has become of it so far.
 
     A process that ends by certain signals may have been ended from outside: by an administrator, a batch system, the
-    kernel because memory ran out. Then the trial is run again, alone. Where it ends in the same way at the same place
-    it was the trial itself. Where it ends at another place each time, the trial is not the cause.
+    kernel because memory ran out. Then the trial is run again, alone. Where it ends in the same way at the same step
+    it was the trial itself. Where it ends at another step each time, the trial is not the cause. Before the first step
+    that says nothing: what forks the processes of trials may have been killed, and started again.
 
     Args:
         spec: the trial.
-        ends: of its processes: which signal, at which step.
+        ends: how its processes ended: which signal, at which step.
     """
 
     spec: TrialSpec
@@ -83,12 +84,13 @@ class Attempt:
         return len(self.ends) >= _ATTEMPTS and len(set(self.ends)) == len(self.ends)
 
     def again(self, scratch: Path, exit_code: int) -> str:
-        """Why it is to be run once more, in words; empty where what has happened is its outcome."""
+        """Why it is to be run once more, in words; empty if what has happened is its outcome."""
         if not is_sent_from_outside(exit_code):
             return ""
         header = where_it_is(scratch, self.spec.number)
         end = exit_code, header.step if header is not None else -1
-        seen = end in self.ends
+        has_begun = header is not None and header.phase != Phase.SETUP
+        seen = end in self.ends and has_begun
         self.ends.append(end)
         if seen or len(self.ends) >= _ATTEMPTS:
             return ""
@@ -96,7 +98,7 @@ class Attempt:
 
 
 def where_it_is(scratch: Path, number: int) -> BlackBoxHeader | None:
-    """Return where a running trial is, or None where it has not begun."""
+    """Return where a running trial is, or None if it has not begun."""
     header = read_header(scratch_of(scratch, number) / layout.BLACK_BOX)
     return header if header is not None and header.trial == number else None
 
@@ -109,7 +111,7 @@ def died(spec: TrialSpec, scratch: Path, exit_code: int, agents: Mapping[str, st
     Args:
         spec: the trial.
         scratch: the folder in which it recorded.
-        exit_code: of its process, negative for a signal.
+        exit_code: exit code of its process, negative for a signal.
         agents: identifier of each agent to its module, where no other code comes from that module.
     """
     header = where_it_is(scratch, spec.number)
@@ -145,7 +147,7 @@ def killed_from_outside(spec: TrialSpec, why: str, exit_code: int) -> TrialResul
     Args:
         spec: the trial.
         why: how often it was killed, and where.
-        exit_code: of its last process; negative for a signal.
+        exit_code: exit code of its last process; negative for a signal.
     """
     return TrialResult(spec, Outcome.INVALID, failure=Failure(KILLED, why, exit_code=exit_code))
 
@@ -157,7 +159,7 @@ def damaged(spec: TrialSpec, scratch: Path, message: str, *, agent: str = "", re
         spec: the trial.
         scratch: the folder in which it recorded.
         message: what is damaged, as a sentence.
-        agent: identifier of the agent that did it, where the recording cannot be read; empty where that is not known.
+        agent: identifier of the agent that did it, where the recording cannot be read; empty if that is not known.
         recorded: whether the recording can be read.
     """
     if recorded:
@@ -250,7 +252,7 @@ def _result(
 
 
 def agent_in_stack(stack: str, agents: Mapping[str, str]) -> str:
-    """Return the agent whose code ran when the process died; empty where the stack does not show it.
+    """Return the agent whose code ran when the process died; empty if the stack does not show it.
 
     A signal handler of an agent may be called while the simulator runs. Its frames then lie above those of crashhunt.
 
@@ -277,7 +279,7 @@ def agent_in_stack(stack: str, agents: Mapping[str, str]) -> str:
 
 
 def read_map(scratch: Path, trial: Path) -> list[Lane]:
-    """Return the map of a trial that is kept, or that of its hunt; nothing where none has been written down."""
+    """Return the map of a trial that is kept, or that of its hunt; nothing if none has been written down."""
     for folder in (trial, scratch):
         with suppress(OSError, ValueError, TypeError):
             data = json.loads((folder / layout.MAP).read_text(encoding="utf-8"))
@@ -286,7 +288,7 @@ def read_map(scratch: Path, trial: Path) -> list[Lane]:
 
 
 def read_tail(path: Path) -> str:
-    """Return the last few thousand characters of a file; nothing where there is none."""
+    """Return the last few thousand characters of a file; nothing if there is none."""
     try:
         with path.open("rb") as file:
             file.seek(0, os.SEEK_END)
@@ -350,7 +352,7 @@ def encode_report(
 
     Args:
         report: what is reported.
-        key: of the trial.
+        key: key of the trial.
         digest: the trace digest; empty for an invalid trial.
         dumps: writes JSON.
     """
@@ -365,9 +367,9 @@ def check_report(
 
     Args:
         report: as it lies behind the records.
-        key: of the trial.
+        key: key of the trial.
         spec: the trial that was asked for.
-        header: of the black box.
+        header: header of the black box.
         records: all committed records.
         pid: the process that was to run the trial.
 
@@ -408,7 +410,7 @@ def _fault_of(data: ErrorData) -> CrashhuntError:
 
 
 def _contradiction(result: TrialResult, spec: TrialSpec, steps: int, time_s: float, digest: str) -> str:
-    """What in a result contradicts its recording; empty where nothing does."""
+    """What in a result contradicts its recording; empty if nothing does."""
     outcome = result.outcome
     if outcome in _SUPERVISED:
         return f"a process cannot report {outcome} of itself"

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, Protocol, TypeAlias, TypedDict, final
 
 from crashhunt.base import layout
@@ -14,7 +17,6 @@ from crashhunt.plans import SizesItself, executor_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.episode import WorkerSettings
@@ -38,8 +40,11 @@ __all__ = [
     "Notes",
     "SizesItself",
     "ToForkServer",
+    "has_fork_server",
     "make_executor",
     "run_trials",
+    "snapshot_environment",
+    "worker_environment",
 ]
 
 
@@ -77,7 +82,7 @@ class Executor(Protocol):
         """Cancel all trials whose number is greater than ``above``, running or not, at once."""
 
     def where(self) -> Mapping[int, BlackBoxHeader]:
-        """Return the progress of running trials, by number, for the status screen; empty where it is unknown."""
+        """Return the progress of running trials, by number, for the status screen; empty if it is unknown."""
 
     def notes(self) -> list[str]:
         """Return new notices for the user on how trials were run."""
@@ -91,7 +96,7 @@ class NodeFigures:
     """A machine on which trials run, for people who watch.
 
     Args:
-        name: of it.
+        name: name of it.
         parallel: how many trials run there at a time.
         trials: how many have ended there in this run of the hunt.
         rate_per_s: trials a second since it takes part.
@@ -122,8 +127,8 @@ class ExecutorFactory(Protocol):
         """Make one.
 
         Args:
-            settings: of the hunt.
-            parallel: how many trials at a time.
+            settings: settings of the hunt.
+            parallel: number of trials at a time.
             recycle_after: trials after which a worker is replaced by a fresh one; 0 for never.
         """
 
@@ -165,7 +170,7 @@ class FreshJob(TypedDict):
 class ForkServerJob(TypedDict):
     """What a fork server needs to know; ``late`` where every trial imports its agents itself.
 
-    ``sys_path`` is empty where crashhunt itself comes from the snapshot, as its environment says.
+    ``sys_path`` is empty if crashhunt itself comes from the snapshot, as its environment says.
     """
 
     settings: JsonObject
@@ -183,7 +188,7 @@ class ToForkServer(TypedDict, total=False):
 class FromForkServer(TypedDict, total=False):
     """What a fork server says: that it is ready, cannot fork, or fails; and which supervisor has ended, and how.
 
-    ``importing`` is what has failed if its template never reports again, in words; empty where that has imported all.
+    ``importing`` is what has failed if its template never reports again, in words; empty if that has imported all.
     """
 
     importing: str
@@ -251,7 +256,7 @@ def make_executor(word: str, settings: WorkerSettings, *, parallel: int, recycle
     """Make the executor that ``--executor`` names.
 
     Raises:
-        PluginError: there is no such executor, or it fails in a way of its own.
+        PluginError: there is no such executor, or it fails in its own way.
         CrashhuntError: it says why no trial could run.
     """
     factory = executor_of(word)
@@ -260,7 +265,7 @@ def make_executor(word: str, settings: WorkerSettings, *, parallel: int, recycle
     except CrashhuntError:
         raise
     except Exception as error:  # code of the user
-        raise blamed(f"the executor {word!r} cannot be made", error) from error
+        raise blamed(f"the executor {word!r} cannot be created", error) from error
     return made
 
 
@@ -283,7 +288,7 @@ def run_trials(
 
     Args:
         executor: runs the trials, and no others meanwhile.
-        specs: of the trials, in ascending order of their numbers.
+        specs: specs of the trials, in ascending order of their numbers.
         stopped: called before each wait for results, so at least once; True ends the loop, and it may raise.
         needed: whether the trial at a place is still needed, asked after each result. Where a trial is not, the trials
             after it are not either.
@@ -309,3 +314,66 @@ def run_trials(
     finally:
         if places:
             executor.cancel()
+
+
+# The environment variables of every process that runs trials: fixed hashes, one thread a library, whose code.
+
+_KEPT_SNAPSHOTS = 16  # of which compiled code is kept; some 3 MB each
+
+
+def worker_environment() -> dict[str, str]:
+    """Return the environment variables that make a worker's results depend on its trial alone.
+
+    Hashes of strings are fixed, and libraries use a single thread. With a worker on every core, more threads would
+    compete for the cores. Parallel sums are also not bit-identical from run to run.
+    """
+    names = (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "NUMEXPR_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+    )
+    return {"PYTHONHASHSEED": "0", **dict.fromkeys(names, "1")}
+
+
+def snapshot_environment(settings: WorkerSettings) -> dict[str, str]:
+    """Return the environment of a process in which crashhunt itself comes from the snapshot too.
+
+    Compiled code does not lie in the snapshot, where it would pass for the code. It lies with the caches of this user,
+    by the digest of the snapshot.
+    """
+    if not settings.code:
+        return {**os.environ, **worker_environment()}
+    paths = os.pathsep.join(filter(None, (*settings.code, os.environ.get("PYTHONPATH"))))
+    ours = {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
+    if settings.sealed is None and (compiled := _compiled(settings)) is not None:
+        ours |= {"PYTHONPYCACHEPREFIX": str(compiled), "PYTHONDONTWRITEBYTECODE": ""}
+    return {**os.environ, **worker_environment(), **ours}
+
+
+def has_fork_server(settings: WorkerSettings) -> bool:
+    """Whether the crashhunt of the settings has a fork server and supervisors: later than 0.1.0, or this one."""
+    package = [Path(folder) / layout.PACKAGE.name for folder in settings.code]
+    return all((found / "executors" / "_fork_server.py").is_file() for found in package if found.is_dir())
+
+
+def _compiled(settings: WorkerSettings) -> Path | None:
+    """The folder for the compiled code of a snapshot; None if there is no place for it."""
+    parts = Path(settings.code[0]).parts
+    if layout.SNAPSHOTS not in parts:
+        return None
+    digest = parts[len(parts) - 1 - parts[::-1].index(layout.SNAPSHOTS) + 1 :][:1]
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "crashhunt" / "compiled"
+    try:
+        cache.mkdir(parents=True, exist_ok=True, mode=0o700)
+        found = cache / (digest[0] if digest else "")
+        found.mkdir(exist_ok=True)
+        os.utime(found)
+        others = sorted(cache.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
+    except (OSError, RuntimeError, IndexError):  # a user without a home
+        return None
+    for old in others[_KEPT_SNAPSHOTS:]:
+        with suppress(OSError):
+            shutil.rmtree(old)
+    return found

@@ -24,7 +24,7 @@ from crashhunt.base.processes import die_with, resume
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import internal_error, scratch_of
-from crashhunt.executors._postmortem import KEY_BYTES, Report, check_report, damaged, died, hung, read_tail
+from crashhunt.executors._postmortem import KEY_BYTES, Report, check_report, damaged, died, hung, read_map, read_tail
 from crashhunt.executors._time_limits import START_UP_S, has_hung
 from crashhunt.recording import BlackBoxFile, Recording, read_black_box
 from crashhunt.simulators import FullBraking
@@ -32,9 +32,10 @@ from crashhunt.trial import Escape, TrialSpec
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
+    from crashhunt.crashes import Borders
     from crashhunt.episode import WorkerSettings
     from crashhunt.executors._protocol import Answer, Done, FromZygote, KillTrial
     from crashhunt.executors._trial_process import Job
@@ -53,7 +54,7 @@ class LostTrialError(Exception):
     """The process of a trial was ended from outside, or by an agent that attacked what it is a fork of.
 
     Args:
-        exit_code: of the process, negative for a signal.
+        exit_code: exit code of the process, negative for a signal.
     """
 
     def __init__(self, exit_code: int) -> None:
@@ -70,7 +71,7 @@ class Ended:
     """A trial that has ended.
 
     Args:
-        result: what came of it.
+        result: the result.
         notices: what people should know.
         braking: how the vehicle brakes that collided, where the settings ask for that.
     """
@@ -81,11 +82,11 @@ class Ended:
 
 
 class Supervisor:
-    """Has a zygote run one trial after another, each in a process of its own.
+    """Has a zygote run one trial after another, each in its own process.
 
     Args:
-        settings: of the hunt.
-        zygote: to the zygote of this slot.
+        settings: settings of the hunt.
+        zygote: connection to the zygote of this slot.
 
     Attributes:
         retires: whether the zygote may run no other trial.
@@ -154,7 +155,7 @@ class Supervisor:
         if not is_there and header.pid == os.getpid():  # another trial has deleted the folder before this one began
             raise LostTrialError(-signal.SIGKILL)
         if report is None:
-            return Ended(self._damaged(spec, "the process could not report what came of it, as it is damaged"))
+            return Ended(self._damaged(spec, "the process could not report the result, as it is damaged"))
         if code != 0 or not report:
             if is_sent_from_outside(code):
                 raise LostTrialError(code)
@@ -239,8 +240,9 @@ class Supervisor:
             self._zygote_pid = message.get("ready", 0) if message is not None else 0
             if not self._zygote_pid and time.monotonic() > deadline:
                 raise CrashhuntError(
-                    f"the simulator cannot be made: it takes more than {START_UP_S + self._settings.timeout_s:g} s",
-                    fix="see what it waits for, or give it more time with --timeout",
+                    f"the simulator cannot be created: its start takes more than "
+                    f"{START_UP_S + self._settings.timeout_s:g} s",
+                    fix="find out why it waits, or raise --timeout",
                 )
 
     def _send(self, message: Job | KillTrial) -> None:
@@ -248,7 +250,7 @@ class Supervisor:
             self._zygote.sendall(json.dumps(message).encode() + b"\n")
 
     def _next(self, timeout_s: float) -> FromZygote | None:
-        """Return the next message of the zygote; None where there is none yet.
+        """Return the next message of the zygote; None if there is none yet.
 
         Raises:
             LostTrialError: the zygote is gone.
@@ -346,9 +348,9 @@ def be_supervisor(pool: socket.socket, zygote: socket.socket, settings: WorkerSe
     """Run trials until the pool has no more; does not return.
 
     Args:
-        pool: to the pool.
-        zygote: to the zygote of this slot.
-        settings: of the hunt.
+        pool: the pool.
+        zygote: connection to the zygote of this slot.
+        settings: settings of the hunt.
         parent: the process that started this one, which ends with it.
     """
     code = 1
@@ -403,7 +405,7 @@ def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) 
 
     Args:
         supervisor: which has run the trial.
-        settings: of the hunt.
+        settings: settings of the hunt.
         ended: the trial.
     """
     result = ended.result
@@ -433,8 +435,13 @@ def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) 
                 shutil.rmtree(scratch_of(settings.scratch, number), ignore_errors=True)
         raise AssertionError
 
+    def borders() -> Iterable[Borders]:
+        from crashhunt.recording import lane_borders  # MCAP takes long to import, and few crashes need it
+
+        return lane_borders(read_map(settings.scratch, scratch_of(settings.scratch, result.spec.number)))
+
     try:
-        return replace(result, escape=find_escape(result, recording(result.spec.number), braking, run))
+        return replace(result, escape=find_escape(result, recording(result.spec.number), braking, run, borders))
     except BundleError as error:
         return replace(result, escape=Escape(why_not=error.message))
     except LostTrialError as error:

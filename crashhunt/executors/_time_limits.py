@@ -35,7 +35,7 @@ def has_hung(
     """Whether a trial is to be ended because it takes too long.
 
     Args:
-        header: of its black box; None where there is none.
+        header: header of its black box; None if there is none.
         begun: whether the process of the trial itself wrote the header; until then `START_UP_S` is added to the limit.
         given_at: when its process was given it, as of `time.monotonic`.
         limit_s: wall time that it may take from its beginning on, in s.
@@ -65,7 +65,7 @@ class ImportKilledError(Exception):
     """A process that imported what trials need was ended by a signal that may come from outside.
 
     Args:
-        exit_code: of the process, negative for a signal.
+        exit_code: exit code of the process, negative for a signal.
         importing: what it could not do, in words.
     """
 
@@ -82,7 +82,7 @@ class ImportWatch:
 
     Attributes:
         importing: what has failed if the process never reports again, as in "the module 'planner' of agent ego cannot
-            be imported"; empty where everything has been imported.
+            be imported"; empty if everything has been imported.
     """
 
     def __init__(self, timeout_s: float) -> None:
@@ -112,7 +112,7 @@ def import_died(importing: str, exit_code: int, *, times: int = 1) -> CrashhuntE
 
     Args:
         importing: as of `ImportWatch`.
-        exit_code: of the process, negative for a signal.
+        exit_code: exit code of the process, negative for a signal.
         times: how often it was tried.
     """
     again = f", {times} times" if times > 1 else ""
@@ -126,8 +126,8 @@ def await_imports(reports: socket.socket, pid: int, timeout_s: float) -> None:
     """Wait until a child has imported what trials need.
 
     Args:
-        reports: from the child: a message before each import, an empty one at the end.
-        pid: of the child.
+        reports: connection from the child: a message before each import, an empty one at the end.
+        pid: pid of the child.
         timeout_s: as of `ImportWatch`.
 
     Raises:

@@ -84,7 +84,7 @@ class TrialProcess:
     Making it takes over the standard output and the signals of the process.
 
     Args:
-        settings: of the hunt.
+        settings: settings of the hunt.
         parts: what has been imported already; None to import it in the process of each trial.
     """
 
@@ -310,7 +310,7 @@ def loaded(settings: WorkerSettings, report: Callable[[str], None] = lambda _: N
     """Import everything that trials need.
 
     Args:
-        settings: of the hunt.
+        settings: settings of the hunt.
         report: as of `Parts.load`.
 
     Raises:

@@ -68,7 +68,7 @@ class WarmTraffics:
     """The suspended processes of a zygote, one for each traffic.
 
     Args:
-        limit: how many there are at most.
+        limit: largest number of suspended processes.
         notify: called with what people should know.
         worth_s: wall time of a warm-up from which on a process is kept for it, in s.
     """
@@ -105,7 +105,7 @@ class WarmTraffics:
             wait: waits until a descriptor can be read; its second argument kills what is waited for.
 
         Returns:
-            The process that ran it and its exit code; None where the trial has to run in a fork of the zygote.
+            The process that ran it and its exit code; None if the trial has to run in a fork of the zygote.
         """
         if self._trial is None or self._limit == 0:
             return None
@@ -182,10 +182,10 @@ class _Suspended:
     """A suspended process, as its zygote knows it.
 
     Args:
-        pid: of the process.
+        pid: pid of the process.
         asks: the end of a pipe to it.
         says: the end of one from it.
-        used: by which trial last.
+        used: number of the trial that used it last.
     """
 
     pid: int
@@ -194,7 +194,7 @@ class _Suspended:
     used: int
 
     def ask(self, text: bytes, wait: Wait) -> _Said | None:
-        """Return what it answers; None where it is gone."""
+        """Return what it answers; None if it is gone."""
         try:
             while text:
                 text = text[_write(self.asks, text) :]
@@ -286,7 +286,7 @@ class Imported:
     """What the processes of trials need not do again, as it was done before they were forked.
 
     Args:
-        parts: what has been imported; None where each trial imports its agents itself.
+        parts: what has been imported; None if each trial imports its agents itself.
         makes_simulator: whether the zygote makes the simulator; if not, each trial makes its own.
     """
 
@@ -301,11 +301,11 @@ def import_parts(settings: WorkerSettings, report: Callable[[str], None]) -> Imp
     """Import what trials need, and find out whether the simulator may be made in a zygote.
 
     Args:
-        settings: of the hunt.
+        settings: settings of the hunt.
         report: as of `Parts.load`; called with nothing at the end.
 
     Returns:
-        None where this process cannot be forked any more.
+        None if this process cannot be forked any more.
 
     Raises:
         CrashhuntError: something cannot be imported.
@@ -362,8 +362,8 @@ def be_zygote(control: socket.socket, settings: WorkerSettings, imported: Import
     """Fork a process for each trial that the supervisor asks for; does not return.
 
     Args:
-        control: to the supervisor.
-        settings: of the hunt.
+        control: connection to the supervisor.
+        settings: settings of the hunt.
         imported: what has been done already.
     """
     try:
@@ -411,7 +411,7 @@ class _Zygote:
                 self._say(said)
 
     def _changed_at(self) -> int:
-        """When a file of the simulator was last added or removed, in ns; 0 where its folder is gone."""
+        """When a file of the simulator was last added or removed, in ns; 0 if its folder is gone."""
         try:
             return self._stage.stat().st_mtime_ns
         except OSError:
@@ -466,7 +466,7 @@ class _Zygote:
                 return
 
     def _next(self) -> Job | KillTrial | None:
-        """Return the next message; None where the supervisor is gone."""
+        """Return the next message; None if the supervisor is gone."""
         while b"\n" not in self._received:
             try:
                 data = self._control.recv(_RECEIVED)

@@ -40,7 +40,7 @@ def write_commonroad(bundle: Bundle, target: Path, *, with_agents: bool = False)
 
     Args:
         bundle: the crash.
-        target: the file; one that is there is replaced.
+        target: the file; an existing one is replaced.
         with_agents: whether the ways that the agents drove are there as obstacles, too.
 
     Returns:

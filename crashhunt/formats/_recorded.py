@@ -34,9 +34,9 @@ class Pose(NamedTuple):
         step: 0 is before the first.
         x: in m.
         y: likewise.
-        z: likewise; 0 where the map is flat.
-        heading: in rad, from -pi to pi, counter-clockwise from the x axis.
-        speed: in m/s.
+        z: likewise; 0 if the map is flat.
+        heading: heading in rad, from -pi to pi, counter-clockwise from the x axis.
+        speed: speed in m/s.
     """
 
     step: int
@@ -109,8 +109,8 @@ class Recorded:
 
     Args:
         title: what it is, in one line.
-        number: of its trial.
-        step_length_s: in s.
+        number: number of its trial.
+        step_length_s: step length in s.
         steps: how many were recorded.
         agents: the ways of the controlled vehicles.
         others: those of everybody else.
@@ -138,19 +138,19 @@ def recorded_of(bundle: Bundle) -> Recorded:
     if not paths.agents:
         raise BundleError(
             f"{bundle.id} has no scene with its agent, so there is nothing to hand on",
-            fix="export it without --as; of a Gymnasium environment no vehicles are recorded",
+            fix="export it without --as: a Gymnasium environment records no vehicles",
         )
     if not lanes:
         raise BundleError(
-            f"{bundle.id} has no map of lanes, so there is no road to hand on",
+            f"{bundle.id} has no map of lanes, so there is no road to export",
             fix="export it without --as, or hunt with a simulator that has lanes",
         )
     for path in (*paths.agents, *paths.others):
         for step, state in enumerate(path.states, path.first):
             if not all(map(math.isfinite, state)):
                 raise BundleError(
-                    f"{bundle.id}: {path.actor.id!r} is nowhere after step {step}: {tuple(state)}",
-                    fix="export it without --as: no other format can say that",
+                    f"{bundle.id}: {path.actor.id!r} has no position after step {step}: {tuple(state)}",
+                    fix="export it without --as, because no other format can represent that",
                 )
     names = _names([*paths.agents, *paths.others])
     ways = [Way(path, name) for path, name in zip((*paths.agents, *paths.others), names, strict=True)]

@@ -20,6 +20,7 @@ SECTIONS = {
     "start": "Start",
     "tutorials": "Tutorials",
     "howto": "How to",
+    "concepts": "Concepts",
     "reference": "Reference",
     "reference/evaluation": "Evaluation",
     "": "More",
@@ -33,7 +34,8 @@ _ORDER = [
     "kinds-of-crashes", "fault", "omissions", "judge", "causes", "what-if", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
     "train-on-crashes",
-    "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "determinism", "security",
+    "criticality", "at-fault", "determinism", "search", "counterfactuals", "crash-rates",
+    "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "security",
     "disturbance-kinds", "forks", "fault-rules", "minimization", "export", "clusters",
     "gallery", "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
@@ -69,7 +71,7 @@ class Page:
         """Return the whole page as Markdown.
 
         Args:
-            parser: of the command line, which is described on one of the pages.
+            parser: parser of the command line, which is described on one of the pages.
         """
         return completed(self.file.read_text(encoding="utf-8"), parser)
 
@@ -109,7 +111,7 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
     Args:
         text: Markdown, in which ``<!-- made from the code: commands -->`` is a placeholder, as are ``api``,
             ``keys`` and ``modules``.
-        parser: of the command line.
+        parser: parser of the command line.
     """
     makers = {
         "commands": lambda: describe_commands(parser),

@@ -64,7 +64,7 @@ def _module(name: str, names: list[str]) -> Iterator[str]:
         if found is not None:
             yield from _described(f"{name}.{public}", found)
         elif names:
-            raise LookupError(f"{name} has no class or function {public}; mend the list in {__file__}")
+            raise LookupError(f"{name} has no class or function {public}; correct the list in {__file__}")
 
 
 def _described(name: str, found: _Definition) -> Iterator[str]:
@@ -239,7 +239,7 @@ def _door(module: str) -> dict[str, tuple[str, str]]:
 
 
 def _listed(tree: ast.Module) -> list[str] | None:
-    """The names in ``__all__``; None where it is made when the module is imported."""
+    """The names in ``__all__``; None if it is made when the module is imported."""
     for node in tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             return ast.literal_eval(node.value) if isinstance(node.value, ast.List) else None
@@ -310,7 +310,7 @@ def _keys(module: str, name: str) -> str:
     text = as_markdown(ast.get_docstring(found) if found else "")
     _, heading, keys = text.partition("*Arguments*:\n\n")
     if not heading:
-        raise LookupError(f"{module}.{name} does not say what its keys are")
+        raise LookupError(f"{module}.{name} does not describe its keys")
     return keys.partition("\n*")[0].rstrip() + "\n"
 
 
@@ -321,7 +321,7 @@ def describe_commands(parser: argparse.ArgumentParser) -> str:
     """Return every command with its arguments and options, as Markdown.
 
     Args:
-        parser: of the command line.
+        parser: parser of the command line.
     """
     return "\n".join(line for command, _ in _commands(parser) for line in _command(command))
 
@@ -419,5 +419,5 @@ def _members(folder: Path) -> Iterator[str]:
 def _said(file: Path) -> str:
     found = _SAID[file.suffix].match(file.read_text(encoding="utf-8"))
     if found is None:
-        raise LookupError(f"{file} does not begin with what it is about")
+        raise LookupError(f"{file} does not begin with a docstring")
     return " ".join(found[1].replace("``", "`").split())

@@ -1,4 +1,4 @@
-"""The shapes of what commands print with ``--json``, as JSON Schema: a file each in ``reference/schemas``.
+"""The output of each command under ``--json``, as JSON Schema: one file per command in ``reference/schemas``.
 
 A shape that its own module declares is used from there. The others are declared here; tests validate all real outputs.
 """
@@ -11,17 +11,21 @@ from typing import Any, Literal, NotRequired, TypedDict
 from crashhunt.base.codec import JsonObject
 from crashhunt.base.json_types import ErrorData, Plain
 from crashhunt.base.schemas import json_schema
-from crashhunt.crashes import CrashSummary
+from crashhunt.crashes import CrashSummary, Ending, JudgementVerdict, Reference, Verdict as FaultVerdict, Why
 from crashhunt.hunts import AuditReport, Finding, HuntState, StoppedBecause
 from crashhunt.ledger import KindData
+from crashhunt.rates import PairVerdict
 from crashhunt.replays import Code, Verdict
-from crashhunt.trial import Value
+from crashhunt.report import ListingEntry
+from crashhunt.trial import Kind, Value
+from crashhunt.whatif import Counts
 
 __all__ = ["SCHEMAS", "describe_schemas"]
 
 _NAMES = {
     "Code": Code,
     "Verdict": Verdict,
+    "Kind": Kind,
     "Value": Value,
     "JsonObject": JsonObject,
     "Plain": Plain,
@@ -306,22 +310,434 @@ class CrashesData(TypedDict):
     left_out: list[str]
 
 
+class PlainRunData(TypedDict):
+    """``crashhunt init``: what the plain traffic did in one run."""
+
+    demand: float
+    simulated_s: float
+    wanted: int
+    entered: int
+    arrived: int
+    running: int
+    halting: int
+    teleports: int
+    collisions: int
+    mean_speed_mps: float
+    persons: int
+
+
+class FirstTrial(TypedDict):
+    """The trial that ``crashhunt init`` runs."""
+
+    outcome: str
+    steps: int
+    wall_s: float
+
+
+class InitData(TypedDict):
+    dir: str
+    map: str
+    lanes_km: float
+    roads: int
+    junctions: int
+    traffic_lights: int
+    crossings: int
+    routes: int
+    ego_routes: int
+    vehicles_per_hour: float
+    plain: list[PlainRunData]
+    trial: FirstTrial | None
+    max_steps: int
+    notes: list[str]
+    next: list[str]
+
+
+"""``crashhunt init``."""
+
+
+class AttemptData(TypedDict):
+    """The runs of one evasive manoeuvre."""
+
+    manoeuvre: str
+    endings: dict[str, Ending]
+    last_step: int | None
+    too_late_step: int | None
+    all_later_run: bool
+    deceleration: float | None
+    changed: list[str]
+
+
+class JudgementData(TypedDict):
+    """The result of ``crashhunt judge`` for one crash."""
+
+    avoidable: bool | None
+    manoeuvre: str
+    last_step: int | None
+    runs: int
+    why_not: str
+    attempts: list[AttemptData]
+    verdict: JudgementVerdict
+    visible_step: int | None
+    why: NotRequired[Why]
+    reference: NotRequired[Reference]
+
+
+class JudgedCrash(JudgementData):
+    """The same with the id of the crash."""
+
+    crash: str
+
+
+class JudgeData(TypedDict):
+    """``crashhunt judge``."""
+
+    judged: list[JudgedCrash]
+
+
+class RuleFinding(TypedDict):
+    """A traffic rule that an actor broke."""
+
+    rule: str
+    blames: FaultVerdict
+    words: str
+    source: str
+
+
+class FaultData(TypedDict):
+    """The vehicle at fault, with the rules."""
+
+    verdict: FaultVerdict
+    findings: list[RuleFinding]
+
+
+class BrakingData(TypedDict):
+    """How the last step was found after which braking avoids the crash."""
+
+    by: Literal["running it", "calculation"] | None
+    how: str | None
+    too_late_step: int | None
+    why_not: str
+
+
+class NearestMoment(TypedDict):
+    """The closest moment of a near miss."""
+
+    step: int
+    danger: float
+    agent: str
+    other: str
+
+
+class DangerSummary(TypedDict):
+    """Criticality over a trial, and its greatest value."""
+
+    over_the_trial: float
+    greatest: float
+    step: int | None
+    other: str | None
+
+
+class DangerStep(TypedDict):
+    """Criticality after one step; null if unknown."""
+
+    step: int
+    own: float | None
+    from_behind: float | None
+
+
+class DangerData(TypedDict):
+    """Criticality of a trial."""
+
+    ranked_by: float
+    own: DangerSummary
+    from_behind: DangerSummary
+    steps: list[DangerStep]
+
+
+class MomentData(TypedDict):
+    """The agent and the collision partner after one step; null for what is unknown or infinite."""
+
+    step: int
+    time_s: float
+    speed: float | None
+    other_speed: float | None
+    closing_speed: float | None
+    gap_to_other_m: float | None
+    time_to_other_s: float | None
+    time_to_collision_s: float | None
+    gap_m: float | None
+    required_deceleration: float | None
+    action: list[float] | str | None
+
+
+class ShowData(TypedDict):
+    """``crashhunt show``."""
+
+    crash: str
+    summary: str
+    agent: str
+    other: str
+    words: list[str]
+    full_braking: float | None
+    last_escape_step: int | None
+    braking: BrakingData
+    judged: JudgementData | None
+    fault: FaultData
+    nearest: NearestMoment | None
+    danger: DangerData | None
+    moments: list[MomentData]
+
+
+class DashboardData(TypedDict):
+    """``crashhunt dashboard``: its address; printed before the server starts."""
+
+    url: str
+    host: str
+    port: int
+    token: str
+
+
+ExportData = TypedDict(
+    "ExportData",
+    {
+        "crash": str,
+        "file": str,
+        "bytes": int,
+        "as": NotRequired[Literal["openscenario", "commonroad"]],
+        "actors": NotRequired[dict[str, list[str | int]]],
+    },
+)
+"""``crashhunt export``."""
+
+
+class SuiteRunData(TypedDict):
+    """``crashhunt suite run``."""
+
+    hunts: list[HuntState]
+
+
+class RerunData(TypedDict):
+    """``crashhunt rerun``."""
+
+    hunts: list[HuntState]
+    replaced: list[str]
+
+
+class Origin(TypedDict):
+    """An origin whose code may run."""
+
+    fingerprint: str
+    path: str
+    runs: str
+    trusted_at: str
+
+
+class TrustedData(TypedDict):
+    """``crashhunt trust``."""
+
+    trusted: list[Origin]
+
+
+class RemovedData(TypedDict):
+    """``crashhunt trust --remove``."""
+
+    removed: list[Origin]
+
+
+class SplitCrash(TypedDict):
+    """A crash in one of the parts."""
+
+    id: str
+    hunt: str
+    path: str
+    seed: int
+
+
+class SplitData(TypedDict):
+    """``crashhunt split``."""
+
+    test: float
+    training: list[SplitCrash]
+    held_out: list[SplitCrash]
+    software_faults: int
+
+
+class ComparedHunt(TypedDict):
+    """One hunt of a comparison."""
+
+    dir: str
+    state: str
+    agents: dict[str, str]
+    trials: int
+    crashes: int
+    crash_rate: float | None
+    interval: tuple[float, float] | None
+    why_not: str
+    median_steps_to_crash: float | None
+    median_time_to_collision_s: float | None
+    outcomes: dict[str, int]
+    counted: str
+    disturbed: int | None
+    excluded: int
+
+
+class ComparedPair(TypedDict):
+    """The first hunt compared with another one."""
+
+    first: str
+    second: str
+    trials: int
+    only_first: int
+    only_second: int
+    both: int
+    p_value: float | None
+    caution: str
+    test: Literal["pairs", "intervals", ""]
+    why_unpaired: str
+    counts: tuple[int, int, int, int]
+    evidence: float | None
+    difference: Bounds | None
+    units: int
+    excluded: int
+    answer: Literal["first", "second", "undecided", ""]
+    verdict: str
+
+
+class CompareData(TypedDict):
+    """``crashhunt compare``."""
+
+    hunts: list[ComparedHunt]
+    pairs: list[ComparedPair]
+
+
+class ScenarioPairs(TypedDict):
+    """The pairs of one scenario."""
+
+    name: str
+    pairs: int
+    only_base: int
+    only_head: int
+    both: int
+    invalid: int
+
+
+class GateCorpus(TypedDict):
+    """The cases of the corpus that a gate ran with HEAD."""
+
+    ok: bool
+    cases: int
+    failed: list[str]
+    cannot_run: list[str]
+
+
+class Compared(TypedDict):
+    """The commits or agents of a gate."""
+
+    base: str
+    head: str
+
+
+class GateData(TypedDict):
+    """``crashhunt gate``."""
+
+    verdict: PairVerdict
+    pairs: int
+    base: RateEntry | None
+    head: RateEntry | None
+    difference: Bounds | None
+    corpus: GateCorpus | None
+    compared: Compared
+    only_base: int
+    only_head: int
+    both: int
+    evidence: float | None
+    margin: float
+    confidence: float
+    seed: int | None
+    scenarios: list[ScenarioPairs]
+    why: str
+    interrupted: bool
+    dir: str | None
+    trained_on: int
+
+
+class AgentsData(TypedDict):
+    """``crashhunt agents``."""
+
+    agents: list[ListingEntry]
+
+
+class DisturbancesData(TypedDict):
+    """``crashhunt disturbances``."""
+
+    disturbances: list[ListingEntry]
+
+
+class OraclesData(TypedDict):
+    """``crashhunt oracles``."""
+
+    oracles: list[ListingEntry]
+
+
+class ScenariosData(TypedDict):
+    """``crashhunt scenarios``."""
+
+    scenarios: list[ListingEntry]
+
+
+class Topic(TypedDict):
+    """A page of the guide."""
+
+    topic: str
+    section: str
+    title: str
+
+
+class TopicText(Topic):
+    """A page of the guide with its text."""
+
+    text: str
+
+
+class TopicsData(TypedDict):
+    """``crashhunt guide`` without a topic."""
+
+    topics: list[Topic]
+
+
 SCHEMAS: dict[str, Any] = {
     "run": RunData,
+    "init": InitData,
     "replay": OneReplay | SeveralReplays,
+    "show": ShowData,
+    "report": ReportData,
+    "dashboard": DashboardData,
+    "export": ExportData,
+    "suite-run": SuiteRunData,
     "status": StatusData,
-    "rate": RatesData,
+    "rerun": RerunData,
     "crashes": CrashesData,
+    "judge": JudgeData,
+    "whatif": Counts,
     "shrink": ShrinkData,
-    "check": CheckData,
-    "bisect": BisectData,
+    "corpus-add": CorpusListData,
     "corpus-run": CorpusRunData,
     "corpus-list": CorpusListData,
-    "corpus-add": CorpusListData,
-    "report": ReportData,
+    "bisect": BisectData,
+    "trust": TrustedData | RemovedData,
+    "check": CheckData,
+    "split": SplitData,
+    "compare": CompareData,
+    "gate": GateData,
+    "rate": RatesData,
+    "agents": AgentsData,
+    "disturbances": DisturbancesData,
+    "oracles": OraclesData,
+    "scenarios": ScenariosData,
+    "guide": TopicsData | TopicText,
     "error": ErrorData,
 }
-"""Commands with the types of what they print; ``error`` is what each prints if it fails."""
+"""Every command that has ``--json``, with the type of its output; ``error`` is the output of each if it fails."""
 
 
 def describe_schemas() -> dict[str, str]:

@@ -1,4 +1,10 @@
 from ._check import Checked as Checked, Finding as Finding, check as check, salvage as salvage
+from ._crashes import (
+    CrashTally as CrashTally,
+    FoundCrashes as FoundCrashes,
+    dropped_crashes as dropped_crashes,
+    find_crashes as find_crashes,
+)
 from ._hunt import Hunt as Hunt
 from ._next_trials import (
     GREATEST_LAG as GREATEST_LAG,
@@ -6,13 +12,14 @@ from ._next_trials import (
     growing_lag as growing_lag,
     spec_of as spec_of,
 )
-from ._phases import PhaseStatus as PhaseStatus
 from ._preflight import Preflight as Preflight, TrafficSurveyor as TrafficSurveyor
 from ._progress import (
     HuntStatus as HuntStatus,
+    PhaseStatus as PhaseStatus,
     SearchStatus as SearchStatus,
     StrategyStatus as StrategyStatus,
 )
+from ._rates import counting_rule as counting_rule, why_no_interval as why_no_interval
 from ._reports import AuditReport as AuditReport, HuntReport as HuntReport, StoppedBecause as StoppedBecause
 from ._results import (
     FACTS as FACTS,
@@ -26,8 +33,6 @@ from ._results import (
     write_parquet as write_parquet,
     write_text as write_text,
 )
-from ._retention import dropped_crashes as dropped_crashes
-from ._running_rates import counting_rule as counting_rule, why_no_interval as why_no_interval
 from ._state import (
     BranchSums as BranchSums,
     HuntDirectory as HuntDirectory,
@@ -42,4 +47,3 @@ from ._state import (
     sums_of_branches as sums_of_branches,
     sums_of_probes as sums_of_probes,
 )
-from ._tally import CrashTally as CrashTally, FoundCrashes as FoundCrashes, find_crashes as find_crashes

@@ -41,7 +41,7 @@ class Finding(Serializable):
     Args:
         where: the file or folder.
         what: is wrong with it.
-        lost: what cannot be had from it any more; empty where nothing is lost.
+        lost: what cannot be had from it any more; empty if nothing is lost.
         fix: what gets the rest.
         damaged: whether it is damage; else it is worth knowing, and harmless.
     """
@@ -62,9 +62,9 @@ class Checked:
         kind: ``hunt``, ``crash`` or ``file``.
         protected: whether every trial has a digest; the ledgers of early versions have none.
         trials: the numbers of the trials whose rows are as they were written.
-        damaged_trials: of those that are not.
+        damaged_trials: reason for each damaged trial.
         crashes: the names of the bundles that are as they were written.
-        damaged_crashes: of those that are not.
+        damaged_crashes: reason for each damaged crash.
         findings: what is wrong.
         dropped: the trials of which the bundles were given up, as shorter crashes of their kind were kept.
     """
@@ -400,13 +400,13 @@ def salvage(found: Checked, to: Path) -> dict[str, int]:
     """
     if found.kind != "hunt":
         raise HuntDirectoryError(
-            f"{str(found.dir)!r} is no hunt, of which parts could be saved", fix="give the directory of a hunt"
+            f"{str(found.dir)!r} is not a hunt with recoverable parts", fix="give the directory of a hunt"
         )
     settings = _settings(found.dir)
     try:
         if to.exists() and not is_empty_folder(to):
             if not _is_same(found, settings, to):
-                raise HuntDirectoryError("it is there already", fix="give a new directory", where=str(to))
+                raise HuntDirectoryError("the directory exists already", fix="give a new directory", where=str(to))
             return {"trials": len(_numbers(found, settings)), "crashes": len(found.crashes)}
         with temporary_beside(to) as building:
             building.mkdir()

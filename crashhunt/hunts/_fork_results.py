@@ -1,6 +1,7 @@
-"""Results of copies: the branches and probes of all trials are summed up, and their crashes run from the start.
+"""Runs from the start after the last trial: crashes of copies, and the most dangerous trials without a crash.
 
-A copy shows what may happen. Only a run from the start is a crash, because a bundle of it replays.
+The branches and probes of all trials are summed up. A copy shows what may happen. Only a run from the start is a
+crash, because a bundle of it replays.
 """
 
 from __future__ import annotations
@@ -11,7 +12,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.hunts._rare import RareWatch, crashed_copies
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.temporary import remove_at_once
+from crashhunt.crashes import list_near_misses
+from crashhunt.hunts._rates import RareWatch, crashed_copies
 from crashhunt.hunts._reports import BranchReport, ProbeReport, RareReport
 from crashhunt.hunts._state import BRANCHES, PROBES
 from crashhunt.hunts._verification import Found
@@ -20,14 +24,16 @@ from crashhunt.trial import Branches, Stress, in_turn
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from crashhunt.crashes import Bundle
     from crashhunt.hunts._next_trials import Trials
     from crashhunt.hunts._progress import Progress
-    from crashhunt.hunts._verification import VerificationRuns
+    from crashhunt.hunts._verification import TrialReruns, VerificationRuns
     from crashhunt.trial import Branch, Disturbance, ForcedCopy, TrialResult
 
 
 __all__ = [
     "CopiedCrashes",
+    "keep_near_misses",
     "likeliest",
     "mildest",
     "verify_branches",
@@ -95,7 +101,7 @@ def verify_branches(copies: VerificationRuns) -> BranchReport | None:
 
 
 def likeliest(result: TrialResult) -> Found | None:
-    """Return the likeliest branch of a trial that crashed, as it is from the start; None where none did."""
+    """Return the likeliest branch of a trial that crashed, as it is from the start; None if none did."""
     if result.branches is None or not result.branches.crashes:
         return None
     return _specification(result, max(result.branches.crashes, key=_likely))
@@ -176,7 +182,7 @@ def _as_it_took_place(stress: Stress | None, result: TrialResult) -> Disturbance
 
 
 def mildest(result: TrialResult) -> Found | None:
-    """Return a trial from the start, with the mildest that made a copy of it crash; None where nothing did."""
+    """Return a trial from the start, with the mildest that made a copy of it crash; None if nothing did."""
     stress = result.stress
     if stress is None or stress.disturbance is None:
         return None
@@ -196,8 +202,8 @@ class CopiedCrashes:
 
     Args:
         copies: runs from the start what they have found.
-        progress: of the hunt, which gets what has crashed there as well.
-        trials: of the hunt that are still to run.
+        progress: progress of the hunt, which gets what has crashed there as well.
+        trials: trials of the hunt that are still to run.
     """
 
     def __init__(self, copies: VerificationRuns, progress: Progress, trials: Trials) -> None:
@@ -295,7 +301,7 @@ def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport
         differences: how many trials of the audit were not the same again.
 
     Returns:
-        None where the hunt is not in rare mode.
+        None if the hunt is not in rare mode.
     """
     again = copies.again
     if not again.settings.rare or copies.disturber is None:
@@ -322,3 +328,47 @@ def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport
 def _crash_of_copy(result: TrialResult, copy: ForcedCopy) -> Found:
     spec = replace(result.spec, disturbances=copy.disturbances, forcing=None, origin="rare")
     return Found(spec, copy.crash, copy.step)
+
+
+# The most dangerous trials without a crash, kept as bundles of their own.
+#
+# They are run once more for that, each in a fresh process, after the last trial: so a hunt is no slower by them until
+# then, a hunt of before can be asked for them, and what is kept is known to happen again.
+
+
+def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
+    """See that the most dangerous trials of a hunt are there as bundles, and no others; return them in that order.
+
+    Args:
+        again: runs trials of the hunt again. Its settings say how many; where that is none, those that are there stay.
+            Its notes get a line for each trial that could not be kept, and why.
+    """
+    directory, ledger, keep = again.place.path, again.ledger, again.settings.run.near_misses
+    if not keep or len(again.stops):
+        return ()
+    wanted = {number: result for number in ledger.most_dangerous(keep)
+              if (result := ledger.result(number)) is not None}  # fmt: skip
+    for bundle in list_near_misses(directory):
+        result = wanted.get(bundle.result.spec.number)
+        if result is not None and result.digest == bundle.result.digest:
+            del wanted[bundle.result.spec.number]
+        else:
+            remove_at_once(bundle.path)
+    if wanted:
+        again.phases.begin("near misses", len(wanted))
+    try:
+        for one in again.run([result.spec for result in wanted.values()], layout.NEAR_MISSES):
+            again.phases.advance()
+            now, was = one.result, wanted[one.result.spec.number]
+            if now.was_killed_from_outside:
+                what = f"trial {now.spec.number}, a near miss, was {now.summary}"
+                again.notes.append(f"{what}: it has no bundle until the same command is run again")
+            elif was.is_identical_run(now):
+                one.write(was, confirmed=True)
+            else:
+                again.failed.append(now)
+                what = f"trial {now.spec.number}, a near miss, is another one in a fresh process"
+                again.notes.append(f"{what}: it has no bundle")
+    except CrashhuntError as error:
+        again.notes.append(f"near misses could not be run again: {error}")
+    return tuple(list_near_misses(directory))

@@ -16,15 +16,13 @@ from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import internal_error, scratch_of
 from crashhunt.executors import SharedExecutors, make_executor, read_map
-from crashhunt.hunts._fork_results import CopiedCrashes, verify_fork_results, verify_rare
+from crashhunt.hunts._crashes import prune_bundles, tally_crashes
+from crashhunt.hunts._fork_results import CopiedCrashes, keep_near_misses, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import GREATEST_LAG, Trials, Unanswered, settings_of_workers
-from crashhunt.hunts._phases import PhaseClock, PhaseStatus, RemainingTime
 from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
-from crashhunt.hunts._progress import HuntStatus, Progress
-from crashhunt.hunts._rare import Forcings, RareWatch
+from crashhunt.hunts._progress import HuntStatus, PhaseClock, PhaseStatus, Progress, RemainingTime
+from crashhunt.hunts._rates import Forcings, RareWatch, bar_watch, rate_watch
 from crashhunt.hunts._reports import HuntReport, StoppedBecause
-from crashhunt.hunts._retention import keep_near_misses, prune_bundles
-from crashhunt.hunts._running_rates import bar_watch, rate_watch
 from crashhunt.hunts._state import (
     HEARTBEAT_S,
     HuntDirectory,
@@ -34,7 +32,6 @@ from crashhunt.hunts._state import (
     sums_of_branches,
     sums_of_probes,
 )
-from crashhunt.hunts._tally import tally_crashes
 from crashhunt.hunts._verification import Audit, AuditsLeft, Confirmation, TrialReruns, VerificationRuns, is_settled
 from crashhunt.ledger import Ledger
 from crashhunt.plans import core_of, disturber, parallel_here, sampler_of
@@ -248,7 +245,9 @@ class Hunt:
         runs_again.judge(progress)
         if stopped in ("all_trials", "time") and progress.last_wanted is not None:
             stopped = progress.why_stopped(keep_going=settings.run.keep_going)
-        prune_bundles(ledger, progress, settings.run, final=not self._stops)
+        progress.crashes = prune_bundles(
+            ledger, progress.kinds, progress.crashes, settings.run.keep, final=not self._stops
+        )
         progress.replace(runs_again.confirm(progress.crashes))
         if self._audits_left.numbers:
             self._audits_left.finish(runs_again, progress)
@@ -385,7 +384,7 @@ class Hunt:
                     heartbeat = time.monotonic()
                     self._restore_ledger(ledger, progress)
                     release_shared_memory(self._place.scratch, of_ended=True)
-                    prune_bundles(ledger, progress, run)
+                    progress.crashes = prune_bundles(ledger, progress.kinds, progress.crashes, run.keep)
                     ledger.note(**progress.noted())
                 watch(self._status(progress, "hunting", executor.where()))
             executor.cancel()
@@ -468,33 +467,22 @@ class Hunt:
     def _take(
         self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, trials: Trials, progress: Progress
     ) -> None:
-        """Account for a trial that has ended."""
+        """Write the row of a trial that has ended, after the files that belong to it; then count the trial."""
         settings = self.settings
         if self._disturber is not None:
             result = replace(result, log_likelihood=self._disturber.log_likelihood_of(result))
-        trials.ended(result)
-        if not self._unanswered.account(result, progress):
-            return
-        crashed = result.outcome in settings.crash_on
-        progress.count(result, crashed=crashed)
-        left = max(0, settings.trials - sum(progress.outcomes.values()))
-        progress.remaining.ended(time.monotonic(), left, progress.parallel)
-        if progress.counted is not None:
-            progress.counted.add(result)
-        if crashed:
-            if progress.kinds is not None:
+        if self._unanswered.account(result, progress):
+            crashed = result.outcome in settings.crash_on
+            if crashed and progress.kinds is not None:
                 self._save(result, ledger, snapshot, progress)
-            else:
-                progress.found[result.spec.number] = result
-            return
-        if result.outcome is Outcome.INVALID:
-            progress.last_invalid = result
-        else:
-            progress.take(result)
-            self._copied.add(result)
-        if result.kept:
-            write_trial(self.directory, result, scratch_of(self._place.scratch, result.spec.number))
-        ledger.record(result, snapshot=snapshot.digest)
+            elif not crashed:
+                if result.kept:
+                    write_trial(self.directory, result, scratch_of(self._place.scratch, result.spec.number))
+                ledger.record(result, snapshot=snapshot.digest)
+            progress.count(result, crashed=crashed, planned=settings.trials)
+            if not crashed and result.outcome is not Outcome.INVALID:
+                self._copied.add(result)
+        trials.ended(result)
 
     def _save(self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, progress: Progress) -> None:
         """Save a crash: first the bundle, then the row, so that a crash in the ledger always has its bundle."""
@@ -534,6 +522,7 @@ class Hunt:
             kinds=kinds,
             newest_kind_s=newest_s,
             newest_kind_trials=newest_trials,
+            types_by_cause=progress.kinds.types_by_cause if progress.kinds is not None else None,
             time_left_s=progress.time_left_s,
             disturbed=progress.disturbed if self._disturber is not None else None,
             stressed=progress.stressed,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.hunts._progress import Progress
-    from crashhunt.hunts._rare import Forcings
+    from crashhunt.hunts._rates import Forcings
     from crashhunt.ledger import Ledger
     from crashhunt.plans import HuntSettings
     from crashhunt.samplers import NamedSampler
@@ -57,7 +57,7 @@ def growing_lag(number: int, most: int) -> int:
     before trial 96.
 
     Args:
-        number: of the trial.
+        number: number of the trial.
         most: the greatest delay.
     """
     return min(most, _FIRST_LAG + number // _TRIALS_PER_LAG)
@@ -71,16 +71,16 @@ class Trials:
     defines when it receives results.
 
     Args:
-        settings: of the hunt.
+        settings: settings of the hunt.
         sampler: who proposes.
-        ledger: of the hunt.
+        ledger: ledger of the hunt.
         finished: the numbers of the trials that have ended.
         unanswered: those of them that run again, in order of their numbers: something outside of them kept answers from
             it. The sampler receives the result in the ledger, and not that of the second run, so that a resumed hunt
             proposes the same trials.
         lag: how many trials the hunt has under way at once; where it is deterministic, how many it may.
         lag_grows: whether the first trials of a deterministic hunt have a smaller lag (`growing_lag`).
-        disturber: what draws their disturbances; None where they have none.
+        disturber: what draws their disturbances; None if they have none.
         forcings: the forcing of each root, in rare mode; None in any other hunt.
 
         begun_with: the version of the sampler's proposals in the hunt so far; None if the hunt has none.
@@ -125,7 +125,7 @@ class Trials:
 
     @property
     def upcoming(self) -> int | None:
-        """The number of the next one; all of lower numbers have ended or are under way. None where there is none."""
+        """The number of the next one; all of lower numbers have ended or are under way. None if there is none."""
         upcoming = [one.number for one in list(self._unanswered)[:1]] + [
             one for one in (self._next,) if one is not None
         ]
@@ -337,7 +337,7 @@ class Unanswered:
     """The trials of a hunt that run again. Their rows stay in the ledger until what comes of it replaces them.
 
     Args:
-        ledger: of the hunt.
+        ledger: ledger of the hunt.
     """
 
     def __init__(self, ledger: Ledger) -> None:
@@ -358,8 +358,8 @@ class Unanswered:
         """Take note of any trial that has ended; return whether its result is to be recorded.
 
         Args:
-            result: of the trial.
-            progress: of the hunt, which has counted the trial before if it runs again.
+            result: result of the trial.
+            progress: progress of the hunt, which has counted the trial before if it runs again.
         """
         if result.is_to_be_run_again:
             self._open.add(result.spec.number)

@@ -50,9 +50,9 @@ class Preflight:
     may well do, and nothing is held back.
 
     Args:
-        settings: of the hunt.
+        settings: settings of the hunt.
         planned: how many trials there are to be.
-        files: of arguments that name files, to where the snapshot has them.
+        files: files of arguments that name files, to where the snapshot has them.
         code: folders of the snapshot from which agents are imported.
         listen: called before the first result is accounted for, as it may be refused why there are none.
     """
@@ -111,7 +111,7 @@ class Preflight:
         places = re.findall(r'^  File "([^"]+)", line (\d+)', trace, re.MULTILINE)
         return ArgumentError(
             f"{self._settings.agents[failure.agent].agent} does not start: {kind}{message}",
-            fix=f"mend {names or 'the agent'}",
+            fix="install the package" if "pip install" in message else f"correct {names or 'the agent'}",
             where=":".join(places[-1]) if kind and places else f"agent {failure.agent}",
         )
 
@@ -126,8 +126,8 @@ class Heard:
     """What workers have to say, until it is written down; it is heard before that, as it may refuse the hunt.
 
     Args:
-        settings: of the hunt.
-        outcomes: of the trials that have ended, with how many.
+        settings: settings of the hunt.
+        outcomes: outcomes of the trials that have ended, with how many.
     """
 
     def __init__(self, settings: HuntSettings, outcomes: Mapping[str, int]) -> None:
@@ -166,7 +166,7 @@ class Heard:
         )
         flags = " and ".join(flag for flag, value in asked if value)
         agents = ", ".join(dict.fromkeys(chosen.agent for chosen in self._settings.agents.values()))
-        fix = f"mend {agents}, or leave {flags} out"
+        fix = f"correct {agents}, or omit {flags}"
         return UsageError(f"{flags}: trials with {agents} cannot be copied: {why}", fix=fix)
 
 
@@ -174,8 +174,8 @@ def is_hopeless(settings: HuntSettings, outcomes: Mapping[str, int]) -> bool:
     """Whether so many trials could not be set up, and none could, that no other will be.
 
     Args:
-        settings: of the hunt.
-        outcomes: of its trials, with how many.
+        settings: settings of the hunt.
+        outcomes: outcomes of its trials, with how many.
     """
     enough = min(settings.most_trials, max(_INVALID_BEFORE_GIVING_UP, 2 * settings.run.parallel))
     invalid = outcomes.get(str(Outcome.INVALID), 0)
@@ -214,7 +214,7 @@ class TrafficSurveyor:
     """Replaces the candidates that route files promise with the vehicles that do enter.
 
     Args:
-        directory: of the hunt. A hunt that is there keeps its candidates.
+        directory: directory of the hunt. A hunt that is there keeps its candidates.
         overwrite: whether that hunt is to be removed.
     """
 

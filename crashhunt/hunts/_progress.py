@@ -1,37 +1,33 @@
-"""How a hunt is going: the figures of the status screen, of ``status`` and of the page."""
+"""How a hunt is going: the figures of the status screen, of ``status`` and of the page; phases and the time left."""
 
 from __future__ import annotations
 
 import math
+import statistics
 import time
-from collections import Counter
+from collections import Counter, deque
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING
+from itertools import islice
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from crashhunt.base.capabilities import supports
-from crashhunt.base.errors import BundleError
+from crashhunt.base.codec import Serializable
 from crashhunt.crashes import (
     SIGNATURE_VERSION,
-    Division,
     Group,
-    cause_of,
-    fault_of,
-    features_of,
-    groups_of,
-    judgement_of,
-    signature_of,
 )
 from crashhunt.executors import HasNodes
-from crashhunt.hunts._phases import PhaseStatus, RemainingTime
+from crashhunt.hunts._crashes import CrashTally, Kinds
 from crashhunt.hunts._reports import kind_data
-from crashhunt.hunts._tally import CrashTally
+from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
-    from crashhunt.crashes import Bundle, Cause, Signature
+    from crashhunt.crashes import Bundle
     from crashhunt.executors import Executor, NodeFigures
-    from crashhunt.hunts._rare import RareWatch
+    from crashhunt.hunts._rates import RareWatch
     from crashhunt.hunts._reports import AuditReport, StoppedBecause
     from crashhunt.ledger import Facts, Noted, RunningRate
     from crashhunt.plans import RunSettings
@@ -42,248 +38,18 @@ if TYPE_CHECKING:
 
 __all__ = [
     "HuntStatus",
-    "Judged",
-    "Kinds",
+    "PhaseClock",
+    "PhaseName",
+    "PhaseStatus",
     "Progress",
+    "RemainingTime",
     "SearchStatus",
     "Searching",
     "StrategyStatus",
 ]
 
-_SHARE_OF_TIME = 0.05  # that grouping crashes for a screen may take
 
-# Which kinds of crashes a hunt has found, while it runs.
-
-
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """A crash whose cause was searched for.
-
-    Args:
-        bundle: the crash, with its judgement.
-        cause: the cause; None where the crash cannot be run again.
-        is_stopped: whether the search was interrupted, so that nothing is known.
-    """
-
-    bundle: Bundle
-    cause: Cause | None = None
-    is_stopped: bool = False
-
-
-class Kinds:
-    """The kinds of the crashes that a hunt has saved.
-
-    Args:
-        wanted: how many kinds are enough; 0 for never.
-        crashes: that were saved before.
-        newest: when the last new kind came, in s since the epoch; None where that is unknown.
-        only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
-        dropped: of each kind, in words, the trials whose bundles were given up before.
-        dropped_at_fault: of these, the trials whose crashes are the agent's own fault.
-        by_cause: how many crashes of each type to judge, so that each cause of a type counts; 0: types count.
-    """
-
-    def __init__(
-        self,
-        wanted: int,
-        crashes: Sequence[Bundle] = (),
-        newest: float | None = None,
-        *,
-        only_at_fault: bool = False,
-        dropped: Mapping[str, Sequence[int]] | None = None,
-        dropped_at_fault: Sequence[int] = (),
-        by_cause: int = 0,
-    ) -> None:
-        self._by_cause = by_cause
-        self._divisions: dict[Signature, Division] = {}
-        self._only_at_fault = only_at_fault
-        self._at_fault: set[int] = set()
-        self._wanted = wanted
-        self._signed: dict[int, tuple[Signature, Bundle]] = {}  # by the number of the trial
-        self._seen: set[Signature] = set()
-        self._first: dict[tuple[Signature, Cause | None], int] = {}  # of what counts, its trial of the least number
-        self._groups: tuple[Group, ...] | None = None
-        self._shown: tuple[Group, ...] = ()
-        self._due = 0.0
-        self.newest = newest
-        self.newest_trial: int | None = None
-        there = {bundle.result.spec.number for bundle in crashes}  # it was killed before it had removed them
-        self.dropped = {
-            words: [number for number in numbers if number not in there] for words, numbers in (dropped or {}).items()
-        }
-        self._dropped_at_fault = {number for number in dropped_at_fault if number not in there}
-        for bundle in crashes:
-            self._sign(bundle)
-
-    def add(self, bundle: Bundle, ended: int) -> None:
-        """Take in a crash that has been saved.
-
-        Args:
-            bundle: the crash.
-            ended: how many trials have ended by now.
-        """
-        if self._sign(bundle):
-            self.newest, self.newest_trial = time.time(), ended
-
-    def groups(self, *, running: bool = False) -> tuple[Group, ...]:
-        """Return what there is, the most frequent kind first, each with its crashes in the order of their trials.
-
-        Args:
-            running: for a screen, which asks ten times a second: those of some moments ago, where new ones would take
-                too much of the time, as with 10,000 crashes.
-        """
-        began = time.monotonic()
-        if running and self._groups is None and began < self._due:
-            return self._shown
-        if self._groups is None:
-            dropped = {words: len(numbers) for words, numbers in self.dropped.items()}
-            self._groups = groups_of((self._signed[number] for number in sorted(self._signed)), dropped)
-            ended = time.monotonic()
-            self._shown, self._due = self._groups, ended + (ended - began) / _SHARE_OF_TIME
-        return self._groups
-
-    def surplus(self, keep: int, *, final: bool = False) -> list[Bundle]:
-        """Return the crashes beyond the `keep` shortest of each crash type, or of each cause, and forget them.
-
-        They still count, but are no members any more. A type whose crashes are still being judged keeps all of them.
-
-        Args:
-            keep: how many stay.
-            final: whether no more crashes are judged.
-        """
-        found = []
-        for group in groups_of(self._signed.values()):
-            for bundles in self._parts(group, final=final):
-                ordered = sorted(bundles, key=self._worth)
-                judged = self._divisions[group.signature].judged if group.signature in self._divisions else frozenset()
-                # The runs that show the cause are in the bundle of a judged crash, so one of them stays.
-                shown = next((place for place, one in enumerate(ordered) if one.result.spec.number in judged), 0)
-                if keep <= shown:
-                    ordered.insert(keep - 1, ordered.pop(shown))
-                for bundle in ordered[keep:]:
-                    number = bundle.result.spec.number
-                    del self._signed[number]
-                    if number in self._at_fault:
-                        self._at_fault.discard(number)
-                        self._dropped_at_fault.add(number)
-                    self.dropped.setdefault(str(group.signature), []).append(number)
-                    found.append(bundle)
-        if found:
-            self._groups = None
-        return found
-
-    def _parts(self, group: Group, *, final: bool) -> list[list[Bundle]]:
-        """Return the crashes of a type by cause; none where that is not known yet."""
-        division = self._divisions.get(group.signature)
-        if division is None:
-            return [list(group.bundles)]
-        if not division.is_complete and not final:
-            return []
-        causes = division.causes()
-        parts: dict[Cause, list[Bundle]] = {}
-        for bundle in group.bundles:
-            parts.setdefault(causes[bundle.result.spec.number], []).append(bundle)
-        return list(parts.values())
-
-    def next_to_judge(self) -> Bundle | None:
-        """Return the next crash whose cause is wanted; None where there is none for now."""
-        for division in self._divisions.values():
-            if (number := division.choose()) is not None:
-                return self._signed[number][1]
-        return None
-
-    def count_to_judge(self) -> int:
-        """Return how many crashes are to be judged."""
-        return sum(division.left for division in self._divisions.values())
-
-    def settle(self, judged: Judged) -> None:
-        """Take in the cause of a crash."""
-        number = judged.bundle.result.spec.number
-        if judged.is_stopped:
-            self._divisions[self._signed[number][0]].postpone(number)
-        else:
-            self._settle(number, judged.cause)
-
-    def _settle(self, number: int, cause: Cause | None) -> None:
-        signature = self._signed[number][0]
-        self._divisions[signature].settle(number, cause)
-        self._count(number, signature, cause)
-
-    @property
-    def types_by_cause(self) -> int | None:
-        """How many causes there are, each type on its own; None where types count."""
-        return len(self._counted()) if self._by_cause else None
-
-    def _count(self, number: int, signature: Signature, cause: Cause | None) -> None:
-        if number in self._at_fault or not self._only_at_fault:
-            known = None if cause is None or cause.kind == "unknown" else cause
-            self._first[signature, known] = min(number, self._first.get((signature, known), number))
-
-    def _counted(self) -> list[int]:
-        """Return the first trials of what counts: a type without a known cause counts once."""
-        caused = {signature for signature, cause in self._first if cause is not None}
-        return sorted(
-            number for (signature, cause), number in self._first.items() if cause is not None or signature not in caused
-        )
-
-    def _worth(self, bundle: Bundle) -> tuple[bool, int, int]:
-        """What is kept first: what was hunted for, and of that the shortest."""
-        result = bundle.result
-        return self._only_at_fault and result.spec.number not in self._at_fault, result.steps, result.spec.number
-
-    @property
-    def until(self) -> int | None:
-        """The least number of a trial up to which there are enough kinds; None where there are not."""
-        firsts = self._counted()
-        return firsts[self._wanted - 1] if 0 < self._wanted <= len(firsts) else None
-
-    @property
-    def at_fault(self) -> tuple[int, ...] | None:
-        """The trials whose crashes are the agent's own fault, also without a bundle; None where that was not asked."""
-        return tuple(sorted(self._at_fault | self._dropped_at_fault)) if self._only_at_fault else None
-
-    @property
-    def dropped_at_fault(self) -> list[int]:
-        """Of the trials whose bundles were deleted, those whose crashes are the agent's own fault."""
-        return sorted(self._dropped_at_fault)
-
-    def refresh(self, crashes: Sequence[Bundle]) -> None:
-        """Take the crashes as they are now: they have been confirmed."""
-        for bundle in crashes:
-            number = bundle.result.spec.number
-            if number in self._signed:
-                self._signed[number] = self._signed[number][0], bundle
-        self._groups = None
-
-    def _sign(self, bundle: Bundle) -> bool:
-        """Take in a crash; return whether it is of a kind that has not been there."""
-        number = bundle.result.spec.number
-        collided = bundle.result.collision is not None
-        try:
-            # All look at it, and reading a log takes longer than looking.
-            recording = bundle.recording() if collided and (self._only_at_fault or self._by_cause) else None
-            signature = signature_of(bundle, recording)
-            if self._only_at_fault and fault_of(bundle, recording).is_egos:
-                self._at_fault.add(number)
-            if self._by_cause and not bundle.result.outcome.is_software_fault:
-                division = self._divisions.setdefault(signature, Division(self._by_cause))
-                division.add(number, bundle.result.steps, features_of(bundle, recording))
-        except BundleError:
-            return False  # it has no crash type, and crashhunt check reports it
-        is_new = signature not in self._seen
-        self._seen.add(signature)
-        self._signed[number] = signature, bundle
-        self._groups = None
-        self._count(number, signature, None)
-        judgement = judgement_of(bundle) if signature in self._divisions else None
-        if judgement is not None and not judgement.is_interrupted:
-            cause = cause_of(bundle, judgement)
-            if cause.kind != "unknown":
-                self._settle(number, cause)
-        return is_new
-
-
-# What a hunt's sampler has tried in this run, strategy by strategy, and what came of it.
+# What a hunt's sampler has tried in this run, strategy by strategy, and the result.
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,11 +57,11 @@ class StrategyStatus:
     """One of the origins of trials.
 
     Args:
-        name: of the strategy.
+        name: name of the strategy.
         trials: that it proposed and that have ended.
-        share: of all that have ended, 0 to 1.
-        danger: mean of its trials, 0 to 1, a crash counting as 1; None where none of them has one.
-        crashes: among its trials.
+        share: share of all that have ended, 0 to 1.
+        danger: mean of its trials, 0 to 1, a crash counting as 1; None if none of them has one.
+        crashes: crashes among its trials.
     """
 
     name: str
@@ -310,8 +76,8 @@ class SearchStatus:
     """How a search is going, for people who watch.
 
     Args:
-        strategies: those that have had trials, the most frequent first; empty where a sampler names none.
-        grown_trials: how many trials have ended since the greatest danger grew; None where it has not in this run.
+        strategies: those that have had trials, the most frequent first; empty if a sampler names none.
+        grown_trials: how many trials have ended since the greatest danger grew; None if it has not in this run.
         grown_s: how long ago that was, in s of wall time; None likewise.
     """
 
@@ -340,8 +106,8 @@ class Searching:
         """Count the trials of earlier runs.
 
         Args:
-            ended: how many there were.
-            tried: of each origin its name, trials, trials with a danger, their sum of danger, and crashes.
+            ended: number of trials that have ended.
+            tried: for each origin its name, trials, trials with a danger, their sum of danger, and crashes.
         """
         self.ended = ended
         for name, trials, measured, danger, crashes in tried:
@@ -388,7 +154,7 @@ class HuntStatus:
 
     Args:
         phase: ``hunting``, ``saving``, ``auditing``, ``done``, or a name of `PhaseStatus`.
-        planned: trials in all; 0 where only the time is limited.
+        planned: trials in all; 0 if only the time is limited.
         done: trials that have ended, in earlier runs of the hunt too.
         outcomes: how they ended.
         rate_per_s: trials a second in this run.
@@ -396,19 +162,20 @@ class HuntStatus:
         nearest: the trial that came nearest to a crash without one.
         workers: trial number to where it is.
         crashes: found so far, with or without a bundle.
-        nodes: the machines that take part now; None where there is this one only.
-        kinds: of crashes, the most frequent first; None where the first crash ends the hunt.
-        newest_kind_s: how long ago the last new one came, in s; None where that is unknown.
-        newest_kind_trials: how many trials have ended since; None where it came in an earlier run of the hunt.
-        time_left_s: until no more trials begin, in s of wall time; infinite without a limit.
-        disturbed: how many of the crashes had disturbances; None where the hunt has none.
+        nodes: the machines that take part now; None if there is this one only.
+        kinds: kinds of crashes, the most frequent first; None if the first crash ends the hunt.
+        newest_kind_s: how long ago the last new one came, in s; None if that is unknown.
+        newest_kind_trials: how many trials have ended since; None if it came in an earlier run of the hunt.
+        types_by_cause: number of causes, each type on its own; None where types count.
+        time_left_s: time until no more trials begin, in s of wall time; infinite without a limit.
+        disturbed: how many of the crashes had disturbances; None if the hunt has none.
         stressed: the trial with the least stress margin; None if no copy was asked, or if no copy crashed.
         branched: how many branches have crashed.
-        not_fully_asked: of how many trials a question to their copies has no answer.
+        not_fully_asked: number of trials with a question to their copies that has no answer.
         search: which strategies have had trials, and when the greatest danger grew in this run.
-        rate: the crash rate so far; None where the trials bound none.
-        trials_left_s: until the last trial ends, in s of wall time; None for an estimate by the mean rate.
-        progress: of what is done after the last trial; None before.
+        rate: the crash rate so far; None if the trials bound none.
+        trials_left_s: time until the last trial ends, in s of wall time; None for an estimate by the mean rate.
+        progress: progress of the work after the last trial; None before.
     """
 
     phase: str
@@ -424,6 +191,7 @@ class HuntStatus:
     kinds: tuple[Group, ...] | None = None
     newest_kind_s: float | None = None
     newest_kind_trials: int | None = None
+    types_by_cause: int | None = None
     time_left_s: float = math.inf
     disturbed: int | None = None
     stressed: TrialResult | None = None
@@ -502,14 +270,29 @@ class Progress:
                 by_cause=run.by_cause,
             )
 
-    def count(self, result: TrialResult, *, crashed: bool) -> None:
-        """Count a trial that has ended."""
+    def count(self, result: TrialResult, *, crashed: bool, planned: int) -> None:
+        """Count a trial that has ended.
+
+        Args:
+            result: The result. A crash has been saved before, or ends the hunt and is saved then.
+            crashed: Whether the outcome counts as a crash.
+            planned: Number of trials of the hunt.
+        """
         self.ended_here += 1
         self.outcomes[str(result.outcome)] += 1
         self.searching.take(result, crashed=crashed)
+        self.remaining.ended(time.monotonic(), max(0, planned - sum(self.outcomes.values())), self.parallel)
+        if self.counted is not None:
+            self.counted.add(result)
+        if result.outcome is Outcome.INVALID and not crashed:
+            self.last_invalid = result
+        elif not crashed:
+            self._compare(result)
+        elif self.kinds is None:
+            self.found[result.spec.number] = result
 
-    def take(self, result: TrialResult) -> None:
-        """Take note of a trial without a crash, which has been counted."""
+    def _compare(self, result: TrialResult) -> None:
+        """Compare a trial without a crash with those before: the nearest miss and the least stress margin are kept."""
         if result.collision is None and result.failure is None:
             before = self.nearest
             self.nearest = max(before or result, result, key=lambda one: one.nearness)
@@ -527,7 +310,7 @@ class Progress:
         self.crashes.append(bundle)
         self.tally.add(bundle.result)
         if self.kinds is not None:
-            self.kinds.add(bundle, self.ended_here)
+            self.kinds.add(bundle, self.ended_here + 1)  # counted after its row is written
 
     def replace(self, crashes: list[Bundle]) -> None:
         """Take the crashes as they are now: they have been confirmed."""
@@ -537,7 +320,7 @@ class Progress:
 
     @property
     def last_wanted(self) -> int | None:
-        """The number of the trial with which the hunt has found what it is after; None where the hunt continues."""
+        """The number of the trial with which the hunt has found what it is after; None if the hunt continues."""
         if self.rate is not None and self.rate.decided_at is not None:
             return self.rate.decided_at
         found = self.found.keys() | self.copied.keys()
@@ -545,7 +328,7 @@ class Progress:
 
     @property
     def ended_by_copy(self) -> Bundle | None:
-        """What a copy has found that ends the hunt; None where it is a trial that does, or nothing."""
+        """What a copy has found that ends the hunt; None if it is a trial that does, or nothing."""
         return self.copied.get(self.last_wanted) if self.last_wanted is not None else None
 
     @property
@@ -590,7 +373,7 @@ class Progress:
         self.nodes = tuple(executor.nodes()) if supports(executor, HasNodes) else None
 
     def running_rate(self, *, now: bool = False) -> RunningRate | None:
-        """Return the crash rate so far; None where the trials bound none.
+        """Return the crash rate so far; None if the trials bound none.
 
         Args:
             now: whether that of some moments ago will not do.
@@ -609,6 +392,8 @@ class Progress:
         if self.kinds is not None:
             groups = list(map(kind_data, self.kinds.groups()))
             kinds = {"kinds": groups, "kinds_version": SIGNATURE_VERSION, "newest_kind": self.kinds.newest}
+            if (by_cause := self.kinds.types_by_cause) is not None:
+                kinds["types_by_cause"] = by_cause
         failed = self.failed_steps + sum(result.steps + result.other_steps for result in self.failed)
         in_vain: Noted = {"failed_steps": failed} if failed else {}
         audits: Noted = {} if self.audit is None else {"audits_left": self.audits_left or None}
@@ -624,3 +409,163 @@ class Progress:
         newest, trial = self.kinds.newest, self.kinds.newest_trial
         since = None if newest is None else max(0.0, time.time() - newest)
         return self.kinds.groups(running=running), since, None if trial is None else self.ended_here - trial
+
+
+# Phases of a hunt, their progress and the time left.
+#
+# The time left is robust against trials that end in batches. The mean rate so far falls while a batch runs. The time
+# left by that rate rises for as long as a trial takes. Therefore a new estimate is made only when a trial ends, over
+# the time of whole batches, and the mean of the estimates of the last batch counts. Between two trials, the time left
+# falls with the clock.
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+PhaseName = Literal["causes", "confirming", "auditing", "near misses", "probes", "branches", "rare crashes"]
+"""What a hunt does after its last trial."""
+
+_TICK_S = 0.1  # how late the screen may be
+_MIN_SPAN = 8  # trials whose mean rate is an estimate
+_MAX_SPAN = 10_000  # trials whose times are kept
+_STALL_BATCHES = 2  # durations of a batch without an end of a trial, after which the time left stands still
+
+
+class RemainingTime:
+    """Estimates when the last of several trials ends, from the times at which trials end.
+
+    Cost: constant for each trial and each question, but for O(`_MAX_SPAN`) memory.
+
+    Args:
+        began: when the first trial began, in s of a monotonic clock.
+    """
+
+    def __init__(self, began: float) -> None:
+        self._began = began
+        self._times: deque[float] = deque(maxlen=_MAX_SPAN)
+        self._count = 0
+        self._ends: deque[float] = deque()
+        self._rate = 0.0
+
+    def ended(self, now: float, left: int, parallel: int) -> None:
+        """Count a trial that has ended.
+
+        Args:
+            now: when, in s of the same clock.
+            left: number of trials that have not ended.
+            parallel: number of trials that run at a time.
+        """
+        self._count += 1
+        self._times.append(now)
+        span = min(max(_MIN_SPAN, 4 * parallel, self._count // 2), self._count, _MAX_SPAN - 1)
+        span = max(span // parallel * parallel, min(span, parallel))  # whole batches
+        first = self._began if span == self._count else self._times[-span - 1]
+        self._rate = span / max(now - first, 1e-6)
+        if self._count <= parallel:  # the first batch is not complete before
+            self._ends.clear()
+        self._ends.append(now + left / self._rate)
+        while len(self._ends) > parallel:
+            self._ends.popleft()
+
+    def seconds_left(self, now: float, left: int, parallel: int) -> float:
+        """Return the time until the last trial ends, in s; infinite before the first trial has ended.
+
+        Args:
+            now: in s of the same clock.
+            left: number of trials that have not ended.
+            parallel: number of trials that run at a time.
+        """
+        if not left:
+            return 0.0
+        if not self._ends:
+            return math.inf
+        stalls = self._times[-1] + _STALL_BATCHES * max(1, parallel) / self._rate
+        return max(1.0, statistics.fmean(self._ends) - min(now, stalls))
+
+
+@dataclass(frozen=True, slots=True)
+class PhaseStatus(Serializable):
+    """Progress of a phase.
+
+    Args:
+        name: of the phase.
+        done: number of runs that have ended.
+        total: number of runs.
+        seconds_left: until the phase ends; None where that is unknown.
+    """
+
+    name: PhaseName
+    done: int
+    total: int
+    seconds_left: float | None
+
+
+class PhaseClock:
+    """Reports the progress of what a hunt does after its last trial.
+
+    Args:
+        show: receives the progress about ten times a second, in the thread of the hunt.
+        parallel: number of runs at a time.
+    """
+
+    def __init__(self, show: Callable[[PhaseStatus], None], parallel: int) -> None:
+        self._show, self._parallel = show, max(1, parallel)
+        self._name: PhaseName | None = None
+        self._done = self._total = 0
+        self._left = RemainingTime(0.0)
+        self._shown = -math.inf
+
+    def begin(self, name: PhaseName, total: int, done: int = 0) -> None:
+        """Begin a phase.
+
+        Args:
+            name: of the phase.
+            total: number of runs.
+            done: number of these that earlier runs of the hunt have finished.
+        """
+        self._name, self._total, self._done = name, total, done
+        self._left = RemainingTime(time.monotonic())
+        self.tick(force=True)
+
+    def advance(self) -> None:
+        """Count a run that has ended."""
+        self._done += 1
+        self._left.ended(time.monotonic(), self._total - self._done, self._parallel)
+        self.tick(force=True)
+
+    def tick(self, *, force: bool = False) -> None:
+        """Show the progress, if that was not done in the last 0.1 s; nothing before the first phase."""
+        now = time.monotonic()
+        if self._name is None or (now - self._shown < _TICK_S and not force):
+            return
+        self._shown = now
+        left = self._left.seconds_left(now, self._total - self._done, self._parallel)
+        self._show(
+            PhaseStatus(
+                name=self._name,
+                done=self._done,
+                total=self._total,
+                seconds_left=left if math.isfinite(left) else None,
+            )
+        )
+
+    def run(
+        self, function: Callable[[T], R], items: Sequence[T], *, counts: Callable[[R], bool] = lambda _: True
+    ) -> list[R]:
+        """Run a function of each item in threads that wait for processes; return the results in their order.
+
+        Args:
+            function: is called in a thread.
+            items: its arguments.
+            counts: whether a result counts as a run that has ended.
+        """
+        with ThreadPoolExecutor(self._parallel) as threads:
+            futures = [threads.submit(function, item) for item in items]
+            pending = dict.fromkeys(futures)
+            while pending:
+                first = list(islice(pending, 8 * self._parallel))  # a wait for 10,000 futures takes longer than a tick
+                for future in wait(first, timeout=_TICK_S, return_when=FIRST_COMPLETED).done:
+                    del pending[future]
+                    if counts(future.result()):
+                        self.advance()
+                self.tick()
+            return [future.result() for future in futures]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.codec import Serializable
-from crashhunt.hunts._tally import CrashTally
+from crashhunt.hunts._crashes import CrashTally
 from crashhunt.rates import TRIALS_PER_ROOT
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ class Difference(Serializable):
 
     Args:
         trial: number of the trial.
-        step: the first step that differs; None where no recording was kept, so that only the digest was compared.
-        agent: identifier of the agent or actor; empty where the difference concerns neither.
+        step: the first step that differs; None if no recording was kept, so that only the digest was compared.
+        agent: identifier of the agent or actor; empty if the difference concerns neither.
         field: name of the value that differs.
         recorded: the value in the hunt.
         replayed: the value in the new process.
@@ -85,7 +85,7 @@ class ProbeReport:
     Args:
         margins: the stress margin of each trial whose probes were all evaluated.
         not_fully_asked: number of further trials, in which a probe has no result.
-        why_unasked: the reason for the first of these trials; empty where there is none.
+        why_unasked: the reason for the first of these trials; empty if there is none.
         probes: number of copies that were run.
         steps: number of steps of the copies.
         skipped: number of probes that were skipped because the copies had used up their steps.
@@ -136,7 +136,7 @@ class BranchReport:
         crashed: number of branches that crashed.
         crashed_trials: number of trials with a branch that crashed.
         not_fully_asked: number of trials in which a branch has no result.
-        why_unanswered: the reason for the first of these trials; empty where there is none.
+        why_unanswered: the reason for the first of these trials; empty if there is none.
         run_again: number of crashed branches that were run again from the start: the likeliest of each trial.
         not_finished: number of these runs that did not reach their end, for example because they were killed.
         crashes: runs that crashed in the same way at the same step, and again bit-identically.
@@ -178,7 +178,7 @@ class RareReport:
     """What came of a hunt in rare mode.
 
     Args:
-        estimate: of the crash probability per trial.
+        estimate: estimate of the crash probability per trial.
         verified: how many of the weightiest crashes of copies were run from the start.
         not_finished: how many of these could not be run to their end.
         crashes: those of them that crashed in the same way at the same step, and once more bit-identically.
@@ -210,7 +210,7 @@ class RareReport:
         found = self.estimate
         if found.estimate is None:
             return [f"rare: no estimate: {found.why_not or 'no root has ended'}"]
-        answer = f"rare: {found.estimate:.2g} per trial"
+        answer = f"rare: {found.estimate:.2g} per trial" if found.estimate else "rare: no crash yet"
         if found.estimated is not None:
             one = found.estimated
             answer += (
@@ -222,7 +222,7 @@ class RareReport:
             more = ""
             if found.more_roots is not None:
                 more = f"; about {found.more_roots * TRIALS_PER_ROOT} more trials are needed"
-            lines.append(f"  no interval from {found.roots} roots: {found.why_not}{more}")
+            lines.append(f"  no interval ({found.roots} roots with their copies): {found.why_not}{more}")
         shares = [
             f"{cell} {part:.2g} ({part / found.disturbed:.0%})" for cell, part in found.parts.items() if found.disturbed
         ]
@@ -264,7 +264,7 @@ class HuntReport:
     """The result of a hunt.
 
     Args:
-        directory: of the hunt.
+        directory: directory of the hunt.
         settings: the settings that it ran with.
         stopped_because: the reason why it ended.
         outcomes: number of trials with each outcome.
@@ -272,11 +272,11 @@ class HuntReport:
         steps_total: number of simulated steps. It includes warm-up traffic, copies, and confirmations that failed.
         wall_s: wall time of this run, in s.
         crashes: the crashes that have a bundle, the one with the fewest steps first.
-        reason: in words, where no trial was valid.
+        reason: reason in words, where no trial was valid.
         notes: facts about the run that users should know, such as trials that were run again.
         events: traffic events of all trials: kind to their number, and the number of trials that had one.
         audit: the result of the audit; None without ``--audit``.
-        kinds: crash types, the most frequent first; None where the first crash ended the hunt.
+        kinds: crash types, the most frequent first; None if the first crash ended the hunt.
         types_by_cause: how many causes the crash types have, each type on its own; None without ``--by-cause``.
         near_misses: the near misses that were kept, the most critical first.
         probes: the result of the probes; None without ``--probe``.
@@ -287,7 +287,7 @@ class HuntReport:
         tally: counts of the crashes of all trials, with or without a bundle.
         unconfirmed: number of crashes that the same command runs again, because Ctrl-C came before their confirmation.
         unanswered: number of trials that the same command runs again, because they or their copies were killed.
-        rate: the rate, compared with the bar of ``until_rate``; None where there is no bar.
+        rate: the rate, compared with the bar of ``until_rate``; None if there is no bar.
     """
 
     directory: Path

@@ -77,10 +77,10 @@ STRESS = ("stress_margin", "stress_asked", "stress_margin_upper_bound")
 upper bound of the margin if that was not all of them."""
 
 BRANCHES = ("branches", "branch_crashes", "branches_asked")
-"""Further ones, of hunts with branches: how many there were, how many crashed, and how many of all have an answer."""
+"""Further ones, of hunts with branches: number of branches, how many crashed, and how many of all have an answer."""
 
 Cell: TypeAlias = "Value | None"
-"""What a table has in one place; None where a trial has no such value."""
+"""What a table has in one place; None if a trial has no such value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class TrialRow:
     a million trials, and a `TrialResult` takes three times as long.
 
     Args:
-        data: of the trial.
+        data: data of the trial.
     """
 
     data: JsonObject
@@ -108,28 +108,28 @@ class TrialRow:
 
     @property
     def time_to_collision_s(self) -> float | None:
-        """The least; None where no course ever crossed."""
+        """The least; None if no course ever crossed."""
         return _closest(self.data).get("time_to_collision_s")
 
     @property
     def danger(self) -> float | None:
-        """Criticality, 0 to 1; None where it was not measured."""
+        """Criticality, 0 to 1; None if it was not measured."""
         return self.data.get("danger")
 
     @property
     def origin(self) -> str:
-        """Which strategy of a sampler proposed it; empty where none did."""
+        """Which strategy of a sampler proposed it; empty if none did."""
         return str(self.data["spec"].get("origin", ""))
 
     @property
     def parent(self) -> int | None:
-        """The number of the trial that it was made from; None where there is none."""
+        """The number of the trial that it was made from; None if there is none."""
         found: int | None = self.data["spec"].get("parent")
         return found
 
     @property
     def stress_margin(self) -> float | None:
-        """How little it would have taken, 0 to 1; None where that was not asked, or not fully."""
+        """How little it would have taken, 0 to 1; None if that was not asked, or not fully."""
         stress = self.data.get("stress")
         return stress.get("margin") if stress else None
 
@@ -212,7 +212,7 @@ class HuntResults:
     """A hunt that has been run, or is running.
 
     Args:
-        directory: of the hunt.
+        directory: directory of the hunt.
 
     Raises:
         HuntDirectoryError: it is not one.
@@ -243,8 +243,8 @@ class HuntResults:
             seed = ledger.facts().get("hunt_seed", settings.seed)
         if seed != settings.seed:
             raise HuntDirectoryError(
-                f"hunt.toml says seed {settings.seed}, and the trials are those of seed {seed}",
-                fix="put the files of one hunt together, or write back the seed",
+                f"hunt.toml has seed {settings.seed}, but the trials have seed {seed}",
+                fix="restore hunt.toml or the ledger of the same hunt",
                 where=str(self.directory),
             )
         return settings
@@ -340,7 +340,7 @@ class HuntResults:
         try:
             import pandas as pd
         except ImportError:
-            raise UsageError("a dataframe needs pandas", fix="pip install pandas, or take trials()") from None
+            raise UsageError("a dataframe needs pandas", fix="pip install pandas, or use trials()") from None
         return pd.DataFrame(self.trials())
 
     def agent(self, trial: int, agent: str = "", *, trust: bool = False) -> Agent:
@@ -348,7 +348,7 @@ class HuntResults:
 
         Args:
             trial: its number.
-            agent: the vehicle's id; may be empty where there is one.
+            agent: the vehicle's id; may be empty if there is one.
             trust: import what the hunt names even if the hunt is neither made here nor trusted.
 
         Raises:

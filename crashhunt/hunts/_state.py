@@ -21,7 +21,7 @@ from crashhunt.base.integrity import changed_file
 from crashhunt.base.temporary import remove_ended, remove_scratch, temporary_beside, this_process
 from crashhunt.base.text import near_path
 from crashhunt.crashes import crash_folders, files_of
-from crashhunt.hunts._tally import outcomes_of_crashes, tally_crashes
+from crashhunt.hunts._crashes import outcomes_of_crashes, tally_crashes
 from crashhunt.ledger import KindData, Ledger, RunningRate, damaged, has_begun
 from crashhunt.plans import HuntSettings, read_settings, write_settings
 from crashhunt.trial import Outcome
@@ -65,9 +65,9 @@ class ProbeSums(TypedDict):
     """What ``status --json`` says of the probes of a hunt.
 
     Args:
-        trials: of how many trials copies were asked all that was to be asked.
-        not_fully_asked: of how many further trials a question has no answer.
-        least: the least stress margin of the former; None where there is none.
+        trials: number of trials whose copies were asked everything that was to be asked.
+        not_fully_asked: number of further trials with a question that has no answer.
+        least: the least stress margin of the former; None if there is none.
         trial: the number of the trial that has it.
         probes: how many copies were asked.
         steps: how many steps they took.
@@ -93,14 +93,14 @@ class BranchSums(TypedDict):
     """What ``status --json`` says of the branches of a hunt, as `ProbeSums`.
 
     Args:
-        trials: of how many trials there might have been some.
-        moments: from how many copies went on.
-        branches: how many there were.
+        trials: number of trials that may have had some.
+        moments: number of moments from which copies continued.
+        branches: number of branches.
         steps: how many steps they took.
         left_out: how many were skipped, because branches had taken enough steps.
         crashed: how many crashed.
-        crashed_trials: of how many trials.
-        not_fully_asked: of how many of the trials a branch has no answer.
+        crashed_trials: number of trials whose copies crashed.
+        not_fully_asked: number of trials with a branch that has no answer.
         run_again: how many of the likeliest were run from the start; None before that.
         confirmed: how many of these crashed there as well.
     """
@@ -118,13 +118,13 @@ class BranchSums(TypedDict):
 
 
 def copies_to_come(settings: HuntSettings) -> list[str] | None:
-    """Return which copies a hunt has of its trials; None where it has none."""
+    """Return which copies a hunt has of its trials; None if it has none."""
     every = ((PROBES, settings.probe), (BRANCHES, settings.branch), (RARE, settings.rare))
     return [name for name, wanted in every if wanted] or None
 
 
 def sums_of_probes(ledger: Ledger, facts: Facts) -> ProbeSums | None:
-    """Return what came of the probes of a hunt so far; None where it has none."""
+    """Return what came of the probes of a hunt so far; None if it has none."""
     if PROBES not in (facts.get("copies") or ()):
         return None
     (row,) = ledger.summed(
@@ -144,7 +144,7 @@ def sums_of_probes(ledger: Ledger, facts: Facts) -> ProbeSums | None:
 
 
 def sums_of_branches(ledger: Ledger, facts: Facts) -> BranchSums | None:
-    """Return what came of the branches of a hunt so far; None where it has none."""
+    """Return what came of the branches of a hunt so far; None if it has none."""
     if BRANCHES not in (facts.get("copies") or ()):
         return None
     (row,) = ledger.summed(
@@ -191,27 +191,28 @@ class HuntState(Serializable):
         state: ``queued``, ``running``, ``finished`` (no crash), ``crashed`` (found one), ``error``, ``interrupted``
             or ``killed`` (its process is gone and did not say why).
         detail: why, where it is an error.
-        trials_planned: how many were asked for; 0 where only the time is limited.
+        trials_planned: how many were asked for; 0 if only the time is limited.
         trials_run: how many have ended.
         outcomes: how.
         crashes: how many were found, with or without a bundle.
         crashes_saved: how many have a bundle, where these are fewer (``--keep``); else None.
         errors: how many trials could not be set up, or ended in a software fault.
         rate_per_s: trials a second, in its last run.
-        seconds_left: to the last trial, or until its time is up, or to the end of its phase; None where it does not
-            run, or where that is unknown.
+        seconds_left: expected time to the last trial, to the time limit, or to the end of the phase, in s; None if
+            unknown.
         owner_alive: whether its process is there.
         damaged: whether its ledger cannot be read, so that the counts say nothing.
         phase: what it does after its last trial: fields of `PhaseStatus` but the time; None before, and where it does
             not run.
-        disturbed: how many of the crashes had disturbances; None where the hunt has none.
-        probes: what came of them so far; None where it has none.
+        disturbed: how many of the crashes had disturbances; None if the hunt has none.
+        probes: what came of them so far; None if it has none.
         branches: likewise.
-        rate: the crash rate, as it was at its last heartbeat: fields of `RunningRate`; None where none is known.
-        core: whether the simulator's compiled core is used; None where it has none.
-        nodes: the machines on which it runs, or ran last: fields of `NodeFigures`; None where it was this one only.
-        kinds: of crashes, the most frequent first: fields of `KindData`; None where the first crash ends the hunt.
-        newest_kind_s: how long ago the last new one came, in s; None where that is unknown.
+        rate: the crash rate, as it was at its last heartbeat: fields of `RunningRate`; None if none is known.
+        core: whether the simulator's compiled core is used; None if it has none.
+        nodes: the machines on which it runs, or ran last: fields of `NodeFigures`; None if it was this one only.
+        kinds: kinds of crashes, the most frequent first: fields of `KindData`; None if the first crash ends the hunt.
+        newest_kind_s: how long ago the last new one came, in s; None if that is unknown.
+        types_by_cause: number of causes, each type on its own; None without ``--by-cause``.
     """
 
     dir: str
@@ -233,6 +234,7 @@ class HuntState(Serializable):
     nodes: list[dict[str, Any]] | None = field(default=None, metadata=OMIT_DEFAULT)
     kinds: list[KindData] | None = field(default=None, metadata=OMIT_DEFAULT)
     newest_kind_s: float | None = field(default=None, metadata=written_if(lambda state: state.kinds is not None))
+    types_by_cause: int | None = field(default=None, metadata=OMIT_DEFAULT)
     probes: ProbeSums | None = field(default=None, metadata=OMIT_DEFAULT)
     branches: BranchSums | None = field(default=None, metadata=OMIT_DEFAULT)
     rate: RunningRate | None = field(default=None, metadata=OMIT_DEFAULT)
@@ -248,6 +250,13 @@ def is_hunt(directory: Path) -> bool:
     return any((directory / name).exists() for name in _SIGNS)
 
 
+def _explain_missing(directory: Path, what: str) -> HuntDirectoryError:
+    is_file = directory.exists()
+    near = "" if is_file else near_path(directory)
+    wrong = "is a file" if is_file else "does not exist"
+    return HuntDirectoryError(f"{str(directory)!r} {wrong}", fix=f"{near}give the directory of {what}")
+
+
 def find_hunts(directory: Path) -> list[Path]:
     """Return the directories of hunts: this one, or those below it.
 
@@ -255,8 +264,7 @@ def find_hunts(directory: Path) -> list[Path]:
         HuntDirectoryError: there is none.
     """
     if not directory.is_dir():
-        fix = f"{near_path(directory)}give the directory of a hunt or a suite"
-        raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix=fix)
+        raise _explain_missing(directory, "a hunt or a suite")
     if is_hunt(directory):
         return [directory]
     found: set[Path] = set()
@@ -285,8 +293,7 @@ def hunt_state(directory: Path) -> HuntState:
             return HuntState(str(directory), "error", str(gone), damaged=True)
         return HuntState(str(directory), "queued", trials_planned=_planned(directory / layout.REQUEST))
     if not directory.is_dir():
-        fix = f"{near_path(directory)}give the directory of a hunt"
-        raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix=fix)
+        raise _explain_missing(directory, "a hunt")
     try:
         with closing(Ledger(directory / layout.LEDGER)) as ledger:
             facts, outcomes, last = ledger.facts(), ledger.outcomes(), ledger.last_ended_at()
@@ -306,10 +313,10 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
     """Return the state of a hunt from what its ledger says, without its crashes and the sums over its copies.
 
     Args:
-        directory: of the hunt.
-        facts: of its ledger.
+        directory: directory of the hunt.
+        facts: facts of its ledger.
         outcomes: how many trials ended how.
-        last: when the last trial ended, in s since the epoch; None where none has.
+        last: when the last trial ended, in s since the epoch; None if none has.
     """
     said = facts.get("state", "queued")
     owner = facts.get("owner")
@@ -335,6 +342,7 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
         core=facts.get("core"),
         nodes=facts.get("nodes"),
         kinds=facts.get("kinds"),
+        types_by_cause=facts.get("types_by_cause"),
         rate=facts.get("running_rate"),
         newest_kind_s=max(0.0, time.time() - newest) if (newest := facts.get("newest_kind")) is not None else None,
     )
@@ -384,8 +392,8 @@ def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
     Trials in the same traffic are not.
 
     Args:
-        facts: of its ledger.
-        settings: of the hunt; before samplers said it, of ours the random one did.
+        facts: facts of its ledger.
+        settings: settings of the hunt; before samplers said it, of ours the random one did.
     """
     return bool(facts.get("independent", settings.sampler == "random")) and not settings.seeds
 
@@ -409,7 +417,7 @@ def _is_alive(owner: Owner, heartbeat: float) -> bool:
 
 
 def _started(pid: int) -> int:
-    """When a process began, in ticks since the machine did; 0 where it is not there, -1 where that is unknown."""
+    """When a process began, in ticks since the machine did; 0 if it is not there, -1 where that is unknown."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
     except OSError:
@@ -452,7 +460,7 @@ class HuntDirectory:
     """A directory to hunt in.
 
     Args:
-        path: of it; it is made where it does not exist, its parents are not.
+        path: path of it; it is made where it does not exist, its parents are not.
     """
 
     def __init__(self, path: Path) -> None:

@@ -23,8 +23,8 @@ from crashhunt.executors import (
     run_trials,
     snapshot_executor,
 )
+from crashhunt.hunts._crashes import Judged
 from crashhunt.hunts._next_trials import settings_again
-from crashhunt.hunts._progress import Judged
 from crashhunt.hunts._reports import AuditReport, Difference
 from crashhunt.recording import Recording, first_divergence, read_black_box
 from crashhunt.replays import ReplayOptions, confirm
@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.executors import Executor
-    from crashhunt.hunts._phases import PhaseClock, PhaseName
-    from crashhunt.hunts._progress import Progress
+    from crashhunt.hunts._progress import PhaseClock, PhaseName, Progress
     from crashhunt.hunts._state import HuntDirectory
     from crashhunt.ledger import Facts, Ledger
     from crashhunt.plans import HuntSettings
@@ -59,7 +58,7 @@ __all__ = [
 
 
 class Confirmation:
-    """Confirms crashes one at a time, in a thread of its own. Meanwhile, the hunt has one slot less.
+    """Confirms crashes one at a time, in its own thread. Meanwhile, the hunt has one slot less.
 
     With ``--by-cause``, the same thread judges crashes, which come before those to confirm. One thread does both, so
     that neither overwrites in a bundle what the other has found. Crashes that are not confirmed or judged at the end of
@@ -67,7 +66,7 @@ class Confirmation:
 
     Args:
         again: runs them.
-        executor: of the hunt.
+        executor: executor of the hunt.
     """
 
     def __init__(self, again: TrialReruns, executor: Executor) -> None:
@@ -155,10 +154,10 @@ class TrialReruns:
     """Runs trials of a hunt again.
 
     Args:
-        place: of the hunt.
-        ledger: of the hunt, which knows the code of each trial.
-        settings: of the hunt.
-        parallel: how many run at a time.
+        place: place of the hunt.
+        ledger: ledger of the hunt, which knows the code of each trial.
+        settings: settings of the hunt.
+        parallel: number of runs at a time.
         notes: gets a line for whatever went wrong.
         failed: gets what was to confirm something, and ended otherwise.
         stops: non-empty as soon as a stop is requested.
@@ -182,8 +181,8 @@ class TrialReruns:
         """Yield each trial as it ends, until a stop is requested.
 
         Args:
-            specs: of different trials of the hunt; what else they say may have been changed.
-            folder: of the hunt, into which bundles of them are written.
+            specs: specs of different trials of the hunt; what else they say may have been changed.
+            folder: folder of the hunt, into which bundles of them are written.
 
         Raises:
             CrashhuntError: they cannot be run.
@@ -301,11 +300,11 @@ class Again:
     """A trial that has been run again.
 
     Args:
-        result: what came of it.
+        result: the result.
         runs: which ran it.
         snapshot: the digest of its code.
         scratch: the folder of the workers.
-        folder: of the hunt, for its bundle.
+        folder: folder of the hunt, for its bundle.
     """
 
     result: TrialResult
@@ -332,7 +331,7 @@ class Found:
 
     Args:
         spec: the same from the start.
-        outcome: of the copy.
+        outcome: outcome of the copy.
         step: at which it ended.
     """
 
@@ -347,7 +346,7 @@ class VerificationRuns:
 
     Args:
         again: runs trials of the hunt again.
-        disturber: knows how likely disturbances are; None where the hunt has no models.
+        disturber: knows how likely disturbances are; None if the hunt has no models.
         kept: by folder and trial, what has been run already, and is not run again.
     """
 
@@ -367,9 +366,9 @@ class VerificationRuns:
 
         Args:
             found: of different trials.
-            folder: of the hunt, for the bundles; what it had before is gone, but for what is kept. If a stop is
+            folder: folder of the hunt, for the bundles; what it had before is gone, but for what is kept. If a stop is
                 requested, it stays.
-            name: of the phase.
+            name: name of the phase.
         """
         if self.is_stopped:
             return (), 0
@@ -389,7 +388,7 @@ class VerificationRuns:
 
         Args:
             found: how a copy crashed.
-            folder: of the hunt, for its bundle.
+            folder: folder of the hunt, for its bundle.
         """
         if self.is_stopped:
             return None
@@ -443,7 +442,7 @@ class Audit:
     """Runs the sample again during the hunt, one trial at a time.
 
     Args:
-        settings: of the hunt; they say which trials.
+        settings: settings of the hunt; they say which trials.
         failed: gets those that were not the same.
     """
 
@@ -571,12 +570,12 @@ class AuditsLeft:
     """The trials that earlier runs of a hunt were to run again, and did not.
 
     Args:
-        ledger: of the hunt.
+        ledger: ledger of the hunt.
         before: its facts, as the earlier runs left them.
-        settings: of the workers; they say which trials belong to the sample.
+        settings: settings of the workers; they say which trials belong to the sample.
 
     Attributes:
-        numbers: of these trials.
+        numbers: numbers of these trials.
     """
 
     def __init__(self, ledger: Ledger, before: Facts, settings: WorkerSettings) -> None:
@@ -588,7 +587,7 @@ class AuditsLeft:
         self.numbers = sorted(left)
 
     def note(self, audit: Audit, progress: Progress) -> None:
-        """Have the progress of the hunt say what came of its audit, and what is left of all audits."""
+        """Have the progress of the hunt say the results audit, and what is left of all audits."""
         progress.audit = audit.report
         progress.audits_left = sorted({*audit.left, *self.numbers})
 
@@ -603,11 +602,11 @@ class AuditsLeft:
 
 
 def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, list[int]]:
-    """Run trials again that are to be audited; return what came of it, and the numbers that are still left.
+    """Run trials again that are to be audited; return the result, and the numbers that are still left.
 
     Args:
         again: runs trials of the hunt again. Its ledger gets a remark for each trial that differs.
-        numbers: of the trials.
+        numbers: numbers of the trials.
     """
     ledger = again.ledger
     wanted = {number: result for number in numbers if (result := ledger.result(number)) is not None and result.digest}

@@ -1,4 +1,3 @@
-from ._file import Row as Row, damaged as damaged, leave_untouched as leave_untouched
 from ._reader import (
     Bounds as Bounds,
     Facts as Facts,
@@ -9,4 +8,5 @@ from ._reader import (
     Turn as Turn,
     UntilRate as UntilRate,
 )
+from ._schema import Row as Row, damaged as damaged, leave_untouched as leave_untouched
 from ._writer import Ledger as Ledger, has_begun as has_begun

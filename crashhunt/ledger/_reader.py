@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypedDict, cast
 
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.ledger._file import Row, checked, damaged, explained, plain_trial
-from crashhunt.ledger._schema import OWN_FACTS, SEAL, WITH_EVENTS
+from crashhunt.ledger._schema import OWN_FACTS, SEAL, WITH_EVENTS, Row, checked, damaged, explained, plain_trial
 from crashhunt.trial import KILLED, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
@@ -60,7 +59,7 @@ class Bounds(TypedDict):
 
     Args:
         low: the least rate.
-        high: the greatest; None where nothing bounds it.
+        high: the greatest; None if nothing bounds it.
     """
 
     low: float
@@ -73,15 +72,15 @@ class RunningRate(TypedDict):
     Args:
         method: ``plain``, counted trials; or ``rare``, copies with forced onsets, and plain trials.
         per: what the rate is per.
-        confidence: of all intervals, in percent.
+        confidence: confidence of all intervals, in percent.
         units: independent units that count: trials, traffics or roots.
         trials: plain trials that count.
-        crashes: of them.
-        origin: the origin of the trials that count; empty where all do.
-        certain: interval that is valid whenever you look; None where there is none.
-        estimate: crash probability per trial by the copies; None where there is none.
-        estimated: interval for it; None where the roots cannot carry one.
-        why_not: why there is no certain interval, or no estimated one; empty where there is.
+        crashes: crashes of them.
+        origin: the origin of the trials that count; empty if all do.
+        certain: interval that is valid whenever you look; None if there is none.
+        estimate: crash probability per trial by the copies; None if there is none.
+        estimated: interval for it; None if the roots cannot carry one.
+        why_not: why there is no certain interval, or no estimated one; empty if there is.
         bar: rate that the hunt is compared with; None for none.
         verdict: ``below``, ``above`` or ``undecided``; empty without a bar.
     """
@@ -102,40 +101,47 @@ class RunningRate(TypedDict):
 
 
 class Noted(TypedDict, total=False):
-    """What is noted of a hunt besides its state; None where something no longer holds.
+    """What is noted of a hunt besides its state; None if something no longer holds.
 
     Args:
         owner: the process that runs it, while it runs.
         began: when it was begun or resumed, in s since the epoch.
         heartbeat: when it was there last, likewise.
         done_before: how many trials had ended when it began.
-        planned: how many trials it has; 0 where only the time is limited.
-        until: when its time is up, in s since the epoch; None where it has all the time.
+        planned: how many trials it has; 0 if only the time is limited.
+        until: when its time is up, in s since the epoch; None if it has all the time.
         hunt_seed: what its trials are drawn from.
         independent: whether they were drawn independently of each other.
-        plain_origin: of the trials that were, where its sampler keeps some apart that it does not guide; else None.
-        lag: by how many trials the results for a sampler that learns are delayed at most.
+        plain_origin: origin of the independent trials, if its sampler keeps some apart that it does not guide;
+            else None.
+        lag: number of trials by which results for a sampler that learns are delayed at most.
         lag_grows: whether they are delayed by fewer at the beginning; None in hunts of before, where the lag is fixed.
-        sampler_version: of the proposals of a sampler that learns; None in hunts of before, which have version 1.
+        sampler_version: version of the proposals of a sampler that learns; None in hunts of before, which have
+            version 1.
         origins: whether its sampler says where trials come from.
-        core: whether the simulator's compiled core is used; None where it has none.
-        disturb: how often what disturbs its trials; None where nothing does.
-        copies: of its trials, which there are to be, some of ``probes`` and ``branches``; None where there are none.
-        confirmed: of these, how many trials were run from the start of what they found, and how many crashed there.
+        core: whether the simulator's compiled core is used; None if it has none.
+        disturb: how often what disturbs its trials; None if nothing does.
+        copies: which copies of its trials there are to be, some of ``probes`` and ``branches``; None if there are
+            none.
+        confirmed: of the trials whose copies crashed, how many were run from the start of what they found, and how many
+            crashed there.
         nodes: the machines on which it ran last, where there were several: fields of `NodeFigures`.
-        kinds: of crashes, the most frequent first, where it collects them all.
-        kinds_version: of the rules that say which crashes are of one kind.
+        kinds: kinds of crashes, the most frequent first, where it collects them all.
+        kinds_version: version of the rules that say which crashes are of one kind.
+        types_by_cause: number of causes, each type on its own, where the hunt counts causes.
         crash_on: the outcomes that count as a crash.
-        dropped: of each kind, in words, the trials whose crashes are in the ledger only, as shorter ones were kept.
-        dropped_at_fault: of these, the trials whose crashes are the agent's own fault, where that is asked.
+        dropped: for each crash type, in words, the trials whose crashes are in the ledger only, as shorter ones were
+            kept.
+        dropped_at_fault: of these trials, the ones whose crashes are the agent's own fault, where that is
+            asked.
         newest_kind: when the last new one came, in s since the epoch; None if none or unknown.
-        audits_left: the trials that were to be run again for the audit, and have not been; None where there is none.
+        audits_left: the trials that were to be run again for the audit, and have not been; None if there is none.
         phase: what the hunt does after its last trial: fields of `PhaseStatus`; None before and at its end.
-        ends_at: when its last trial is expected to end, in s since the epoch; None where that is unknown.
+        ends_at: when its last trial is expected to end, in s since the epoch; None if that is unknown.
         failed_steps: how many steps were simulated to confirm something that was not confirmed.
         until_rate: ``bar``, as it was given, ``decided_at``, the number of the trial that decided, and ``verdict``;
-            None where the hunt has no bar.
-        running_rate: the crash rate so far: None where no rate is known.
+            None if the hunt has no bar.
+        running_rate: the crash rate so far: None if no rate is known.
     """
 
     owner: Owner | None
@@ -158,6 +164,7 @@ class Noted(TypedDict, total=False):
     nodes: list[dict[str, Any]]
     kinds: list[KindData]
     kinds_version: int
+    types_by_cause: int
     crash_on: list[str]
     newest_kind: float | None
     audits_left: list[int] | None
@@ -222,7 +229,7 @@ class LedgerReader:
 
     Args:
         database: that is open.
-        path: of its file.
+        path: path of its file.
         shape: what its tables have.
     """
 
@@ -431,7 +438,7 @@ class LedgerReader:
                 raise damaged(self._path, " ".join(str(found).split()))
 
     def result(self, number: int) -> TrialResult | None:
-        """Return one trial, or None where it has not ended."""
+        """Return one trial, or None if it has not ended."""
         row = self._row(number)
         if row is None:
             self.outcomes()  # which finds out whether one is missing
@@ -448,7 +455,7 @@ class LedgerReader:
         return map(self._plain, rows)
 
     def result_text(self, number: int) -> str | None:
-        """Return one trial as it is written, or None where it has not ended."""
+        """Return one trial as it is written, or None if it has not ended."""
         row = self._row(number)
         return None if row is None else str(self._plain(row) and row[10])
 
@@ -569,7 +576,7 @@ class LedgerReader:
         return sorted(number for (number,) in self._select(query, (first, sign)))
 
     def plain_trial(self, number: int) -> JsonObject | None:
-        """Return one trial as plain data; None where it has not ended.
+        """Return one trial as plain data; None if it has not ended.
 
         Raises:
             HuntDirectoryError: it is not as it was written.
@@ -578,7 +585,7 @@ class LedgerReader:
         return None if row is None else self._plain(row)
 
     def last_ended_at(self) -> float | None:
-        """Return when the last trial ended, in s since the epoch; None where none has."""
+        """Return when the last trial ended, in s since the epoch; None if none has."""
         row = next(self._select(f"{self._shape.select('trials')} ORDER BY number DESC LIMIT 1"), None)
         return float(row[8]) if row and self._plain(row) else None
 

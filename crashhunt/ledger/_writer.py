@@ -16,16 +16,28 @@ from typing import TYPE_CHECKING, Unpack
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.ledger._file import damaged, explained, is_untouched, opened, removed, rewrite
 from crashhunt.ledger._reader import LedgerReader, Turn
-from crashhunt.ledger._schema import SEAL, VERSION, columns_of_trials, create, migrate, shape_of
+from crashhunt.ledger._schema import (
+    SEAL,
+    VERSION,
+    columns_of_trials,
+    create,
+    damaged,
+    explained,
+    is_untouched,
+    migrate,
+    opened,
+    removed,
+    rewrite,
+    shape_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from crashhunt.ledger._file import Row
     from crashhunt.ledger._reader import Facts, Noted
+    from crashhunt.ledger._schema import Row
     from crashhunt.trial import TrialResult
 
 
@@ -47,7 +59,7 @@ class Ledger(LedgerReader):
     """What happened in a hunt.
 
     Args:
-        path: of ``ledger.sqlite``.
+        path: path of ``ledger.sqlite``.
         writable: the one writer; creates the file, and brings one of an earlier version to this one.
         read_only: leave even SQLite's own files next to it as they are; for a reader of foreign hunts.
 
@@ -61,7 +73,7 @@ class Ledger(LedgerReader):
         if not writable and not path.exists():
             raise HuntDirectoryError(
                 f"{str(path.parent)!r} is not the directory of a hunt: it has no ledger.sqlite",
-                fix="give the directory that crashhunt run was given",
+                fix="give the directory of a hunt",
             )
         try:
             if writable and not has_begun(path):
@@ -255,8 +267,8 @@ class Ledger(LedgerReader):
         """
         if self._shape.version > VERSION:  # its columns are unknown here
             raise HuntDirectoryError(
-                f"a ledger of version {self._shape.version}, and this crashhunt writes version {VERSION}: it can be "
-                "read, and no trial can be added",
+                f"the ledger has version {self._shape.version}, but this crashhunt writes version {VERSION}: the "
+                "ledger can be read, but not extended",
                 fix="resume with the crashhunt that made it, or run with --overwrite to begin again",
                 where=str(self._path),
             )

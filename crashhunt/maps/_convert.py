@@ -137,7 +137,7 @@ def _unpack_pbf(path: Path, target: Path) -> None:
                 writer.add(one)
     except RuntimeError as error:
         fix = "download the map again"
-        raise ScenarioError(f"osmium refuses the map: {error}", fix=fix, where=str(path)) from None
+        raise ScenarioError(f"osmium cannot read the map: {error}", fix=fix, where=str(path)) from None
 
 
 def _keeps_left(path: Path) -> bool:
@@ -185,7 +185,7 @@ def _make(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path
     if "o nodes loaded" in error or "o edges loaded" in error or "could not be found" in error:
         raise _no_road(source, options, tools, folder)
     fix = "correct the map, or choose a part of it with --bbox W,S,E,N" if source.kind == "osm" else "correct the map"
-    raise ScenarioError(f"{program} refuses the map: {error}", fix=fix, where=_where(source))
+    raise ScenarioError(f"{program} cannot read the map: {error}", fix=fix, where=_where(source))
 
 
 def _where(source: MapSource) -> str:

@@ -49,7 +49,7 @@ class Route:
         id: such as ``r7``.
         edges: ids of its edges.
         weight: how many of the drawn trips take it.
-        length_m: in m.
+        length_m: length in m.
         free_s: its time on free roads, in s.
     """
 
@@ -65,8 +65,8 @@ class Demand:
     """The traffic of a place.
 
     Args:
-        routes: of vehicles.
-        vehicles_per_hour: of all routes together, at demand 1.
+        routes: routes of vehicles.
+        vehicles_per_hour: vehicles per hour of all routes together, at demand 1.
         walks: the edges of each person flow.
         ego_routes: ids of the routes from which that of the controlled vehicle is drawn.
     """
@@ -92,7 +92,7 @@ def find_demand(network: Network, tools: Tools, folder: Path, *, net: str, peopl
     Args:
         network: what the file holds.
         tools: the programs.
-        folder: in which they work.
+        folder: folder in which they work.
         net: name of the network in the folder.
         people: whether persons walk.
 
@@ -165,7 +165,7 @@ def _walks(tools: Tools, folder: Path, net: str) -> tuple[tuple[str, ...], ...]:
 
 
 def _counted(path: Path, tag: str) -> dict[tuple[str, ...], int]:
-    """Return how often each way is in a file, in the order of the file; nothing where the file is missing."""
+    """Return how often each way is in a file, in the order of the file; nothing if the file is missing."""
     if not path.is_file():
         return {}
     counts: dict[tuple[str, ...], int] = {}

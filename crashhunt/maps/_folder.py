@@ -119,8 +119,8 @@ def scenario_toml(
 
     Args:
         title: one line, for people.
-        arguments: of the scenario.
-        warmup_s: in s.
+        arguments: arguments of the scenario.
+        warmup_s: warmup in s.
         speed_limit_mps: usual on the routes, in m/s; agents want to drive about as fast.
         agent: who drives; crashhunt's car-following agent by default.
     """
@@ -227,7 +227,7 @@ def next_commands(folder: str, steps: int) -> list[str]:
     """Return the next commands.
 
     Args:
-        folder: of the scenario, as the user named it; empty for the current one.
+        folder: folder of the scenario, as the user named it; empty for the current one.
         steps: a bound on a trial.
     """
     enter = [f"cd {shlex.quote(folder)}"] if folder else []
@@ -283,7 +283,7 @@ def readme(
     """Return ``README.md``.
 
     Args:
-        title: of the place.
+        title: title of the place.
         place: what it is, in lines.
         demand: its traffic.
         steps: a bound on a trial.
@@ -337,7 +337,7 @@ def workflow(folder: str, steps: int) -> str:
     """Return a workflow of GitHub's that uses both actions.
 
     Args:
-        folder: of the scenario, relative to the top of the repository; ``.`` where it is the top.
+        folder: folder of the scenario, relative to the top of the repository; ``.`` where it is the top.
         steps: a bound on a trial.
     """
     crashes = "crashes" if folder == "." else f"{folder}/crashes"

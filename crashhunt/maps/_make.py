@@ -81,7 +81,7 @@ class PlainTrial:
 
     Args:
         outcome: how it ended.
-        steps: after how many steps.
+        steps: number of steps.
         wall_s: how long it took, in s, with the start of its processes.
     """
 
@@ -95,7 +95,7 @@ class MadeScenario:
     """A scenario that has been made and tried.
 
     Args:
-        folder: of it.
+        folder: folder of the scenario.
         source: the map.
         network: what the map holds.
         demand: its traffic.
@@ -103,7 +103,7 @@ class MadeScenario:
         busy: what it did at the largest.
         steps: a bound on trials, from the longest route.
         notes: what the user should know.
-        trial: what came of one trial; None where none ran.
+        trial: what came of one trial; None if none ran.
     """
 
     folder: Path
@@ -219,10 +219,10 @@ def _put_in_place(building: Path, target: Path, directory: Path) -> None:
 
 def _check_options(source: MapSource, options: MapOptions) -> None:
     if options.bbox is not None and source.path is None:
-        raise UsageError(f"--bbox does not go with --{source.kind}", fix="choose the size of the map instead")
+        raise UsageError(f"--bbox cannot be used with --{source.kind}", fix="choose the size of the map instead")
     if options.left_hand and source.kind == "net":
-        fix = "leave it out: a network keeps the side that it was made for"
-        raise UsageError("--lefthand does not go with --net", fix=fix)
+        fix = "omit the option: a network keeps the side that it was made for"
+        raise UsageError("--lefthand cannot be used with --net", fix=fix)
 
 
 def _build(

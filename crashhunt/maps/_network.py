@@ -25,7 +25,7 @@ class Lane:
     """One lane.
 
     Args:
-        length_m: in m.
+        length_m: length in m.
         speed_mps: the speed limit, in m/s.
         allowed: the vehicle classes that may use it; None for all.
         disallowed: those that may not.
@@ -51,8 +51,8 @@ class Edge:
 
     Args:
         id: SUMO's.
-        name: of the street; empty where the map has none.
-        lanes: from right to left in right-hand traffic.
+        name: name of the street; empty if the map has none.
+        lanes: lanes from right to left in right-hand traffic.
     """
 
     id: str
@@ -78,7 +78,7 @@ class Network:
     """A network, without what is inside junctions.
 
     Args:
-        edges: by id, in the order of the file.
+        edges: edges by id, in the order of the file.
         junctions: type of junction to how many there are; ends of roads are not counted.
         crossings: number of pedestrian crossings.
         left_hand: whether traffic keeps to the left.

@@ -39,8 +39,8 @@ def draw_map(
 
     Args:
         network: what is drawn.
-        vehicles: on each edge, in the time that was simulated.
-        path: of the PNG.
+        vehicles: vehicles on each edge, in the time that was simulated.
+        path: path of the PNG.
         title: above the map.
         hours: that were simulated.
         busiest: edges to name, with their vehicles per hour; the first has the most.
@@ -126,7 +126,7 @@ def _draw_labels(
 
 
 def drawable(text: str) -> str:
-    """Return a text in letters that the font has; empty where it has too few of them.
+    """Return a text in letters that the font has; empty if it has too few of them.
 
     Pillow's own font has Latin letters, and draws boxes for all others, such as the sharp s of German.
     """

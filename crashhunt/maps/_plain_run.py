@@ -48,10 +48,10 @@ class PlainRun:
         entered: those that did.
         arrived: those that reached their destination.
         running: those on the road at the end.
-        halting: of these, those that stood.
+        halting: number of these vehicles that stood.
         teleports: vehicles that SUMO moved on after they had stood for 300 s.
-        collisions: of the traffic with itself.
-        mean_speed_mps: of those that arrived, in m/s.
+        collisions: number of collisions between vehicles of the traffic.
+        mean_speed_mps: mean speed of those that arrived, in m/s.
         persons: that walked.
         edge_vehicles: vehicles that entered each edge.
         probe_delays_s: route to the time that a vehicle waited to enter on it, in s; routes that none entered on
@@ -73,7 +73,7 @@ class PlainRun:
 
     @property
     def jam(self) -> str:
-        """Why the traffic does not flow, in words; empty where it does."""
+        """Why the traffic does not flow, in words; empty if it does."""
         if not self.entered:
             return "no vehicle enters"
         if self.wanted - self.entered > max(5, _MAX_WAITING_SHARE * self.wanted):
@@ -95,10 +95,10 @@ def run_plain_traffic(
 
     Args:
         demand: the traffic.
-        network: on which.
+        network: network in which the traffic drives.
         tools: the programs.
-        folder: with the network, in which files are written.
-        values: of the scenario's arguments.
+        folder: folder with the network, in which files are written.
+        values: values of the scenario's arguments.
         net: name of the network.
         scale: the factor on the traffic.
         probes_at_s: when the probes are to enter, in s.
@@ -130,7 +130,7 @@ def run_plain_traffic(
     done = tools.run("sumo", words, folder)
     if done.code:
         error = first_error(done.output) or f"exit code {done.code}"
-        raise ScenarioError(f"SUMO refuses the scenario of this map: {error}", fix="choose another part of the map")
+        raise ScenarioError(f"SUMO cannot load the scenario of this map: {error}", fix="choose another part of the map")
     return _measured(folder, scale, len(demand.ego_routes))
 
 
@@ -181,10 +181,10 @@ def calibrate(
 
     Args:
         demand: the traffic to begin with.
-        network: on which.
+        network: network in which the traffic drives.
         tools: the programs.
-        folder: with the network.
-        values: of the scenario's arguments.
+        folder: folder with the network.
+        values: values of the scenario's arguments.
         net: name of the network.
         scales: the usual factor on the traffic, and the largest.
         probes_at_s: when probes enter, in s.
@@ -212,7 +212,7 @@ def calibrate(
     if busy.jam:
         rate = demand.vehicles_per_hour * most
         raise ScenarioError(
-            f"the traffic of this map jams even with {rate:,.0f} vehicles/h: {busy.jam}",
+            f"the traffic on this map jams even with {rate:,.0f} vehicles/h: {busy.jam}",
             fix="choose another part of the map, or correct its traffic lights and lanes",
         )
     ready = tuple(route for route in demand.ego_routes if busy.probe_delays_s.get(route, 1e9) <= _MAX_PROBE_DELAY_S)

@@ -41,9 +41,9 @@ class MapSource:
     """Where a map comes from.
 
     Args:
-        kind: of the map.
-        path: of the file; None where the map is generated.
-        shape: of a generated map: columns and rows of a grid, arms and rings of a spider's web.
+        kind: kind of the map.
+        path: path of the file; None if the map is generated.
+        shape: shape of a generated map: columns and rows of a grid, arms and rings of a spider's web.
     """
 
     kind: Kind
@@ -72,7 +72,7 @@ class MapSource:
 
 
 def kind_of_file(path: Path) -> Kind | None:
-    """Return what kind of map a file has by its ending; None where it is another file."""
+    """Return what kind of map a file has by its ending; None if it is another file."""
     for kind, endings in ENDINGS.items():
         if path.name.lower().endswith(endings):
             return kind  # type: ignore[return-value]
@@ -155,7 +155,7 @@ def check_source(source: MapSource) -> None:
     if path.name.lower().endswith(".pbf"):
         if b"OSMHeader" not in head:
             fix = "download the map again, or give it the ending of its format"
-            raise ScenarioError("the file is no OpenStreetMap PBF", fix=fix, where=where)
+            raise ScenarioError("the file is not an OpenStreetMap PBF", fix=fix, where=where)
         return
     _check_root(source, head)
 

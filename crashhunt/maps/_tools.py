@@ -43,7 +43,7 @@ class Tools:
 
     Args:
         home: the folder that SUMO's documentation calls SUMO_HOME.
-        version: of the distribution, such as ``1.28.0``.
+        version: version of the distribution, such as ``1.28.0``.
     """
 
     home: Path
@@ -55,7 +55,7 @@ class Tools:
         Args:
             program: such as ``netconvert``, or a script below ``tools`` such as ``randomTrips.py``.
             words: its arguments.
-            folder: in which it runs; names in its arguments are relative to it.
+            folder: folder in which it runs; names in its arguments are relative to it.
 
         Raises:
             ScenarioError: it cannot be started, or it takes too long.
@@ -117,7 +117,7 @@ def _release(version: str) -> tuple[int, ...]:
 
 
 def first_error(output: str) -> str:
-    """Return the first error in what a program has printed, without its prefix; empty where there is none."""
+    """Return the first error in what a program has printed, without its prefix; empty if there is none."""
     for line in output.splitlines():
         if line.startswith("Error:"):
             return line.removeprefix("Error:").strip()

@@ -26,7 +26,7 @@ __all__ = [
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 8
+_INTERFACE = 9
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -185,7 +185,7 @@ _UsualSteps = UsualSteps
 
 
 class Core(Protocol):
-    """The compiled module. A function returns None where only the equivalent Python code can do the work."""
+    """The compiled module. A function returns None if only the equivalent Python code can do the work."""
 
     INTERFACE: int
 
@@ -250,16 +250,18 @@ class Core(Protocol):
         """Return the usual observation of `Kinematics`, as float32."""
 
     def within_reach(
-        self, columns: Columns, earlier: Columns, row: int, step_s: float, hardest: float, /
-    ) -> list[int] | None:
+        self, columns: Columns, earlier: Columns, row: int, step_s: float, hardest: float,
+        earlier_rows: list[int] | None, /,
+    ) -> list[int] | None:  # fmt: skip
         """Return the rows that the oracle ``overlap`` looks at, nearest first.
 
         Args:
             columns: The numbers of a scene.
-            earlier: The numbers of the same actors in the previous scene.
+            earlier: The numbers of the previous scene.
             row: The row of the actor that they may touch.
             step_s: The time between the two scenes, in s.
             hardest: upper bound of braking, in m/s².
+            earlier_rows: The row of each actor in the previous scene, or -1; None if both scenes have the same actors.
         """
 
     def may_be_near(

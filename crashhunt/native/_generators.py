@@ -50,7 +50,7 @@ def why_no_reseeding(libsumo: str, library: str) -> str:
 
 
 def reseed_generators(library: str, seed: int) -> int:
-    """Give each generator of the running simulation a seed of its own, drawn from one seed.
+    """Give each generator of the running simulation its own seed, drawn from one seed.
 
     Args:
         library: The path of libsumo's library, for which `why_no_reseeding` returned an empty text.
@@ -77,5 +77,5 @@ def reseed_generators(library: str, seed: int) -> int:
     for place, value in zip(places, drawn.tolist(), strict=True):
         set_seed(place, False, value)
         if get_seed(place) != value:
-            raise RuntimeError("libsumo's generators do not keep the seed that they get")
+            raise RuntimeError("libsumo's generators do not keep their seed")
     return len(places)

@@ -797,12 +797,35 @@ bool reach(const Scene &present, const Scene &previous, size_t row, double step_
 
 std::vector<size_t> reached; // used again
 
-// within_reach(columns, earlier columns, row, step_s, hardest) -> list of rows | None
+// The earlier row of each row, or -1, as a list; false with an exception where it is none.
+bool read_earlier(PyObject *list, size_t rows, size_t earlier_rows, Earlier &found) {
+    found.clear();
+    if (!PyList_CheckExact(list) || static_cast<size_t>(PyList_GET_SIZE(list)) != rows) {
+        PyErr_SetString(PyExc_TypeError, "earlier rows are a list with a row, or -1, for each row");
+        return false;
+    }
+    for (size_t row = 0; row < rows; row++) {
+        const long was = PyLong_AsLong(PyList_GET_ITEM(list, static_cast<Py_ssize_t>(row)));
+        if (was == -1 && PyErr_Occurred()) {
+            return false;
+        }
+        if (was < -1 || was >= static_cast<long>(earlier_rows)) {
+            PyErr_SetString(PyExc_IndexError, "there is no such earlier row");
+            return false;
+        }
+        found.push_back(was);
+    }
+    return true;
+}
+
+Earlier rows_before; // used again
+
+// within_reach(columns, earlier columns, row, step_s, hardest, earlier rows | None) -> list of rows | None
 PyObject *within_reach(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    Columns *columns = count == 5 ? columns_of(given[0]) : nullptr;
+    Columns *columns = count == 6 ? columns_of(given[0]) : nullptr;
     Columns *earlier = columns ? columns_of(given[1]) : nullptr;
     if (!earlier) {
-        PyErr_SetString(PyExc_TypeError, "within_reach takes columns twice and three numbers");
+        PyErr_SetString(PyExc_TypeError, "within_reach takes columns twice, three numbers and earlier rows");
         return nullptr;
     }
     const Py_ssize_t asked = PyLong_AsSsize_t(given[2]);
@@ -812,8 +835,12 @@ PyObject *within_reach(PyObject *, PyObject *const *given, Py_ssize_t count) {
     }
     const Scene present(columns), previous(earlier);
     const size_t row = static_cast<size_t>(asked);
-    if (previous.size != present.size || !present.sized() || !previous.sized() || asked < 0 || row >= present.size ||
-        !reach(present, previous, row, step_s, hardest, reached)) {
+    rows_before.clear(); // empty where the actors are the same
+    if (given[5] != Py_None && !read_earlier(given[5], present.size, previous.size, rows_before)) {
+        return nullptr;
+    }
+    if ((given[5] == Py_None && previous.size != present.size) || !present.sized() || !previous.sized() || asked < 0 ||
+        row >= present.size || !reach(present, previous, row, step_s, hardest, reached, rows_before)) {
         Py_RETURN_NONE;
     }
     PyObject *found = PyList_New(static_cast<Py_ssize_t>(reached.size()));

@@ -1,19 +1,17 @@
-from ._choice import (
+from ._crashes import HARDEST as HARDEST, OffRoad as OffRoad, Overlap as Overlap, ReportedCollision as ReportedCollision
+from ._protocol import (
     DEFAULT_ORACLES as DEFAULT_ORACLES,
+    BringsOutcomes as BringsOutcomes,
+    Finding as Finding,
+    Oracle as Oracle,
     OracleChoice as OracleChoice,
+    SeesMap as SeesMap,
     chosen_oracles as chosen_oracles,
+    merge_findings as merge_findings,
     modules_of as modules_of,
     oracle_name as oracle_name,
     outcomes_brought as outcomes_brought,
     parse_oracle as parse_oracle,
-)
-from ._crashes import HARDEST as HARDEST, OffRoad as OffRoad, Overlap as Overlap, ReportedCollision as ReportedCollision
-from ._protocol import (
-    BringsOutcomes as BringsOutcomes,
-    Finding as Finding,
-    Oracle as Oracle,
-    SeesMap as SeesMap,
-    merge_findings as merge_findings,
 )
 from ._traffic import (
     OffRoute as OffRoute,

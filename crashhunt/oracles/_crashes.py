@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.oracles._protocol import Finding
 from crashhunt.trial import Collision, Outcome
-from crashhunt.world import contact_at, first_contact, lane_jump, outlines_overlap, reachable_m
+from crashhunt.world import MAX_CONTACT_GAP_M, contact_at, first_contact, lane_jump, outlines_overlap, reachable_m
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Contact, Rectangle, Scene, Touch
 
 __all__ = ["HARDEST", "OffRoad", "Overlap", "ReportedCollision"]
-
-_NEAR_M = 1.0  # a reported collision of actors further apart is not one of their outlines
 
 HARDEST = 10.0
 """Upper bound of braking, in m/s²: it bounds the speed of an actor in the previous scene."""
@@ -47,7 +45,7 @@ class ReportedCollision:
         other = contact.victim if agent == contact.collider else contact.collider
         if scene.swept and agent in index and other in index:
             touch = contact_at(scene.previous, scene, index[agent], index[other])
-            if touch.gap_m < _NEAR_M:
+            if touch.gap_m < MAX_CONTACT_GAP_M:
                 lane = _lane_at(scene, agent, touch) or contact.lane
                 return _touching(self.name, agent, other, touch, contact.kind, lane)
         x, y, lane = _where(scene, agent)
@@ -133,9 +131,13 @@ def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
     roster, further = scene.roster, 0.0
     if previous is not None:
         step_s = scene.time_s - previous.time_s
-        same = previous.roster is roster and not (scene.spines or previous.spines)
-        if same and scene.core is not None and scene.columns is not None and previous.columns is not None:
-            rows = scene.core.within_reach(scene.columns, previous.columns, row, step_s, HARDEST)
+        bends = scene.spines or previous.spines
+        if not bends and scene.core is not None and scene.columns is not None and previous.columns is not None:
+            before = None
+            if previous.roster is not roster:
+                index = previous.roster.index
+                before = [index.get(actor.id, -1) for actor in roster.actors]
+            rows = scene.core.within_reach(scene.columns, previous.columns, row, step_s, HARDEST, before)
             if rows is not None:
                 return rows
         further = 2 * reachable_m(max(scene.speeds) + HARDEST * step_s, step_s)

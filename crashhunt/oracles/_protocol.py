@@ -1,17 +1,37 @@
-"""The oracle protocol: whether a step is a crash."""
+"""The oracle protocol: whether a step is a crash; and the choice of oracles by name."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+from crashhunt.base.errors import ArgumentError, CrashhuntError, UsageError
+from crashhunt.base.exceptions import blamed
+from crashhunt.base.plugins import locate
+from crashhunt.trial import Constant, Outcome, parse_spec, signature_of
 
-    from crashhunt.trial import Category, Collision, Outcome
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from crashhunt.trial import Category, Collision, Value
     from crashhunt.world import Event, Lane, Scene
 
-__all__ = ["BringsOutcomes", "Finding", "Oracle", "SeesMap", "merge_findings"]
+
+__all__ = [
+    "DEFAULT_ORACLES",
+    "BringsOutcomes",
+    "Finding",
+    "Oracle",
+    "OracleChoice",
+    "SeesMap",
+    "chosen_oracles",
+    "merge_findings",
+    "modules_of",
+    "oracle_name",
+    "outcomes_brought",
+    "parse_oracle",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +70,12 @@ class SeesMap(Protocol):
     """Offered by an oracle that wants to know the roads."""
 
     def see_map(self, lanes: Sequence[Lane]) -> None:
-        """Take the map of the trial, before the first `Oracle.check`; empty where the simulator has none."""
+        """Take the map of the trial, before the first `Oracle.check`; empty if the simulator has none."""
 
 
 @runtime_checkable
 class BringsOutcomes(Protocol):
-    """Implemented by oracles with outcomes of their own, or with findings that are crashes only on request."""
+    """Implemented by oracles with their own outcomes, or with findings that are crashes only on request."""
 
     outcomes: Mapping[str, Category]
     """Name to ``traffic crash`` or ``traffic event``. A hunt that chooses the oracle stops on them, unless
@@ -63,7 +83,7 @@ class BringsOutcomes(Protocol):
 
 
 def merge_findings(findings: Sequence[Finding]) -> Finding | None:
-    """Return the first finding, credited to every oracle that saw the same; None where there is none."""
+    """Return the first finding, credited to every oracle that saw the same; None if there is none."""
     if not findings:
         return None
     first = findings[0]
@@ -74,3 +94,122 @@ def merge_findings(findings: Sequence[Finding]) -> Finding | None:
     same = [hit for hit in hits if {hit.collider, hit.victim} == parties]
     seen_by = tuple(sorted({name for hit in same for name in hit.seen_by}))
     return Finding(first.outcome, replace(first.collision, seen_by=seen_by))
+
+
+# Oracles as they are chosen: ``NAME`` or ``NAME:key=value,key=value``; NAME is registered or ``module:attribute``.
+
+DEFAULT_ORACLES = ("reported-collision", "overlap", "off-road")
+"""Who looks at every hunt, unless ``none`` is among those that are chosen."""
+
+_NONE = "none"
+# A colon may belong to module:attribute; one that is followed by key= begins the arguments.
+_CHOICE = re.compile(r"(?P<name>.+?)(?::(?P<arguments>[A-Za-z_]\w*=.*))?")
+
+
+@dataclass(frozen=True, slots=True)
+class OracleChoice:
+    """An oracle with its arguments.
+
+    Args:
+        name: name of a registered object, or ``module:attribute``.
+        arguments: arguments by name.
+        factory: the object of that name, kept because each trial makes an oracle and a lookup takes milliseconds.
+    """
+
+    name: str
+    arguments: dict[str, Value]
+    factory: Callable[..., Oracle]
+
+    def make(self) -> Oracle:
+        """Return a new oracle.
+
+        Raises:
+            CrashhuntError: it cannot be made.
+        """
+        try:
+            made = self.factory(**self.arguments)
+            if isinstance(made, BringsOutcomes):
+                for name, category in made.outcomes.items():
+                    Outcome.own(name, category)
+        except CrashhuntError:
+            raise
+        except Exception as error:  # of user code
+            fix = "correct it, or its arguments"
+            raise blamed(f"the oracle {self.name!r} cannot be created", error, fix=fix) from error
+        return made
+
+    def outcomes(self) -> tuple[Outcome, ...]:
+        """The outcomes that it brings.
+
+        Raises:
+            CrashhuntError: as of `make`.
+        """
+        made = self.make()
+        return tuple(map(Outcome, made.outcomes)) if isinstance(made, BringsOutcomes) else ()
+
+
+def oracle_name(text: str) -> str:
+    """Return the name in a choice; nothing is imported."""
+    match = _CHOICE.fullmatch(text)
+    return match["name"] if match else text
+
+
+def modules_of(oracles: Iterable[str]) -> list[str]:
+    """Return the modules of the oracles that are chosen as ``module:attribute``; nothing is imported."""
+    return [name.partition(":")[0] for text in oracles if ":" in (name := oracle_name(text))]
+
+
+def parse_oracle(text: str) -> OracleChoice:
+    """Read a choice.
+
+    Raises:
+        CrashhuntError: there is no such oracle, it takes no such argument, or a value is none of the right type.
+    """
+    match = _CHOICE.fullmatch(text)
+    if match is None:
+        raise UsageError(f"--oracle {text!r} names no oracle", fix="give NAME or NAME:key=value")
+    name, pairs = match["name"], match["arguments"]
+    factory: Callable[..., Oracle] = locate("oracles", name)
+    signature = signature_of(factory)
+    arguments: dict[str, Value] = {}
+    for pair in pairs.split(",") if pairs else ():
+        key, equals, value = pair.partition("=")
+        if not equals:
+            raise UsageError(f"--oracle {text!r}: {pair!r} is not an argument", fix="write key=value")
+        if key in arguments:
+            raise UsageError(f"--oracle {text!r} gives {key!r} twice", fix="give it once")
+        signature.check([key], where=f"--oracle {name}")
+        kind = signature.arguments[key].kind if key in signature.arguments else None
+        distribution = parse_spec(value, kind, where=f"--oracle {name}:{key}")
+        if not isinstance(distribution, Constant):
+            fix = "give one value; what is searched are the arguments of agents and of the scenario"
+            raise ArgumentError(f"{value!r} is not a single value", fix=fix, where=f"--oracle {name}:{key}")
+        arguments[key] = distribution.value
+    return OracleChoice(name, arguments, factory)
+
+
+def chosen_oracles(asked: Sequence[str]) -> tuple[str, ...]:
+    """Return the oracles of a hunt in the order of their checks: the default ones, then the chosen ones.
+
+    Args:
+        asked: what ``--oracle`` was given, as often as it was; ``none`` drops the default ones.
+
+    Raises:
+        CrashhuntError: an oracle cannot be made, or none is chosen.
+    """
+    added = [text for text in asked if text != _NONE]
+    found = tuple(dict.fromkeys([*(() if _NONE in asked else DEFAULT_ORACLES), *added]))
+    if not found:
+        raise UsageError("--oracle none leaves no oracle to detect crashes", fix="add another --oracle")
+    for text in added:
+        parse_oracle(text).make()
+    return found
+
+
+def outcomes_brought(oracles: Iterable[str]) -> tuple[Outcome, ...]:
+    """Return the outcomes that oracles bring, beyond those that every hunt stops on.
+
+    Raises:
+        CrashhuntError: one of them cannot be had.
+    """
+    return tuple(dict.fromkeys(outcome for text in oracles for outcome in parse_oracle(text).outcomes()))

@@ -26,8 +26,8 @@ class TooClose:
     """Sees a near miss: an agent that moves comes nearer to another actor than a gap, without touching it.
 
     Args:
-        gap_m: between the outlines.
-        speed: of the agent relative to the other, at least; 0 includes an agent that creeps up in a queue.
+        gap_m: gap between the outlines.
+        speed: speed of the agent relative to the other, at least; 0 includes an agent that creeps up in a queue.
     """
 
     name = "too-close"
@@ -70,7 +70,7 @@ class TooClose:
         return found
 
     def _gap(self, scene: Scene, row: int, other: int) -> tuple[float, int] | None:
-        """The gap to another actor, in m, and its row; None where it counts as no near miss."""
+        """The gap to another actor, in m, and its row; None if it counts as no near miss."""
         vx, vy = (
             scene.speeds[row] * turn(scene.headings[row]) - scene.speeds[other] * turn(scene.headings[other])
             for turn in (math.cos, math.sin)

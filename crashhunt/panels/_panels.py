@@ -96,10 +96,10 @@ class Panel:
     """A picture of something inside an agent.
 
     Args:
-        title: above it; scopes and keys come before it in the label.
+        title: title above the panel; the label has scopes and keys before the title.
 
     Attributes:
-        scopes: in which it was made.
+        scopes: scopes in which it was made.
     """
 
     title: str = ""
@@ -109,8 +109,8 @@ class Panel:
         """Return it as uint8, shape (height, width, 3).
 
         Args:
-            width: in pixels.
-            height: in pixels.
+            width: width in pixels.
+            height: height in pixels.
             label: above it; its title by default.
 
         Raises:
@@ -143,8 +143,8 @@ class Contour(Panel):
 
     Args:
         values: shape (rows, columns).
-        low: of the lowest level; the least value by default.
-        high: of the highest level; the greatest by default.
+        low: value of the lowest level; the least value by default.
+        high: value of the highest level; the greatest by default.
         levels: how many.
     """
 
@@ -161,7 +161,7 @@ class Curve(Panel):
     Args:
         series: name to values; or the values of the only one.
         x: of all values; their number by default.
-        low: of the vertical axis; the least value by default.
+        low: lower end of the vertical axis; the least value by default.
         high: likewise.
         cursor: where to draw a vertical line.
     """
@@ -179,7 +179,7 @@ class Curve3D(Panel):
 
     Args:
         points: shape (n, 3).
-        azimuth: from where it is seen, in degrees.
+        azimuth: direction from which the scene is seen, in degrees.
     """
 
     points: ArrayLike
@@ -192,7 +192,7 @@ class Bar(Panel):
 
     Args:
         values: name to value, or values.
-        low: of the axis; 0 or the least value by default.
+        low: lower end of the axis; 0 or the least value by default.
         high: likewise.
     """
 
@@ -217,10 +217,10 @@ class Action(Panel):
     """An action: bars within their bounds, or an integer.
 
     Args:
-        value: of a Box space, or the integer of a discrete one.
+        value: value of a Box space, or the integer of a discrete one.
         low: the bounds of each part; needed for bars.
         high: likewise.
-        names: of the parts.
+        names: names of the parts.
     """
 
     value: ArrayLike
@@ -234,10 +234,10 @@ class ActionDistribution(Panel):
     """How likely an agent is to act in which way.
 
     Args:
-        probabilities: of each discrete action.
-        mean: of each part of a continuous action, with ``std``.
+        probabilities: probabilities of each discrete action.
+        mean: mean of each part of a continuous action, with ``std``.
         std: its standard deviation.
-        names: of the actions or parts.
+        names: names of the actions or parts.
     """
 
     probabilities: ArrayLike | None = None
@@ -333,8 +333,8 @@ class Canvas:
     """An empty panel with its title, to draw on.
 
     Args:
-        width: in pixels.
-        height: in pixels.
+        width: width in pixels.
+        height: height in pixels.
         title: above it.
 
     Attributes:
@@ -390,7 +390,7 @@ def painted(panel: Panel, width: int, height: int, label: str) -> NDArray[np.uin
 
 @singledispatch
 def _paint(panel: Panel, _canvas: Canvas) -> None:
-    raise TypeError(f"{type(panel).__name__} does not say how it is drawn")
+    raise TypeError(f"{type(panel).__name__} has no method that draws it")
 
 
 @_paint.register(Heatmap)
@@ -521,7 +521,7 @@ def _paint_distribution(panel: ActionDistribution, canvas: Canvas) -> None:
         _bars(canvas, [_name(panel.names, place) for place in range(len(values))], values, 0.0, 1.0)
         return
     if panel.mean is None or panel.std is None:
-        raise ValueError("probabilities are needed, or mean and std")
+        raise ValueError("give probabilities, or mean and std")
     mean, std = _numbers(panel.mean).ravel(), np.maximum(_numbers(panel.std).ravel(), 1e-9)
     if len(mean) != len(std):
         raise ValueError(f"mean has {len(mean)} parts, std {len(std)}")
@@ -546,7 +546,7 @@ def _paint_picture(panel: Picture, canvas: Canvas) -> None:
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.ndim != 3 or 0 in pixels.shape:
-        raise ValueError(f"an image is needed, not shape {pixels.shape}")
+        raise ValueError(f"give an image, not shape {pixels.shape}")
     if pixels.shape[2] < 3:
         pixels = np.repeat(pixels[:, :, :1], 3, axis=2)
     scale = min((canvas.width - 12) / pixels.shape[1], (canvas.height - _TOP - 6) / pixels.shape[0])
@@ -606,7 +606,7 @@ def _bars(canvas: Canvas, names: Sequence[str], values: NDArray[np.float64], low
 def _matrix_of(values: ArrayLike) -> NDArray[np.float64]:
     matrix = np.atleast_2d(_numbers(values))
     if matrix.ndim != 2 or 0 in matrix.shape:
-        raise ValueError(f"a matrix is needed, not shape {matrix.shape}")
+        raise ValueError(f"give a matrix, not shape {matrix.shape}")
     return matrix
 
 

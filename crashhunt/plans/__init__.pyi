@@ -33,20 +33,18 @@ from ._plan import (
     with_recorded_load_order as with_recorded_load_order,
     with_settings as with_settings,
 )
-from ._request import (
-    Request as Request,
-    SizesItself as SizesItself,
-    executor_of as executor_of,
-    fields_of as fields_of,
-    parallel_here as parallel_here,
-    request_of as request_of,
-    spec_words as spec_words,
-)
 from ._settings import (
     AgentSettings as AgentSettings,
     ArgumentSpec as ArgumentSpec,
     HuntSettings as HuntSettings,
+    Request as Request,
     RunSettings as RunSettings,
+    SizesItself as SizesItself,
+    executor_of as executor_of,
+    fields_of as fields_of,
+    parallel_here as parallel_here,
     read_settings as read_settings,
+    request_of as request_of,
+    spec_words as spec_words,
     write_settings as write_settings,
 )

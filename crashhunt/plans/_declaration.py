@@ -53,16 +53,16 @@ class About:
     """What the list says of an option besides its name, type and default.
 
     Args:
-        meaning: of its value, in words.
+        meaning: meaning of its value, in words.
         help: the same on the command line, where it has to be said otherwise.
-        unset: what holds where it is not given, in words; empty where that is the default itself.
-        flag: on the command line; empty where it is not there.
-        metavar: of its value, on the command line.
-        group: of the help of ``crashhunt run``: what is tested, search, faults and probes, what is kept, how it runs,
-            output.
+        unset: what holds where it is not given, in words; empty if that is the default itself.
+        flag: flag on the command line; empty if it is not there.
+        metavar: metavar of its value, on the command line.
+        group: group of the help of ``crashhunt run``: what is tested, search, faults and probes, what is kept, how it
+            runs, output.
         brief: the same in one line, for the short help of ``crashhunt run``; empty for options that it only names.
         check: says what to give instead of a value that is none.
-        separator: of a list that is one word on the command line; empty where its flag may be repeated.
+        separator: separator of a list that is one word on the command line; empty if its flag may be repeated.
         named: of a table, whether every value has a name.
         anywhere: whether ``suite run`` and ``rerun`` have the flag as well, for all their hunts: it belongs to the
             machine, and not to the hunt.
@@ -110,8 +110,8 @@ class HuntOption:
     """One option of the list.
 
     Args:
-        name: in Python and in files.
-        form: of its values.
+        name: name in Python and in files.
+        form: form of its values.
         default: what holds where it is not given.
         about: everything else.
     """
@@ -233,12 +233,12 @@ def seconds_of(text: str) -> float:
     parts = found.groups() if found else ()
     seconds = sum(float(part or 0) * unit for part, unit in zip(parts, _UNITS, strict=bool(parts)))
     if not 0 < seconds < math.inf:
-        raise ValueError(f"{text!r} is no time")
+        raise ValueError(f"{text!r} is not a time")
     return seconds
 
 
 def check_duration(text: str) -> str:
-    """Return what to give instead of a text that is no time; empty where it is one."""
+    """Return what to give instead of a text that is no time; empty if it is one."""
     try:
         seconds_of(text)
     except ValueError:
@@ -257,12 +257,12 @@ def share_of(text: str) -> float:
     """
     found = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
     if not 0 < found <= 1:
-        raise ValueError(f"{text!r} is no share")
+        raise ValueError(f"{text!r} is not a share")
     return found
 
 
 def check_share(text: str) -> str:
-    """Return what to give instead of a text that is no share; empty where it is a share, or nothing."""
+    """Return what to give instead of a text that is no share; empty if it is a share, or nothing."""
     try:
         share_of(text or "1")
     except ValueError:
@@ -271,10 +271,10 @@ def check_share(text: str) -> str:
 
 
 def check_probe(text: str) -> str:
-    """Return what to give instead of how often copies are asked; empty where that is fine."""
+    """Return what to give instead of how often copies are asked; empty if that is fine."""
     if check_duration(text):
-        return "give a time above 0, such as 4s, or leave it out"
-    return "" if not text or sys.platform == "linux" else "leave it out: processes are copied on Linux only"
+        return "give a time above 0, such as 4s, or omit the option"
+    return "" if not text or sys.platform == "linux" else "omit the option: forks need Linux"
 
 
 # ``--until-rate RATE/UNIT`` and ``--bar RATE/UNIT``: how often an agent may crash.
@@ -282,6 +282,7 @@ def check_probe(text: str) -> str:
 RatePer = Literal["trial", "hour", "1000km"]
 """What a rate is per."""
 RATE_PERS: tuple[RatePer, ...] = get_args(RatePer)
+_MIN_BAR, _MAX_BAR = 1e-12, 1e12  # beyond these, trials decide nothing and floats overflow
 _RATE = re.compile(r"(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)\s*/\s*(trial|hour|1000\s?km)")
 
 
@@ -292,22 +293,22 @@ def rate_of(text: str) -> tuple[float, RatePer]:
     (2.0, 'hour')
 
     Raises:
-        ValueError: the text is no such rate, or the rate is not above 0, or not below 1 per trial.
+        ValueError: the text is no such rate, or the rate is out of range.
     """
     found = _RATE.fullmatch(text.strip())
     if found is None:
-        raise ValueError(f"{text!r} is no rate")
+        raise ValueError(f"{text!r} is not a rate")
     value, per = float(found[1]), cast(RatePer, found[2].replace(" ", ""))
-    if not 0 < value < (1 if per == "trial" else math.inf):
+    if not _MIN_BAR <= value <= _MAX_BAR or (per == "trial" and value >= 1):
         raise ValueError(f"{text!r} is out of range")
     return value, per
 
 
 def check_rate(text: str) -> str:
-    """Return what to give instead of a text that is no rate; empty where it is one, or empty."""
+    """Return what to give instead of a text that is no rate; empty if it is one, or empty."""
     try:
         if text:
             rate_of(text)
     except ValueError:
-        return "give a rate above 0, such as 1e-3/trial (below 1), 2/hour or 5/1000km"
+        return "give a rate from 1e-12 to 1e12, such as 1e-3/trial (below 1), 2/hour or 5/1000km"
     return ""

@@ -72,7 +72,8 @@ class Subject(_Options):
     )  # fmt: skip
     ego: str = option(
         "", "which vehicle of a bare ``.sumocfg``",
-        help="for a .sumocfg: the vehicle to control; route=ID or edges=FROM,TO to add one; any: another in each trial",
+        help="for a .sumocfg: the vehicle to control; route=ID or edges=FROM,TO adds a vehicle; any: a random "
+            "vehicle in each trial",
         unset="any",
         flag="--ego", metavar="VEHICLE", group="what",
     )  # fmt: skip
@@ -83,28 +84,28 @@ class Subject(_Options):
         flag="--action", metavar="FORM", group="what",
     )  # fmt: skip
     agents: Mapping[str, Driver] | None = option(
-        {}, "vehicle to who drives it, where there are several",
-        help="who drives: a class or function, or a name that crashhunt agents lists; ID= where the scenario has "
-        "several controlled vehicles",
+        {}, "vehicle to its agent, where there are several",
+        help="the agent that drives: a class or function, or a name that crashhunt agents lists; ID= if the scenario "
+            "has several controlled vehicles",
         brief="the class, function or listed name that drives",
         flag="--agent", metavar="[ID=]MODULE:ATTR", group="what", named=False,
     )  # fmt: skip
     arguments: Mapping[str, Spec] | None = option(
         {}, '``NAME`` or ``AGENT.NAME`` to a value or a specification such as ``"5:40"``',
-        help=f"what to try for an argument of the agent: {_SPEC}; ID.NAME=SPEC for one of several agents",
+        help=f"values to try for an argument of the agent: {_SPEC}; ID.NAME=SPEC for one of several agents",
         brief="values of an argument of the agent: 20, 5:40, log:1e-3:1, a|b|c",
         flag="--arg", metavar="NAME=SPEC", group="what",
     )  # fmt: skip
     scenario_arguments: Mapping[str, Spec] | None = option(
         {}, "the same for arguments of the scenario: name to value or specification",
-        help="the same for an argument of the scenario, such as its traffic demand",
+        help="values to try for an argument of the scenario, such as its traffic demand",
         brief="the same for an argument of the scenario, such as its traffic",
         flag="--set", metavar="NAME=SPEC", group="what",
     )  # fmt: skip
     oracles: Sequence[str] = option(
         (), "who looks for crashes besides the simulator's report, overlaps and the edge of the road",
-        help="have an oracle look for crashes as well, with its arguments; crashhunt oracles lists them; none drops "
-        "those that look at every hunt; may be repeated",
+        help="an additional oracle that detects crashes, with its arguments; crashhunt oracles lists all; none: "
+            "without the default oracles; may be repeated",
         flag="--oracle", metavar="NAME[:KEY=VALUE,…]", group="what",
     )  # fmt: skip
 
@@ -115,17 +116,18 @@ class TrialOptions(_Options):
 
     sampler: str = option(
         "random", "its name",
-        help="random, halton, sobol, grid or sweep; or one that learns: guided, cross-entropy, mutation, cma-es, "
-        "optuna:NAME, as in optuna:tpe",
+        help="random, halton, sobol, grid or sweep; or one that learns from results: guided, cross-entropy, "
+            "mutation, cma-es, optuna:NAME, as in optuna:tpe",
         brief="random, grid, guided and others: how arguments are chosen",
         flag="--sampler", group="search", metavar="NAME",
     )  # fmt: skip
     points: int = option(
-        10, "values that grid and sweep try of a range without a step", flag="--points", group="search", metavar="N",
+        10, "number of values that grid and sweep try in a range without a step", flag="--points", group="search",
+        metavar="N",
         check=at_least(1),
     )  # fmt: skip
     seed: int | None = option(
-        None, "of the hunt", unset="a new one, which is printed", brief="the same seed runs the same trials",
+        None, "seed of the hunt", unset="a new one, which is printed", brief="the same seed runs the same trials",
         flag="--seed", group="search", metavar="N", check=at_least(0),
     )  # fmt: skip
     crash_on: Sequence[str] = option(
@@ -138,23 +140,25 @@ class TrialOptions(_Options):
     disturb: Sequence[str] = option(
         (), "how often others around the agent err, or it sees or acts late: ``NAME=RATE`` with a rate per second; or "
         "what every trial has in one step, ``KIND@STEP=WHO:HOW_STRONG:HOW_LONG``",
-        help="have others around the agent err, or the agent see or act late, so often a second, as in "
-        "brake=0.02,cut_in=0.01: brake, stop, dawdle, speed, cut_in, late_merge, step_out, ignore_priority, unseen, "
-        "late_observation, noisy_observation, late_action or module:attribute; or in every trial from one step on, as "
-        "in brake@124=ahead:4:2 for 4 m/s² and 2 s; none for nothing at all",
-        unset="as the scenario says, and nothing where it is silent",
+        help="inject faults of the vehicles around the agent, or of its sensors and actuators, with rates per "
+            "second, as in brake=0.02,cut_in=0.01: brake, stop, dawdle, speed, cut_in, late_merge, step_out, "
+            "ignore_priority, unseen, "
+        "late_observation, noisy_observation, late_action or module:attribute; or in every trial from a given step, "
+        "as in brake@124=ahead:4:2 for 4 m/s² and 2 s; none: no disturbances",
+        unset="those of the scenario, if it has any",
         brief="faults of other actors or of sensors, such as brake=0.02",
         flag="--disturb", group="faults", metavar="NAME=RATE,…", separator=",",
     )  # fmt: skip
     probe: str = option(
         "", "how often copies of a trial are asked for the mildest disturbance with which it crashes, such as ``4s``",
-        help="every so many seconds of simulation, ask copies of the trial for the mildest disturbance with which it "
-        "crashes, such as 4s", unset="never", flag="--probe", group="faults", metavar="TIME", check=check_probe,
+        help="at this interval of simulation time, such as 4s, search copies of the trial for the mildest "
+            "disturbance with which it crashes", unset="never", flag="--probe", group="faults", metavar="TIME",
+        check=check_probe,
     )  # fmt: skip
     branch: bool = option(
         False, "whether copies of a trial continue with other disturbances where another actor is near",
-        help="where another actor is near, continue copies of a trial with several disturbances, from then and "
-        "from some seconds before; needs --disturb",
+        help="when another actor is near, continue copies of the trial with several disturbances, from this moment "
+            "and from some seconds earlier; needs --disturb",
         flag="--branch", group="faults",
     )  # fmt: skip
     rare: bool = option(
@@ -165,8 +169,8 @@ class TrialOptions(_Options):
     )  # fmt: skip
     seeds: int = option(
         0, "how many traffics there are, each used for many arguments; 0: every trial has its own",
-        help="draw so many traffics (a seed, and the scenario's arguments), and use each for many arguments of the "
-        "agents, from one warm-up",
+        help="draw this many traffics (a seed and the scenario's arguments), and use each for many arguments of the "
+            "agents after one warm-up; 0: a new traffic in each trial",
         unset="every trial has its own",
         flag="--seeds", group="search", metavar="N", check=at_least(0, zero="every trial has its own"),
     )  # fmt: skip
@@ -178,8 +182,8 @@ class RunOptions(_Options):
 
     duration: str = option(
         "", "time limit of the hunt: ``90s``, ``30m``, ``1h30m``; TRIALS may be 0 then",
-        help="begin no trial after this time, such as 90s, 30m or 1h30m; TRIALS may be 0 then, for no limit",
-        unset="as long as it takes", brief="begin no trial after this time, such as 30m",
+        help="start no trial after this time, such as 90s, 30m or 1h30m; TRIALS may then be 0 (no limit)",
+        unset="no time limit", brief="begin no trial after this time, such as 30m",
         flag="--for", group="search", metavar="TIME", check=check_duration,
     )  # fmt: skip
     keep_going: bool = option(
@@ -189,20 +193,20 @@ class RunOptions(_Options):
     )  # fmt: skip
     distinct: int = option(
         0, "end after so many crash types, and collect all crashes until then; 0: never",
-        help="collect all crashes until N crash types have been found, as crashhunt crashes groups "
-        "them; 0: never stop for that",
+        help="collect all crashes until N crash types have been found, as crashhunt crashes counts them; 0: no such "
+            "limit",
         flag="--distinct", group="search", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
     until_rate: str = option(
         "", "a rate, such as ``1e-3/trial``, ``2/hour`` or ``5/1000km``: end once the agent certainly crashes less, or "
         "more, often",
-        help="end once the agent certainly crashes less, or more, often than this, such as 1e-3/trial, 2/hour or "
-        "5/1000km; collects all crashes, and TRIALS may be 0; exit code 0: below, 1: above, 3: undecided",
+        help="stop when the crash rate is certainly below or above this rate, such as 1e-3/trial, 2/hour or "
+            "5/1000km; collects all crashes, and TRIALS may be 0; exit code 0: below, 1: above, 3: undecided",
         unset="run all trials", flag="--until-rate", group="search", metavar="RATE", check=check_rate,
     )  # fmt: skip
     most: int = option(
         0, "with ``until_rate``, how many trials it has at most; 0: as many as TRIALS says",
-        help="with --until-rate: run N trials at most; 0: as many as TRIALS says",
+        help="with --until-rate: the most trials to run; 0: as many as TRIALS",
         flag="--most", group="search", metavar="N", check=at_least(0, zero="as many as TRIALS says"),
     )  # fmt: skip
     keep: int = option(
@@ -220,14 +224,14 @@ class RunOptions(_Options):
     )  # fmt: skip
     only_at_fault: bool = option(
         False, "stop only at crashes that are the agent's own fault; the others are kept, and the hunt continues",
-        help="hunt for crashes that are the agent's own fault, according to the rules; other and undecided crashes "
-        "are kept and do not end the hunt",
+        help="stop only at a crash that is the agent's fault according to the rules; crashes that are not its fault, "
+            "or undecided, are saved and do not end the hunt",
         flag="--only-at-fault", group="search",
     )  # fmt: skip
     until_error: str = option(
         "", "with ``rare``, end once half of the width of the interval is at most this share of the estimate: ``0.3``",
-        help="with --rare: end once half of the width of the interval is at most this share of the estimate, such as "
-        "0.3", unset="all trials", flag="--until-error", group="faults", metavar="SHARE", check=check_share,
+        help="with --rare: stop when half the width of the interval is at most this share of the estimate, such as "
+            "0.3", unset="all trials", flag="--until-error", group="faults", metavar="SHARE", check=check_share,
     )  # fmt: skip
     deterministic: bool = option(
         False, "at a crash, let running trials of lower numbers finish: the same seed gives the same crash",
@@ -238,21 +242,21 @@ class RunOptions(_Options):
         check=above_zero("give seconds above 0"),
     )  # fmt: skip
     keep_trials: bool = option(
-        False, "keep the logs of every trial, not of crashes only", flag="--keep-trials", group="kept",
+        False, "keep the log of every trial, not only of crashes", flag="--keep-trials", group="kept",
     )  # fmt: skip
     accelerate: bool = option(
         True, "speed simulators up where that changes no bit",
-        help="run highway-env as it is; the accelerator changes no bit, and only the time it takes",
+        help="run highway-env without the accelerator; trials stay bit-identical and take longer",
         flag="--no-accelerate", group="run",
     )  # fmt: skip
     native: bool = option(
         True, "use the compiled core of simulators where it is there, which changes no bit",
-        help="do without the compiled core, which changes no bit of SUMO's trials, and only the time they take",
+        help="run SUMO without the compiled core; trials stay bit-identical and take longer",
         flag="--no-native", group="run",
     )  # fmt: skip
     recycle_after: int = option(
-        1000, "not used any more: every trial has a process of its own",
-        help="not used any more: every trial has a process of its own",
+        1000, "no effect, because every trial has its own process",
+        help="no effect, because every trial has its own process",
         flag="--recycle-after", group="run", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
     warm_copies: int = option(
@@ -262,20 +266,21 @@ class RunOptions(_Options):
     )  # fmt: skip
     audit: float = option(
         0.0, "the share of trials without a crash that are run again in a fresh process, to see that they are the same",
-        help="run this share of the trials without a crash again, each in a fresh process, and say where one is not "
-        "the same: 0.02 is one in fifty",
+        help="replay this share of the trials without a crash, each in a new process, and report every difference; "
+            "0.02 is one trial in fifty",
         flag="--audit", group="run", metavar="SHARE", check=within(0, 1, "give a share of the trials, from 0 to 1"),
     )  # fmt: skip
     near_misses: int = option(
         0, "how many of the most dangerous trials without a crash are kept as bundles of their own",
-        help="keep the N most dangerous trials without a crash as bundles of their own, to be replayed and shown; each "
-        "is run once more for that, at the end",
+        help="save the N most critical trials without a crash as bundles, for replay and show; each is run once more "
+            "at the end",
         flag="--near-misses", group="kept", metavar="N", check=at_least(0, zero="none"),
     )  # fmt: skip
     executor: str = option(
         "pool", "where trials run: its name, and perhaps ``:ARG``",
         help="where trials run: pool (warm processes on this machine), fresh (a new process for each), "
-        "ray[:HOST:PORT] (all machines of a Ray cluster) or module:attribute; ARG is for one that takes an argument",
+        "ray[:HOST:PORT] (all machines of a Ray cluster) or module:attribute; append :ARG to pass an argument to the "
+        "executor",
         flag="--executor", group="run", metavar="NAME[:ARG]", anywhere=True,
     )  # fmt: skip
 
@@ -290,7 +295,7 @@ class RunOptions(_Options):
             raise UsageError(f"--most is {found.most} without --until-rate", fix="give TRIALS, or --until-rate as well")
         if found.until_rate and (found.distinct or found.only_at_fault):
             other = "--distinct" if found.distinct else "--only-at-fault"
-            raise UsageError(f"--until-rate and {other} both end a hunt", fix=f"leave {other} out")
+            raise UsageError(f"--until-rate and {other} both end a hunt", fix=f"omit {other}")
         if found.keep and not (found.keep_going or found.distinct or found.only_at_fault or found.until_rate):
             message = f"--keep {found.keep} requires a hunt that continues after a crash"
             raise UsageError(message, fix="give --keep-going or --distinct as well")
@@ -298,7 +303,7 @@ class RunOptions(_Options):
             raise UsageError(f"--by-cause {found.by_cause} counts nothing", fix="give --distinct or --keep as well")
         if found.by_cause and found.distinct and found.deterministic:
             message = "--deterministic and --by-cause contradict each other with --distinct"
-            raise UsageError(f"{message}: which crashes are judged depends on which end first", fix="leave one out")
+            raise UsageError(f"{message}: the analysed crashes would depend on which trials end first", fix="omit one")
         return replace(found, keep_going=True) if found.distinct or found.until_rate else found
 
 
@@ -308,17 +313,17 @@ class SnapshotChoices(_Options):
 
     snapshot_roots: Sequence[str | Path] = option(
         (), "files and folders that the snapshot takes in besides the agents' own projects",
-        help="a file or folder that the snapshot takes in besides the agent's own project; may be repeated",
+        help="a file or folder to add to the snapshot, in addition to the agent's project; may be repeated",
         flag="--snapshot-root", group="kept", metavar="PATH",
     )  # fmt: skip
     snapshot_limit_mb: float = option(
-        500.0, "the most that a snapshot may have, in MB", help="the most that a snapshot may have",
+        500.0, "the greatest size of a snapshot, in MB", help="the greatest size of a snapshot, in MB",
         flag="--snapshot-limit", group="kept", metavar="MB",
         check=above_zero("give MB above 0, or --no-snapshot", finite=False),
     )  # fmt: skip
     snapshot_code: bool = option(
         True, "whether the snapshot has code at all; without, a replay runs what is current",
-        help="keep no code; a replay then runs what is current", flag="--no-snapshot", group="kept",
+        help="save no code; a replay then runs today's code", flag="--no-snapshot", group="kept",
     )  # fmt: skip
 
 

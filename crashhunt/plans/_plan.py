@@ -10,28 +10,30 @@ import subprocess
 import sys
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from crashhunt.base.apart import work_apart
 from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, UsageError
-from crashhunt.base.plugins import locate, registered
+from crashhunt.base.plugins import is_foreign, locate, registered
 from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates, word_of
 from crashhunt.oracles import chosen_oracles, outcomes_brought
 from crashhunt.plans._options import TrialOptions
-from crashhunt.plans._request import fields_of, sized
-from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
+from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
 from crashhunt.scenario import Scenario, backend_of, load_scenario, scenario_digest, titles, with_action
-from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, parse_spec, signature_of
+from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, Signature, parse_spec, signature_of
 from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
+    from crashhunt.base.json_types import Plain
     from crashhunt.disturbances import DisturbanceSampler
-    from crashhunt.plans._request import Request
-    from crashhunt.trial import Signature, Value
+    from crashhunt.plans._settings import Request
+    from crashhunt.trial import Value
 
     Surveyor = Callable[[Scenario, Request, HuntSettings], Scenario]
 
@@ -61,7 +63,7 @@ FIXED = "fixed"
 
 
 def load_order_of(scenario: Scenario) -> str | None:
-    """Return ``fixed`` or ``not fixed: REASON``; None where the simulator's results do not depend on an order."""
+    """Return ``fixed`` or ``not fixed: REASON``; None if the simulator's results do not depend on an order."""
     order = scenario.backend.load_order
     if order is None:
         return None
@@ -74,20 +76,20 @@ def with_recorded_load_order(scenario: Scenario, recorded: str | None) -> Scenar
 
     Args:
         scenario: what is run again.
-        recorded: ``load_order`` of the snapshot; None where it has none.
+        recorded: ``load_order`` of the snapshot; None if it has none.
     """
     order = scenario.backend.load_order
     return scenario if order is None or recorded == FIXED else order.keep(scenario)
 
 
 def load_order_change(scenario: Scenario, recorded: str | None) -> str:
-    """Return how the load order here differs from the recorded one, as a clause; empty where it does not.
+    """Return how the load order here differs from the recorded one, as a clause; empty if it does not.
 
     An order that was not fixed is kept by `with_recorded_load_order`, so only a fixed one can be missing here.
 
     Args:
         scenario: what is run again.
-        recorded: ``load_order`` of the snapshot; None where it has none.
+        recorded: ``load_order`` of the snapshot; None if it has none.
     """
     order, now = scenario.backend.load_order, load_order_of(scenario)
     if order is None or recorded != FIXED or now == FIXED:
@@ -127,9 +129,9 @@ class Takes:
     """Which arguments an agent takes.
 
     Args:
-        names: of those that it declares.
+        names: names of those that it declares.
         open: whether it takes any other as well (``**kwargs``).
-        defaults: of those that have a number, a string or a truth value as default.
+        defaults: defaults of those that have a number, a string or a truth value as default.
     """
 
     names: Collection[str] = ()
@@ -139,15 +141,15 @@ class Takes:
 
 @dataclass(frozen=True, slots=True)
 class Owners:
-    """Who has which arguments.
+    """The owner of each argument: an agent or the scenario.
 
-    ``AGENT.NAME`` is that agent's, and ``scenario.NAME`` the scenario's. A bare ``NAME`` is whose it is where that is
-    one only: of the agents that declare it and the scenario, or else of the agents that take any. Where there are
-    several, it belongs to none of them.
+    ``AGENT.NAME`` is an argument of that agent, and ``scenario.NAME`` one of the scenario. A bare ``NAME`` belongs to
+    the agent or the scenario that declares it, or else to the agent that accepts any argument. If there are several
+    such owners, a bare ``NAME`` belongs to none.
 
     Args:
-        agents: what each takes.
-        scenario: the names of the scenario's.
+        agents: arguments of each agent.
+        scenario: names of the arguments of the scenario.
     """
 
     agents: Mapping[str, Takes]
@@ -158,7 +160,7 @@ class Owners:
 
         Args:
             word: as it was written.
-            option: in which, for the error.
+            option: option in which, for the error.
 
         Raises:
             ArgumentError: several have it.
@@ -184,9 +186,9 @@ class Owners:
 
         Args:
             word: as it was written.
-            ask: returns what an agent takes by its code, which is asked only where the record does not know; None where
+            ask: returns what an agent takes by its code, which is asked only where the record does not know; None if
                 that code may not run.
-            option: in which the word was, for the error.
+            option: option in which the word was, for the error.
 
         Raises:
             ArgumentError: several have it.
@@ -219,7 +221,7 @@ class Owners:
 
 
 def agent_of(word: str, agents: Collection[str]) -> str:
-    """Return the agent whose id a word begins with, and a dot; empty where it is a bare name.
+    """Return the agent whose id a word begins with, and a dot; empty if it is a bare name.
 
     Identifiers may contain dots, and one may be a
     prefix of another. If several match, the longest is used.
@@ -228,12 +230,12 @@ def agent_of(word: str, agents: Collection[str]) -> str:
 
 
 def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None) -> Takes:
-    """Ask the code of an agent what it takes, in a process of its own, as that code may be of a snapshot.
+    """Ask the code of an agent what it takes, in its own process, as that code may be of a snapshot.
 
     Args:
-        locator: of the agent.
+        locator: locator of the agent.
         code: folders whose modules win over installed ones.
-        folder: from where it is imported otherwise; by default the current one.
+        folder: folder from where it is imported otherwise; by default the current one.
 
     Returns:
         What it takes; anything, where it cannot be asked, because its first run reports the reason.
@@ -267,18 +269,22 @@ def plan(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario,
     """
     request = request.checked()
     loaded = load_scenario(request.scenario, ego=request.ego)
-    scenario, settings = _planned(request, loaded)
+    known: dict[str, Signature] = {}
+    scenario, settings = _planned(request, loaded, known)
     if survey is not None and (surveyed := survey(loaded, request, settings)) is not loaded:
-        scenario, settings = _planned(request, surveyed)
+        scenario, settings = _planned(request, surveyed, known)
     return scenario, settings
 
 
-def _planned(request: Request, scenario: Scenario) -> tuple[Scenario, HuntSettings]:
+def _planned(request: Request, scenario: Scenario, known: dict[str, Signature]) -> tuple[Scenario, HuntSettings]:
+    """Resolve a request in a scenario; ``known`` holds the signatures of agents, and gets those it lacks."""
     scenario = _acting(
         scenario.with_agents(_locators(request, scenario)), dict.fromkeys(scenario.agents, request.action)
     )
     hunted = not varies_only_asked(request.sampler)
-    signatures = {agent: signature_of(locate("agents", setup.agent)) for agent, setup in scenario.agents.items()}
+    locators = {setup.agent for setup in scenario.agents.values()}
+    known |= _signatures(sorted(locators - known.keys()), request.run.timeout_s)
+    signatures = {agent: known[setup.agent] for agent, setup in scenario.agents.items()}
     oracles = chosen_oracles(request.oracles)
     brought = outcomes_brought(oracles)
     crash_on, limits = parse_crash_on(request.crash_on, brought)
@@ -317,6 +323,23 @@ def _planned(request: Request, scenario: Scenario) -> tuple[Scenario, HuntSettin
     return scenario, replace(settings, run=sized(run))
 
 
+def _signatures(locators: Sequence[str], timeout_s: float) -> dict[str, Signature]:
+    """Return what agents take, by locator; foreign ones are imported in a process of their own."""
+
+    def described(locator: str) -> Plain:
+        return signature_of(locate("agents", locator)).to_json()
+
+    found: dict[str, Signature] = {}
+    for locator in locators:
+        if is_foreign("agents", locator):
+            task = f"{locator!r} cannot be imported"
+            data = work_apart(partial(described, locator), task=task, timeout_s=_ASK_S + timeout_s)
+            found[locator] = Signature.from_json(data)
+        else:
+            found[locator] = signature_of(locate("agents", locator))
+    return found
+
+
 def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
     """Return the scenario with notes on the accelerator or compiled core, and on the reason if it is not used."""
     accelerator, core = scenario.backend.accelerator, core_of(scenario, run)
@@ -329,7 +352,7 @@ def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
 
 
 def core_of(scenario: Scenario, run: RunSettings) -> str | None:
-    """Return whether trials use the simulator's compiled core, in words; None where it has none."""
+    """Return whether trials use the simulator's compiled core, in words; None if it has none."""
     core = scenario.backend.core
     if core is None:
         return None
@@ -342,7 +365,7 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
     missing = scenario.agents.keys() ^ settings.agents.keys()
     if missing:
         raise UsageError(
-            f"hunt.toml and the scenario do not agree on the controlled vehicle {min(missing)!r}",
+            f"hunt.toml and the scenario name different controlled vehicles: {min(missing)!r}",
             fix="name the same vehicles in both",
         )
     if scenario.backend.accelerator is not None and not settings.run.accelerate:
@@ -360,7 +383,7 @@ def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
     """Return the scenario with the forms of action that are asked for; an empty one is as the scenario says."""
     for agent, action in actions.items():
         if action and not scenario.backend.actions:
-            meant, fix = titles(lambda backend: bool(backend.actions)), "leave it out; the environment has its own"
+            meant, fix = titles(lambda backend: bool(backend.actions)), "omit the option; the environment has its own"
             raise UsageError(f"--action {action} is for {meant}, and {scenario.name} is not", fix=fix)
         if action:
             scenario = with_action(scenario, agent, action)
@@ -368,10 +391,10 @@ def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
 
 
 def disturber(scenario: Scenario, disturb: Sequence[str], agents: Sequence[str]) -> DisturbanceSampler | None:
-    """Return what draws the disturbances of trials; None where there are none.
+    """Return what draws the disturbances of trials; None if there are none.
 
     Args:
-        scenario: in which they take place.
+        scenario: scenario in which they take place.
         disturb: how often what happens: ``NAME=RATE`` each; or what happens when.
         agents: the agents around which disturbances take place.
 
@@ -423,7 +446,7 @@ def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
     late = next((one for one in fixed if one.step > request.max_steps), None) if request.disturb else None
     if late is not None:
         fix = f"give a step up to {request.max_steps}, or more MAX_STEPS"
-        raise UsageError(f"--disturb {late.what}@{late.step}: a trial has {request.max_steps} steps", fix=fix)
+        raise UsageError(f"--disturb {late.what}@{late.step}: a trial has only {request.max_steps} steps", fix=fix)
     begun = [one for one in fixed if one.step <= request.max_steps]  # a scenario is for trials of any length
     return (
         *(f"{name}={rate!r}" for name, rate in parse_rates(words).items()),
@@ -436,7 +459,7 @@ def _check_branch(settings: HuntSettings) -> None:
         fix = "give rates, such as --disturb brake=0.02,cut_in=0.02"
         raise UsageError("--branch needs disturbances, and there are none", fix=fix)
     if settings.branch and sys.platform != "linux":
-        raise UsageError("--branch: processes are copied on Linux only", fix="leave it out")
+        raise UsageError("--branch: forks need Linux", fix="omit it")
 
 
 _MAX_RARE_CHANCE = 0.2  # per step: above that a first onset is no rare event, and plain trials are cheaper
@@ -473,7 +496,7 @@ def _check_rare(settings: HuntSettings, scenario: Scenario) -> None:
             message = f"--rare: --disturb {name}={rate:g} has a chance of {sampler.chance(name):.2g} per step"
             raise UsageError(message, fix=f"give at most {most:g} a second, or omit --rare")
     if sys.platform != "linux":
-        raise UsageError("--rare: processes are copied on Linux only", fix="omit it")
+        raise UsageError("--rare: forks need Linux", fix="omit it")
 
 
 def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
@@ -486,7 +509,7 @@ def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
     names = ",".join(never)
     if len(never) == len(crash_on):
         fix = f"it reports {', '.join(told)}" if told else "remove it"
-        raise UsageError(f"--crash-on {names}: the simulator {scenario.simulator!r} never reports that", fix=fix)
+        raise UsageError(f"--crash-on {names}: the simulator {scenario.simulator!r} cannot report that", fix=fix)
     return replace(scenario, notes=(*scenario.notes, f"the simulator {scenario.simulator!r} never reports {names}"))
 
 
@@ -527,7 +550,7 @@ def _limit(name: str, text: str) -> float:
         value = math.nan
     if not 0 < value < math.inf:
         fix = f"give {unit} above 0, such as {name}:{'30' if unit == 's' else '6'}"
-        raise UsageError(f"--crash-on {name}:{text}: {text!r} is no limit", fix=fix)
+        raise UsageError(f"--crash-on {name}:{text}: {text!r} is not a limit", fix=fix)
     return value
 
 
@@ -570,23 +593,12 @@ def _agents(
             found = _spec(name, signature.arguments.get(name), known.get(name), asked[agent].get(name), hunted=hunted)
             if found is not None:
                 specs[name] = found
-            elif (
-                name in signature.arguments
-                and signature.arguments[name].default is None
-                and not _has_default(setup.agent, name)
-            ):
+            elif name in signature.required:
                 raise ArgumentError(
                     f"{setup.agent} needs the argument {name!r}", fix=f"give --arg {name}=SPEC", where=f"agent {agent}"
                 )
         agents[agent] = AgentSettings(agent=setup.agent, arguments=specs)
     return agents
-
-
-def _has_default(locator: str, name: str) -> bool:
-    import inspect
-
-    parameter = inspect.signature(locate("agents", locator)).parameters[name]
-    return parameter.default is not parameter.empty
 
 
 def _owner(name: str, scenario: Scenario, signatures: Mapping[str, Signature]) -> tuple[str, str]:

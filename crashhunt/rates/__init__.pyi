@@ -24,7 +24,12 @@ from ._rare import (
     root_of as root_of,
     with_plain as with_plain,
 )
-from ._rate import CrashRate as CrashRate, RatePart as RatePart, make_rate as make_rate
+from ._rate import (
+    CrashRate as CrashRate,
+    RatePart as RatePart,
+    check_confidence as check_confidence,
+    make_rate as make_rate,
+)
 from ._running import (
     BarWatch as BarWatch,
     Paced as Paced,

@@ -67,7 +67,7 @@ class Interval(NamedTuple):
 
     Args:
         low: the least.
-        high: the greatest; infinite where there is no exposure.
+        high: the greatest; infinite if there is no exposure.
     """
 
     low: float
@@ -108,7 +108,7 @@ class Bets:
         return found
 
     def log_evidence(self, log_capitals: NDArray[np.float64]) -> float:
-        """Return the logarithm of the sum of the components that have won; minus infinity where no component has."""
+        """Return the logarithm of the sum of the components that have won; minus infinity if no component has."""
         won = log_capitals > 0
         if not won.any():
             return -math.inf
@@ -141,8 +141,8 @@ class RateTest:
         """Add units.
 
         Args:
-            events: of each, from 0 to the greatest number.
-            exposure: of each, from 0 to the greatest.
+            events: number of events in each unit, from 0 to the greatest number.
+            exposure: exposure of each unit, from 0 to the greatest.
             times: how many such units.
 
         Raises:
@@ -189,7 +189,7 @@ class RateTest:
 
     @property
     def observed(self) -> float | None:
-        """Events by exposure; None where there is no exposure."""
+        """Events by exposure; None if there is no exposure."""
         return self.events / self.exposure if self.exposure > 0 else None
 
     def log_capitals(self, rate: float) -> NDArray[np.float64]:

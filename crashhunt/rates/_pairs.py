@@ -91,7 +91,7 @@ class PairSequence:
 
         Args:
             side: 0 for a trial of the first agent, 1 for one of the second.
-            trial: of any number; one that was added before is ignored.
+            trial: trial of any number; one that was added before is ignored.
         """
         if not trial.has_ended or self._has(trial.number) or not self._is_wanted(trial.number):
             return
@@ -156,7 +156,7 @@ class PairSequence:
 
     @property
     def why_not(self) -> str:
-        """Why the pairs say nothing; empty where they do."""
+        """Why the pairs say nothing; empty if they do."""
         if self.invalid_share <= MAX_INVALID_SHARE:
             return ""
         many = f"{self.invalid} of {self.invalid + self.valid} pairs have an invalid trial"
@@ -168,12 +168,12 @@ class PairTest:
 
     Attributes:
         pairs: how many count.
-        only_first: of them, in how many the first agent crashes and the second does not. Where a pair is a traffic: in
-            how many the first crashes more often.
+        only_first: number of the pairs in which the first agent crashes and the second does not. Where a pair is a
+            traffic: in how many the first crashes more often.
         only_second: likewise.
         both: in how many both crash, equally often.
-        crashes: of the first and of the second.
-        trials: of each, in these pairs.
+        crashes: crashes of the first and of the second.
+        trials: trials of each, in these pairs.
     """
 
     def __init__(self, rounds: int = 1) -> None:
@@ -279,7 +279,7 @@ class PairWatch:
         """Add pairs in their order, until one decides.
 
         Args:
-            pairs: in order.
+            pairs: pairs in order.
             may_end: whether better and no difference are verdicts yet; worse always is one.
         """
         for pair in pairs:

@@ -41,6 +41,7 @@ from typing import TYPE_CHECKING, Final
 
 from crashhunt.disturbances import COPIES_PER_ROOT, SECONDS_PER_COPY
 from crashhunt.rates._betting import Bets, RateTest
+from crashhunt.rates._units import MAX_INVALID_SHARE
 from crashhunt.trial import Forcing, Outcome
 
 if TYPE_CHECKING:
@@ -92,6 +93,7 @@ class Root:
         crashed: whether the root itself crashed undisturbed.
         copies: the part of copies, from 0 to `bound`.
         plain: valid plain trials after it.
+        invalid: invalid ones, which do not count.
         plain_crashes: how many of them crashed.
         plain_undisturbed: how many of these crashed undisturbed.
         plain_steps: simulated for them.
@@ -107,6 +109,7 @@ class Root:
     crashed: bool = False
     copies: float = 0.0
     plain: int = 0
+    invalid: int = 0
     plain_crashes: int = 0
     plain_undisturbed: int = 0
     plain_steps: int = 0
@@ -122,10 +125,10 @@ class Estimated:
     """An estimated interval, and what it rests on.
 
     Args:
-        low: of the interval.
-        high: of the interval.
+        low: lower end of the interval.
+        high: upper end of the interval.
         effective: effective sample size, in roots.
-        largest_share: of the root with the greatest value in the sum, 0 to 1.
+        largest_share: share of the root with the greatest value in the sum, 0 to 1.
         roots_with_crash: how many roots have a value above 0.
     """
 
@@ -142,24 +145,24 @@ class RareEstimate:
 
     Args:
         roots: how many.
-        estimate: crash probability per trial; None where there is no root.
+        estimate: crash probability per trial; None if there is no root.
         undisturbed: the part of crashes that no disturbance had an effect on.
         disturbed: the other part.
-        estimated: interval for ``estimate``; None where the roots cannot carry one.
+        estimated: interval for ``estimate``; None if the roots cannot carry one.
         estimated_disturbed: the same for ``disturbed``.
-        why_not: why there is no interval for ``estimate``; empty where there is.
+        why_not: why there is no interval for ``estimate``; empty if there is.
         why_not_disturbed: the same for ``disturbed``.
-        more_roots: how many more roots are probably needed for ``estimated``; None where that cannot be predicted.
-        certain: bounds that hold whatever the roots have not met; None where they were not asked for.
+        more_roots: how many more roots are probably needed for ``estimated``; None if that cannot be predicted.
+        certain: bounds that hold whatever the roots have not met; None if they were not asked for.
         excluded: how many roots have no complete result.
-        parts: by cell, the part of ``disturbed`` whose first onset is of that cell.
+        parts: parts by cell, the part of ``disturbed`` whose first onset is of that cell.
         undisturbed_crashes: how many roots and plain trials crashed undisturbed.
         plain: how many plain trials count.
         plain_crashes: how many of them crashed.
         steps: how many were simulated.
         plain_steps: how many of them for plain trials.
         plain_equivalent_steps: how many steps plain trials would take to the same standard error; None without one.
-        relative_error: half the width of ``estimated`` over the estimate; infinite where there is none.
+        relative_error: half the width of ``estimated`` over the estimate; infinite if there is none.
     """
 
     roots: int
@@ -256,6 +259,7 @@ def with_plain(root: Root, trials: Iterable[TrialResult], crash_on: Sequence[Out
         trials: the plain trials; invalid ones do not count.
         crash_on: the outcomes that count as a crash.
     """
+    trials = list(trials)
     valid = [trial for trial in trials if trial.outcome is not Outcome.INVALID]
     crashed = [trial for trial in valid if trial.outcome in crash_on]
     undisturbed = sum(not trial.disturbed for trial in crashed)
@@ -263,6 +267,7 @@ def with_plain(root: Root, trials: Iterable[TrialResult], crash_on: Sequence[Out
         root,
         undisturbed=(root.undisturbed + undisturbed) / (1 + len(valid)),
         plain=len(valid),
+        invalid=len(trials) - len(valid),
         plain_crashes=len(crashed),
         plain_undisturbed=undisturbed,
         plain_steps=sum(trial.steps + (trial.setup_steps or 0) for trial in valid),
@@ -270,10 +275,10 @@ def with_plain(root: Root, trials: Iterable[TrialResult], crash_on: Sequence[Out
 
 
 def root_of(result: TrialResult, crash_on: Sequence[Outcome], hazard: float) -> Root | None:
-    """Return the value of a root; None where it has no complete result.
+    """Return the value of a root; None if it has no complete result.
 
     Args:
-        result: of the root.
+        result: result of the root.
         crash_on: the outcomes that count as a crash.
         hazard: sum of the chances per step of all models around all agents.
     """
@@ -309,7 +314,7 @@ def _bound(forcing: Forcing, hazard: float) -> float:
     """Return the largest sum of the weights of copies.
 
     Args:
-        forcing: of the root.
+        forcing: forcing of the root.
         hazard: sum of all chances of a trial, which bounds the probability of an onset from above.
     """
     ratios = (1.0, *forcing.ratios.values())
@@ -387,7 +392,7 @@ class _Learned:
 
     @property
     def second_mass(self) -> float:
-        """Mean probability of a second onset after a first one; 0 where no second onset was forced."""
+        """Mean probability of a second onset after a first one; 0 if no second onset was forced."""
         return self._mass / self._forced.total() if self._forced else 0.0
 
     def cells_with_seconds(self) -> tuple[str, ...]:
@@ -405,7 +410,7 @@ class RareCounter:
 
     Args:
         least_bound: lower limit of all `Root.bound`, fixed before the first root; None for no certain interval.
-        confidence: of all intervals, in (0, 1).
+        confidence: confidence of all intervals, in (0, 1).
     """
 
     def __init__(self, least_bound: float | None = None, confidence: float = 0.95) -> None:
@@ -420,16 +425,18 @@ class RareCounter:
         if least_bound is not None:
             self._tests = RateTest(), RateTest(Bets(1.0, 1.0 / least_bound, fixed_exposure=False))
 
-    def add(self, root: Root | None, plain: Iterable[bool] = ()) -> None:
+    def add(self, root: Root | None, plain: Iterable[bool] = (), invalid: int = 0) -> None:
         """Add a root.
 
         Args:
-            root: with its plain trials; None where it has no complete result.
-            plain: of a root without a complete result, which of its valid plain trials crashed: they count for the
-                certain interval.
+            root: root with its plain trials; None if it has no complete result.
+            plain: of a root without a complete result, which of its valid plain trials crashed: they count for
+                the certain interval.
+            invalid: of a root without a complete result, how many of its plain trials are invalid.
         """
         if root is None:
             self.excluded += 1
+            self._counts["invalid"] += invalid
             self._add_plain(list(plain))
             return
         self.roots += 1
@@ -439,6 +446,7 @@ class RareCounter:
         for cell, weight in root.by.items():
             self._parts[cell] += weight
         self._counts.update(
+            invalid=root.invalid,
             undisturbed=root.crashed + root.plain_undisturbed,
             steps=root.steps + root.plain_steps,
             plain_steps=root.plain_steps,
@@ -458,7 +466,7 @@ class RareCounter:
                 self._tests[0].add(float(one))
 
     def certain(self) -> tuple[float, float] | None:
-        """Return bounds that are valid whenever you look; None where they were not asked for, or nothing counts."""
+        """Return bounds that are valid whenever you look; None if they were not asked for, or nothing counts."""
         if self._tests is None or not self._tests[0].count:
             return None
         alpha = 1.0 - self.confidence
@@ -476,7 +484,10 @@ class RareCounter:
         if self.excluded > MAX_EXCLUDED * (count + self.excluded):
             why = f"{self.excluded} of {count + self.excluded} roots have no complete result"
             why += f" (allowed: {MAX_EXCLUDED:.0%})"
-            certain = None
+        elif counts["invalid"] > MAX_INVALID_SHARE * (counts["plain"] + counts["invalid"]):
+            why = f"{counts['invalid']} of {counts['plain'] + counts['invalid']} plain trials are invalid, more than "
+            why += f"{MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
+        certain = None if why else certain
         whole, why_not, more = self._whole.interval(count, self.confidence)
         part, why_not_part, _ = self._disturbed.interval(count, self.confidence)
         if not why and whole is not None and certain is not None and certain[0] > whole.high:
@@ -517,10 +528,10 @@ def rare_estimate(
     """Return the crash probability per trial with its intervals.
 
     Args:
-        roots: with a complete result, in the order of their numbers.
+        roots: roots with a complete result, in the order of their numbers.
         least_bound: lower limit of all `Root.bound`, fixed before the first root; None for no certain interval.
         excluded: how many roots have none.
-        confidence: of all intervals, in (0, 1).
+        confidence: confidence of all intervals, in (0, 1).
     """
     counter = RareCounter(least_bound, confidence)
     for root in roots:
@@ -550,7 +561,7 @@ class _Sums:
         return math.sqrt(max(0.0, self.squares - self.total**2 / count) / (count - 1) / count)
 
     def skewness(self, count: int) -> float:
-        """Return the skewness of the values of so many roots; 0 where all are equal."""
+        """Return the skewness of the values of so many roots; 0 if all are equal."""
         mean = self.total / count
         variance = self.squares / count - mean**2
         if variance <= 1e-12 * mean**2:  # rounding
@@ -570,7 +581,7 @@ class _Sums:
         few = self.positive < MIN_ROOTS_WITH_CRASH
         reasons = [
             f"the effective sample size is {effective:.1f} (at least {MIN_EFFECTIVE:g})" * (effective < MIN_EFFECTIVE),
-            f"{self.positive} roots have a crash (at least {MIN_ROOTS_WITH_CRASH})" * few,
+            f"roots with a crash: {self.positive} (at least {MIN_ROOTS_WITH_CRASH})" * few,
             f"one root is {share:.0%} of the sum (at most {MAX_SHARE:.0%})" * (share > MAX_SHARE),
         ]
         if why := ", ".join(filter(None, reasons)):

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from crashhunt.base.errors import UsageError
 from crashhunt.rates._units import MAX_INVALID_SHARE
 
 if TYPE_CHECKING:
@@ -13,9 +14,10 @@ if TYPE_CHECKING:
     from crashhunt.rates._betting import Interval
     from crashhunt.rates._units import Per, RateCounter, UnitSequence
 
-__all__ = ["CrashRate", "RatePart", "make_rate"]
+__all__ = ["CrashRate", "RatePart", "check_confidence", "make_rate"]
 
 _S_PER_HOUR, _M_PER_KM = 3600.0, 1000.0
+_MIN_CONFIDENCE, _MAX_CONFIDENCE = 50.0, 99.9999  # percent; above that, six digits would show 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,11 +26,11 @@ class RatePart:
 
     Args:
         by: what divides the parts: ``kind``, ``fault``, ``disturbance`` or an argument.
-        name: of the part.
+        name: name of the part.
         trials: valid trials in it.
-        crashes: of them.
-        estimate: crashes by exposure; None where the number of trials was not fixed ahead.
-        certain: interval, at the confidence of all parts together; None where there is none.
+        crashes: crashes of them.
+        estimate: crashes by exposure; None if the number of trials was not fixed ahead.
+        certain: interval, at the confidence of all parts together; None if there is none.
     """
 
     by: str
@@ -53,22 +55,22 @@ class CrashRate:
     Args:
         dir: directory of the hunt.
         per: what the rate is per.
-        confidence: of the certain interval, in percent.
+        confidence: confidence of the certain interval, in percent.
         method: ``plain``, counted trials; or ``rare``, copies with forced onsets.
         units: independent units that count: trials, or traffics.
-        crashes: in them.
+        crashes: crashes in them.
         trials: valid trials in them.
         driven_s: time that the agents drove in them, in s.
         driven_m: distance, in m.
-        estimate: crashes by exposure; None where the number of trials was not fixed ahead.
-        certain: interval that is valid whenever you look; None where there is none.
-        why_not: why there is no interval, or no estimate; empty where there are both.
+        estimate: crashes by exposure; None if the number of trials was not fixed ahead.
+        certain: interval that is valid whenever you look; None if there is none.
+        why_not: why there is no interval, or no estimate; empty if there are both.
         excluded: reason to number of trials that do not count.
         parts: parts of the rate, by disturbance and by what was asked for.
         steps: that the trials took.
         bar: rate that it was compared with; None for none.
         verdict: ``below``, ``above`` or ``undecided``; empty without a bar.
-        why_undecided: why more trials do not help to compare it; empty where they do, or it is decided.
+        why_undecided: why more trials do not help to compare it; empty if they do, or it is decided.
     """
 
     dir: str
@@ -118,6 +120,17 @@ class CrashRate:
         return found
 
 
+def check_confidence(percent: float) -> None:
+    """Refuse a confidence, in percent, that no interval or verdict can have.
+
+    Raises:
+        UsageError: it is out of range.
+    """
+    if not _MIN_CONFIDENCE <= percent <= _MAX_CONFIDENCE:
+        fix = f"give percent from {_MIN_CONFIDENCE:g} to {_MAX_CONFIDENCE:g}, such as 95"
+        raise UsageError(f"--confidence is {percent:.12g}", fix=fix)
+
+
 def make_rate(
     directory: str,
     per: Per,
@@ -133,15 +146,15 @@ def make_rate(
     """Return the rate of counted units.
 
     Args:
-        directory: of the hunt.
+        directory: directory of the hunt.
         per: what the rate is per.
-        counter: of all units.
+        counter: counter of all units.
         sequence: that the units came from.
-        confidence: of the interval, in percent.
+        confidence: confidence of the interval, in percent.
         why_no_interval: reason against any interval, such as a sampler that learns; empty for none.
         why_no_estimate: reason against an estimate; empty for none.
-        parts: of the rate.
-        bar: to compare with.
+        parts: parts of the rate.
+        bar: rate to compare with.
     """
     why_not = why_no_interval or counter.why_not
     if not why_not and not counter.units:

@@ -46,7 +46,7 @@ class Paced(Generic[T]):
         """Return the value.
 
         Args:
-            version: of what it is made from.
+            version: version of what it is made from.
             now: whether one that is out of date will not do.
         """
         began = time.monotonic()
@@ -86,11 +86,11 @@ class RateWatch:
             self._count(unit)
 
     def _count(self, unit: Unit) -> tuple[float, float] | None:
-        """Count a unit; return its crashes and exposure, or None where it does not count."""
+        """Count a unit; return its crashes and exposure, or None if it does not count."""
         return self.counter.add(unit)
 
     def interval(self) -> Interval | None:
-        """Return the certain interval; None where there is no unit, or an exposure is not known."""
+        """Return the certain interval; None if there is no unit, or an exposure is not known."""
         return self.counter.interval(self.alpha)
 
     def running(self, *, now: bool = False) -> RunningRate:

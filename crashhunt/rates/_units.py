@@ -58,13 +58,13 @@ class TrialFacts(NamedTuple):
 
     Args:
         number: its place in the hunt.
-        has_ended: False where its process was killed from outside, so that a resumed hunt runs it again.
+        has_ended: False if its process was killed from outside, so that a resumed hunt runs it again.
         valid: whether it could be set up.
         crashed: whether it ended with an outcome that the hunt counts as a crash.
         steps: how many it took.
-        driven_s: time that the agents drove, in s; None where it is not known.
-        driven_m: distance, in m; None where it is not known.
-        step_length_s: of the simulator; None where it is not known.
+        driven_s: time that the agents drove, in s; None if it is not known.
+        driven_m: distance, in m; None if it is not known.
+        step_length_s: step length of the simulator; None if it is not known.
         origin: the strategy that proposed it; empty for none.
         tags: what it belongs to, such as the bin of an argument; for parts of a rate.
     """
@@ -124,8 +124,8 @@ class CountingRule:
     Args:
         max_steps: the bound on each trial, in steps.
         agents: how many controlled vehicles there are.
-        plain_origin: the origin of the trials that were drawn independently; empty where all were.
-        traffics: how many traffics the hunt has; 0 where each trial has its own.
+        plain_origin: the origin of the trials that were drawn independently; empty if all were.
+        traffics: how many traffics the hunt has; 0 if each trial has its own.
         planned: how many trials; 0 for no limit.
     """
 
@@ -268,7 +268,7 @@ class RateCounter:
         self.why_not = ""
 
     def add(self, unit: Unit) -> tuple[float, float] | None:
-        """Add a unit; return its crashes and exposure, or None where it does not belong to the part."""
+        """Add a unit; return its crashes and exposure, or None if it does not belong to the part."""
         trials = [trial for trial in unit if self._within(trial)] if self._within is not None else unit
         if not trials:
             return None
@@ -296,7 +296,7 @@ class RateCounter:
 
         Args:
             trials: valid ones.
-            crashes: of them.
+            crashes: crashes of them.
             steps: that they took.
         """
         self.units += trials
@@ -319,10 +319,10 @@ class RateCounter:
         return driven / (_S_PER_HOUR if self._per == "hour" else _M_PER_1000KM)
 
     def interval(self, alpha: float) -> Interval | None:
-        """Return the certain interval; None where there is no unit, or an exposure is not known."""
+        """Return the certain interval; None if there is no unit, or an exposure is not known."""
         return None if self.test is None or self.why_not else self.test.interval(alpha)
 
     @property
     def observed(self) -> float | None:
-        """Crashes by exposure; None where that is not known."""
+        """Crashes by exposure; None if that is not known."""
         return None if self.test is None or self.why_not else self.test.observed

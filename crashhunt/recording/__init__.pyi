@@ -8,17 +8,21 @@ from ._blackbox import (
     read_black_box as read_black_box,
     read_header as read_header,
 )
-from ._compact import Compact as Compact
-from ._compare import (
+from ._foxglove import foxglove_layout as foxglove_layout, lane_borders as lane_borders, read_lanes as read_lanes
+from ._log import read_log as read_log, write_log as write_log
+from ._reading import (
+    AgentChannel as AgentChannel,
+    Divergence as Divergence,
+    Prologue as Prologue,
+    StepRecord as StepRecord,
+)
+from ._recording import (
+    Compact as Compact,
+    Recording as Recording,
     first_divergence as first_divergence,
     has_same_scenes as has_same_scenes,
     values_around as values_around,
 )
-from ._divergence import Divergence as Divergence
-from ._foxglove import foxglove_layout as foxglove_layout, lane_borders as lane_borders, read_lanes as read_lanes
-from ._log import read_log as read_log, write_log as write_log
-from ._reading import AgentChannel as AgentChannel, Prologue as Prologue, StepRecord as StepRecord
-from ._recording import Recording as Recording
 from ._values import (
     OPAQUE_SHAPE as OPAQUE_SHAPE,
     OpaqueValue as OpaqueValue,

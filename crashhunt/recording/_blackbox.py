@@ -150,7 +150,7 @@ class BlackBox:
 
     Args:
         path: the file to create.
-        begun: how much of it another process has reserved that has begun the next trial there, in bytes; 0 where it is
+        begun: how much of it another process has reserved that has begun the next trial there, in bytes; 0 if it is
             to be created.
 
     Raises:
@@ -251,7 +251,7 @@ class BlackBox:
         """Have the core record steps of one agent by itself, until anything else is asked of this black box.
 
         Args:
-            steps: of the core.
+            steps: steps of the core.
             roster: who the steps are of; it must have been recorded.
         """
         self._take_back()
@@ -412,7 +412,7 @@ def cannot_record(error: OSError, path: Path) -> RecorderError:
 
 
 def read_header(path: Path) -> BlackBoxHeader | None:
-    """Return the header of a black box, or None where there is none (yet)."""
+    """Return the header of a black box, or None if there is none (yet)."""
     try:
         with path.open("rb") as file:
             data = file.read(HEADER.size)
@@ -422,7 +422,7 @@ def read_header(path: Path) -> BlackBoxHeader | None:
 
 
 def decode_header(data: bytes) -> BlackBoxHeader | None:
-    """Return the header that a black box begins with; None where that is damaged."""
+    """Return the header that a black box begins with; None if that is damaged."""
     if len(data) < HEADER.size or not data.startswith(MAGIC):
         return None
     _, pid, setup_steps, trial, started, committed, step, phase, agent = HEADER.unpack(data)
@@ -532,7 +532,7 @@ class BlackBoxFile:
         os.pwrite(self._file, header + REPORT.pack(0), 0)
 
     def header(self) -> BlackBoxHeader | None:
-        """Return the header; None where it is damaged."""
+        """Return the header; None if it is damaged."""
         return decode_header(os.pread(self._file, HEADER.size, 0))
 
     def has(self, header: BlackBoxHeader) -> bool:
@@ -544,7 +544,7 @@ class BlackBoxFile:
         return self._read(FIRST, max(0, header.committed - FIRST))
 
     def read_report(self, header: BlackBoxHeader) -> bytes | None:
-        """Return the report; empty where there is none, None where the process announced that it cannot report."""
+        """Return the report; empty if there is none, None if the process announced that it cannot report."""
         size = self._announced()
         if size == UNREPORTABLE:
             return None

@@ -14,26 +14,41 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
+from mcap_protobuf.schema import build_file_descriptor_set
 
 from crashhunt.base.errors import BundleError
-from crashhunt.recording._mcap import MESSAGES, LogWriter, to_ns
+from crashhunt.recording.records import RECORD_TYPES
+from crashhunt.recording.records._type import BytesForm
 from crashhunt.world import approaches, is_person, levels, outlines
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from google.protobuf.timestamp_pb2 import Timestamp
+    from mcap.writer import Writer
     from numpy.typing import NDArray
 
     from crashhunt.recording._recording import Recording
+    from crashhunt.recording.records._type import Message
     from crashhunt.trial import TrialResult
     from crashhunt.world import Actor, Lane, Scene
 
-__all__ = ["foxglove_layout", "lane_borders", "read_lanes", "write_views"]
+
+__all__ = [
+    "MESSAGES",
+    "NAMESPACE",
+    "LogWriter",
+    "foxglove_layout",
+    "lane_borders",
+    "read_lanes",
+    "to_ns",
+    "write_views",
+]
 
 _MAP_REACH_M = 300.0  # around where anybody drove; a town's whole map is too much for a viewer
 _HEIGHT_M = 1.5  # of a car of unknown height
@@ -53,7 +68,7 @@ def write_views(log: LogWriter, recording: Recording, lanes: Sequence[Lane], cra
     Args:
         log: where to.
         recording: what happened.
-        lanes: of the map; those far from every controlled vehicle are skipped.
+        lanes: lanes of the map; those far from every controlled vehicle are skipped.
         crash: how it ended.
     """
     scenes = recording.scenes()
@@ -160,7 +175,9 @@ def read_lanes(path: Path) -> list[tuple[NDArray[np.float64], NDArray[np.float64
     except OSError as error:
         raise BundleError(f"cannot be read: {error.strerror}", where=str(path)) from None
     except (McapError, DecodeError, ValueError, EOFError, struct.error) as error:
-        raise BundleError(f"its map is damaged: {error}", fix="get an undamaged copy", where=str(path)) from None
+        raise BundleError(
+            f"the map of the recording is damaged: {error}", fix="get an undamaged copy", where=str(path)
+        ) from None
     return []
 
 
@@ -318,3 +335,112 @@ def _varint(value: int) -> bytes:
         value >>= 7
     out.append(value)
     return bytes(out)
+
+
+# Topics and protobuf messages of an MCAP file, at simulation time; the file itself is written in `_log`.
+
+
+class LogWriter:
+    """Writes protobuf messages to an MCAP file, at simulation time.
+
+    Args:
+        writer: writer of the file.
+    """
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+
+    def write(
+        self,
+        topic: str,
+        kind: type[Message],
+        data: bytes,
+        time_ns: int,
+        sequence: int = 0,
+        metadata: Mapping[str, str] | None = None,
+    ) -> None:
+        """Write a serialised message.
+
+        Args:
+            topic: its channel, made at its first message.
+            kind: its protobuf class.
+            data: the message.
+            time_ns: simulation time.
+            sequence: its number within the evidence.
+            metadata: metadata of the channel.
+        """
+        channel = self._channels.get(topic)
+        if channel is None:
+            name = kind.DESCRIPTOR.full_name
+            if name not in self._schemas:
+                described = build_file_descriptor_set(kind).SerializeToString()
+                self._schemas[name] = self._writer.register_schema(name, "protobuf", described)
+            channel = self._writer.register_channel(topic, "protobuf", self._schemas[name], dict(metadata or {}))
+            self._channels[topic] = channel
+        self._writer.add_message(channel, time_ns, data, time_ns, sequence)
+
+
+def to_ns(time_s: float) -> int:
+    """Return simulation time in ns."""
+    return round(time_s * 1e9) if math.isfinite(time_s) and time_s > 0 else 0
+
+
+# The messages of our own evidence channels, as protobuf types made here, without a compiler.
+
+NAMESPACE = "crashhunt."
+_TYPES = {
+    "double": descriptor_pb2.FieldDescriptorProto.TYPE_DOUBLE,
+    "float": descriptor_pb2.FieldDescriptorProto.TYPE_FLOAT,
+    "int64": descriptor_pb2.FieldDescriptorProto.TYPE_INT64,
+    "uint32": descriptor_pb2.FieldDescriptorProto.TYPE_UINT32,
+    "string": descriptor_pb2.FieldDescriptorProto.TYPE_STRING,
+    "bytes": descriptor_pb2.FieldDescriptorProto.TYPE_BYTES,
+}
+_METRICS = {
+    "Metrics": {
+        "speed": "double",
+        "time_to_collision_s": "double",
+        "gap_m": "double",
+        "required_deceleration": "double",
+    },
+}
+_OF_RECORDS = {name: fields for kind in RECORD_TYPES.values() for name, fields in kind.form.messages.items()}
+# A schema in a log has its whole file, so what few logs have is in one of its own.
+_FILES: dict[str, Mapping[str, Mapping[str, str]]] = {
+    "crashhunt/log.proto": {**_OF_RECORDS, **_METRICS},
+    "crashhunt/bytes.proto": BytesForm.messages,
+}
+
+
+def _make() -> dict[str, type[Message]]:
+    # A pool of its own: another version of crashhunt in the same process must not clash with it.
+    pool = descriptor_pool.DescriptorPool()
+    for place, messages in _FILES.items():
+        file = _file(place, messages)
+        pool.Add(file) if hasattr(pool, "Add") else pool.AddSerializedFile(file.SerializeToString())
+    return {
+        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(NAMESPACE + name))
+        for messages in _FILES.values()
+        for name in messages
+    }
+
+
+def _file(place: str, messages: Mapping[str, Mapping[str, str]]) -> descriptor_pb2.FileDescriptorProto:
+    file = descriptor_pb2.FileDescriptorProto(name=place, package=NAMESPACE.rstrip("."), syntax="proto3")
+    for name, fields in messages.items():
+        message = file.message_type.add(name=name)
+        for number, (field, kind) in enumerate(fields.items(), 1):
+            label = descriptor_pb2.FieldDescriptorProto
+            message.field.add(
+                name=field,
+                number=number,
+                type=_TYPES[kind.rstrip("*")],
+                label=label.LABEL_REPEATED if kind.endswith("*") else label.LABEL_OPTIONAL,
+            )
+    return file
+
+
+MESSAGES = _make()
+"""The class of each message, by its name."""

@@ -20,11 +20,9 @@ from mcap.writer import Writer
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
 from crashhunt.recording._blackbox import Record
-from crashhunt.recording._compact import Compact
-from crashhunt.recording._foxglove import write_views
-from crashhunt.recording._mcap import MESSAGES, NAMESPACE, LogWriter, to_ns
+from crashhunt.recording._foxglove import MESSAGES, NAMESPACE, LogWriter, to_ns, write_views
 from crashhunt.recording._reading import Prologue
-from crashhunt.recording._recording import Recording
+from crashhunt.recording._recording import Compact, Recording
 from crashhunt.recording.records import RECORD_TYPES
 from crashhunt.recording.records._scene import STEP, time_of
 from crashhunt.recording.records._type import BytesForm, TextForm
@@ -57,9 +55,9 @@ def write_log(
     """Write a log; all of it or nothing.
 
     Args:
-        path: of the file.
+        path: path of the file.
         recording: what happened.
-        lanes: of the map, for viewers.
+        lanes: lanes of the map, for viewers.
         metadata: further facts.
         crash: how it ended, for the crash marker and the log line.
         views: whether other tools have something to see; without, it is half as large.
@@ -86,7 +84,7 @@ def read_log(path: Path) -> Recording:
         BundleError: it is missing, damaged, not a log of ours, or of another version.
     """
 
-    def refuse(message: str, fix: str = "get an undamaged copy of it") -> BundleError:
+    def refuse(message: str, fix: str = "get an undamaged copy of the log") -> BundleError:
         return BundleError(message, fix=fix, where=str(path))
 
     try:
@@ -118,7 +116,7 @@ def read_log(path: Path) -> Recording:
     except BundleError as error:
         raise refuse(error.message, error.fix) from None
     except (McapError, ValueError, KeyError, IndexError, EOFError, struct.error, OverflowError, MemoryError) as error:
-        raise refuse(f"not a whole MCAP file: {type(error).__name__}: {error}") from None
+        raise refuse(f"an incomplete MCAP file: {type(error).__name__}: {error}") from None
     except Exception as error:
         raise refuse(f"damaged: {type(error).__name__}: {error}") from None
 
@@ -188,7 +186,7 @@ def _read_evidence(messages: Sequence[_Message]) -> Iterator[Record]:
     prologue: Prologue | None = None
     for expected, message in enumerate(messages, 1):
         if message.sequence != expected:
-            raise BundleError(f"message {expected} of the evidence is missing", fix="get an undamaged copy of it")
+            raise BundleError(f"message {expected} of the log is missing", fix="get an undamaged copy of the log")
         channel = channels.get(message.topic)
         if channel is None:
             channel = channels[message.topic] = _unknown(message)
@@ -210,6 +208,6 @@ def _unknown(message: _Message) -> _Channel:
     if form is None:
         raise BundleError(
             f"there are records of a type that this version does not know ({message.topic})",
-            fix="use the version that wrote it",
+            fix="use the version that wrote the trial",
         )
     return _Channel(tag=tag, aux=int(message.metadata.get("aux", 0)), topic=message.topic, form=form)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, TypedDict
 
-from crashhunt.base.tolerance import known_values
+import numpy as np
+
+from crashhunt.base.codec import known_values
 from crashhunt.world import Roster
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.base.json_types import Plain
     from crashhunt.world import Actor, Contact, Event, Scene, Spine
 
-__all__ = ["AgentChannel", "Prologue", "Reading", "SceneParts", "StepRecord"]
+
+__all__ = ["AgentChannel", "Divergence", "Prologue", "Reading", "SceneParts", "StepRecord", "first_difference"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,9 +29,9 @@ class AgentChannel:
     Args:
         id: the agent, which is also the id of its vehicle among the actors.
         observation_dtype: as NumPy writes it, such as ``<f4``.
-        observation_shape: of one observation.
+        observation_shape: observation shape of one observation.
         action_dtype: likewise.
-        action_shape: of one action.
+        action_shape: shape of one action.
         action_names: what the elements of an action are.
         observation_names: what the columns of an observation are.
     """
@@ -47,8 +50,8 @@ class Prologue:
     """What an episode consists of.
 
     Args:
-        agents: in the order of their numbers.
-        step_length_s: in s of simulation time.
+        agents: agents in the order of their numbers.
+        step_length_s: step length in s of simulation time.
     """
 
     agents: tuple[AgentChannel, ...]
@@ -83,12 +86,12 @@ class StepRecord:
 
     Args:
         step: 0 is the start of the episode, before the first action.
-        scene: after the step.
+        scene: scene after the step.
         rewards: agent id to reward.
         observations: what each agent was shown before this step; nothing at step 0.
         actions: what each agent answered.
         more: what further types of records say of the step, by their names.
-        whole: False where the process ended inside the step, so that there is no scene after it.
+        whole: False if the process ended inside the step, so that there is no scene after it.
     """
 
     step: int
@@ -136,3 +139,46 @@ class Reading:
     roster: Roster = field(default_factory=lambda: Roster(()))
     scene: SceneParts = field(default_factory=SceneParts)
     events: tuple[Event, ...] = ()
+
+
+# What is said of a difference between two recordings: step, agent, field, both values.
+
+
+@dataclass(frozen=True, slots=True)
+class Divergence:
+    """The first difference between a recording and its replay.
+
+    Args:
+        step: at which step; the observation and the action of step n lead to the scene of step n.
+        agent: the agent or actor that it is about; empty if it is about the whole episode.
+        field: such as ``observation[1, x]``, ``action[target_speed]``, ``scene.x`` or ``length``.
+        recorded: the value in the recording; None if there is none.
+        replayed: likewise in the replay.
+        place: place of the value within the step: the name of the type of record, and the index in what it holds.
+    """
+
+    step: int
+    agent: str
+    field: str
+    recorded: object
+    replayed: object
+    place: tuple[str, tuple[int, ...]] | None = None
+
+    def to_json(self) -> JsonObject:
+        """Return the shape that ``replay --json`` prints."""
+        facts = asdict(self)
+        del facts["place"]
+        data: JsonObject = json.loads(json.dumps(facts, default=float))
+        return data
+
+    def __str__(self) -> str:
+        who = f"{self.agent} " if self.agent else ""
+        return f"step {self.step}, {who}{self.field}: recorded {self.recorded!r}, replayed {self.replayed!r}"
+
+
+def first_difference(left: NDArray[np.generic], right: NDArray[np.generic]) -> tuple[int, ...]:
+    """Return the index at which two arrays of one shape first differ in a bit, where they do."""
+    size = left.itemsize
+    was, now = left.tobytes(), right.tobytes()
+    flat = next(n for n in range(left.size) if was[n * size : (n + 1) * size] != now[n * size : (n + 1) * size])
+    return tuple(int(index) for index in np.unravel_index(flat, left.shape))

@@ -1,33 +1,56 @@
-"""A recording: everything that was recorded of one episode, whichever file it came from."""
+"""Recordings of episodes, from any file: whole or compact, and the first difference of two recordings."""
 
 from __future__ import annotations
 
+import json
 import struct
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from crashhunt.base.errors import BundleError
 from crashhunt.base.text import one_of
 from crashhunt.recording._blackbox import digest_of, is_evidence
-from crashhunt.recording._compact import Compact, Near, Present, compact_records
-from crashhunt.recording._reading import Prologue, Reading
+from crashhunt.recording._reading import Divergence, Prologue, Reading
 from crashhunt.recording._values import is_opaque
 from crashhunt.recording.records import RECORD_TYPES
-from crashhunt.recording.records._agents import PROLOGUE
+from crashhunt.recording.records._agents import OBSERVATION, PROLOGUE
+from crashhunt.recording.records._scene import (
+    ACTORS,
+    HEIGHTS,
+    LANES,
+    ROSTER,
+    SPINES,
+    STEP,
+    encode_roster,
+    points_of,
+    select_actors,
+    step_of,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
     from crashhunt.recording._blackbox import Record
     from crashhunt.recording._reading import AgentChannel, StepRecord
+    from crashhunt.recording.records._type import Difference
     from crashhunt.trial import Disturbance
     from crashhunt.world import Actor, Scene
 
-__all__ = ["Recording"]
+
+__all__ = [
+    "Compact",
+    "Near",
+    "Present",
+    "Recording",
+    "compact_records",
+    "first_divergence",
+    "has_same_scenes",
+    "values_around",
+]
 
 
 class Recording:
@@ -49,7 +72,7 @@ class Recording:
         try:
             reading = _read(self.records)
         except (ValueError, IndexError, KeyError, TypeError, struct.error) as error:
-            raise BundleError(f"the recording is damaged: {error}", fix="get an undamaged copy of it") from error
+            raise BundleError(f"the recording is damaged: {error}", fix="get an undamaged copy of the log") from error
         self.prologue: Prologue = reading.prologue
         self.actors: list[Actor] = reading.actors
         self.all_steps: list[StepRecord] = reading.steps
@@ -165,3 +188,220 @@ def _stacked(found: list[NDArray[np.generic]], dtype: str, shape: tuple[int, ...
     for place, array in enumerate(found):
         stacked[place] = array
     return stacked
+
+
+# Compact recordings: in each step the agents, the vehicles of the crash, and the actors near an agent.
+#
+# A compact recording has the digest of the whole recording. A replay of all actors is therefore still compared bit by
+# bit: the actors that are left give the first difference, and the digest decides about the others.
+
+
+@dataclass(frozen=True, slots=True)
+class Compact:
+    """What is missing in a compact recording.
+
+    Args:
+        digest: digest of the whole recording; empty if only its beginning is here.
+        actors: number of actors of the whole recording.
+        radius_m: greatest distance to an agent, in m, up to which an actor is recorded.
+        observations: whether the observations are left.
+    """
+
+    digest: str
+    actors: int
+    radius_m: float
+    observations: bool
+
+
+class Choice(Protocol):
+    """Chooses the actors of a step."""
+
+    def __call__(self, step: int, actors: Sequence[str], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether to keep each actor, shape (actors,).
+
+        Args:
+            step: number of the step.
+            actors: identifiers of the actors that are present.
+            points: their positions, in m, shape (actors, 2).
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Near:
+    """Keeps some actors, and those near an agent.
+
+    Args:
+        agents: identifiers of the controlled vehicles.
+        always: identifiers of the actors that are kept in each step.
+        radius_m: greatest distance between the centres, in m.
+    """
+
+    agents: Collection[str]
+    always: Collection[str]
+    radius_m: float
+
+    def __call__(self, step: int, actors: Sequence[str], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether to keep each actor."""
+        mask = np.array([name in self.always or name in self.agents for name in actors], bool)
+        for row, name in enumerate(actors):
+            if name in self.agents:
+                mask |= np.hypot(*(points - points[row]).T) <= self.radius_m
+        return mask
+
+
+@dataclass(frozen=True, slots=True)
+class Present:
+    """Keeps the actors that another recording has in the same step.
+
+    Args:
+        actors: identifiers of the actors of each step.
+    """
+
+    actors: Sequence[Collection[str]]
+
+    def __call__(self, step: int, actors: Sequence[str], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether to keep each actor."""
+        there = self.actors[step] if step < len(self.actors) else ()
+        return np.array([name in there for name in actors], bool)
+
+
+def compact_records(records: Iterable[Record], choose: Choice, *, observations: bool) -> Iterator[Record]:
+    """Yield the records of a recording without some actors.
+
+    Args:
+        records: records of the whole recording.
+        choose: chooses the actors of each step.
+        observations: whether to keep what the agents observed.
+    """
+    actors: list[list[object]] = []  # as their definitions say
+    numbers: dict[int, int] = {}  # of the actors that are kept: number there to number here
+    roster: list[int] = []
+    shown: list[int] | None = None
+    waiting: list[Record] = []
+    agents: int | None = None
+    scene = (STEP.tag, HEIGHTS.tag, SPINES.tag, LANES.tag)
+    for record in records:
+        tag, _, payload = record
+        if agents is None:  # the prologue comes first
+            agents = len(Prologue.decode(payload).agents)
+            yield record
+            continue
+        if tag == ACTORS.tag:
+            actors += json.loads(payload)
+            continue
+        if tag == ROSTER.tag:
+            roster = np.frombuffer(payload, "<u4").tolist()
+            continue
+        if tag != OBSERVATION.tag or observations:
+            waiting.append(record)
+        if tag != STEP.tag:
+            continue
+        # Only at the end of a step is it certain who is present, and where.
+        mask = choose(step_of(payload), [str(actors[number][0]) for number in roster], points_of(payload, agents))
+        there = [number for number, is_kept in zip(roster, mask.tolist(), strict=True) if is_kept]
+        new = [number for number in there if number not in numbers]
+        numbers |= {number: len(numbers) + place for place, number in enumerate(new)}
+        changes: list[tuple[int, bytes]] = []
+        if new:
+            changes.append((ACTORS.tag, json.dumps([actors[number] for number in new]).encode()))
+        if there != shown:
+            changes.append((ROSTER.tag, encode_roster([numbers[number] for number in there])))
+        shown = there
+        yield from (record._replace(tag=kind, aux=0, payload=data) for kind, data in changes)
+        for one in waiting:
+            yield one._replace(payload=select_actors(one.tag, one.payload, mask, agents))
+        waiting = []
+    yield from (one for one in waiting if one.tag not in scene)
+
+
+# Where two recordings first differ, and the values around it; how values are compared is in `records`, a type each.
+
+
+def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | None:
+    """Return the first difference of bits, or None if the two are bit-identical.
+
+    Within a step, observations come before actions and actions before the scene, as in the episode. If the first is
+    compact, the values of its actors are compared, and the digest of the whole recording.
+    """
+    whole, replayed = replayed, replayed.like(recorded)
+    if recorded.prologue != replayed.prologue:
+        return Divergence(
+            step=0,
+            agent="",
+            field="setup",
+            recorded=recorded.prologue.encode().decode(),
+            replayed=replayed.prologue.encode().decode(),
+        )
+    differences = _differences(recorded.prologue.agents)
+    for left, right in zip(recorded.all_steps, replayed.all_steps, strict=False):
+        for difference, agent in differences:
+            found = difference(left, right, agent)
+            if found is not None:
+                return found
+    if len(recorded.all_steps) != len(replayed.all_steps):
+        step = min(len(recorded.all_steps), len(replayed.all_steps))
+        return Divergence(
+            step=step,
+            agent="",
+            field="length",
+            recorded=len(recorded.all_steps) - 1,
+            replayed=len(replayed.all_steps) - 1,
+        )
+    if recorded.compact is not None and not recorded.compact.digest:  # the beginning of one
+        whole = replayed.beginning(len(replayed.records))
+    if recorded.digest != whole.digest:
+        # Every value of every step agrees, so only the way it was written can differ, or an actor that is not kept.
+        return Divergence(
+            step=recorded.steps, agent="", field="digest", recorded=recorded.digest, replayed=whole.digest
+        )
+    return None
+
+
+def values_around(
+    recorded: Recording, replayed: Recording, divergence: Divergence, *, reach: int
+) -> list[tuple[int, object, object]]:
+    """Return (step, recorded value, replayed value) of the field that diverges, in the steps around.
+
+    Nothing where the divergence is not about one value; None if a recording does not have the step.
+    """
+    if divergence.place is None:
+        return []
+    first = max(0, divergence.step - reach)
+    return [
+        (step, _value(recorded, step, divergence), _value(replayed, step, divergence))
+        for step in range(first, divergence.step + reach + 1)
+    ]
+
+
+def _value(recording: Recording, number: int, divergence: Divergence) -> object:
+    if divergence.place is None or number >= len(recording.all_steps):
+        return None
+    name, index = divergence.place
+    kind = next(kind for kind in RECORD_TYPES.values() if kind.name == name)
+    return None if kind.value is None else kind.value(recording.all_steps[number], divergence.agent, index)
+
+
+def _differences(agents: tuple[AgentChannel, ...]) -> list[tuple[Difference, AgentChannel | None]]:
+    """How the steps of two recordings are compared, in this order."""
+    kinds = [(kind.per_agent, kind.difference) for kind in RECORD_TYPES.values() if kind.difference is not None]
+    of_agents = [(difference, agent) for agent in agents for per_agent, difference in kinds if per_agent]
+    return [*of_agents, *((difference, None) for per_agent, difference in kinds if not per_agent)]
+
+
+def has_same_scenes(recorded: Recording, rerun: Recording, step: int) -> bool:
+    """Return whether the scenes of a run are bit-identical to the recorded ones up to and including a step.
+
+    Where a change begins after this step, only such a run says something about the recorded trial. Observations and
+    actions are not compared: other versions may record them in another form.
+
+    Args:
+        recorded: the recording of the trial, which reaches the step.
+        rerun: the recording of the run.
+        step: the last step to compare.
+    """
+    rerun = rerun.like(recorded)
+    return rerun.steps >= step and all(
+        recorded.scene(number).frame[1].tobytes() == rerun.scene(number).frame[1].tobytes()
+        for number in range(step + 1)
+    )

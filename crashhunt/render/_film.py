@@ -65,11 +65,11 @@ class FilmOptions:
 
     Args:
         fps: pictures a second; as many as there are steps by default, so that it runs in real time.
-        size: of the scene, in pixels.
+        size: size of the scene, in pixels.
         last_s: length of the film, in s: the end of a crash, or the time around the nearest moment of a near miss. 0
             shows all of a crash and 10 s of a near miss.
         last_step_repeats: how often the last picture is shown again.
-        blank_frames: between two crashes.
+        blank_frames: blank frames between two crashes.
         panels: whether to show panels at all.
         scale: pixels a metre.
     """
@@ -99,7 +99,7 @@ class Shot:
 
     Args:
         recording: what to show.
-        lanes: of its map.
+        lanes: lanes of its map.
         agent: the vehicle in the centre of the picture.
         other: the one it crashed with.
         crash_step: where the crash is.
@@ -123,7 +123,7 @@ class Layout:
 
     Args:
         frame: width and height of the scene.
-        labels: of all panels.
+        labels: labels of all panels.
         panel: width and height of one.
     """
 
@@ -168,11 +168,13 @@ def check_places(*, video: Path | None = None, gif: Path | None = None, folder: 
         if place is None:
             continue
         if ending and place.suffix != ending:
-            raise UsageError(f"{option} {str(place)!r} does not end in {ending}", fix="name it so")
+            raise UsageError(f"{option} {str(place)!r} does not end in {ending}", fix="add this ending")
         if not place.parent.is_dir():
-            raise UsageError(f"{option} {str(place)!r}: there is no folder {str(place.parent)!r}", fix="make it first")
+            raise UsageError(
+                f"{option} {str(place)!r}: there is no folder {str(place.parent)!r}", fix="create it first"
+            )
     if folder is not None and folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        raise UsageError(f"--frames {str(folder)!r} is not an empty folder", fix="name one that is new")
+        raise UsageError(f"--frames {str(folder)!r} is not an empty folder", fix="give a new folder")
     if video is not None:
         try:
             import av  # noqa: F401
@@ -367,7 +369,7 @@ def shown_steps(recording: Recording, last_s: float, nearest: int) -> tuple[int,
     """Return the first and the last step of a film.
 
     Args:
-        recording: of what.
+        recording: recording of the trial.
         last_s: as in `FilmOptions`.
         nearest: as in `Shot`.
     """

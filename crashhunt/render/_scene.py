@@ -34,12 +34,12 @@ class SceneView:
     """Draws the scenes of a recording.
 
     Args:
-        recording: of the episode.
+        recording: recording of the episode.
         lanes: the right and left border of each, shape (n, 2), in m.
         agent: the vehicle in the centre of the picture.
         other: the one it crashed with; empty for none.
-        width: in pixels.
-        height: in pixels.
+        width: width in pixels.
+        height: height in pixels.
         scale: pixels a metre.
         crash_step: where to mark the crash; -1 for nowhere.
         nearest_step: where to mark that a near miss was nearest, for a second; -1 for nowhere.
@@ -99,7 +99,7 @@ class SceneView:
         return as_array(smooth)
 
     def _marked(self, step: int) -> str:
-        """What is written above a step that is marked; empty where none is."""
+        """What is written above a step that is marked; empty if none is."""
         if step == self._crash_step:
             return "CRASH"
         # One picture alone would be gone before anybody has seen it.

@@ -168,7 +168,7 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
 
     Args:
         rerun: the crash.
-        look: at what.
+        look: what to look at.
 
     Raises:
         UsageError: there is no display for a window.
@@ -242,7 +242,7 @@ class _Stop(Observer):
     """Has the debugger drive in place of an agent, for one step.
 
     Args:
-        name: of the vehicle.
+        name: name of the vehicle.
         step: the step in which to stop; 0 for none.
     """
 
@@ -276,9 +276,9 @@ class _Stopped:
 
     Args:
         agent: who drives.
-        name: of the vehicle.
+        name: name of the vehicle.
         step: which one it is.
-        scene: before it.
+        scene: scene before it.
         backwards: goes back.
     """
 
@@ -309,7 +309,7 @@ class _Panels(Observer):
 
     Args:
         first: the first step to draw.
-        folder: for the pictures.
+        folder: folder for the pictures.
     """
 
     def __init__(self, first: int, folder: Path) -> None:
@@ -349,7 +349,7 @@ class _Job(TypedDict):
         spec: the trial, to the step up to which it runs.
         stop_at: the step in which the debugger stops; 0 for none.
         agent: who is looked at.
-        other: the other party of a collision; empty where there was none.
+        other: the other party of a collision; empty if there was none.
         panels: the step of which panels are shown, and the folder for them.
         window: how long a step takes in a window, in s; None for none.
         pause_before: the step before which a window waits.
@@ -366,7 +366,7 @@ class _Job(TypedDict):
 
 
 class _Window(Observer):
-    """Slows a simulator down that shows what happens in a window of its own, and follows who crashes.
+    """Slows a simulator down that shows what happens in its own window, and follows who crashes.
 
     Args:
         simulator: what is simulated.

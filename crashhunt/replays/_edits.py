@@ -40,7 +40,7 @@ def edited_disturbances(
     """Return the disturbances with one change, and what is not as it was, in words.
 
     Args:
-        planned: of the trial.
+        planned: plan of the trial.
         name: ``disturbances`` for all; ``disturbances.STEP`` or ``disturbances.KIND@STEP`` for one, and perhaps a dot
             and one of its fields.
         text: ``none``, the words that fix others, or the value of the field.
@@ -64,20 +64,20 @@ def edited_disturbances(
     if not meant:
         every = dict.fromkeys(f"{one.what}@{one.step}" if asked.kind else str(one.step) for one in planned)
         fix = one_of(asked.written, every, give="they begin at", none=f"there is none; write {NAME}.{FORM}")
-        raise ArgumentError(f"{where}: none begins at step {asked.step!r}", fix=fix)
+        raise ArgumentError(f"{where}: no disturbance begins at step {asked.step!r}", fix=fix)
     if not asked.field and text == _NONE:
         left = tuple(one for one in planned if one not in meant)
         return left, [f"{name} was {_all(meant, agents)} and is none"]
     if not asked.field:
-        raise ArgumentError(f"{where}: {text!r} is not none", fix=f"write none, or {NAME}.{FORM}")
+        raise ArgumentError(f"{where}: {text!r} cannot be set", fix=f"write none, or {NAME}.{FORM}")
     if asked.field not in _FIELDS:
         fix = one_of(asked.field, _FIELDS, give="write one of")
-        raise ArgumentError(f"{where}: {asked.field!r} is nothing to change", fix=fix)
+        raise ArgumentError(f"{where}: {asked.field!r} cannot be changed", fix=fix)
     if len(meant) > 1:
         several = [word_of(one, agents).partition("=")[0] for one in meant]
         fix = f"write {NAME}.{several[0]}.{asked.field}"
         raise ArgumentError(
-            f"{where}: {' and '.join(several)} begin at this step, and the edit means one of them", fix=fix
+            f"{where}: {' and '.join(several)} begin at this step, but the edit must name one of them", fix=fix
         )
     before, value = meant[0], _value(where, asked.field, text)
     now = replace(before, **{asked.field: value})
@@ -96,7 +96,7 @@ def with_other_words(
     cannot be drawn again with another rate.
 
     Args:
-        planned: of the trial.
+        planned: plan of the trial.
         before: ``disturb`` as the hunt had it.
         after: as it is.
         agents: the controlled vehicles.
@@ -158,7 +158,7 @@ def _fixed(where: str, words: Sequence[str], agents: Sequence[str]) -> tuple[Dis
     odd = next((word for word in words if not is_fixed(word)), None)
     if odd is not None:
         fix = f"write {NAME}=none, {NAME}={FORM},… or {NAME}.STEP.how_strong=2"
-        raise ArgumentError(f"{where}: {odd!r} is not none", fix=fix)
+        raise ArgumentError(f"{where}: {odd!r} cannot be set", fix=fix)
     try:
         return parse_fixed(words, agents, shown=where.partition(".")[0] + ":")
     except UsageError as error:
@@ -168,7 +168,7 @@ def _fixed(where: str, words: Sequence[str], agents: Sequence[str]) -> tuple[Dis
 def _value(where: str, field: str, text: str) -> Any:
     if field == "who":
         if text not in CELLS:
-            raise ArgumentError(f"{where}: {text!r} is no place", fix=one_of(text, CELLS))
+            raise ArgumentError(f"{where}: {text!r} is not a place", fix=one_of(text, CELLS))
         return text
     try:
         value = float(text)
@@ -176,7 +176,7 @@ def _value(where: str, field: str, text: str) -> Any:
         value = math.nan
     if not (0 <= value < math.inf) or (field == "how_long" and value == 0):
         least = "seconds above 0" if field == "how_long" else "a number from 0 on"
-        raise ArgumentError(f"{where}: {text!r} is none", fix=f"give {least}")
+        raise ArgumentError(f"{where}: {text!r} is out of range", fix=f"give {least}")
     return value
 
 
@@ -236,7 +236,7 @@ def edited_spec(
         original: ``hunt.toml`` as it was when the trial ran.
         changes: ``NAME`` or ``AGENT.NAME`` to value, applied last.
         code: the folders of the code that is to drive, which is asked what an agent takes where the record is silent;
-            None where none of it may run.
+            None if none of it may run.
 
     Raises:
         ArgumentError: an argument does not exist, or a range is given where it takes one value.
@@ -292,7 +292,7 @@ def edited_spec(
     late = next((one for one in disturbances if one.step > max_steps and one not in recorded.disturbances), None)
     if late is not None:
         fix = f"give a step up to {max_steps}"
-        raise ArgumentError(f"{NAME}: {late.what}@{late.step} is never, as the trial has {max_steps} steps", fix=fix)
+        raise ArgumentError(f"{NAME}: {late.what}@{late.step} cannot happen: the trial has {max_steps} steps", fix=fix)
     return trial, Edits(tuple(agents), tuple(others), (*kept, *unheard))
 
 
@@ -306,7 +306,7 @@ def _specs(settings: HuntSettings) -> dict[tuple[str, str], ArgumentSpec]:
 def _constant(text: str, spec: ArgumentSpec | None, where: str) -> Value:
     distribution = parse_spec(text, spec.kind if spec else None, where=where)
     if not isinstance(distribution, Constant):
-        raise ArgumentError(f"{where}: {text!r} is not one value, and a replay needs one", fix="give a value")
+        raise ArgumentError(f"{where}: {text!r} is not a single value", fix="give one value")
     return distribution.value
 
 

@@ -67,7 +67,7 @@ class ReplayOptions:
     """How to replay.
 
     Args:
-        code: who drives: the code of the snapshot, today's, or the recorded actions.
+        code: which code drives: that of the snapshot, today's, or the recorded actions.
         changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value.
         force: replay even from a snapshot that is damaged.
         times: how often.
@@ -98,7 +98,7 @@ class Rerun:
         spec: the trial, with all edits.
         worker: where and how it runs; its scratch folder is not set yet.
         code: who drives.
-        snapshot: of the bundle.
+        snapshot: snapshot of the bundle.
         edits: what is not as it was recorded, in words.
         warnings: what may make a difference, in words.
         other_traffic: those edits that are not about who drives: without the crash, they may be why.
@@ -118,7 +118,7 @@ class Rerun:
 
     @property
     def defaults(self) -> dict[tuple[str, str], Value | None]:
-        """The default of each argument, by agent (empty for the scenario's own) and name; None where it has none."""
+        """The default of each argument, by agent (empty for the scenario's own) and name; None if it has none."""
         scenario = self.worker.scenario
         found = {("", name): known.default for name, known in scenario.scenario_arguments().items()}
         for agent in scenario.agents:
@@ -167,7 +167,9 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     warnings += edits.ignored
     if not options.scenario and (odd := _kind_it_cannot_do(scenario, spec)):
         able = ", ".join((*(scenario.backend.disturbances or ()), *OF_AGENT))
-        raise UsageError(f"{scenario.backend.title} cannot do the disturbance {odd!r}", fix=f"it can do {able}")
+        raise UsageError(
+            f"{scenario.backend.title} does not support the disturbance {odd!r}", fix=f"it supports {able}"
+        )
     if code == "log":
         if edits.all:
             raise UsageError(
@@ -186,7 +188,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     if options.scenario:
         if code == "log":
             message = f"recorded actions belong to the recorded scenario, not to {options.scenario!r}"
-            raise UsageError(message, fix="leave --scenario or --from-log out")
+            raise UsageError(message, fix="omit --scenario or --from-log")
         scenario, spec = _elsewhere(options.scenario, settings, spec, recorded.prologue.step_length_s)
         elsewhere = f"the scenario was {settings.scenario} and is {options.scenario}"
         edits = replace(edits, others=(*edits.others, elsewhere))
@@ -228,7 +230,7 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
     there = other.backend.step_length_s(other)
     odd = _kind_it_cannot_do(other, spec)
     if odd:
-        message = f"--scenario {name!r}: {other.backend.title} cannot do the disturbance {odd!r}"
+        message = f"--scenario {name!r}: {other.backend.title} does not support the disturbance {odd!r}"
         raise UsageError(message, fix="replay with --set disturbances=none as well")
     return with_settings(other, replace(settings, agents=agents)), replace(
         spec,
@@ -245,7 +247,7 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
 
 
 def _kind_it_cannot_do(scenario: Scenario, spec: TrialSpec) -> str:
-    """The first kind of disturbance of a trial that a scenario's simulator cannot do; empty where there is none."""
+    """The first kind of disturbance of a trial that a scenario's simulator cannot do; empty if there is none."""
     able = scenario.backend.disturbances
     odd = (one.what for one in spec.disturbances if able is not None and one.what not in (*able, *OF_AGENT))
     return next(odd, "")

@@ -47,11 +47,11 @@ class ReplayReport:
         rerun: what was run.
         verdict: whether it is the same; of several times, the first that was not.
         replayed: the trial that was run now.
-        recording: of it.
+        recording: recording of it.
         divergence: the first difference.
         around: step, recorded and replayed value of the field that differs, in the steps around.
         reason: why the two cannot be compared.
-        verdicts: of all runs, and how many had each.
+        verdicts: verdicts of all runs, and how many had each.
     """
 
     rerun: Rerun
@@ -103,7 +103,7 @@ def judged(
     Args:
         rerun: what was run.
         recorded: the recording, or its beginning.
-        replayed: of as many steps.
+        replayed: number of steps that were replayed.
         result: what came of the replay.
         whole: whether the replay was to end where the crash did.
     """
@@ -299,7 +299,7 @@ def _run(
         if result.was_killed_from_outside:
             raise CrashhuntError(
                 f"the replay was {message}",
-                fix="run it again; if memory ran out, end other processes first",
+                fix="run it again; if memory is short, end other processes first",
                 where=rerun.bundle.id,
             )
         try:

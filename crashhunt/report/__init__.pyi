@@ -45,6 +45,7 @@ from ._show import Story as Story
 from ._status_screen import (
     Watcher as Watcher,
     describe_phase as describe_phase,
+    describe_types as describe_types,
     format_arguments as format_arguments,
     format_pace as format_pace,
     format_seconds as format_seconds,

@@ -135,7 +135,7 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
 
 
 def _drawn_rate(hunt: HuntFigures) -> float:
-    """Return the length of a hunt's bar; 0 where there is no rate."""
+    """Return the length of a hunt's bar; 0 if there is no rate."""
     return hunt.crash_rate if np.isfinite(hunt.crash_rate) else 0.0
 
 

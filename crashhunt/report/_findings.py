@@ -44,7 +44,7 @@ class Finding:
 
     Args:
         rule: the outcome, such as ``collision``.
-        title: of the crash type.
+        title: title of the crash type.
         message: summary of the shortest crash, and the command that shows it.
         file: the agent's file, relative to its project; empty if unknown.
         line: line in the file, from 1: of the failure, otherwise of the agent's definition.
@@ -67,7 +67,7 @@ def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None =
     """Return the crash types in the order of their groups. Runs no code of the bundles.
 
     Args:
-        groups: of the crashes.
+        groups: groups of the crashes.
         known: crash type to the case of a corpus.
     """
     found = []

@@ -154,8 +154,8 @@ def lineage_of(number: int, trial: Callable[[int], TrialResult | None]) -> list[
     """Return the trials that a trial was made from: its parent, that one's parent, and so on.
 
     Args:
-        number: of the trial.
-        trial: returns one by its number, None where it is missing.
+        number: number of the trial.
+        trial: returns one by its number, None if it is missing.
     """
     found: list[TrialResult] = []
     result = trial(number)
@@ -185,12 +185,12 @@ def write_report(
     """Write the report of a hunt, all of it or nothing.
 
     Args:
-        directory: of the hunt; its ledger may be missing, as in an exported crash.
+        directory: directory of the hunt; its ledger may be missing, as in an exported crash.
         bundles: the crashes and near misses to animate.
-        target: the file; one that is there is replaced.
+        target: the file; an existing one is replaced.
         found: all crashes of the hunt; by default those of the directory.
         near_misses: number of near misses of the hunt, of which `bundles` has some.
-        name: of the hunt, for the title; its directory's by default.
+        name: name of the hunt, for the title; its directory's by default.
         watch: called after each crash with how many are done, and how many there are.
 
     Returns:
@@ -246,7 +246,7 @@ def player_data(bundle: Bundle, story: Story | None = None) -> dict[str, object]
 
     Args:
         bundle: the crash; its log is read.
-        story: of it, where there is one already.
+        story: story of it, where there is one already.
 
     Raises:
         BundleError: it is damaged.
@@ -395,6 +395,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
             "drawn": _drawn(trials, total, crashes, settings) if len(trials) < total else None,
             "importance": importance_of(unchosen),
             "rate": _rate(ledger.facts().get("running_rate")),
+            "typesByCause": ledger.facts().get("types_by_cause"),
             "weighed": [min(len(unchosen), _MOST), unchosen_in_all] if unchosen_in_all > _MOST else None,
         }
     finally:
@@ -402,7 +403,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
 
 
 def _rate(rate: RunningRate | None) -> dict[str, object] | None:
-    """Return the crash rate as the hunt has left it; None where it has none, as those of earlier versions."""
+    """Return the crash rate as the hunt has left it; None if it has none, as those of earlier versions."""
     if rate is None:
         return None
     words = f"At least and at most are certain: {rate['confidence']:g} % confidence, valid whenever you look."

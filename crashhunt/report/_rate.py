@@ -78,6 +78,8 @@ def _describe_rare(rate: RunningRate) -> str:
     certain = f"; certain: {_certain(rate['certain'])} ({rate['confidence']:g} %)" if rate["certain"] else ""
     if rate["estimate"] is None:
         return f"rate: not known yet ({rate['why_not']}){certain}"
+    if not rate["estimate"]:
+        return f"rate: no crash yet in {roots} and their copies{certain}"
     found = f"rate: {format_rate(rate['estimate'])} per trial"
     if (one := rate["estimated"]) is not None and one["high"] is not None:
         found += f" ({format_rate(one['low'])} to {format_rate(one['high'])}, estimated from {roots})"
@@ -132,6 +134,8 @@ def _verdict(rate: CrashRate, bar: float) -> str:
         return f"certainly {rate.verdict} {shown}"
     if rate.why_undecided:
         return f"undecided about {shown}: {rate.why_undecided}"
+    if rate.certain is None:
+        return f"undecided about {shown}: there is no rate"
     return f"undecided: more trials are needed to compare with {shown}"
 
 

@@ -19,9 +19,11 @@ from crashhunt.crashes import (
 from crashhunt.recording import describe_value, is_opaque
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
+from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import (
     COLUMNS,
     STANDS,
+    about_changes,
     about_danger,
     about_disturbances,
     about_events,
@@ -93,6 +95,7 @@ class Story:
         return {
             "crash": self.bundle.id,
             "summary": self.bundle.result.summary,
+            "verdict": verdict_of(self),
             "agent": self.agent,
             "other": self.other,
             "words": self.words(),
@@ -101,6 +104,7 @@ class Story:
             "braking": {
                 "by": "calculation" if self._braking else "running it" if tried else None,
                 "how": tried.how if tried and not self._braking else None,
+                "changed": list(tried.changed) if tried and not self._braking else [],
                 "too_late_step": tried.too_late if tried and not self._braking else None,
                 "why_not": (why_not or self.bundle.result.why_no_escape) if not self._braking else "",
             },
@@ -158,6 +162,9 @@ class Story:
         lines = [f"{self.bundle.id}  ({self.bundle.result.outcome.category})"]
         lines.append(f"  seed {self.bundle.result.spec.seed}, {format_arguments(self.bundle.result)}")
         lines += _shrunk(self.bundle)
+        verdict = verdict_of(self)
+        is_new = verdict != f"{self.bundle.result.summary}."  # the words begin with the summary
+        lines += ["", verdict] if is_new else []
         lines += ["", *self.words(), "", *self.table()]
         shown, steps = len(self._steps_shown()), len(self._steps())
         lines += [f"{shown} of {steps} steps shown"] if shown < steps else []
@@ -212,7 +219,7 @@ class Story:
         return "" if same or math.isnan(own) or math.isnan(its) else f"<- they touched at {own:.1f} and {its:.1f} m/s"
 
     def _speeds_at_contact(self) -> tuple[float, float]:
-        """Return the speeds of the agent and of the other actor, in m/s; NaN where they are unknown."""
+        """Return the speeds of the agent and of the other actor, in m/s; NaN if they are unknown."""
         hit = self.bundle.result.collision
         if hit is None:
             return math.nan, math.nan
@@ -266,10 +273,10 @@ class Story:
         if tried.step is None:
             assert tried.too_late is not None
             return [f"{braking} would not have avoided it even {self._ago(tried.too_late)}; that was run."]
+        also, until = about_changes(tried.changed), self._ago(tried.step)
         if tried.too_late is None:
-            return [f"{braking} would have avoided it until {self._ago(tried.step)}; that was run."]
-        until = self._ago(tried.step)
-        return [f"{braking} would have avoided it until {until}; one step later it was too late. Both were run."]
+            return [f"{braking} would have avoided it until {until}; that was run.{also}"]
+        return [f"{braking} would have avoided it until {until}; one step later it was too late. Both were run.{also}"]
 
     def about_judgement(self) -> list[str]:
         """Return until when the crash could have been avoided, according to the runs of `judge`."""

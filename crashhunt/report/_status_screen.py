@@ -75,7 +75,7 @@ class Watcher:
             self._console.print(_line(status), soft_wrap=True, highlight=False)
 
     def _is_new_phase(self, status: HuntStatus) -> bool:
-        """Whether a phase with a progress of its own begins."""
+        """Whether a phase with its own progress begins."""
         return status.progress is not None and status.phase != self._last_phase
 
     def tell_notes(self) -> None:
@@ -252,10 +252,24 @@ def format_seconds(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
+def describe_types(count: int, by_cause: int | None, noun: str = "type") -> str:
+    """Return how many crash types there are, and how many causes if the hunt counts these.
+
+    >>> describe_types(4, 6)
+    '4 types, 6 by cause'
+
+    Args:
+        count: number of types.
+        by_cause: number of causes, each type on its own; None where types count.
+        noun: for a type.
+    """
+    words = f"{count} {noun}{'' if count == 1 else 's'}"
+    return words if by_cause is None else f"{words}, {by_cause} by cause"
+
+
 def describe_kinds(status: HuntStatus) -> str:
-    """Return the number of crash types, and how long ago the last new type was found."""
-    count = len(status.kinds or ())
-    words = f"{count} crash {'type' if count == 1 else 'types'}"
+    """Return the number of crash types, and of causes if they count, and the age of the last new type."""
+    words = describe_types(len(status.kinds or ()), status.types_by_cause, "crash type")
     if status.newest_kind_s is None:
         return words
     ago, trials = format_seconds(status.newest_kind_s), status.newest_kind_trials

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.text import in_lines
 from crashhunt.report._rate import describe_rates
-from crashhunt.report._status_screen import format_arguments, format_seconds
+from crashhunt.report._status_screen import describe_types, format_arguments, format_seconds
 from crashhunt.report._words import (
     by_likelihood,
     describe_branches,
@@ -35,12 +35,15 @@ __all__ = ["describe_groups", "describe_hunt", "describe_replay"]
 # The table of crash types. `crashhunt.crashes` decides which crashes are of one type, and in which order.
 
 
-def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> str:
+def describe_groups(
+    groups: Sequence[Group], known: Mapping[Signature, str] | None = None, *, by_cause: int | None = None
+) -> str:
     """Return one line for each crash type, with its shortest crash.
 
     Args:
         groups: one for each crash type.
-        known: crash type to the case of a corpus; None where no corpus was given.
+        known: crash type to the case of a corpus; None if no corpus was given.
+        by_cause: number of causes, each type on its own; None if they do not count.
     """
     if not groups:
         return "No crash was saved."
@@ -62,7 +65,7 @@ def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | No
             ]
         )
     count = sum(group.count for group in groups)
-    words = f"{count} {'crash' if count == 1 else 'crashes'} of {len(groups)} {'type' if len(groups) == 1 else 'types'}"
+    words = f"{count} {'crash' if count == 1 else 'crashes'} of {describe_types(len(groups), by_cause)}"
     saved = sum(len(group.bundles) for group in groups)
     if saved < count:
         words += f" ({saved} of {count} have a bundle{', and faults are of these' if faults else ''})"
@@ -84,7 +87,10 @@ def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGrou
             cells = [f"  {part.cause}", str(len(part.judged)), shortest.id, str(shortest.result.steps)]
             rows.append([str(len(part.members)), *cells])
     count = len({part.cause for parts in causes for part in parts})
-    return "\n".join(["", f"{count} {'cause' if count == 1 else 'causes'}:", "", *_lines(rows)])
+    of_types = sum(map(len, causes))
+    words = f"{count} {'cause' if count == 1 else 'causes'}"
+    words += f" ({of_types} if each type counts its own)" if of_types != count else ""
+    return "\n".join(["", f"{words}:", "", *_lines(rows)])
 
 
 def _lines(rows: list[list[str]]) -> list[str]:
@@ -120,8 +126,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     lines += [f"Note: {note}" for note in report.notes]
     lines += _describe_audit(report)
     if report.stopped_because == "distinct":
-        by_cause = report.types_by_cause
-        found = f"{len(report.kinds or ())} crash types" if by_cause is None else f"{by_cause} crash types by cause"
+        found = describe_types(len(report.kinds or ()), report.types_by_cause, "crash type")
         lines.append(f"Found {found} (--distinct {report.settings.run.distinct}).")
     if report.rate is not None:
         lines += describe_rates([report.rate]).splitlines()
@@ -155,7 +160,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
         what = "crash is" if all_of_them == 1 else "crashes are"
         lines.append(f"{len(report.at_fault)} of {all_of_them} {what} the agent's own fault.")
     if report.kinds and sum(group.count for group in report.kinds) > 1:  # `--keep` leaves fewer bundles than crashes
-        lines += ["", *describe_groups(report.kinds).splitlines()]
+        lines += ["", *describe_groups(report.kinds, by_cause=report.types_by_cause).splitlines()]
     crashes = by_likelihood(report.crashes)
     for bundle in crashes[:_SHOWN]:
         lines += ["", *_describe_crash(bundle)]

@@ -68,10 +68,10 @@ def check_fields(recording: Recording, fields: Sequence[str], agent: str) -> lis
 
 
 def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: str = "") -> list[TableRow]:
-    """Return one row a step: the step, the time and the fields; None where there is no value.
+    """Return one row a step: the step, the time and the fields; None if there is no value.
 
     Args:
-        recording: of the episode.
+        recording: recording of the episode.
         fields: ``x``, ``y``, ``heading``, ``speed``, ``reward``, ``time_to_collision_s``, ``gap_m``,
             ``required_deceleration`` (relative to the nearest actor), ``gap_to_other_m``, ``time_to_other_s``,
             ``closing_speed`` (relative to the collision partner), ``observation[ROW,NAME]``, the parts of the

@@ -7,15 +7,15 @@ avoided it. A clause whose facts are unknown, or contradict each other, is omitt
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from crashhunt.world import is_person, lane_jump
 
 if TYPE_CHECKING:
-    from crashhunt.crashes import ContactRecord, Omission
-    from crashhunt.report._show import Story
+    from crashhunt.crashes import Bundle, ContactRecord, Encounter, Judgement, Omission
+    from crashhunt.world import DangerousMoment
 
 __all__ = ["describe_contact", "verdict_of"]
 
@@ -32,21 +32,51 @@ _MANOEUVRES = {
 }
 
 
-def verdict_of(story: Story) -> str:
+class CrashFacts(Protocol):
+    """What a verdict is built from; a `Story` has it.
+
+    Attributes:
+        bundle: the crash or near miss.
+        agent: the controlled vehicle.
+        other: the collision partner; empty if there is none.
+        contact: of the two; None if they did not touch.
+        nearest: the moment of the greatest criticality; None for a crash.
+        encounter: of the two; None without a collision partner.
+        judgement: what `judge` has found; None if it has not run.
+    """
+
+    bundle: Bundle
+    agent: str
+    other: str
+    contact: ContactRecord | None
+    nearest: DangerousMoment | None
+    encounter: Encounter | None
+    judgement: Judgement | None
+
+    def before_contact_s(self, step: int) -> float:
+        """Return how long before the contact a step ended, in s."""
+        ...
+
+
+def verdict_of(story: CrashFacts) -> str:
     """Return one sentence on a crash or near miss: what happened, and which run avoids it.
 
     Args:
-        story: of the crash or near miss.
+        story: story of the crash or near miss.
     """
     if story.nearest is not None:
         return _of_a_near_miss(story)
     omission = _omission(story)
-    what = describe_contact(story.contact, omission) if story.contact is not None else story.bundle.result.summary
+    contact = story.contact
+    if contact is None or contact.is_disputed:
+        what = story.bundle.result.summary
+    else:
+        what = describe_contact(contact, omission)
     clauses = [what, _avoided(story, omission)]
     return f"{'; '.join(clause for clause in clauses if clause)}."
 
 
-def _of_a_near_miss(story: Story) -> str:
+def _of_a_near_miss(story: CrashFacts) -> str:
     near = story.nearest
     assert near is not None
     moments = story.encounter.moments if story.encounter is not None else []
@@ -63,7 +93,7 @@ def describe_contact(contact: ContactRecord, omission: Omission | None = None) -
     """Return what happened at a contact, without a period.
 
     Args:
-        contact: of the agent with the other actor.
+        contact: contact of the agent with the other actor.
         omission: the lane change that runs have shown to be the cause, where there is one.
     """
     changers = contact.lane_changers(_CHANGE_S) if contact.same_way else ()
@@ -115,7 +145,7 @@ def _touches_a_side(contact: ContactRecord, met: str) -> bool:
 
 
 def _side(contact: ContactRecord, changer: str) -> str:
-    """Return to which side an actor changed lanes; empty where its path does not show it."""
+    """Return to which side an actor changed lanes; empty if its path does not show it."""
     if changer in contact.jumpers and len(contact.through) > 1:
         jump = lane_jump(contact.through[-2], contact.through[-1], changer)
         return ("left" if jump > 0 else "right") if jump else ""
@@ -131,7 +161,7 @@ def _side(contact: ContactRecord, changer: str) -> str:
 
 
 def _gap_at(contact: ContactRecord, changer: str) -> str:
-    """Return the gap between the two when one changed lanes; empty where it is unknown."""
+    """Return the gap between the two when one changed lanes; empty if it is unknown."""
     since = 0.0 if changer in contact.jumpers else contact.changed_s(changer)
     if since is None:
         return ""
@@ -161,15 +191,15 @@ def _gap_words(gap_m: float, speed_mps: float) -> str:
     return f"the gap was {gap_m / speed_mps:.1f} s ({gap_m:.1f} m)"
 
 
-def _omission(story: Story) -> Omission | None:
+def _omission(story: CrashFacts) -> Omission | None:
     """Return the omission that runs have shown, where it is about the collision partner or about no actor."""
     reference = story.judgement.reference if story.judgement is not None else None
     found = reference.omission if reference is not None else None
     return found if found is not None and found.actor in ("", story.other) else None
 
 
-def _avoided(story: Story, omission: Omission | None) -> str:
-    """Return which run avoided the crash, or that no run did; empty where that is unknown."""
+def _avoided(story: CrashFacts, omission: Omission | None) -> str:
+    """Return which run avoided the crash, or that no run did; empty if that is unknown."""
     judgement, tried = story.judgement, story.bundle.result.escape
     if omission is not None:
         return f"{_omitted(story.agent, omission)}with a reference driver there is no crash"
@@ -180,16 +210,21 @@ def _avoided(story: Story, omission: Omission | None) -> str:
             return f"when {story.agent} first observed {story.other}, no run avoided it any more"
         best = judgement.best
         if best is not None and best.last_step is not None:
-            also = "".join(f" and {each.removeprefix(f'{story.agent} ')}" for each in best.changed)
             how = _MANOEUVRES.get(best.manoeuvre, best.manoeuvre)
-            when = f"{story.before_contact_s(best.last_step):.1f} s before"
-            return f"if {story.agent} {how} {when}{also}, there is no crash"
+            return _if_it(story, how, best.last_step, best.changed)
         return "no run avoids it" if judgement.avoidable is False else ""
     if tried is None or tried.why_not or tried.step is None:
         return ""
-    if story.contact is not None and story.agent in story.contact.lane_changers(_CHANGE_S):
-        return ""  # the run that brakes also drops the lane change, and the hunt has not recorded which of both helps
-    return f"if {story.agent} brakes {story.before_contact_s(tried.step):.1f} s before, there is no crash"
+    is_changing = story.contact is not None and story.agent in story.contact.lane_changers(_CHANGE_S)
+    if is_changing and not tried.changed:
+        return ""  # an earlier version ran it, and has not recorded whether the run drops the lane change
+    return _if_it(story, "brakes", tried.step, tried.changed)
+
+
+def _if_it(story: CrashFacts, how: str, step: int, changed: tuple[str, ...]) -> str:
+    """Return that a run from a step on avoids the crash, with what else the agent does otherwise in the run."""
+    also = "".join(f" and {each.removeprefix(f'{story.agent} ')}" for each in changed)
+    return f"if {story.agent} {how} {story.before_contact_s(step):.1f} s before{also}, there is no crash"
 
 
 def _omitted(agent: str, omission: Omission) -> str:

@@ -121,12 +121,12 @@ def about_danger(course: DangerCourse, *, touched: bool = False) -> str:
     """Return the greatest criticality of both kinds, and their sums over the trial.
 
     Args:
-        course: of the recording.
+        course: course of the recording.
         touched: whether the agent touched another actor. That no actor was near is then not reported: an actor that
             jumps into another lane is on no way before the contact.
 
     Returns:
-        A sentence; empty where it would say nothing.
+        A sentence; empty if it would say nothing.
     """
     parts = []
     for whose, moment, total, relation, absent in (
@@ -164,8 +164,8 @@ def danger_to_json(course: DangerCourse | None, bundle: Bundle, first: int, last
     """Return the object under ``danger`` of ``show --json``; None if the recording has no criticality.
 
     Args:
-        course: of the recording.
-        bundle: of the trial.
+        course: course of the recording.
+        bundle: bundle of the trial.
         first: first step of the table.
         last: last step of the table.
     """
@@ -211,9 +211,9 @@ def about_disturbances(recording: Recording, result: TrialResult, first_step: in
     """Return what disturbed a trial in its last steps, a sentence each, and how often anything did before.
 
     Args:
-        recording: of the episode.
-        result: of it.
-        first_step: from which on.
+        recording: recording of the episode.
+        result: result of it.
+        first_step: step from which on it holds.
     """
     step_length_s = recording.prologue.step_length_s
     recent = [one for one in result.disturbances if one.step + one.how_long / step_length_s >= first_step]
@@ -254,7 +254,7 @@ def describe_disturbances(report: HuntReport) -> list[str]:
 
 
 def traffic_of(bundle: Bundle, likeliest: str) -> str:
-    """Return which traffic a crash took place in, in words; empty where its hunt has no disturbances.
+    """Return which traffic a crash took place in, in words; empty if its hunt has no disturbances.
 
     Args:
         bundle: the crash.
@@ -296,8 +296,8 @@ def about_events(recording: Recording, first_step: int, *, besides: Event | None
     """Return what else happened in the traffic in the last steps, a sentence each.
 
     Args:
-        recording: of the episode.
-        first_step: from which on.
+        recording: recording of the episode.
+        first_step: step from which on it holds.
         besides: the event that ended the trial, which is described elsewhere.
     """
     end = recording.steps * recording.prologue.step_length_s
@@ -327,7 +327,7 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
     """Return the results of the counterfactual analysis, one sentence each.
 
     Args:
-        judgement: of the crash.
+        judgement: judgement of the crash.
         ago: returns the time of a step as words, such as ``0.4 s before, after step 68``.
         agent: the controlled vehicle.
         other: the collision partner.
@@ -369,7 +369,7 @@ _FACULTIES = {
 
 
 def about_reference(reference: Reference, ago: Callable[[int], str], agent: str) -> list[str]:
-    """Return what the agent omitted, in sentences; empty where no run says so.
+    """Return what the agent omitted, in sentences; empty if no run says so.
 
     Args:
         reference: the runs with a reference driver.
@@ -421,13 +421,18 @@ def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
     return f"{agent} did not {what} ({gap}{safe}){seen}, and {omission.instead}"
 
 
+def about_changes(changed: Sequence[str]) -> str:
+    """Return what else the agent does otherwise in a run, as a sentence with a leading space; empty for nothing."""
+    return f" In that run {' and '.join(changed)}, too." if changed else ""
+
+
 def _until(attempt: Attempt, ago: Callable[[int], str]) -> str:
     assert attempt.last_step is not None
     braking = f" (at up to {attempt.deceleration:.1f} m/s²)" if attempt.deceleration is not None else ""
     words = (
         f"It could be avoided until {ago(attempt.last_step)}, {_BY.get(attempt.manoeuvre, attempt.manoeuvre)}{braking}"
     )
-    more = f" In that run {' and '.join(attempt.changed)}, too." if attempt.changed else ""
+    more = about_changes(attempt.changed)
     if attempt.all_later_run and attempt.last_step < attempt.end - 1:
         return f"{words}; that was run, and after each later step it was too late.{more}"
     if attempt.too_late_step is not None:

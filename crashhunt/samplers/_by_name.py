@@ -54,7 +54,7 @@ class NamedSampler:
             raise PluginError(f"the sampler {name!r} has no {missing[0]!r}", fix="see crashhunt.samplers.Sampler")
         if self.learns and self.independent:
             raise PluginError(
-                f"the sampler {name!r} says that it learns, and that its draws are independent",
+                f"the sampler {name!r} declares both learns and independent",
                 fix="set independent = False, or learns = False",
             )
 
@@ -70,7 +70,7 @@ class NamedSampler:
 
     @property
     def plain_origin(self) -> str:
-        """The origin of the trials that it draws independently of all others; empty where it keeps none apart."""
+        """The origin of the trials that it draws independently of all others; empty if it keeps none apart."""
         return self._sampler.plain_origin if isinstance(self._sampler, PlainStream) else ""
 
     @property
@@ -93,7 +93,9 @@ class NamedSampler:
         proposal = answer if isinstance(answer, Proposal) else Proposal(answer)
         wrong = self._wrong_with(proposal)
         if wrong:
-            raise PluginError(f"the sampler {self._name!r} proposes for trial {number} {wrong}", fix="mend it")
+            raise PluginError(
+                f"the sampler {self._name!r} proposes for trial {number} {wrong}", fix="correct the sampler"
+            )
         return proposal
 
     def tell(self, result: TrialResult) -> None:

@@ -66,7 +66,7 @@ class Niches:
     """Climbs one peak after the other.
 
     Args:
-        cube: of the arguments.
+        cube: cube of the arguments.
         like: a model whose fitted parameters are the initial ones of the models of peaks.
     """
 
@@ -126,7 +126,7 @@ class Niches:
                 return
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
-        """Return a proposal of the model of this peak; None where there is no other peak."""
+        """Return a proposal of the model of this peak; None if there is no other peak."""
         if self._foot is None:
             return None
         for _ in range(_TRIES):
@@ -165,7 +165,7 @@ class KnownCrashes:
     The same traffic leads to the same crash even with other arguments, so no proposal reuses the seed of a crash.
 
     Args:
-        dimensions: of the space.
+        dimensions: dimensions of the space.
     """
 
     def __init__(self, dimensions: int) -> None:
@@ -264,7 +264,7 @@ class Portfolio:
     """A model of criticality and mutation, in addition to Halton's sequence.
 
     Args:
-        cube: of the arguments.
+        cube: cube of the arguments.
         space: the same as distributions.
         hunt: its seed scrambles the sequence.
     """

@@ -49,8 +49,8 @@ class Process:
 
     Args:
         points: trials x arguments; a choice is the index of its value.
-        seeds: of the trials.
-        scores: of the trials; only their order matters.
+        seeds: seeds of the trials.
+        scores: scores of the trials; only their order matters.
         categorical: which arguments are choices.
         scales: factors of the arguments, the reciprocals of length scales.
         noise: the share of the variance of scores that is noise, above 0 and below 1.
@@ -78,8 +78,8 @@ class Process:
         """Return by how many standard deviations the expected score at each point exceeds the target.
 
         Args:
-            points: in the same form as those of the trials.
-            seeds: of the points; below 0 for a seed that no trial has.
+            points: points in the same form as those of the trials.
+            seeds: seeds of the points; below 0 for a seed that no trial has.
             ambition: by how much the target exceeds the best score, in standard deviations of all scores.
         """
         half = np.linalg.solve(self._lower, self._kernel(points, seeds).T)
@@ -138,7 +138,7 @@ class Model:
     """Proposes the candidate with the greatest chance to exceed the best score.
 
     Args:
-        cube: of the arguments.
+        cube: cube of the arguments.
         like: a model whose fitted parameters are the initial ones.
     """
 

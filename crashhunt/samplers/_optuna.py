@@ -82,7 +82,7 @@ def optuna_maker(name: str) -> OptunaMaker:
     }  # fmt: skip
     short = _short(asked)
     if short in _INSTEAD:
-        raise UsageError(f"the sampler {name!r} is not for hunts", fix=_INSTEAD[short])
+        raise UsageError(f"the sampler {name!r} cannot be used for hunts", fix=_INSTEAD[short])
     if short not in kinds:
         known = [kind for key, kind in kinds.items() if key not in _INSTEAD]
         raise PluginError(f"Optuna has no sampler {asked!r}", fix=one_of(asked, known))
@@ -123,7 +123,7 @@ class _Study:
     Args:
         kind: the class in ``optuna.samplers``.
         options: the number of values of each choice; 0 for a numeric argument.
-        seed: of the hunt.
+        seed: seed of the hunt.
     """
 
     def __init__(self, kind: str, options: tuple[int, ...], seed: int) -> None:

@@ -30,8 +30,8 @@ class Proposal:
 
     Args:
         arguments: a value for every key of the space.
-        seed: of the trial, 0 to 2**31 - 1; None for the one that its number has in the hunt.
-        parent: the number of the trial that it was made from; None where there is none.
+        seed: seed of the trial, 0 to 2**31 - 1; None for the one that its number has in the hunt.
+        parent: the number of the trial that it was made from; None if there is none.
         origin: a word on where it came from, such as the name of a strategy; empty for nothing.
     """
 
@@ -46,7 +46,7 @@ class HuntFacts:
     """What a sampler may know of the hunt that it is made for.
 
     Args:
-        seed: of the hunt.
+        seed: seed of the hunt.
         crash_on: the outcomes that count as a crash.
     """
 
@@ -85,7 +85,7 @@ class Sampler(Protocol):
         """Return a proposal, or only its arguments.
 
         Args:
-            number: of the trial, from 0.
+            number: number of the trial, from 0.
             rng: the trial's own generator, the same for the same hunt seed and number.
         """
 

@@ -93,7 +93,7 @@ class SweepSampler(GridSampler):
 
     Args:
         space: exactly one argument that varies; the others are constants.
-        points: in how many steps, where the range has no step of its own.
+        points: number of steps, where the range has no step of its own.
 
     Raises:
         UsageError: none or several arguments vary.
@@ -104,7 +104,7 @@ class SweepSampler(GridSampler):
         varying = [".".join(filter(None, key)) for key, values in self._axes if len(values) > 1]
         if len(varying) != 1:
             raise UsageError(
-                f"a sweep is over one argument, and what varies is: {', '.join(varying) or 'nothing'}",
+                f"a sweep needs exactly one varying argument, not: {', '.join(varying) or 'nothing'}",
                 fix="name one, such as --arg speed=5:30:5",
             )
 
@@ -116,7 +116,7 @@ class Cube:
     """The unit cube whose points represent arguments.
 
     Args:
-        space: of the arguments; those with one value have no dimension.
+        space: space of the arguments; those with one value have no dimension.
     """
 
     def __init__(self, space: Space) -> None:

@@ -38,7 +38,7 @@ class CmaEs:
     trials; the ten before a later run may include proposals of the run before.
 
     Args:
-        cube: of the arguments.
+        cube: cube of the arguments.
 
     Raises:
         UsageError: the package is not installed.
@@ -105,7 +105,7 @@ class CrossEntropy:
     """A mixture of normal distributions around the elites.
 
     Args:
-        cube: of the arguments.
+        cube: cube of the arguments.
     """
 
     def __init__(self, cube: Cube) -> None:
@@ -159,7 +159,7 @@ class Mutation:
     """Proposes mutants of the trials in the corpus.
 
     Args:
-        cube: of the arguments.
+        cube: cube of the arguments.
     """
 
     def __init__(self, cube: Cube) -> None:

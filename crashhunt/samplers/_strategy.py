@@ -27,9 +27,9 @@ class Draft:
     """A proposed point.
 
     Args:
-        point: in the cube.
-        seed: of the trial; None for the one that its number has.
-        parent: the number of the trial that it is derived from; None where there is none.
+        point: point in the cube.
+        seed: seed of the trial; None for the one that its number has.
+        parent: the number of the trial that it is derived from; None if there is none.
         origin: the strategy that proposes it, where there are several.
     """
 
@@ -67,13 +67,13 @@ class ScoredTrial:
     """A trial that has ended.
 
     Args:
-        number: of the trial.
+        number: number of the trial.
         point: where it was in the cube.
-        seed: of the trial.
+        seed: seed of the trial.
         score: 0 to 1, `CRASHED` for a crash.
-        origin: from which strategy it was.
-        parent: the number of the trial that it was made from; None where there is none.
-        kind: of a crash, its manner and its place as far as its result says so; empty where it does not.
+        origin: origin from which strategy it was.
+        parent: the number of the trial that it was made from; None if there is none.
+        kind: kind of a crash, its manner and its place as far as its result says so; empty if it does not.
     """
 
     number: int
@@ -91,7 +91,7 @@ class ScoredTrial:
 
 
 def scored_trial(result: TrialResult, cube: Cube, hunt: HuntFacts) -> ScoredTrial | None:
-    """Return a result as a sampler learns from it; None where it says nothing, as after a failed setup."""
+    """Return a result as a sampler learns from it; None if it says nothing, as after a failed setup."""
     if result.outcome in hunt.crash_on:
         score = CRASHED
     elif result.danger is None or result.outcome.category != "no crash":

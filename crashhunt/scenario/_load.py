@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
+from crashhunt.base.codec import known_part
 from crashhunt.base.errors import ArgumentError, ScenarioError
 from crashhunt.base.layout import PACKAGE, SCENARIO
 from crashhunt.base.plugins import registered
 from crashhunt.base.text import did_you_mean, listed, near_path, one_of
-from crashhunt.base.tolerance import known_part
 from crashhunt.base.validation import validate
 from crashhunt.scenario._scenario import (
     AgentSetup,
@@ -67,7 +67,7 @@ def check(scenario: Scenario, where: str, *, kept: bool) -> None:
     """Refuse a scenario that cannot be meant.
 
     Args:
-        scenario: with the folder in which its files are.
+        scenario: scenario with the folder in which its files are.
         where: the file that it was read from.
         kept: it has been run.
 
@@ -96,7 +96,7 @@ def check(scenario: Scenario, where: str, *, kept: bool) -> None:
         if kind not in LIMITS:
             refuse(where, "events", kind, "has no limit", f"give some of {', '.join(LIMITS)}")
         if not 0 < limit < float("inf"):
-            refuse(where, f"events.{kind}", limit, "is no limit", f"give {LIMITS[kind][1]} above 0")
+            refuse(where, f"events.{kind}", limit, "is not a limit", f"give {LIMITS[kind][1]} above 0")
 
 
 def check_arguments(scenario: Scenario, *, kept: bool) -> None:
@@ -179,9 +179,9 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
     """Load a scenario.
 
     Args:
-        name: of a shipped one, or the path of a folder, a ``scenario.toml`` or a simulator's own configuration.
+        name: name of a shipped scenario, or the path of a folder, a ``scenario.toml`` or a simulator's configuration.
         ego: for such a configuration, which vehicle is controlled, as its `Configuration` understands it.
-        kept: it is that of a snapshot, which has been run: what was accepted then is not refused now.
+        kept: whether the scenario is that of a snapshot. A snapshot has run before, so its scenario is not refused now.
 
     Raises:
         ScenarioError: it does not exist or is not valid, with file, key, value and the fix.
@@ -210,7 +210,7 @@ def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool 
     """Validate what a ``scenario.toml`` says, without looking at the files that it names.
 
     Args:
-        data: what it says.
+        data: content of the file.
         where: the file, for the error.
         folder: where its files are.
         tolerant: crashhunt itself has written it, perhaps another version: keys that are not known are kept
@@ -319,7 +319,7 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise ScenarioError(f"not valid TOML: {error}", fix="mend the file", where=str(path)) from None
+        raise ScenarioError(f"not valid TOML: {error}", fix="correct the file", where=str(path)) from None
     except OSError as error:
         raise ScenarioError(f"cannot be read: {error.strerror}", where=str(path)) from None
     for key in _INTERNAL:

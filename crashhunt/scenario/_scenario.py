@@ -83,11 +83,11 @@ class ArgumentSetup:
     """``[arguments.NAME]`` or ``[agents.ID.arguments.NAME]``.
 
     Args:
-        range: what a hunt tries, as a specification such as ``5:40``; empty where it stays at the default.
+        range: what a hunt tries, as a specification such as ``5:40``; empty if it stays at the default.
         default: the value without a request for another one.
-        unit: for people.
-        help: for people.
-        option: of a scenario argument, its target: an option of SUMO such as ``scale``, or a dotted entry of an
+        unit: unit for people.
+        help: description for people.
+        option: option of a scenario argument, its target: an option of SUMO such as ``scale``, or a dotted entry of an
             environment's configuration or keywords such as ``observation.vehicles_count``. Without an option, it
             fills ``${NAME}`` in SUMO's route and additional files, or sets the entry of its own name.
     """
@@ -109,7 +109,7 @@ class ArgumentSetup:
 
 @dataclass(frozen=True, kw_only=True)
 class AgentSetup:
-    """``[agents.ID]``: one controlled vehicle and who drives it. All but the first and the last are SUMO's.
+    """``[agents.ID]``: one controlled vehicle and its agent. All but the first and the last are SUMO's.
 
     Args:
         agent: ``module:attribute``, or the name of a registered agent.
@@ -192,11 +192,11 @@ class Scenario:
         events: limits of traffic events, such as ``not_moving`` in s, where they are not the default.
         disturbances: how often others err, or an agent sees or acts late: name to a rate per second. Hunts heed it, and
             nothing else.
-        schema: of the file format.
+        schema: schema of the file format.
         name: what people call it; the folder's name by default.
         folder: where its files are; not part of the file.
         file: what was read, relative to the folder; not part of it, and not of what crosses to a worker.
-        notes: what was decided on the user's behalf, for people; not part of the file.
+        notes: decisions of crashhunt, as texts for the user; not part of the file.
         added: what a later version has written into the file, for a worker of that version; nothing here reads it.
     """
 
@@ -234,7 +234,7 @@ class Scenario:
 
     @property
     def backend(self) -> Backend:
-        """The descriptor of its simulator; one that says nothing where there is none."""
+        """The descriptor of its simulator; one that says nothing if there is none."""
         return next(iter(self.backends.values()), Backend())
 
     def table(self, kind: type[T]) -> T:
@@ -290,7 +290,7 @@ class Scenario:
         return {name: setup.argument(name, where) for name, setup in self.agents[agent].arguments.items()}
 
     def with_agents(self, locators: dict[str, str]) -> Scenario:
-        """Return this scenario with other agents at the wheel; what it says of the old ones' arguments is dropped."""
+        """Return this scenario with other agents. The arguments of the replaced agents are dropped."""
         agents = dict(self.agents)
         for agent, locator in locators.items():
             if agents[agent].agent != locator:
@@ -319,7 +319,7 @@ def argument_values(scenario: Scenario) -> dict[str, Value]:
 
 
 class HasDigest(TypedDict):
-    """What is written down of a file."""
+    """The recorded properties of a file."""
 
     blake2b: str
 
@@ -340,7 +340,7 @@ def digest_of_described(files: Mapping[str, HasDigest], *, plain_data: object = 
 
     Args:
         files: name of each file to an entry with its digest, ``blake2b``.
-        plain_data: what JSON can hold; None where only the files matter.
+        plain_data: what JSON can hold; None if only the files matter.
     """
     content = {name: entry["blake2b"] for name, entry in files.items()}
     text = json.dumps(content if plain_data is None else [content, plain_data], sort_keys=True)
@@ -379,11 +379,11 @@ class Configuration:
     """A file of the simulator's own, which is run as it is, without a ``scenario.toml``.
 
     Args:
-        endings: of its name, such as ``.sumocfg``; messages name the first one.
+        endings: endings of its name, such as ``.sumocfg``; messages name the first one.
         load: returns it as a scenario, from its path and from what ``--ego`` says, which may be empty.
         arguments: the scenario arguments that every such scenario has, for completion in the shell.
         takes_ego: whether ``--ego`` chooses its controlled vehicle.
-        waiting: what takes its time when one is loaded, in words; empty where nothing does.
+        waiting: what takes its time when one is loaded, in words; empty if nothing does.
     """
 
     endings: tuple[str, ...]
@@ -412,7 +412,7 @@ class CompiledCore:
 
     Args:
         switched_off: returns a scenario without it, as ``--no-native`` asks for.
-        why_not: returns why it is not used, in words that follow "not used: "; empty where it is.
+        why_not: returns why it is not used, in words that follow "not used: "; empty if it is.
     """
 
     switched_off: Callable[[Scenario], Scenario]
@@ -428,7 +428,7 @@ class LoadOrder:
     Args:
         what: the objects that are in the order, in words.
         keep: returns a scenario that keeps the simulator's own order.
-        why_not: returns why the order is not fixed, in words that follow "not fixed: "; empty where it is.
+        why_not: returns why the order is not fixed, in words that follow "not fixed: "; empty if it is.
     """
 
     what: str
@@ -470,12 +470,12 @@ class Backend:
         check_names: the same for what its files do not define, given what ``--ego`` says; not asked about what has run.
         files: what an episode reads; it is part of the digest, and travels in the snapshot.
         texts: those of ``files`` that may say ``${NAME}``, for a scenario argument.
-        relocated: returns the content of one of ``texts`` as it is right wherever its folder goes, None where it is.
+        relocated: returns the content of one of ``texts`` as it is right wherever its folder goes, None if it is.
         modules: the code of the user's that it imports besides the agents', as ``module:attribute``. Names without
             a colon are ignored, so the id of an environment is allowed.
-        notes: what to tell people about what was decided on their behalf, in lines.
+        notes: lines for the user about decisions of crashhunt.
         versions: the distributions on whose version everything depends that it computes.
-        variables: of the environment, on which it depends; written down with the versions.
+        variables: variables of the environment, on which it depends; written down with the versions.
         per_processor: whether it may round otherwise on another processor.
         step_length_s: the control step, in s, where it is not the scenario's own.
         reported_events: the types of traffic events that it reports; None if that is unknown.
@@ -487,10 +487,10 @@ class Backend:
         configurations: files of its own that are run as they are.
         explained: returns the mistake in the scenario after a failed setup, from the message of the failure and from
             printed output; None if the scenario is not the cause.
-        side_effect: of a stranger's scenario, returns what it would do besides simulating, in words that follow "the
-            crash is a stranger's, and"; empty where it does nothing else. It is given the values of the trial's
-            scenario arguments, and the specifications of those that are texts. Without, strangers are refused.
-        right_of_way: returns who has to give way at the junctions of the map; None where that is not known.
+        side_effect: of a stranger's scenario, returns what it would do besides simulating, in words that
+            follow "the crash is a stranger's, and"; empty if it does nothing else. It is given the values of the
+            trial's scenario arguments, and the specifications of those that are texts. Without, strangers are refused.
+        right_of_way: returns the vehicles that have to give way at the junctions of the map; None if unknown.
         plays_paths: whether it can move others along recorded ways.
         one_per_process: whether a process can have only one simulation at a time.
         forkable: whether it is known that a process can be forked after it has made the simulator, which starts no
@@ -556,10 +556,10 @@ def backend_names() -> tuple[str, ...]:
 
 @cache
 def backend_of(name: str) -> Backend | None:
-    """Return the descriptor of a simulator; None where it has none.
+    """Return the descriptor of a simulator; None if it has none.
 
     Args:
-        name: under which the simulator is registered; a ``module:attribute`` has none.
+        name: name under which the simulator is registered; a ``module:attribute`` has none.
 
     Raises:
         PluginError: there is one, and it cannot be imported, or is something else.
@@ -632,11 +632,11 @@ class TrafficSurvey:
     """How a simulator finds the vehicles that an agent can replace: it simulates the traffic before the hunt.
 
     Args:
-        module: its ``main()`` runs in a process of its own, with the file of a `SurveyJob` as its only argument.
+        module: its ``main()`` runs in its own process, with the file of a `SurveyJob` as its only argument.
         refine: returns the scenario with the candidates that the runs confirm, from what ``module`` answered. Raises
             `ScenarioError` where no trial can be valid.
         restore: returns the scenario with the candidates of an earlier hunt, given the scenario that this hunt kept;
-            None where the hunt drew no candidates.
+            None if the hunt drew no candidates.
     """
 
     module: str

@@ -34,12 +34,12 @@ class OutOfTimeError(StoppedError):
 
 @dataclass(frozen=True, slots=True)
 class Ran:
-    """What came of a candidate.
+    """The result of a candidate.
 
     Args:
         same: whether it crashes in the same manner.
-        steps: after how many.
-        digest: of what was recorded.
+        steps: number of steps.
+        digest: digest of the recording.
     """
 
     same: bool
@@ -57,13 +57,13 @@ class Runs:
         memory: A file with the results of candidates, for a search that resumes after an interruption.
         parallel: trials at a time.
         budget: how many may be run.
-        time_s: how long they may take altogether, in s of wall-clock time; None for as long as it takes.
+        time_s: time limit for all of them, in s of wall-clock time; None without a limit.
         stopped: Returns whether to stop; called repeatedly.
         watch: called with how many have been run, and how many may be.
 
     Attributes:
         count: how many have been run, or are known from the last time.
-        steps: of these, altogether.
+        steps: number of steps of these, altogether.
         most_steps: what takes longer to crash does not count as the same.
         found_steps: how many steps the last candidate that crashed in the same manner has begun.
     """
@@ -97,13 +97,13 @@ class Runs:
         self._reruns = Reruns(rerun, scratch, parallel=parallel, stopped=is_over, keep_all=False, warm_copies=0)
 
     def first(self, candidates: Sequence[TrialSpec], *, again: bool = False) -> int | None:
-        """Return the place of the first candidate that crashes in the same manner; None where none does.
+        """Return the place of the first candidate that crashes in the same manner; None if none does.
 
         Which it is does not depend on how many run at a time.
 
         Args:
-            candidates: to be tried.
-            again: run even what is known not to do it.
+            candidates: vehicles to try.
+            again: whether to run candidates again that are known not to crash.
 
         Raises:
             StoppedError: The search stopped before the answer was known.

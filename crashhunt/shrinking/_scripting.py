@@ -24,11 +24,11 @@ _LONGER_S = 1.0  # by which the crash may come later than it did: the others are
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What of a crash takes part.
+    """The actors of a crash that remain.
 
     Args:
-        agents: who drives themselves.
-        others: who is moved; agents may be among them.
+        agents: the actors that drive themselves.
+        others: the actors that are moved; may include agents.
         begin: the step of the recording with which it begins.
     """
 

@@ -1,8 +1,8 @@
-"""Delta debugging of a set, plainer values of one: what is tried next. Nothing here knows what a trial is.
+"""Delta debugging of a set, simpler values of an argument: the order of candidates. Nothing here knows what a trial is.
 
 Delta debugging (Zeller and Hildebrandt, *Simplifying and Isolating Failure-Inducing Input*, 2002) for what there are
-several of; for a value, the plainest first, as Hypothesis does it. There is no chance in it: what is tried depends on
-what came of what was tried before, and not on how many run at a time.
+several of; for a value, the plainest first, as Hypothesis does it. The search is deterministic: the next candidate
+depends on earlier results, and not on the number of workers.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["Tried", "as_type_of", "fewest", "plainest"]
 
 T = TypeVar("T")
 Tried = Callable[[Sequence[T]], int | None]
-"""Tries candidates; returns the place of the first that still crashes in the same manner, None where none does."""
+"""Tries candidates; returns the place of the first that still crashes in the same manner, None if none does."""
 
 _DIGITS = (1, 2, 3, 4)
 
@@ -72,7 +72,7 @@ def plainest(value: Value, default: Value | None) -> list[Value]:
 
 
 def as_type_of(value: Value, default: Value) -> Value | None:
-    """Return a default as the type of a value; None where that would be another value. ``speed=5`` may mean 5.0."""
+    """Return a default as the type of a value; None if that would be another value. ``speed=5`` may mean 5.0."""
     if isinstance(value, float) and isinstance(default, int) and not isinstance(default, bool):
         return float(default)
     return default if type(default) is type(value) else None

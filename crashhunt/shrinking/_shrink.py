@@ -1,4 +1,4 @@
-"""Making a crash smaller, from the crash to the bundle of what is left."""
+"""Minimization of a crash, from the crash to the bundle of the result."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ _WRITE_AGAIN = "free some space and run the same command again: what came of the
 
 @dataclass(frozen=True, slots=True)
 class Shrunk:
-    """What came of making a crash smaller.
+    """The result of a minimization.
 
     Args:
         bundle: the crash.
         verdict: whether it is smaller, or cannot be made so, or did not come again.
         ended: why it was ended.
-        small: what is left of it; None where nothing was taken away.
-        why: what is to be known about the end, in words.
+        small: the minimized crash; None if nothing was removed.
+        why: reason for the end, in words.
         actors: how many were seen before and after, the agents with them.
         trials: how many were run.
-        steps: of these, altogether.
-        removed: who and what was taken away.
-        changed: arguments that have another value: name to what it was and what it is.
+        steps: number of steps of these, altogether.
+        removed: the removed actors and disturbances.
+        changed: arguments with a new value: name to old and new value.
         steps_cut: how many steps of the beginning were cut off.
         notes: what may make a difference, in words.
     """
@@ -68,7 +68,7 @@ class Shrunk:
 
     @property
     def scripted(self) -> tuple[str, ...] | None:
-        """Who is moved along a recorded way; None where the others drive."""
+        """The actors that are moved along recorded paths; None if the others drive."""
         script = self.small.result.spec.script if self.small is not None else None
         return None if script is None else script.names
 
@@ -123,7 +123,7 @@ def shrink(
     Args:
         bundle: the crash.
         budget: how many trials may be run.
-        time_s: how long that may take, in s of wall-clock time; two runs that confirm what is left come on top.
+        time_s: time limit, in s of wall-clock time; two runs that confirm the result are additional.
         form: ``traffic``: the other actors drive. ``scripted``: they follow recorded paths. ``either``: the form
             depends on the number of remaining actors.
         parallel: how many at a time; 0 for one per core.
@@ -140,7 +140,7 @@ def shrink(
         fix = f"give --crash {bundle.id.removesuffix(layout.SMALL)} to minimize the original crash again"
         raise UsageError(f"{bundle.id!r} is already minimized", fix=fix)
     if bundle.result.outcome in (Outcome.SURVIVED, Outcome.FINISHED):
-        raise UsageError(f"{bundle.id!r} is a near miss, and nothing crashes in it", fix="give a crash")
+        raise UsageError(f"{bundle.id!r} is a near miss, not a crash", fix="give a crash")
     if budget < 1:
         raise UsageError(f"the budget is {budget}", fix="give at least 1 trial")
     if time_s is not None and not time_s > 0:
@@ -223,7 +223,7 @@ def _constructor_defaults(rerun: Rerun) -> dict[tuple[str, str], Value]:
 def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | None:
     """Run the smallest in a fresh process, and write its bundle; another process confirms it, as of every crash.
 
-    Of what does not do the same there, the next larger one is taken; None where none does.
+    Of what does not do the same there, the next larger one is taken; None if none does.
     """
     bundle = rerun.bundle
     tries = _TRIES if bundle.confirmed is False else 1
@@ -240,7 +240,7 @@ def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | Non
 
 
 def _kept(small: Bundle) -> Bundle:
-    """Have it confirmed; what is left says of what it is left before that, which may take a minute."""
+    """Confirm the minimized crash. Its bundle is written before, because this may take a minute."""
     try:
         small.write()
         small = confirm(small, trusted=True) or small  # it runs what the whole crash was trusted to run

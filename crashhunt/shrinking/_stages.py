@@ -1,4 +1,4 @@
-"""What is tried to make a crash smaller, in which order, and the smallest that still did it."""
+"""The candidates of a minimization in their order, and the smallest one that still crashes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Search:
 
     Attributes:
         best: the smallest that did it.
-        smaller: all that did it and are smaller, one after another.
+        smaller: all smaller candidates that still crash, in their order.
         reproduced: whether the crash itself came again.
         notes: what could not be tried, in words.
     """
@@ -360,7 +360,7 @@ class Search:
         return round((script.time_s - recorded.scene(0).time_s) / recorded.prologue.step_length_s)
 
     def removed(self) -> tuple[str, ...]:
-        """Who and what was taken away."""
+        """The removed actors and disturbances."""
         was, best = self._rerun.spec, self.best
         everybody = self._everybody
         if best.script is not None:

@@ -132,7 +132,7 @@ def cast(action: object, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
     # Integers that are too large wrap around silently, and floats that are too large become infinite.
     same = array == given if dtype.kind in "biu" else np.isfinite(array) == np.isfinite(given)
     if not np.all(same):
-        raise ValueError("the type cannot hold the value")
+        raise ValueError("the data type cannot hold the value")
     return array
 
 

@@ -34,8 +34,8 @@ def coarse_cell(observation: NDArray[np.generic], space: gymnasium.Space[object]
 
     Args:
         observation: the last one, any shape.
-        space: of observations. Values are relative to its bounds, if it has any.
-        info: of the last step. Flags that are true and short texts count; numbers do not.
+        space: space of observations. Values are relative to its bounds, if it has any.
+        info: info of the last step. Flags that are true and short texts count; numbers do not.
     """
     words = []
     for key, value in info.items():

@@ -124,7 +124,7 @@ class Simulator(Protocol):
     actions. This holds in the same process and in another process, whatever ran before. The simulator never changes an
     array that it has returned.
 
-    Each optional capability is a protocol of its own: `TellsNotices`, `FlattensObservations`, `RestoresObservations`,
+    Each optional capability is its own protocol: `TellsNotices`, `FlattensObservations`, `RestoresObservations`,
     `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `SeesSurroundings`,
     `SupportsDisturbances`, `HoldsBack`, `LeavesOut`, `PlaysPaths`, `Reseeds`, `CountsSetUp`, `RunsForeignCode`,
     `Tidies` and `ReadiesProcess`. A simulator supports a protocol if it has the methods and attributes of the protocol.

@@ -191,13 +191,17 @@ class GymSimulator:
             learner, names = self._setup.learner, list(map(str, made.possible_agents))
             if learner and learner not in names:
                 raise ScenarioError(
-                    f"gym.learner = {learner!r} is no agent", fix=one_of(learner, names), where=self._scenario.origin
+                    f"gym.learner = {learner!r} is not an agent",
+                    fix=one_of(learner, names),
+                    where=self._scenario.origin,
                 )
             with _CONSTRUCTOR:
                 made = OneLearner(made, self._setup.learner, self._others)
         elif self._setup.learner or self._setup.others:
             fix = "remove gym.learner and gym.others"
-            raise self._mistake("this environment has one agent, and is not a parallel one of PettingZoo", fix=fix)
+            raise self._mistake(
+                "this environment has one agent and is not a parallel environment of PettingZoo", fix=fix
+            )
         if not isinstance(made, gymnasium.Env):
             fix, what = (
                 "return a gymnasium.Env, or a parallel environment of PettingZoo",

@@ -1,4 +1,4 @@
-"""Snapshots: the code and the scenario of a hunt, stored in its directory under the digest of their content."""
+"""Snapshots: code, scenario and environment of a hunt, stored in its directory under the digest of their content."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ import hashlib
 import importlib.machinery
 import json
 import os
+import platform
 import shutil
+import sys
 from contextlib import suppress
-from functools import cached_property
+from functools import cached_property, lru_cache
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base import layout
+from crashhunt.base.codec import typed_where_there
 from crashhunt.base.errors import BundleError
 from crashhunt.base.integrity import (
     FILES,
@@ -24,16 +28,26 @@ from crashhunt.base.integrity import (
     read_object,
     typed,
 )
-from crashhunt.base.tolerance import typed_where_there
+from crashhunt.base.plugins import distributions as installed
 from crashhunt.plans import HuntSettings, read_settings
-from crashhunt.scenario import Scenario, digest_of_described, load_scenario
+from crashhunt.scenario import Scenario, digest_of_described, installed_backends, load_scenario
 
 if TYPE_CHECKING:
     from crashhunt.base.integrity import FileEntry
 
 
-__all__ = ["Environment", "Manifest", "Snapshot", "code_of_manifest", "latest_snapshot", "without_code"]
-
+__all__ = [
+    "Environment",
+    "Manifest",
+    "Snapshot",
+    "code_of_manifest",
+    "environment",
+    "environment_changes",
+    "latest_snapshot",
+    "processor",
+    "versions",
+    "without_code",
+]
 
 # The content of ``manifest.json`` and ``environment.json``.
 
@@ -114,13 +128,15 @@ class Snapshot:
             typed(found, {"schema": int, "paths": list[str], "files": FILES})
             if not 1 <= found["schema"] <= SCHEMA:
                 raise BundleError(
-                    f"schema {found['schema']} is above {SCHEMA}", fix="use the version that wrote it", where=str(file)
+                    f"schema {found['schema']} is above {SCHEMA}",
+                    fix="use the version that wrote the trial",
+                    where=str(file),
                 )
             if found["schema"] >= _PROTECTED or "integrity" in found:
                 typed(found, {"integrity": str, "described": FILES})
                 said = found.pop("integrity")
                 if digest_of_data(found) != said:
-                    raise ValueError("it has changed since it was written")
+                    raise ValueError("the file has changed since it was written")
             found.setdefault("argument_files", {})
             typed(found, {"argument_files": dict[str, str]})
             _check_names(found)
@@ -162,7 +178,7 @@ class Snapshot:
         return read_settings(self.path / layout.HUNT)
 
     def environment(self) -> Environment:
-        """Return what was installed; it is read once.
+        """Return the installed packages; they are read once.
 
         Raises:
             BundleError: the file is missing or damaged.
@@ -257,7 +273,7 @@ class Snapshot:
             more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
             raise BundleError(
                 f"the snapshot is damaged: {faults[0]}{more}",
-                fix="get an undamaged copy of the hunt's directory; crashhunt replay --force --trust runs it as it is",
+                fix="get an undamaged copy of the hunt's directory; or run crashhunt replay --force --trust",
                 where=str(self.path),
             )
 
@@ -280,10 +296,10 @@ def _check_names(manifest: Manifest) -> None:
     for name in names:
         parts = name.split("/")
         if parts[0] not in _PARTS or not {"", ".", ".."}.isdisjoint(parts) or "\\" in name or "\0" in name:
-            raise ValueError(f"the name {name!r} leads out of the snapshot")
+            raise ValueError(f"the path {name!r} leads out of the snapshot")
     for name in manifest.get("described", {}):
         if name not in _DESCRIBING:
-            raise ValueError(f"the name {name!r} is none of its files")
+            raise ValueError(f"the snapshot has no file {name!r}")
     for entry in (*manifest["files"].values(), *manifest.get("described", {}).values()):
         typed(entry, {"size": int, "blake2b": str})
 
@@ -339,3 +355,117 @@ def _of_simulation(found: Environment) -> Environment:
     loaded = set(found["loaded"])
     distributions = {name: version for name, version in found["distributions"].items() if name in loaded}
     return {**found, "distributions": distributions, "variables": {}, "git": {}}
+
+
+# The environment of a hunt: Python, the machine, and the installed distributions, on which results may depend.
+
+_VERSIONED = ("crashhunt", "numpy")  # besides those of simulators
+_VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "OMP_NUM_THREADS", "VIRTUAL_ENV")
+
+
+def environment() -> Environment:
+    """Return the content of ``environment.json``.
+
+    ``loaded`` lists the distributions with an imported module, and those of simulators. Results may depend on them.
+    """
+    modules = {name.partition(".")[0] for name in list(sys.modules)}
+    distributions: dict[str, str] = {}
+    named = versions()
+    loaded: set[str] = set()
+    for distribution in installed():
+        name, version, theirs = _facts_of(distribution)
+        if not name:
+            continue
+        distributions[name] = version
+        if name in named or not modules.isdisjoint(theirs):
+            loaded.add(name)
+    return {
+        "schema": 1,
+        "python": platform.python_version(),
+        "implementation": platform.python_implementation(),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "cpu": processor(),
+        "versions": named,
+        "distributions": dict(sorted(distributions.items(), key=lambda item: item[0].lower())),
+        "loaded": sorted(loaded, key=str.lower),
+        "variables": {name: os.environ[name] for name in _variables() if name in os.environ},
+    }
+
+
+@lru_cache(maxsize=1024)
+def _facts_of(distribution: metadata.Distribution) -> tuple[str, str, set[str]]:
+    return *_name_and_version(distribution), _top_level_modules(distribution)
+
+
+def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
+    """Return name and version from the head of the text, because `Distribution.metadata` parses the whole text."""
+    text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
+    head, _, _ = text.partition("\n\n")
+    found = dict(line.split(": ", 1) for line in head.splitlines() if line.startswith(("Name: ", "Version: ")))
+    if len(found) == 2:
+        return found["Name"].strip(), found["Version"].strip()
+    return distribution.metadata["Name"] or "", distribution.metadata["Version"] or ""
+
+
+def _version_of(name: str) -> str:
+    return _name_and_version(metadata.distribution(name))[1]
+
+
+def _top_level_modules(distribution: metadata.Distribution) -> set[str]:
+    """Return the modules of a distribution, as `importlib.metadata.packages_distributions` does, but faster."""
+    declared = (distribution.read_text("top_level.txt") or "").split()
+    if declared:
+        return set(declared)
+    record = distribution.read_text("RECORD")
+    names = map(str, distribution.files or ()) if record is None else record.splitlines()
+    files = (name.partition(",")[0].strip('"') for name in names)
+    return {file.partition("/")[0].removesuffix(".py") for file in files if file.endswith(".py")}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that every crash records, including those of all installed simulators."""
+    found = {"python": platform.python_version()}
+    for name in dict.fromkeys(
+        (*_VERSIONED, *(name for _, backend in installed_backends() for name in backend.versions))
+    ):
+        try:
+            found[name] = _version_of(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _variables() -> tuple[str, ...]:
+    return (*_VARIABLES, *(name for _, backend in installed_backends() for name in backend.variables))
+
+
+def environment_changes(recorded: Environment) -> dict[str, tuple[str, str]]:
+    """Return the versions that differ from an ``environment.json``: name to (recorded, current)."""
+    changes = {}
+    for name, then, now in (
+        ("python", recorded.get("python"), platform.python_version()),
+        ("implementation", recorded.get("implementation"), platform.python_implementation()),
+        ("machine", recorded.get("machine"), platform.machine()),
+    ):
+        if then not in (None, now):
+            changes[name] = (str(then), now)
+    distributions = recorded.get("distributions", {})
+    for name in recorded.get("loaded", ()):
+        try:
+            now = _version_of(name)
+        except metadata.PackageNotFoundError:
+            now = "not installed"
+        then = distributions.get(name, now)
+        if then != now and name != "crashhunt":  # crashhunt itself comes from the snapshot
+            changes[name] = (str(then), now)
+    return changes
+
+
+def processor() -> str:
+    """Return the model of the processor, because NumPy's results may differ between models."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")

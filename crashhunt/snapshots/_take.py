@@ -12,26 +12,27 @@ import sysconfig
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
+from crashhunt.base.apart import work_apart
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import BundleError, SnapshotError, UsageError
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree
 from crashhunt.base.git import environment_of_git
 from crashhunt.base.integrity import describe_files, digest_of_content, digest_of_data, digest_of_file
-from crashhunt.base.plugins import import_module, locate
+from crashhunt.base.plugins import import_module, is_foreign, is_foreign_module, locate
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
 from crashhunt.oracles import modules_of
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, load_order_of, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, digest_of_described
-from crashhunt.snapshots._environment import environment
-from crashhunt.snapshots._snapshot import SCHEMA, Snapshot, code_of_manifest
+from crashhunt.snapshots._snapshot import SCHEMA, Snapshot, code_of_manifest, environment
 from crashhunt.trial import Choice, Constant
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.base.integrity import FileEntry
     from crashhunt.snapshots._snapshot import Environment, Manifest
 
@@ -59,6 +60,17 @@ class Sources:
     paths: list[str] = field(default_factory=lambda: [layout.CODE])
     trees: list[Path] = field(default_factory=list)
     excluded: list[str] = field(default_factory=list)
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Sources:
+        """Return the sources that `to_json` has described."""
+        files = {str(place): Path(path) for place, path in data["files"].items()}
+        return cls(files, list(data["paths"]), list(map(Path, data["trees"])), list(data["excluded"]))
+
+    def to_json(self) -> JsonObject:
+        """Return a description that can be written as JSON."""
+        files = {place: str(path) for place, path in self.files.items()}
+        return {"files": files, "paths": self.paths, "trees": list(map(str, self.trees)), "excluded": self.excluded}
 
 
 def find_sources(
@@ -93,6 +105,7 @@ def find_sources(
     _take_module("crashhunt", found)
     # A replay never reads the pages of the guide.
     found.files = {place: file for place, file in found.files.items() if not _is_page(place)}
+    work_tree_of = cache(_work_tree_of)  # a project has many modules in one folder, and git takes milliseconds
     for name in sorted(names - {"crashhunt"}):
         place = _place_of(name)
         if place is None:
@@ -100,7 +113,8 @@ def find_sources(
         if _is_installed(place) and (place / f"{name}.libs").is_dir():
             # Its compiled code loads libraries from there, and a copy would not find them. Its version identifies it.
             continue
-        listing = None if _is_installed(place) else _listing_that_has(place, name, found)
+        tree = None if _is_installed(place) else work_tree_of(place)
+        listing = None if tree is None else _listing_that_has(tree, place / name, found)
         if listing is None:
             _take_module(name, found)
         else:
@@ -175,16 +189,18 @@ def _walk(folder: Path) -> Iterator[str]:
                 yield name if below == "." else f"{below}/{name}"
 
 
-def _listing_that_has(place: Path, name: str, found: Sources) -> tuple[Path, list[str]] | None:
-    """Return the work tree that holds a module, and its files; None if there is none, or if git ignores the module."""
-    top = git(place, "rev-parse", "--show-toplevel")
-    if top is None:
-        return None
-    tree = Path(os.fsdecode(top.rstrip(b"\n"))).resolve()
+def _work_tree_of(folder: Path) -> Path | None:
+    """Return the git work tree that holds a folder, if there is one."""
+    top = git(folder, "rev-parse", "--show-toplevel")
+    return None if top is None else Path(os.fsdecode(top.rstrip(b"\n"))).resolve()
+
+
+def _listing_that_has(tree: Path, path: Path, found: Sources) -> tuple[Path, list[str]] | None:
+    """Return a work tree and its files; None if git ignores the module at a path (without its suffix)."""
     if tree in found.trees:
         return tree, []
     files = list(_listed(tree))
-    module = (place / name).relative_to(tree).as_posix()
+    module = path.relative_to(tree).as_posix()
     if any(file.startswith((f"{module}.", f"{module}/")) for file in files):
         return tree, files
     return None
@@ -260,13 +276,14 @@ def _take_root(root: Path, found: Sources, without: Path | None) -> None:
         found.files[f"{layout.CODE}/@{path.parent.name}/{path.name}"] = path
         return
     if not path.is_dir():
-        raise SnapshotError(f"--snapshot-root {str(root)!r} does not exist", fix="mend the path")
+        raise SnapshotError(f"--snapshot-root {str(root)!r} does not exist", fix="correct the path")
     names = list(_listed(path)) or list(_walk(path))
     _take_tree(path, names, found, imports=[path], without=without)
 
 
 _MEGABYTE = 10**6
 _SMALL = 1 << 20  # bytes
+_LOOK_S = 60.0  # besides the time limit of a trial, for the modules of agents to be imported
 
 
 @clear_constructor
@@ -319,20 +336,36 @@ def take_snapshot(
         SnapshotError: The snapshot is too large, or a file cannot be read or written.
     """
     options = options or SnapshotOptions()
-    found = Sources(paths=[])
-    if options.code:
-        locators = [setup.agent for setup in scenario.agents.values()]
-        modules = [*scenario.modules(), *modules_of(settings.oracles)]
-        found = find_sources(locators, modules, roots=options.roots, without=snapshots.parent)
+    locators = [setup.agent for setup in scenario.agents.values()]
+    modules = [*scenario.modules(), *modules_of(settings.oracles)] if options.code else []
+
+    def look() -> JsonObject:
+        """Import the agents, and describe what a snapshot needs to know of the imported modules."""
+        for locator in locators:
+            locate("agents", locator)
+        agents = [getattr(sys.modules.get(locator.partition(":")[0]), "__file__", None) for locator in locators]
+        found = Sources(paths=[])
+        if options.code:
+            found = find_sources(locators, modules, roots=options.roots, without=snapshots.parent)
+        return {"sources": found.to_json(), "agents": list(filter(None, agents)), "environment": environment()}
+
+    foreign = [locator for locator in locators if is_foreign("agents", locator)]
+    foreign += filter(is_foreign_module, modules)
+    if foreign:
+        task = f"{foreign[0]!r} cannot be imported"
+        seen: Any = work_apart(look, task=task, timeout_s=_LOOK_S + settings.run.timeout_s)
+    else:
+        seen = look()
+    found = Sources.from_json(seen["sources"])
     argument_files = _argument_files(settings) if options.code else {}
-    argument_files |= _training_records(scenario, argument_files)
+    argument_files |= _training_records(seen["agents"], argument_files)
     files = found.files | {argument_files[value]: Path(value) for value in argument_files}
     _check_size(files, options.limit_mb)
     try:
         snapshots.mkdir(exist_ok=True)
         remove_ended(snapshots)
         with temporary_beside(snapshots / layout.MANIFEST, name=f"{layout.BUILDING}{this_process().token}") as building:
-            return _build(building, files, found, argument_files, scenario, settings)
+            return _build(building, files, found, argument_files, scenario, settings, seen["environment"])
     except OSError as error:
         raise SnapshotError(
             f"the snapshot cannot be made: {error.strerror or error}",
@@ -348,6 +381,7 @@ def _build(
     argument_files: dict[str, str],
     scenario: Scenario,
     settings: HuntSettings,
+    around: Environment,
 ) -> Snapshot:
     """Copy all files into a folder and rename the folder to its digest, unless that snapshot exists already."""
     building.mkdir()
@@ -369,7 +403,7 @@ def _build(
     if final.exists() and not _is_damaged(Snapshot(final)) and Snapshot(final).is_made_here:
         return Snapshot(final)
     write_settings(building / layout.HUNT, settings, ["crashhunt", "run", "as resolved"])
-    facts: Environment = {**environment(), "git": _describe_trees(found.trees, building / layout.GIT_DIFF)}
+    facts: Environment = {**around, "git": _describe_trees(found.trees, building / layout.GIT_DIFF)}
     if (core := core_of(scenario, settings.run)) is not None:
         facts["core"] = core
     if (load_order := load_order_of(scenario)) is not None:
@@ -409,14 +443,12 @@ def _argument_files(settings: HuntSettings) -> dict[str, str]:
     return found
 
 
-def _training_records(scenario: Scenario, argument_files: dict[str, str]) -> dict[str, str]:
-    """Return the records of trainings next to policies and next to agents' modules, and their places.
+def _training_records(modules: Sequence[str], argument_files: dict[str, str]) -> dict[str, str]:
+    """Return the records of trainings next to policies and next to the files of agents' modules, and their places.
 
     A comparison of hunts must know which traffics an agent was trained on.
     """
-    modules = (sys.modules.get(setup.agent.partition(":")[0]) for setup in scenario.agents.values())
-    policies = [*argument_files, *filter(None, (getattr(module, "__file__", None) for module in modules))]
-    records = dict.fromkeys(str(Path(policy).parent / layout.TRAINED_ON) for policy in policies)
+    records = dict.fromkeys(str(Path(policy).parent / layout.TRAINED_ON) for policy in (*argument_files, *modules))
     there = [record for record in records if os.path.isfile(record)]  # noqa: PTH113
     first = len(argument_files)
     return {record: f"{layout.FILES}/{place}-{layout.TRAINED_ON}" for place, record in enumerate(there, first)}
@@ -430,7 +462,7 @@ def _check_size(files: dict[str, Path], limit_mb: float) -> None:
         names = ", ".join(f"{path} ({sizes[path] / _MEGABYTE:.3g} MB)" for path in largest)
         raise SnapshotError(
             f"the snapshot would have {total / _MEGABYTE:.3g} MB, above the limit of {limit_mb:g} MB; largest: {names}",
-            fix="have git ignore what the agent does not need, raise --snapshot-limit, or give --no-snapshot",
+            fix="list unneeded files in .gitignore, raise --snapshot-limit, or give --no-snapshot",
         )
 
 

@@ -1,4 +1,4 @@
-"""Suites: many hunts, each in a process of its own, and running them again."""
+"""Suites: many hunts, each in its own process, and running them again."""
 
 import lazy_loader
 

@@ -1,7 +1,7 @@
 """A gate: a verdict on a change, from hunts of two versions in the same traffic.
 
 BASE and HEAD are two commits of a Git repository, each imported from a temporary work tree, or two agents. Their hunts
-run at the same time, each in a process of its own, with the same seed. Trials, traffic and disturbances follow from the
+run at the same time, each in its own process, with the same seed. Trials, traffic and disturbances follow from the
 seed and the number of a trial, and not from what the agent does. The hunts end as soon as `PairWatch` decides.
 
 The hunts of a suite run one pair after the other: the order of all pairs must not depend on results.
@@ -26,14 +26,14 @@ import numpy as np
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, NoValidTrialError, UsageError
 from crashhunt.base.files import whole_file
+from crashhunt.base.git import checked_out, commit_of, git, import_environment, run_to_end, top_of
 from crashhunt.base.plugins import registered
 from crashhunt.base.temporary import temporary_folder
-from crashhunt.base.work_trees import checked_out, commit_of, import_environment, run_to_end, top_of
 from crashhunt.corpus import find_cases
 from crashhunt.estimation import GateCase, GateReport, PairedHunts, measure_rates
 from crashhunt.hunts import HuntDirectory, hunt_state, is_hunt
 from crashhunt.plans import read_settings
-from crashhunt.rates import PairWatch
+from crashhunt.rates import PairWatch, check_confidence
 from crashhunt.scenario import load_scenario
 from crashhunt.suites._processes import (
     REQUEST,
@@ -69,8 +69,8 @@ class GateVersion:
 
     Args:
         word: as the user gave it.
-        agents: vehicle to who drives it, as in ``--agent``; empty where the version is a commit.
-        commit: its digits; empty where the version is an agent.
+        agents: vehicle to its agent, as in ``--agent``; empty if the version is a commit.
+        commit: its digits; empty if the version is an agent.
     """
 
     word: str
@@ -88,12 +88,12 @@ class GateVersion:
         if ":" in locator or locator in registered("agents"):
             return cls(word, {vehicle: locator})
         if equals or not word:
-            raise UsageError(f"{word!r} is no agent and no commit", fix="give [ID=]MODULE:ATTR, or a revision")
+            raise UsageError(f"{word!r} is neither an agent nor a commit", fix="give [ID=]MODULE:ATTR, or a revision")
         try:
             return cls(word, {}, commit_of(top_of(folder), word))
         except CrashhuntError as error:
             fix = "give a revision of the repository around this folder, or an agent as module:attribute"
-            raise UsageError(f"{word!r} is no agent and no commit: {error.message}", fix=fix) from None
+            raise UsageError(f"{word!r} is neither an agent nor a commit: {error.message}", fix=fix) from None
 
     def __str__(self) -> str:
         """The name of the agent, or the revision with the first digits of its commit."""
@@ -104,14 +104,14 @@ class GateVersion:
 
 @dataclass(frozen=True, slots=True)
 class GateProgress:
-    """How far a gate is, for people who watch.
+    """Progress of a gate, for display.
 
     Args:
-        name: of the hunt that runs.
+        name: name of the hunt that runs.
         done: pairs of trials that have ended, of all hunts.
-        most: how many there are at most.
-        only_base: in which only BASE crashes.
-        only_head: in which only HEAD does.
+        most: largest number.
+        only_base: number of pairs in which only BASE crashes.
+        only_head: number of pairs in which only HEAD crashes.
         evidence: e-value that they do not crash equally often.
     """
 
@@ -131,12 +131,13 @@ class Gate:
         base: the version before the change.
         head: the version with it.
         hunts: name to what a hunt of either version is; its ``trials`` do not count.
-        folder: from which the user imports agents.
+        folder: folder from which the user imports agents.
         most: how many pairs of trials, of all hunts together.
         duration_s: the most wall time, in s; infinite for no limit.
         margin: the greatest difference in crashes per trial that counts as none; 0 for no such verdict.
-        confidence: of the verdict, in percent.
-        corpus: of HEAD, as a path from the folder; where it is None, ``crashes``, if HEAD is a commit that has it.
+        confidence: confidence of the verdict, in percent.
+        corpus: corpus of HEAD, as a path from the folder; where it is None, ``crashes``, if HEAD is a commit that has
+            it.
         parallel: trials at a time, of both together; 0 for one per core.
         is_suite: whether there may be several hunts; then only *worse* ends the gate before the last of them.
         trusted: whether hunts that are there already, and the corpus, may run in any case.
@@ -165,6 +166,7 @@ class Gate:
             watch: called about once a second.
 
         Raises:
+            UsageError: an agent was trained on all traffics, or an option is out of range.
             CrashhuntError: a hunt cannot be run, or the directory is of another gate.
         """
         self._check()
@@ -172,6 +174,14 @@ class Gate:
             place = directory if directory is not None else stack.enter_context(temporary_folder("gate"))
             stack.enter_context(_locked(place))
             return _Run(self, place, stack, watch, is_kept=directory is not None).report()
+
+    def cautions(self) -> Iterator[str]:
+        """Yield what a user of two commits may not expect."""
+        if self.base.commit and self.base.commit == self.head.commit:
+            yield f"BASE and HEAD are the same commit ({self.head.commit[:10]})"
+        status = ("--no-optional-locks", "status", "--porcelain", "--untracked-files=no")
+        if self.head.commit and git(self.folder, *status, skipped=True):
+            yield "the work tree has changes that are not committed; the gate does not compare them"
 
     def _check(self) -> None:
         if bool(self.base.commit) != bool(self.head.commit):
@@ -185,10 +195,7 @@ class Gate:
             )
         if not 0 <= self.margin < 1:
             raise UsageError(f"--margin is {self.margin:g}", fix="give a share from 0 to below 1, such as 0.01")
-        if not 50 <= self.confidence < 100:
-            raise UsageError(
-                f"--confidence is {self.confidence:g}", fix="give percent from 50 to below 100, such as 95"
-            )
+        check_confidence(self.confidence)
         slots_of(self.parallel)
         for name, run in self.hunts.items():
             _check_request(run, f"{name}: " if self.is_suite else "")
@@ -205,7 +212,7 @@ def _locked(place: Path) -> Iterator[None]:
         place.mkdir(exist_ok=True)
         if is_hunt(place) or (not (place / GATE).exists() and any(place.iterdir())):
             raise HuntDirectoryError(
-                "the folder is not empty and not that of a gate", fix="give --keep a new folder", where=str(place)
+                "the folder is not empty and has no gate", fix="give --keep a new folder", where=str(place)
             )
         with (place / _LOCK).open("a") as lock:
             try:
@@ -228,7 +235,7 @@ def _check_request(run: RunRequest, where: str) -> None:
         "--only-at-fault": request.run.only_at_fault,
     }  # fmt: skip
     if given := next((option for option, value in options.items() if value), ""):
-        raise UsageError(f"{where}a gate compares plain trials, one by one, so not with {given}", fix="leave it out")
+        raise UsageError(f"{where}a gate compares single trials and does not support {given}", fix="omit it")
 
 
 class _Run:
@@ -259,7 +266,7 @@ class _Run:
         return {BASE: self._gate.base, HEAD: self._gate.head}
 
     def report(self) -> GateReport:
-        """Run the corpus and the hunts, and return what came of it."""
+        """Run the corpus and the hunts, and return the result."""
         try:
             self._corpus = self._run_corpus()
             if any(case.has_come_back for case in self._corpus or ()):
@@ -287,7 +294,7 @@ class _Run:
             )
             if is_other:
                 raise HuntDirectoryError(
-                    "another gate is there: of other versions, other hunts or another seed",
+                    "the directory has a gate of other versions, hunts or seed",
                     fix="give --keep another directory", where=str(self._place),
                 )  # fmt: skip
             seed = before["seed"] if before is not None and given is None else given
@@ -352,7 +359,7 @@ class _Run:
             write_request(place, request)
         except OSError as error:
             raise HuntDirectoryError(
-                f"cannot be made: {error.strerror}", fix="choose another directory", where=str(place)
+                f"cannot be created: {error.strerror}", fix="choose another directory", where=str(place)
             ) from error
 
     def _check_origins(self) -> None:
@@ -371,14 +378,14 @@ class _Run:
             if modules and len(elsewhere) == len(modules):
                 module, place = elsewhere[0]
                 raise UsageError(
-                    f"{module!r} comes from {place}, whatever commit is checked out",
+                    f"{module!r} is imported from {place}, independent of the commit",
                     fix="run it from the folder of the repository that holds the module, with --agent module:attribute",
                 )
 
     # The corpus.
 
     def _run_corpus(self) -> tuple[GateCase, ...] | None:
-        """Run the cases of HEAD with its code, in a process of its own; None where there is no corpus."""
+        """Run the cases of HEAD with its code, in its own process; None if there is no corpus."""
         gate = self._gate
         given = gate.corpus or Path(_USUAL_CORPUS)
         folder = self._folder_of(HEAD, gate.folder)
@@ -389,7 +396,7 @@ class _Run:
         if not corpus.is_dir():
             if gate.corpus is None:
                 return None
-            raise UsageError(f"--corpus {gate.corpus} is no folder of HEAD", fix="give the folder of a corpus")
+            raise UsageError(f"--corpus {gate.corpus} is not a folder of HEAD", fix="give the folder of a corpus")
         try:
             cases = find_cases([corpus])
         except CrashhuntError:
@@ -401,7 +408,7 @@ class _Run:
             cases = [case for case in cases if drivers & _drivers_of(case)]
             if not cases:
                 message = f"--corpus {gate.corpus} has no case of {gate.head.word}"
-                raise UsageError(message, fix="leave it out, or give the corpus of that agent")
+                raise UsageError(message, fix="omit the option, or give the corpus of that agent")
         command = [sys.executable, "-m", "crashhunt", "corpus", "run", *map(str, cases), "--json"]
         command += ["--parallel", str(slots_of(gate.parallel))]
         if gate.trusted or tree is not None:  # a commit's corpus is trusted as its code is
@@ -500,10 +507,13 @@ class _Run:
             return invalid
         if time.monotonic() > self._until:
             return "the time is up; give --for more, or --most fewer pairs with a greater --margin"
-        if not self._pairs.test.pairs and any(one.trained_on for one in self._hunts):
-            return "an agent was trained on all these traffics; give another --seed"
         if ended := next((said for one in self._hunts if not one.is_complete and (said := _ended_early(one))), ""):
             return ended
+        if not self._pairs.test.pairs and (trained_on := sum(one.trained_on for one in self._hunts)):
+            raise UsageError(
+                f"an agent was trained on all {trained_on} traffics of this gate",
+                fix="give another --seed, or train with a test share",
+            )
         return f"all {self._gate.most} pairs have ended; give more with --most, or a greater --margin"
 
     # What came of it.
@@ -542,7 +552,7 @@ class _Run:
         return report
 
     def _rates(self) -> tuple[CrashRate, CrashRate] | None:
-        """Return the rates of the only two hunts; None where there are several, or one has not begun."""
+        """Return the rates of the only two hunts; None if there are several, or one has not begun."""
         (paired, *others) = self._hunts
         if others or not all((folder / layout.HUNT).exists() for folder in paired.folders) or not paired.counts.pairs:
             return None
@@ -577,7 +587,7 @@ def _wait_until_free(hunt: Path) -> None:
 
 
 def _ended_early(paired: PairedHunts) -> str:
-    """Return which hunt ended without all its trials, and the last line that it printed; empty where neither did."""
+    """Return which hunt ended without all its trials, and the last line that it printed; empty if neither did."""
     for side, folder in zip((BASE, HEAD), paired.folders, strict=True):
         state = hunt_state(folder).state
         if state not in ("finished", "crashed"):

@@ -1,4 +1,4 @@
-"""Hunts in processes of their own, several at a time: a failure of one does not affect the others."""
+"""Hunts in their own processes, several at a time: a failure of one does not affect the others."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ class RunRequest:
     """What a run of a suite will be: `request.json` in its folder.
 
     Args:
-        request: of the hunt.
-        folder: from where agents are imported.
+        request: request of the hunt.
+        folder: folder from where agents are imported.
         snapshot: what the snapshot takes in.
     """
 
@@ -88,7 +88,7 @@ class RunRequest:
         return {"request": asdict(self.request), "folder": self.folder, **asdict(self.snapshot)}
 
     def to_plain(self) -> object:
-        """Return what is read from the file that has it."""
+        """Return the object as read from its file."""
         return json.loads(json.dumps(self.to_json(), default=str))
 
     @classmethod
@@ -147,10 +147,10 @@ def run_all(
     is_enough: Callable[[], bool] = lambda: False,
     environments: Mapping[Path, Mapping[str, str]] | None = None,
 ) -> None:
-    """Run hunts, each in a process of its own, until the last has ended, is not needed any more, or is interrupted.
+    """Run hunts, each in its own process, until the last has ended, is not needed any more, or is interrupted.
 
     Args:
-        folders: of the runs, each with its ``request.json``.
+        folders: folders of the runs, each with its ``request.json``.
         parallel: trials at a time, of all hunts together; 0 for one per core.
         watch: called about once a second, and at the end.
         machine: options that hold for all of them, whatever each says.
@@ -208,7 +208,7 @@ def set_aside(folder: Path, planned: Callable[[Path], RunRequest]) -> Path:
     A process that is killed meanwhile leaves the folder either unchanged, or planned again.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         planned: called with where its content will be; returns what the run will be.
 
     Raises:
@@ -293,7 +293,7 @@ def _main(folder: Path, run: Given, parent: int) -> None:
 
 
 def _planned(folder: Path, request: Request, machine: Given) -> tuple[Scenario, HuntSettings]:
-    """What to run: what is there already, or what was asked for; ``trials`` in the options replaces their number."""
+    """The hunts to run: existing ones or new ones; ``trials`` in the options replaces their number of trials."""
     run = dict(machine)
     trials = run.pop("trials", None)
     begun, snapshot = (folder / layout.HUNT).exists(), latest_snapshot(folder)

@@ -50,7 +50,7 @@ def rerun(
     machine: Given | None = None,
     trusted: bool = False,
 ) -> tuple[list[HuntState], list[Path]]:
-    """Run hunts again; return where they stand now, and where what they replace is kept.
+    """Run hunts again; return their states, and the folders with the replaced files.
 
     A hunt that ended in an error runs again. A hunt that was interrupted or killed resumes. A hunt with trials that
     could not be set up resumes with these trials. Finished hunts stay unchanged.
@@ -59,7 +59,7 @@ def rerun(
         hunts: their directories.
         everything: run all of them again, including finished ones.
         changes: ``NAME`` or ``AGENT.NAME`` of an argument, ``trials``, ``max_steps`` or ``seed`` to what it shall be.
-        to: run one hunt in this directory instead, and leave its own as it is.
+        to: run one hunt in this directory instead; its own directory does not change.
         parallel: trials at a time, of all hunts together; 0 for one per core.
         watch: called about once a second.
         machine: options such as ``executor`` that hold for all of them, whatever each says.
@@ -78,8 +78,8 @@ def rerun(
         return _elsewhere(hunts, to, changes, parallel, watch, machine), []
     if changes and not everything:
         raise UsageError(
-            f"--set {next(iter(changes))}: other settings make another hunt",
-            fix="give --to DIR, or --all to begin again",
+            f"--set {next(iter(changes))}: a hunt cannot change its settings",
+            fix="give --to DIR for a new hunt, or --all to start over",
         )
     busy = [hunt for hunt in hunts if hunt_state(hunt).state == "running"]
     if busy:
@@ -106,7 +106,7 @@ def rerun(
 
 
 def _request_of(settings: HuntSettings) -> Request:
-    """What has to be asked for to get these settings."""
+    """The request that results in these settings."""
     arguments = {
         f"{agent}.{name}": spec.spec
         for agent, chosen in settings.agents.items()
@@ -199,7 +199,7 @@ class _Names:
 
 
 def _replace_invalid(hunt: Path, state: HuntState) -> int:
-    """Have the trials that could not be set up run again, unless the hunt has found what it was after."""
+    """Run trials again that could not be set up, unless the hunt has reached its goal."""
     run = read_settings(hunt / layout.HUNT).run
     done = (state.crashes and not run.keep_going) or 0 < run.distinct <= len(state.kinds or ())
     if not state.outcomes.get(Outcome.INVALID):
@@ -221,7 +221,7 @@ def _elsewhere(
     machine: Given | None,
 ) -> list[HuntState]:
     if len(hunts) != 1:
-        raise UsageError(f"--to takes one hunt, and there are {len(hunts)}", fix="choose one with --run")
+        raise UsageError(f"--to takes one hunt, but there are {len(hunts)}", fix="choose one with --run")
     request = _changed(_request(hunts[0]), changes, hunts[0])
     try:
         if to.exists() and not is_empty_folder(to):
@@ -233,14 +233,14 @@ def _elsewhere(
                 building.rename(to)
                 sync_folder(to.absolute().parent)
     except OSError as error:
-        raise HuntDirectoryError(f"cannot be made: {error.strerror}", fix="choose another", where=str(to)) from error
+        raise HuntDirectoryError(f"cannot be created: {error.strerror}", fix="choose another", where=str(to)) from error
     if hunt_state(to).state in ("queued", "killed", "interrupted"):
         run_all([to], parallel, watch=None if watch is None else lambda: watch([hunt_state(to)]), machine=machine)
     return [hunt_state(to)]
 
 
 def _see_that_it_resumes(to: Path, request: RunRequest) -> None:
-    """See that what is in a directory is what the same command made there before it was killed or interrupted.
+    """Check that a directory is that of the same command, which was killed or interrupted.
 
     Raises:
         HuntDirectoryError: it is something else, it runs, or it ended in an error.
@@ -250,10 +250,10 @@ def _see_that_it_resumes(to: Path, request: RunRequest) -> None:
     except HuntDirectoryError:
         same = False
     if not same:
-        raise HuntDirectoryError("it is there already", fix="give a new directory", where=str(to))
+        raise HuntDirectoryError("the directory exists already", fix="give a new directory", where=str(to))
     state = hunt_state(to).state
     if state == "running":
         raise HuntDirectoryError("it is running", fix="wait for it, or stop it", where=str(to))
     if state == "error":
         fix = f"see crashhunt logs {to}, then crashhunt rerun {to}"
-        raise HuntDirectoryError("it is there already, and ended in an error", fix=fix, where=str(to))
+        raise HuntDirectoryError("the directory exists, and its hunt ended in an error", fix=fix, where=str(to))

@@ -45,10 +45,10 @@ class SuiteEntry(HuntOptions):
 
     Args:
         id: names its folder; unique in the suite.
-        agent: who drives, where the scenario has one controlled vehicle.
-        agents: vehicle to who drives it, where it has several.
-        runs: how often, each with a seed of its own.
-        trials: of each run, at most.
+        agent: the agent that drives, if the scenario has one controlled vehicle.
+        agents: vehicle to its agent, if there are several.
+        runs: how often, each with its own seed.
+        trials: trials of each run, at most.
         max_steps: the bound on each trial, in steps.
     """
 
@@ -74,7 +74,7 @@ class Suite:
 
     Args:
         entries: the hunts.
-        folder: from which scenarios that are paths are looked for, and agents imported.
+        folder: folder from which scenarios that are paths are looked for, and agents imported.
 
     Raises:
         UsageError: an id is missing, taken or no name for a folder.
@@ -87,10 +87,10 @@ class Suite:
         for place, entry in enumerate(self.entries):
             if not _ID.fullmatch(entry.id):
                 raise UsageError(
-                    f"hunts[{place}].id = {entry.id!r} is no name for a folder", fix="use letters, digits and ._+=-"
+                    f"hunts[{place}].id = {entry.id!r} is not a valid folder name", fix="use letters, digits and ._+=-"
                 )
             if entry.id.lower() in seen:
-                raise UsageError(f"the id {entry.id!r} is there twice", fix="give each hunt one of its own")
+                raise UsageError(f"the id {entry.id!r} is used twice", fix="give each hunt its own id")
             seen.add(entry.id.lower())
             if entry.runs < 1:
                 raise UsageError(f"hunts.{entry.id}.runs = {entry.runs}", fix="give at least 1")
@@ -115,7 +115,7 @@ class Suite:
             fix = f"{near_path(file, '.toml')}give a suite.toml"
             raise UsageError(f"cannot be read: {error.strerror}", fix=fix, where=str(file)) from None
         except (ValueError, RecursionError) as error:
-            raise UsageError(f"not valid TOML: {error}", fix="mend the file", where=str(file)) from None
+            raise UsageError(f"not valid TOML: {error}", fix="correct the file", where=str(file)) from None
         whole = validate(_File, data, where=str(file), error=UsageError)
         if whole.schema != 1:
             raise UsageError(f"schema = {whole.schema}", fix="this crashhunt reads schema 1", where=str(file))
@@ -132,14 +132,16 @@ class Suite:
             raise UsageError(error.message, fix=error.fix, where=str(file)) from None
 
     def plan(self, directory: Path | str) -> list[Path]:
-        """Make a folder for every run, and say in it what it will be. Done twice, nothing changes.
+        """Create a folder for every run, with its request. Done twice, nothing changes.
 
         Raises:
             HuntDirectoryError: the directory has another suite in it, or cannot be written.
         """
         place = Path(directory)
         if is_hunt(place):
-            raise HuntDirectoryError("a hunt is there, not a suite", fix="give another directory", where=str(place))
+            raise HuntDirectoryError(
+                "the directory has a hunt, not a suite", fix="give another directory", where=str(place)
+            )
         planned: dict[Path, RunRequest] = {}
         for entry in self.entries:
             for number in range(entry.runs):
@@ -154,7 +156,9 @@ class Suite:
             return list(planned)
         except OSError as error:
             raise HuntDirectoryError(
-                f"cannot be made: {error.strerror}", fix="choose another directory", where=str(error.filename or place)
+                f"cannot be created: {error.strerror}",
+                fix="choose another directory",
+                where=str(error.filename or place),
             ) from error
 
     def run(
@@ -166,10 +170,10 @@ class Suite:
         machine: Given | None = None,
         trusted: bool = False,
     ) -> list[HuntState]:
-        """Run what has not ended, whatever becomes of the others; return where each run stands.
+        """Run all hunts that have not ended, even if some fail; return the state of each.
 
         Args:
-            directory: made where it does not exist; what has ended there stays as it is.
+            directory: directory of the suite; created if it does not exist. Finished hunts in it stay unchanged.
             parallel: trials at a time, of all hunts together; 0 for one per core.
             watch: called about once a second.
             machine: options such as ``executor`` that hold for all of them, whatever each says.
@@ -177,7 +181,7 @@ class Suite:
                 the first one runs.
 
         Raises:
-            UntrustedError: a hunt that is there already is neither made here nor trusted.
+            UntrustedError: an existing hunt was not made on this machine and is not trusted.
             HuntDirectoryError: the directory has another suite in it, or cannot be written.
             PluginError: there is no such executor.
         """
@@ -195,14 +199,14 @@ class Suite:
         return [hunt_state(folder) for folder in folders]
 
     def request(self, entry: SuiteEntry, number: int) -> RunRequest:
-        """Return what a run of an entry will be, with a seed of its own.
+        """Return what a run of an entry will be, with its own seed.
 
         Args:
-            entry: of this suite.
-            number: of the run, from 0.
+            entry: entry of this suite.
+            number: number of the run, from 0.
 
         Raises:
-            UsageError: who drives is in no module that a worker could import.
+            UsageError: who drives is not in a module that workers can import.
         """
         roots = tuple(str((self.folder / root).resolve()) for root in entry.snapshot_roots)
         snapshot = SnapshotChoices(**{name: getattr(entry, name) for name in fields_of(SnapshotChoices)})

@@ -25,8 +25,8 @@ Make = Callable[[], Agent]
 class AgentContract:
     """Checks `crashhunt.agents.Agent`, and the faculties that an agent offers.
 
-    The fixture ``make`` returns a function that makes an agent, ``form`` how its actions are written, and
-    ``observations`` what it is shown, in order.
+    The fixture ``make`` returns a function that makes an agent, ``form`` the form of its actions, and ``observations``
+    its observations in order.
     """
 
     @pytest.fixture

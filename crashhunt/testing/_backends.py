@@ -72,7 +72,7 @@ class BackendContract:
         assert done.stdout.strip() == "False", done.stderr
 
     def test_a_wrong_key_in_its_table_is_named(self, name: str, scenario: Path, tmp_path: Path) -> None:
-        """With what was meant, where that is near."""
+        """The message has the most similar name."""
         backend = self._backend(name)
         if backend.table is None:
             with pytest.raises(ScenarioError, match=f"unknown key '{name}'"):
@@ -126,7 +126,7 @@ class BackendContract:
         assert scenario_digest(loaded) == before
 
     def test_it_crosses_to_workers_and_to_snapshots(self, scenario: Path, tmp_path: Path) -> None:
-        """What comes out is what went in; the table stands under its own name."""
+        """Reading returns what was written; the table has its own name."""
         loaded = load_scenario(scenario)
         settings = WorkerSettings(scenario=loaded, oracles=(), crash_on=(), scratch=tmp_path)
         sent = json.loads(json.dumps(settings.to_json()))

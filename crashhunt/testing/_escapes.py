@@ -26,13 +26,13 @@ _AFTERWARDS_S = 10.0  # longer than what is checked looks
 
 @dataclass(frozen=True, slots=True)
 class EscapeCheck:
-    """What came of trying what a crash says about braking.
+    """The result of checking the last avoidable step of a crash.
 
     Args:
         crash: its id.
         step: the last step after which braking helps, as the crash says it.
-        too_late: a step after which it does not, likewise.
-        avoided: whether braking after ``step`` avoided the collision; None where nothing is said.
+        too_late: a step after which braking does not help, found in the same way.
+        avoided: whether braking after ``step`` avoided the collision; None if nothing is said.
         avoided_later: whether braking after ``too_late`` did.
     """
 
@@ -57,7 +57,7 @@ class RecordedThenBrakes:
         log: the path of a ``log.mcap``.
         agent: whose actions.
         after: the step; an agent that is not overruled repeats its last action when the log is exhausted.
-        action_space: of the vehicle.
+        action_space: action space of the vehicle.
     """
 
     def __init__(self, log: str, agent: str, after: int, action_space: Any) -> None:

@@ -106,7 +106,7 @@ class ExecutorContract:
         assert all(result.steps == 30 and result.digest for result in good.values())
 
     def test_cancelled_trials_do_not_come_back(self, executor: Executor) -> None:
-        """Nor do they hold anything up, even where they hang; trials submitted afterwards run."""
+        """They block no other trial, even if they hang. Trials submitted later run."""
         executor.submit(self._spec(0))
         self._collect(executor, 1)
         for number in range(1, 6):

@@ -53,7 +53,7 @@ class OracleContract:
                 assert [part.agent in _AGENTS for part in evidence] == [True]
 
     def test_the_same_scenes_give_the_same_findings(self, make: Make) -> None:
-        """It draws no random numbers, keeps no clock, and another one remembers nothing of this one's scenes."""
+        """It draws no random numbers, keeps no clock, and a new oracle has no memory of earlier scenes."""
         assert list(_watch(make(), seed=1)) == list(_watch(make(), seed=2))
 
     def test_it_leaves_scenes_as_they_are(self, make: Make) -> None:

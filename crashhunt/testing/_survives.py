@@ -33,9 +33,9 @@ class Example(TypedDict, total=False):
     """One trial, as a failure of `assert_survives` prints it.
 
     Args:
-        seed: of the trial.
-        arguments: of the agents, by their ids.
-        scenario_arguments: of the scenario.
+        seed: seed of the trial.
+        arguments: arguments of the agents, by their ids.
+        scenario_arguments: arguments of the scenario.
         only: which of the others take part; all where it is missing.
         disturbances: as in `crash.json`; none where it is missing.
     """
@@ -71,8 +71,8 @@ def assert_survives(
         scenario: a shipped name, or a path.
         trials: how many.
         max_steps: the bound on each, in steps.
-        seed: of all of them.
-        arguments: of the agent, as `crashhunt.run` takes them: values or what to try.
+        seed: seed of all of them.
+        arguments: arguments of the agent, as `crashhunt.run` takes them: values or what to try.
         scenario_arguments: the same of the scenario.
         example: the one trial to run; what it says of arguments goes before ``arguments``.
         budget: how many further trials may be run to make a crash smaller; 0 for none.
@@ -103,7 +103,7 @@ def assert_survives(
         if report.stopped_because == "interrupted":
             raise KeyboardInterrupt
         if report.stopped_because == "no_valid_trial":
-            raise CrashhuntError(f"not one trial was valid: {report.reason}", fix="see to what the scenario needs")
+            raise CrashhuntError(f"no trial was valid: {report.reason}", fix="correct the scenario")
         if report.crashes:
             bundle = _smaller(report.crashes[0], budget, parallel)
             look = f"look at it: crashhunt show {place} --crash {bundle.id}" if directory else ""
@@ -175,7 +175,7 @@ def _run_one(options: HuntOptions, example: Example, max_steps: int) -> TrialRes
             executor.close()
     result = found[0]
     if result.outcome is Outcome.INVALID:
-        raise CrashhuntError(f"the example could not be set up: {result.summary}", fix="see to what the scenario needs")
+        raise CrashhuntError(f"the example could not be set up: {result.summary}", fix="correct the scenario")
     return replace(result, spec=spec)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterable
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,7 +58,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
             hunt, with today's code.
         max_steps: The longest plain episode in steps; None for that of the hunt.
         crash_reward: Added to the reward of the step of a crash, such as -10.
-        process: Whether the simulation runs in a process of its own; by default with SUMO, of which a process can have
+        process: Whether the simulation runs in its own process; by default with SUMO, of which a process can have
             only one.
         render_mode: Only None.
 
@@ -86,14 +88,16 @@ class CrashEnv(gymnasium.Env[Any, Any]):
         process: bool | None = None,
         render_mode: str | None = None,
     ) -> None:
+        _check_types(before_s=before_s, after_s=after_s, share=share, test=test, crash_reward=crash_reward)
         _check(before_s, after_s, share, max_steps, crash_reward)
+        if not isinstance(agent, str):
+            raise UsageError(f"agent is {agent!r}", fix="give the name of a controlled vehicle")
         if render_mode is not None:
             raise UsageError(
-                f"render_mode is {render_mode!r}", fix="leave it out; crashhunt replay --video makes films"
+                f"render_mode is {render_mode!r}", fix="omit the option; crashhunt replay --video makes films"
             )
-        places = [crashes] if isinstance(crashes, str | Path) else list(crashes)
-        if not places:
-            raise UsageError("crashes is empty", fix="give the directories of hunts or of a corpus")
+        places = _places(crashes)
+        record = _record_file(trained_on)
         split = split_crashes(places, check_test_share(test, "test"))
         if not split.training:
             fix = "hunt for more crashes, or give a lower test share"
@@ -117,10 +121,8 @@ class CrashEnv(gymnasium.Env[Any, Any]):
         self.crashes = tuple(crash.name for crash in self._training)
         self._replay = CrashReplay(len(self._training))
         self._index: int | None = None
-        if trained_on:
-            path = Path(trained_on)
-            path = path if path.suffix == ".json" else path / layout.TRAINED_ON
-            self.trained_on.write(path)
+        if record is not None:
+            self.trained_on.write(record)
 
     @property
     def trained_on(self) -> TrainedOn:
@@ -176,6 +178,8 @@ class CrashEnv(gymnasium.Env[Any, Any]):
 
     def _chosen(self, options: dict[str, Any]) -> int | None:
         """Return the index of the crash that options choose: -1 for a plain episode, None for no choice."""
+        if not isinstance(options, dict):
+            raise UsageError(f"options is {options!r}", fix="give {'crash': NAME}")
         unknown = sorted(options.keys() - {"crash"})
         if unknown:
             raise UsageError(f"options has {unknown[0]!r}", fix="give only 'crash'")
@@ -249,14 +253,44 @@ class _RemoteCrashEpisodes(RemoteEpisodes):
         return found
 
 
+def _check_types(**numbers: object) -> None:
+    """Refuse options that are no numbers, such as those of a configuration file."""
+    for name, value in numbers.items():
+        if not isinstance(value, Real):
+            raise UsageError(f"{name} is {value!r}", fix="give a number")
+
+
+def _places(crashes: object) -> list[str | Path]:
+    """Return the directories with crashes."""
+    fix = "give the directories of hunts or of a corpus"
+    if isinstance(crashes, str | Path):
+        return [crashes]
+    found: list[Any] = [*crashes] if isinstance(crashes, Iterable) else [crashes]
+    if not all(isinstance(place, str | Path) for place in found):
+        raise UsageError(f"crashes is {crashes!r}", fix=fix)
+    if not found:
+        raise UsageError("crashes is empty", fix=fix)
+    return found
+
+
+def _record_file(trained_on: object) -> Path | None:
+    """Return the file ``trained_on.json``; None for no file."""
+    if not isinstance(trained_on, str | Path) or "\0" in str(trained_on):
+        raise UsageError(f"trained_on is {trained_on!r}", fix="give the folder of the policy")
+    if not str(trained_on):
+        return None
+    path = Path(trained_on)
+    return path if path.suffix == ".json" else path / layout.TRAINED_ON
+
+
 def _check(before_s: float, after_s: float, share: float, max_steps: int | None, crash_reward: float) -> None:
     for name, value in (("before_s", before_s), ("after_s", after_s)):
         if not 0 < value < math.inf:
             raise UsageError(f"{name} is {value:g}", fix="give a time above 0, in s")
     if not 0 <= share <= 1:
         raise UsageError(f"share is {share:g}", fix="give a probability from 0 to 1")
-    if max_steps is not None and max_steps < 1:
-        raise UsageError(f"max_steps is {max_steps}", fix="give at least 1, or None for that of the hunt")
+    if max_steps is not None and (not isinstance(max_steps, Integral) or max_steps < 1):
+        raise UsageError(f"max_steps is {max_steps!r}", fix="give at least 1, or None for that of the hunt")
     if not math.isfinite(crash_reward):
         raise UsageError(f"crash_reward is {crash_reward:g}", fix="give a finite number, such as -10")
 

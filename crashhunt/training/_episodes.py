@@ -247,7 +247,7 @@ class _Stage:
 
 
 class _Caller:
-    """The place of the caller in an episode, whose actions `Episode.step` receives."""
+    """The agent slot of the caller in an episode. `Episode.step` receives the actions of the caller."""
 
     def reset(self, seed: int) -> None:
         """Nothing to reset."""
@@ -266,7 +266,7 @@ def _require_same(first: _Stage, other: _Stage) -> None:
     where = f"{first.title} and {other.title}"
     if first.name != other.name:
         raise UsageError(
-            f"the crashes are of two scenarios: {first.name!r} and {other.name!r} ({where})",
+            f"the crashes belong to two scenarios: {first.name!r} and {other.name!r} ({where})",
             fix="give crashes of one scenario",
         )
     for what in ("observation_space", "action_space"):

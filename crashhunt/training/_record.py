@@ -37,8 +37,8 @@ class TrainedOn:
 
     Args:
         test: share of the test part, which the training never uses.
-        seeds: of the crashes that were trained on.
-        hunt_seeds: of the hunts that found them. Survived traffics of these hunts are split as well.
+        seeds: seeds of the crashes that were trained on.
+        hunt_seeds: seeds of the hunts that found them. Survived traffics of these hunts are split as well.
     """
 
     test: float
@@ -59,7 +59,8 @@ class TrainedOn:
                 before = read_trained_on(path) if path.exists() else self
                 if before.test != self.test:
                     raise UsageError(
-                        f"{path} is of a training with test={before.test:g}, and this one has test={self.test:g}",
+                        f"{path} records a training with test={before.test:g}, but this training has "
+                        f"test={self.test:g}",
                         fix="use the same test share, or name another file",
                     )
                 if path.exists() and self.seeds <= before.seeds and self.hunt_seeds <= before.hunt_seeds:
@@ -116,12 +117,17 @@ class HeldOutTraffics:
     """The traffics of a hunt that no agent in a comparison was trained on.
 
     Args:
-        hunt_seed: of the hunt.
-        records: of the agents.
+        hunt_seed: seed of the hunt.
+        records: records of the agents.
     """
 
     hunt_seed: int
     records: tuple[TrainedOn, ...] = ()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no traffic of the hunt can be held out: an agent was trained on the hunt without a test part."""
+        return any(not record.test and self.hunt_seed in record.hunt_seeds for record in self.records)
 
     def has(self, seed: int) -> bool:
         """Return whether a comparison may use the traffic of a seed.
@@ -140,7 +146,7 @@ def held_out_traffics(settings: HuntSettings, hunts: Iterable[Path]) -> HeldOutT
     """Return the rule by which hunts with common traffic are compared.
 
     Args:
-        settings: of one of the hunts; all have the same seed.
+        settings: settings of one of the hunts; all have the same seed.
         hunts: their directories.
 
     Raises:

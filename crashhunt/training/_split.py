@@ -33,7 +33,7 @@ def is_test_traffic(seed: int, test: float) -> bool:
     share adds traffics to the test part and removes none.
 
     Args:
-        seed: of the trial.
+        seed: seed of the trial.
         test: share of the traffics in the test part, from 0 to 1.
     """
     digest = hashlib.blake2b(str(seed).encode(), digest_size=_HASH_BYTES).digest()
@@ -143,7 +143,7 @@ def split_crashes(places: Iterable[Path | str], test: float) -> Split:
 def _bundles_of(place: Path) -> list[Bundle]:
     if not place.is_dir():
         fix = f"{near_path(place)}give the directory of a hunt, a corpus or a crash"
-        raise BundleError(f"{str(place)!r} is no directory", fix=fix)
+        raise BundleError(f"{str(place)!r} is not a directory", fix=fix)
     if (place / layout.CRASH).is_file():
         return [read_bundle(place)]
     if (place / layout.HUNT).is_file():

@@ -1,4 +1,4 @@
-"""Trials: the spaces that arguments are drawn from, what a trial is asked, how it can end, and what came of it."""
+"""Trials: the spaces that arguments are drawn from, what a trial is asked, how it can end, and the result."""
 
 import lazy_loader
 

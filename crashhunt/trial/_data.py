@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.base.codec import plain_types
+from crashhunt.base.codec import plain_types, typed_where_there
 from crashhunt.base.integrity import typed
-from crashhunt.base.tolerance import typed_where_there
 from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._evidence import Collision, Escape, Failure
 from crashhunt.world import ClosestApproach, Event

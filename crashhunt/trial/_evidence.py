@@ -69,6 +69,7 @@ class Escape(Serializable):
         braking: The greatest deceleration of these runs, in m/s²; None if the vehicle never slowed down.
         how: A description of the braking, as in `FullBraking`.
         why_not: Why there is no such step, and no step after which braking does not help; empty if there is one.
+        changed: What else the agent does otherwise in the run that avoids it, such as ``ego does not change lanes``.
     """
 
     step: int | None = None
@@ -76,6 +77,7 @@ class Escape(Serializable):
     braking: float | None = None
     how: str = ""
     why_not: str = field(default="", metadata=OMIT_DEFAULT)
+    changed: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -78,7 +78,7 @@ class Branches(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class ForcedCopy(Serializable):
-    """What came of a copy with a forced first onset.
+    """The result of a copy with a forced first onset.
 
     Args:
         cell: the model and strength of the first onset, as in `Forcing.ratios`.
@@ -88,7 +88,7 @@ class ForcedCopy(Serializable):
         crash: the outcome where that is one of the hunt's crashes, else empty.
         step: at which the copy ended.
         disturbed: whether any disturbance had an effect on the copy.
-        disturbances: of a crash, all that were planned from the start of the trial.
+        disturbances: disturbances of a crash, all that were planned from the start of the trial.
         within: probability of what this copy represents, given its first onset. It is 1 where later disturbances are
             drawn as ever. With forced second onsets it is the probability of that onset, or of none.
         second: the cell of its forced second onset; empty for none.
@@ -108,15 +108,15 @@ class ForcedCopy(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Forced(Serializable):
-    """What came of the copies of a root.
+    """The results of the copies of a root.
 
     Args:
         survival: probability that no first onset begins before the root ends.
-        masses: by cell, the probability that the first onset is of this cell and begins before the root ends.
-        copies: in the order of their onsets; after each copy its own copies, with a second onset.
+        masses: masses by cell, the probability that the first onset is of this cell and begins before the root ends.
+        copies: copies in the order of their onsets; after each copy its own copies, with a second onset.
         steps: how many steps they took.
         unanswered: how many further copies there were to be, of which nothing is known.
-        why_unanswered: the reason for the first of them; empty where there is none.
+        why_unanswered: the reason for the first of them; empty if there is none.
         may_be_asked_again: whether a reason lies outside of the trial, so that another run may get all answers.
     """
 

@@ -15,9 +15,9 @@ import inspect
 import math
 import types
 import typing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base.errors import ArgumentError
 from crashhunt.base.text import one_of
@@ -142,7 +142,7 @@ class Range:
                 fix=f"write it as {_number(self.high)}:{_number(self.low)}",
             )
         if not math.isfinite(self.high - self.low):
-            raise ArgumentError(f"the range {text!r} is wider than a float can say", fix="give a narrower range")
+            raise ArgumentError(f"the range {text!r} is wider than a float can represent", fix="give a narrower range")
         if self.log and self.low <= 0:
             raise ArgumentError(f"the log range {text!r} must begin above 0", fix="give a positive lower end")
         if self.step is not None and not (math.isfinite(self.step) and self.step > 0):
@@ -390,14 +390,45 @@ class Signature:
     """What a factory takes.
 
     Args:
-        arguments: by name, in order.
+        arguments: arguments by name, in order.
         open: whether it takes any other keyword as well (``**kwargs``).
         given: which of ``observation_space``, ``action_space`` and ``step_length_s`` it asks for.
+        required: names of the arguments that have no default of any type.
     """
 
     arguments: dict[str, Argument]
     open: bool
     given: tuple[str, ...]
+    required: tuple[str, ...] = ()
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Signature:
+        """Return the signature that `to_json` has described.
+
+        Raises:
+            ArgumentError: a distribution cannot be parsed.
+            KeyError, TypeError: the data are not of a signature.
+        """
+        found = [Argument(**{**facts, "distribution": None}) for facts in data["arguments"]]
+        texts = [facts["distribution"] for facts in data["arguments"]]
+        drawn = [
+            replace(one, distribution=None if text is None else parse_spec(text, one.kind, where=one.name))
+            for one, text in zip(found, texts, strict=True)
+        ]
+        names = {argument.name: argument for argument in drawn}
+        given, required = tuple(data["given"]), tuple(data["required"])
+        return cls(names, open=bool(data["open"]), given=given, required=required)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a description that can be written as JSON."""
+        arguments = [
+            {
+                "name": one.name, "kind": one.kind, "default": one.default, "unit": one.unit, "help": one.help,
+                "distribution": None if one.distribution is None else str(one.distribution),
+            }
+            for one in self.arguments.values()
+        ]  # fmt: skip
+        return {"arguments": arguments, "open": self.open, "given": self.given, "required": self.required}
 
     def check(self, names: Iterable[str], *, where: str) -> None:
         """Refuse arguments that it does not take.
@@ -428,6 +459,7 @@ def signature_of(factory: Callable[..., object]) -> Signature:
     names = getattr(target, "__globals__", {})
     arguments: dict[str, Argument] = {}
     given: list[str] = []
+    required: list[str] = []
     is_open = False
     for parameter in parameters:
         if parameter.kind is parameter.VAR_KEYWORD:
@@ -438,7 +470,9 @@ def signature_of(factory: Callable[..., object]) -> Signature:
             given.append(parameter.name)
         else:
             arguments[parameter.name] = _argument(parameter, _annotation(parameter, names))
-    return Signature(arguments, is_open, tuple(given))
+            if parameter.default is parameter.empty:
+                required.append(parameter.name)
+    return Signature(arguments, open=is_open, given=tuple(given), required=tuple(required))
 
 
 def _takes_nothing(factory: Callable[..., object]) -> bool:
@@ -448,7 +482,7 @@ def _takes_nothing(factory: Callable[..., object]) -> bool:
 
 
 def _annotation(parameter: inspect.Parameter, names: dict[str, object]) -> object:
-    """The annotation as an object; None where it cannot be had, such as a name imported for type checkers only."""
+    """The annotation as an object; None if it cannot be had, such as a name imported for type checkers only."""
     if not isinstance(parameter.annotation, str):
         return parameter.annotation
     try:

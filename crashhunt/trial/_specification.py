@@ -6,9 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from crashhunt.base.codec import OMIT_DEFAULT, JsonObject, Serializable, from_plain, to_plain
+from crashhunt.base.codec import (
+    ESSENTIAL,
+    OMIT_DEFAULT,
+    JsonObject,
+    Serializable,
+    from_plain,
+    not_understood,
+    required_of,
+    to_plain,
+)
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.tolerance import ESSENTIAL, not_understood, required_of
 from crashhunt.base.version import __version__
 from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._space import Value
@@ -66,7 +74,7 @@ class Reseeding(Serializable):
 
     Args:
         after: the step; the next step is the first that draws from the new seeds.
-        seed: of all generators of the simulator; 0 to 2**31 - 1.
+        seed: seed of all generators of the simulator; 0 to 2**31 - 1.
     """
 
     after: int
@@ -79,8 +87,8 @@ class Forcing(Serializable):
 
     Args:
         spacing: proposed probability per copy. One copy is made in each interval of this length.
-        ratios: by cell, how many times more often than by its own law a first onset is proposed; 1 where it is missing.
-            A cell is a model with one strength, such as ``brake=4.0``.
+        ratios: ratios by cell, how many times more often than by its own law a first onset is proposed; 1 where it is
+            missing. A cell is a model with one strength, such as ``brake=4.0``.
         second: cells of first onsets whose copies have forced second onsets.
         second_spacing: probability per forced second onset; 0 for none.
     """
@@ -97,7 +105,7 @@ class TrialSpec(Serializable):
 
     Args:
         number: its place in the hunt, from 0.
-        seed: for the simulator, the agents and the global generators; 0 to 2**31 - 1.
+        seed: seed for the simulator, the agents and the global generators; 0 to 2**31 - 1.
         arguments: agent id to argument name to value.
         scenario_arguments: name to value.
         max_steps: the bound on its length, in steps.
@@ -145,7 +153,7 @@ class TrialSpec(Serializable):
         unknown = not_understood(data.get("requires") or (), cls, Overruled, Handover, Reseeding)
         if unknown:
             raise CrashhuntError(
-                f"trial {data['number']} has {', '.join(unknown)}, which crashhunt {__version__} does not know",
-                fix="use the version that wrote it",
+                f"trial {data['number']} has {', '.join(unknown)}, which crashhunt {__version__} does not support",
+                fix="use the version that wrote the trial",
             )
         return from_plain(cls, {"arguments": {}, "scenario_arguments": {}, **data})

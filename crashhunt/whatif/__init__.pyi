@@ -1,6 +1,11 @@
 from ._avoidability import judge as judge
-from ._counts import Counts as Counts, Run as Run
-from ._engine import FUTURES as FUTURES, WhatIfOptions as WhatIfOptions, what_if as what_if
+from ._engine import (
+    FUTURES as FUTURES,
+    Counts as Counts,
+    Run as Run,
+    WhatIfOptions as WhatIfOptions,
+    what_if as what_if,
+)
 from ._interventions import (
     Disturb as Disturb,
     HandOver as HandOver,

@@ -13,6 +13,7 @@ from crashhunt.crashes import (
     Attempt,
     Judgement,
     LaneMap,
+    changes_of,
     ending_of,
     last_escape,
     overruled_trial,
@@ -23,7 +24,7 @@ from crashhunt.recording import read_lanes
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Outcome
 from crashhunt.whatif._causes import find_why
-from crashhunt.whatif._omissions import changes_of, find_omission
+from crashhunt.whatif._omissions import find_omission
 from crashhunt.whatif._reruns import NotUnderstoodError, Reruns, StoppedError
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ class _Enough(Exception):  # noqa: N818 - no error
 
 @dataclass(slots=True)
 class _Tries:
-    """A manoeuvre, and what has come of it so far."""
+    """A manoeuvre, and its results so far."""
 
     manoeuvre: str
     most: int
@@ -94,7 +95,7 @@ class Search:
     Args:
         end: the step of the crash.
         start: where to begin.
-        run: runs a manoeuvre after each of some steps, and yields what comes of it; raises `CannotError`.
+        run: runs a manoeuvre after each of some steps, and yields the result; raises `CannotError`.
         runs: the most runs.
         parallel: how many to ask for at a time.
     """
@@ -126,7 +127,7 @@ class Search:
                 self.why_not = _TOO_FEW
 
     def judgement(self) -> Judgement:
-        """Return what has been found so far."""
+        """Return the results so far."""
         attempts = [
             Attempt(
                 manoeuvre=tried.manoeuvre,
@@ -141,7 +142,7 @@ class Search:
         return Judgement(tuple(attempts), self.why_not)
 
     def _try(self, manoeuvre: str, most: int, start: int, first: int) -> int | None:
-        """Search for the last step from which a manoeuvre helps; return it, None where none was found."""
+        """Search for the last step from which a manoeuvre helps; return it, None if none was found."""
         tries = _Tries(manoeuvre, most)
         self._tries.append(tries)
         try:
@@ -222,13 +223,13 @@ def judge(
     The agent is overruled after some step: it brakes as hard as its vehicle can, or changes lanes and brakes; the
     others react as they then do. The search begins where a calculation guesses it, bisects, and then runs the steps
     after the last one that helped, as many as it may: that it is too late after one step does not say that it is too
-    late after the next. What it hangs on is found by leaving one thing out at a time.
+    late after the next. Causes are found by removing one candidate at a time.
 
     Args:
         bundle: The bundle of a crash. Without a collision partner, only the runs for causes are possible.
-        options: of the replays; only whose code drives, and whether it is trusted.
+        options: options of the replays; only the code that drives, and whether it is trusted.
         runs: the most trials to run to avoid it.
-        why: the most trials to run for what it hangs on; 0 leaves that out.
+        why: the most trials to run for the causes; 0 for none.
         reference: the most trials to run with a reference driver, for what the agent omitted; 0 leaves that out.
         parallel: how many at a time.
         watch: called with how many have been run, and the most.
@@ -290,11 +291,11 @@ def _see_that_it_can_be_judged(bundle: Bundle, *, of_two: bool, why: int) -> Non
     """
     outcome = bundle.result.outcome
     if bundle.is_near_miss:
-        raise UsageError(f"{bundle.id} is a near miss, and nothing crashes in it", fix="give a crash")
+        raise UsageError(f"{bundle.id} is a near miss, not a crash", fix="give a crash")
     if outcome is Outcome.HANG:
         raise UsageError(
-            f"{bundle.id} is a hang, and every run of it would take its time limit",
-            fix=f"look where it hangs: crashhunt show {bundle.path}",
+            f"{bundle.id} is a hang, so every run would reach the time limit",
+            fix=f"find where it hangs with: crashhunt show {bundle.path}",
         )
     if not of_two and why == 0:
         raise UsageError(
@@ -323,7 +324,7 @@ class _Trials:
     done: int = 0
 
     def run(self, manoeuvre: str, steps: list[int]) -> Iterator[Tried]:
-        """Yield what comes of a manoeuvre after each of some steps, as it ends.
+        """Yield the result of a manoeuvre after each of some steps, as soon as it is known.
 
         Raises:
             CannotError: the vehicle cannot do it.

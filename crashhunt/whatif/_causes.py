@@ -15,11 +15,10 @@ import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError
-from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why, partner, signature_of_fault
+from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why, changes_of, partner, signature_of_fault
 from crashhunt.plans import read_settings
 from crashhunt.recording import has_same_scenes, read_lanes
 from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled
-from crashhunt.whatif._omissions import changes_of
 from crashhunt.whatif._reruns import StoppedError
 from crashhunt.world import first_contact
 
@@ -67,10 +66,10 @@ class Doing:
 
 
 def relevant_actors(recording: Recording, agent: str, other: str, most: int) -> list[str]:
-    """Return who may have to do with a crash: the other one, and who came nearest to the agent before it.
+    """Return the actors to examine for a crash: the collision partner, and the actors that came closest before.
 
     Args:
-        recording: of the collision.
+        recording: recording of the collision.
         agent: the controlled vehicle.
         other: The collision partner; empty if there was none.
         most: how many at most.
@@ -97,9 +96,9 @@ def maneuvers_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> 
     """Return an actor's manoeuvres in the last seconds before a step: the last one of each type.
 
     Args:
-        recording: of the collision.
+        recording: recording of the collision.
         actor: who.
-        lanes: around the place.
+        lanes: lanes around the place.
         end: The step of the collision, which is excluded, because a collision changes speeds.
     """
     dt = recording.prologue.step_length_s
@@ -193,7 +192,7 @@ def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], Non
     Args:
         rerun: the crash.
         runs: which runs its trials.
-        most: how many to run, besides one that must be as it was.
+        most: number of trials to run, without the unchanged one.
         tell: called with how many have been run.
 
     Raises:
@@ -329,7 +328,7 @@ class _Search:
                 )
 
     def _agents(self) -> Iterator[_Asked]:
-        """What the agent decided; and the other one, where that is one too."""
+        """What the agent decided; and the other actor, where that is one too."""
         agents = [name for name in (self._agent, self._other) if name in self._recording.agents]
         for doing in (doing for agent in agents for doing in self._doings(agent)):
             runs = [

@@ -1,7 +1,7 @@
 """Interventions: what is changed in the trial of a crash before it is run again.
 
 Each is a value with one method, `applied`, which returns the run with the change. An intervention that begins at a step
-leaves everything before it as it was recorded, and the engine verifies that. One that holds from the start says so.
+leaves everything before it as recorded, and the engine verifies that. One that holds from the start says so.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Intervention(Protocol):
 
     @property
     def from_step(self) -> int | None:
-        """The last step that stays as it was recorded; None where the change holds from the start."""
+        """The last step that stays as recorded; None if the change holds from the start."""
 
     def applied(self, rerun: Rerun) -> Rerun:
         """Return the run with the change.
@@ -84,7 +84,7 @@ class Disturb:
     """Disturbances in addition to those of the trial.
 
     Args:
-        disturbances: at least one.
+        disturbances: disturbances; at least one.
     """
 
     disturbances: tuple[Disturbance, ...]
@@ -108,7 +108,7 @@ class Overrule:
     """An agent that does not drive as its code says.
 
     Args:
-        from_step: the last step that stays as it was recorded.
+        from_step: the last step that stays as recorded.
         manoeuvre: ``brake`` as hard as the vehicle can, change lanes to the ``left`` or ``right`` and brake, or
             ``keep_lane`` or ``keep_speed``. With ``reference_speed``, ``reference_lanes`` or ``reference``, a reference
             driver corrects unsafe speeds, unsafe lane changes, or both.
@@ -150,7 +150,7 @@ class LeaveOut:
         """No step: it holds from the start."""
 
     def applied(self, rerun: Rerun) -> Rerun:
-        """Return the run; the engine asks who takes part first."""
+        """Return the run; the engine first determines the actors."""
         return rerun
 
     def taking_part(self, entered: tuple[str, ...]) -> tuple[str, ...]:
@@ -165,7 +165,7 @@ class LeaveOut:
         for actor in self.actors:
             if actor not in entered:
                 fix = one_of(actor, entered) if entered else "drop --leave-out: the simulator does not support it"
-                raise UsageError(f"--leave-out {actor!r}: no such actor enters", fix=fix)
+                raise UsageError(f"--leave-out {actor!r}: there is no such actor", fix=fix)
         return tuple(name for name in entered if name not in self.actors)
 
     def __str__(self) -> str:
@@ -182,7 +182,7 @@ class HandOver:
     Args:
         from_step: how many recorded actions are played.
         driver: ``module:Name`` of the new agent; empty for the recorded one.
-        arguments: of the new agent. Of the recorded agent, all others keep their recorded values.
+        arguments: arguments of the new agent. Of the recorded agent, all others keep their recorded values.
         agent: the id of the vehicle; empty for the only one.
         option: how the user wrote the arguments, for errors.
     """
@@ -252,7 +252,7 @@ def step_before(bundle: Bundle, seconds: float) -> int:
     step = steps - round(seconds / length_s) if 0 < seconds < 1e9 else -1
     if not 0 <= step < steps:
         allowed = f"give {length_s:g} to {steps * length_s:g}"
-        raise UsageError(f"--before is {seconds:g}, and the trial lasts {steps * length_s:g} s", fix=allowed)
+        raise UsageError(f"--before is {seconds:g}, but the trial lasts only {steps * length_s:g} s", fix=allowed)
     return step
 
 
@@ -270,7 +270,7 @@ def _agent_of(name: str, rerun: Rerun) -> str:
 def _value(option: str, name: str, text: str) -> Value:
     distribution = parse_spec(text, None, where=f"{option} {name}")
     if not isinstance(distribution, Constant):
-        raise ArgumentError(f"{option} {name}: {text!r} is not one value", fix="give one value")
+        raise ArgumentError(f"{option} {name}: {text!r} is not a single value", fix="give one value")
     return distribution.value
 
 
@@ -292,15 +292,15 @@ def interventions_of(
 
     Args:
         bundle: the crash.
-        changes: of ``--set``; from a step on they are for the agent alone.
+        changes: changes of ``--set``; from a step on they are for the agent alone.
         from_step: the last step that stays as recorded.
         before_s: the same, in s before the crash.
         agent: ``module:Name`` of an agent that takes over, or ``ID=module:Name``.
-        arguments: of that agent.
+        arguments: arguments of that agent.
         futures: whether each run has other random numbers from that step on.
         overrule: a manoeuvre from that step on.
         leave_out: the ids of actors that do not take part.
-        code: whose code drives, where the user says so.
+        code: the code that drives, if the user chooses it.
         more: interventions that need none of these options.
 
     Raises:
@@ -335,7 +335,7 @@ def interventions_of(
         assert step is not None
         found.append(Reseed(from_step=step))
     if step is not None and not found:
-        raise UsageError(f"{option} is given, and nothing changes after it", fix="give --futures, --agent or --set too")
+        raise UsageError(f"{option} is given without a change", fix="also give --futures, --agent or --set")
     return found
 
 
@@ -348,7 +348,7 @@ def _handover_to_same(bundle: Bundle, step: int, changes: Mapping[str, str], opt
     odd = next((name for name in changes if name in bundle.result.spec.scenario_arguments), "")
     if odd:
         message = f"--set {odd} is an argument of the scenario, which holds from the start"
-        raise UsageError(message, fix=f"leave {option} out")
+        raise UsageError(message, fix=f"omit {option}")
     vehicle = next(iter(vehicles), "")
     named = {name.removeprefix(f"{vehicle}.") if vehicle else name: value for name, value in changes.items()}
     return HandOver(from_step=step, arguments=named, agent=vehicle, option="--set")

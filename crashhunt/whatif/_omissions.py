@@ -16,7 +16,16 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError
-from crashhunt.crashes import INTERRUPTED, LaneMap, Omission, Reference, ReferenceRun, partner, visible_from
+from crashhunt.crashes import (
+    INTERRUPTED,
+    LaneMap,
+    Omission,
+    Reference,
+    ReferenceRun,
+    changes_of,
+    partner,
+    visible_from,
+)
 from crashhunt.plans import with_recorded_load_order
 from crashhunt.recording import has_same_scenes, read_lanes
 from crashhunt.replays import is_todays
@@ -34,7 +43,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult, TrialSpec
     from crashhunt.whatif._reruns import Ended
 
-__all__ = ["changes_of", "find_omission"]
+__all__ = ["find_omission"]
 
 _BEFORE_S = 10.0  # a period that ended longer before the crash has not led to it
 _EARLIER_S = (0.0, 0.5, 1.0)  # the reference driver takes over from these times before the period
@@ -62,7 +71,7 @@ def find_omission(
     Args:
         rerun: the crash.
         scratch: a folder for the workers.
-        most: how many runs at most.
+        most: largest number of runs.
         parallel: how many at a time.
         stopped: returns whether to stop.
         tell: called with how many have been run.
@@ -88,24 +97,6 @@ def find_omission(
         return Reference(runs=tuple(search.runs), why_not=error.message)
     finally:
         runs.close()
-
-
-def changes_of(recorded: Recording, rerun: Recording, agent: str, lanes: LaneMap, step: int) -> tuple[str, ...]:
-    """Return what else an agent does otherwise in a run: lane changes that are dropped or added after a step.
-
-    Args:
-        recorded: the recorded crash.
-        rerun: the recording of the run.
-        agent: identifier of the agent.
-        lanes: around the place of the crash.
-        step: the last step that both have in common.
-    """
-    if not lanes:
-        return ()
-    was, now = (lanes.change_began(one.scenes()[step:], agent) is not None for one in (recorded, rerun))
-    if was and not now:
-        return (f"{agent} does not change lanes",)
-    return (f"{agent} changes lanes",) if now and not was else ()
 
 
 class _Search:

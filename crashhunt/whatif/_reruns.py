@@ -57,12 +57,12 @@ class Ended:
     """A run that has ended.
 
     Args:
-        place: of its specification among those of the call.
-        result: of the trial.
-        recording: of the trial; None where it was not wanted, or where the process died before there was one.
-        folder: with the files of the trial, until the next run is asked for.
+        place: place of its specification among those of the call.
+        result: result of the trial.
+        recording: recording of the trial; None if it was not wanted, or where the process died before there was one.
+        folder: folder with the files of the trial, until the next run is asked for.
         entered: the ids of all actors that entered, where the specification asked for them (`EVERYBODY`).
-        responses: of the reference driver, where the specification has one; None where the trial left none.
+        responses: responses of the reference driver, where the specification has one; None if the trial left none.
     """
 
     place: int
@@ -162,11 +162,11 @@ class Reruns:
 
 
 def _require_same_trial(asked: TrialSpec, run: TrialSpec) -> None:
-    """Check that all that determines a trial came back as it was asked: early versions ignore what they do not know.
+    """Check that the specification of a trial came back unchanged, because early versions ignore unknown keys.
 
     Raises:
         NotUnderstoodError: a part did not.
     """
     named = attrgetter("overruled", "disturbances", "only", "handover", "reseeding")
     if named(asked) != named(run):
-        raise NotUnderstoodError("the crashhunt in its snapshot is too old for that")
+        raise NotUnderstoodError("the version of crashhunt in its snapshot is too old")

@@ -48,7 +48,7 @@ def find_cause(
 
     Args:
         bundle: the crash.
-        options: of the replays.
+        options: options of the replays.
         parallel: runs at a time.
         stopped: returns whether to stop.
 
@@ -87,7 +87,7 @@ def divide_by_cause(
 
     Args:
         group: the crashes of one type.
-        options: of the replays.
+        options: options of the replays.
         most: how many of them to judge at most.
         parallel: runs at a time.
         write: whether to write what the runs have shown into the bundles, so that the next call needs no run.

@@ -5,6 +5,7 @@ from ._approach import (
     closest_approach as closest_approach,
 )
 from ._contact import (
+    MAX_CONTACT_GAP_M as MAX_CONTACT_GAP_M,
     STANDS_MPS as STANDS_MPS,
     Face as Face,
     Touch as Touch,

@@ -38,7 +38,7 @@ class ClosestApproach(Serializable):
     """The closest approach of a trial to a crash: each value over all steps, controlled vehicles and other actors.
 
     Args:
-        time_to_collision_s: the minimum, at constant velocities; infinite where no courses crossed.
+        time_to_collision_s: the minimum, at constant velocities; infinite if no courses crossed.
         gap_m: the minimum distance between outlines; 0 at a touch.
         required_deceleration: the maximum that was needed to avoid a collision, in m/s².
     """
@@ -95,7 +95,7 @@ def approaches(
     """Return the closest approach of an agent in each scene.
 
     Args:
-        frames: in order.
+        frames: frames in order.
         agent: the controlled vehicle; scenes without it have no approach.
         closest: approaches no closer than this in any measure may be skipped.
         only_best: whether approaches no closer than that of another scene may be skipped too.
@@ -194,7 +194,7 @@ def _whole_block(frames: Sequence[Frame], agent: str, closest: ClosestApproach) 
 def _near_block(
     frames: Sequence[Frame], agent: str, closest: ClosestApproach, only_best: bool = False
 ) -> _Block | None:
-    """Return only the rectangles that may be near, found by the core; None where the core cannot do that."""
+    """Return only the rectangles that may be near, found by the core; None if the core cannot do that."""
     core = core_of(frames)
     if core is None:
         return None

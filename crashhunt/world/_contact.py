@@ -25,10 +25,22 @@ if TYPE_CHECKING:
     from crashhunt.world._geometry import Level, Rectangle
     from crashhunt.world._scene import Scene
 
-__all__ = ["STANDS_MPS", "Face", "Touch", "contact_at", "first_contact", "lane_jump", "poses_between"]
+__all__ = [
+    "MAX_CONTACT_GAP_M",
+    "STANDS_MPS",
+    "Face",
+    "Touch",
+    "contact_at",
+    "first_contact",
+    "lane_jump",
+    "poses_between",
+]
 
 STANDS_MPS = 0.1
 """An actor that moves more slowly than this stands, in m/s."""
+
+MAX_CONTACT_GAP_M = 1.0
+"""A reported collision of actors whose outlines are further apart than this is no contact of the outlines, in m."""
 
 Face = Literal["front", "rear", "left", "right"]
 """A side of an actor, as seen from its driver."""
@@ -51,18 +63,18 @@ class Touch:
 
     Args:
         time_s: simulation time, in s.
-        share: of the step, from 0 to 1; 1 is the present scene.
+        share: share of the step, from 0 to 1; 1 is the present scene.
         drives_into: whether the first actor drives into the second; otherwise the second drives into the first.
         x: of the first actor's front bumper, in m.
         y: likewise.
-        speed: of the first actor, in m/s.
-        other_speed: of the second actor, in m/s.
+        speed: speed of the first actor, in m/s.
+        other_speed: speed of the second actor, in m/s.
         face: the side of the first actor that is touched.
         other_face: the side of the second actor that is touched.
         turn: the heading of the second actor less that of the first, in rad, within -pi and pi.
         jumps: whether the first actor makes the contact by an instantaneous lane change.
         other_jumps: whether the second actor does.
-        gap_m: a lower bound of the distance between their outlines; 0 where they touch.
+        gap_m: a lower bound of the distance between their outlines; 0 if they touch.
     """
 
     time_s: float
@@ -93,7 +105,7 @@ class _Party:
         rectangle: the part of it that is touched.
         leads: whether that is its front part.
         trails: whether that is its back part.
-        velocity: of that part, without a jump, in m/s.
+        velocity: velocity of that part, without a jump, in m/s.
         jump: sideways, at the contact, in m.
     """
 
@@ -177,9 +189,9 @@ def poses_between(start: Rectangle, end: Rectangle, shares: Sequence[float], *, 
     """Return the rectangles of an actor at some shares of a step, on the way that contacts are computed with.
 
     Args:
-        start: at the beginning of the step: x and y of the front in m, heading in rad, length and width in m.
-        end: at the end of the step, likewise.
-        shares: of the step, 0 to 1; an instantaneous lane change takes place at 1.
+        start: start at the beginning of the step: x and y of the front in m, heading in rad, length and width in m.
+        end: pose at the end of the step, likewise.
+        shares: share of the step, 0 to 1; an instantaneous lane change takes place at 1.
         bends: whether the actor drives along a curve; persons do not.
     """
     way = _Way(start, end, bends=bends)
@@ -196,7 +208,7 @@ def first_contact(previous: Scene | None, present: Scene, row: int, other: int) 
         other: another.
 
     Returns:
-        The first contact; None where they do not touch, or pass on different levels.
+        The first contact; None if they do not touch, or pass on different levels.
     """
     pair = (row, other)
     before = _rows_before(previous, present, pair)
@@ -336,7 +348,7 @@ def _speed_at(share: float, was: float, now: float, way: _Way, step_s: float) ->
 
 
 def lane_jump(previous: Scene, present: Scene, actor: str) -> float:
-    """Return how far an actor jumped sideways between two scenes, in m to its left; 0 where it did not jump.
+    """Return how far an actor jumped sideways between two scenes, in m to its left; 0 if it did not jump.
 
     SUMO changes lanes in an instant. A movement that a bend explains is no jump, nor is a teleport.
 
@@ -360,7 +372,7 @@ def reachable_m(speed: float, time_s: float) -> float:
 
 
 def _rows_before(previous: Scene | None, present: Scene, pair: tuple[int, int]) -> tuple[int, int] | None:
-    """Return both rows in the previous scene; None where an actor was absent, or was moved instead of driving."""
+    """Return both rows in the previous scene; None if an actor was absent, or was moved instead of driving."""
     if previous is None:
         return None
     found = []
@@ -399,7 +411,7 @@ def _same_level(scene: Scene, pair: tuple[int, int], ways: tuple[_Way, _Way], on
 
 
 def _first_share(way: _Way, other: _Way, *, until: float, still: bool) -> float | None:
-    """Return the share of the step at which two rectangles first overlap; None where they do not.
+    """Return the share of the step at which two rectangles first overlap; None if they do not.
 
     Conservative advancement: during the gap divided by a bound of the approach speed, no contact is possible.
     """

@@ -80,7 +80,7 @@ class DangerousMoment(NamedTuple):
         danger: criticality, from 0 to 1.
         step: its step.
         agent: the controlled vehicle.
-        other: the other actor; empty where none was near.
+        other: the other actor; empty if none was near.
     """
 
     danger: float
@@ -94,7 +94,7 @@ class DangerMeter:
 
     Args:
         agents: the controlled vehicles.
-        step_length_s: in s.
+        step_length_s: step length in s.
     """
 
     def __init__(self, agents: Sequence[str], step_length_s: float) -> None:
@@ -117,7 +117,7 @@ class DangerMeter:
 
     @property
     def danger(self) -> float | None:
-        """Return the criticality of all scenes so far; None where no agent was in any of them."""
+        """Return the criticality of all scenes so far; None if no agent was in any of them."""
         found = [total for total in self._summed(self._count).values() if total is not None]
         return summed_danger(max(found)) if found else None
 
@@ -137,9 +137,9 @@ def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float
     """Return the criticality of each scene, shape (scenes,), and the most critical moment.
 
     Args:
-        frames: of the whole episode, in order; later scenes determine the criticality of earlier ones.
+        frames: frames of the whole episode, in order; later scenes determine the criticality of earlier ones.
         agents: the controlled vehicles.
-        step_length_s: in s.
+        step_length_s: step length in s.
     """
     count = sum(len(frame.columns) for frame in frames)
     whole: Array
@@ -392,9 +392,9 @@ def followers_danger(frames: Sequence[Frame], agent: str, step_length_s: float) 
     It is measured after the fact, from a recording. Of long vehicles that bend, the first part counts.
 
     Args:
-        frames: of the whole episode, in order.
+        frames: frames of the whole episode, in order.
         agent: the controlled vehicle.
-        step_length_s: in s.
+        step_length_s: step length in s.
 
     Returns:
         The rear criticality of each scene, shape (scenes,); the most critical moment; and the value of the trial,

@@ -37,7 +37,7 @@ class DrivenMeter:
 
     Args:
         agents: the controlled vehicles.
-        step_length_s: in s.
+        step_length_s: step length in s.
     """
 
     def __init__(self, agents: Sequence[str], step_length_s: float) -> None:
@@ -72,11 +72,11 @@ class DrivenMeter:
 
     @property
     def driven_m(self) -> float | None:
-        """The distance of all agents together, in m; None where no scene has an agent, or a speed is not a number."""
+        """The distance of all agents together, in m; None if no scene has an agent, or a speed is not a number."""
         meters = self._speeds * self._dt
         return round(meters, _DIGITS) if self._seen and math.isfinite(meters) else None
 
     @property
     def driven_s(self) -> float | None:
-        """The time of all agents together, in s of simulation time; None where no scene has an agent."""
+        """The time of all agents together, in s of simulation time; None if no scene has an agent."""
         return round(self._steps * self._dt, _DIGITS) if self._seen else None

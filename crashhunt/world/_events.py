@@ -112,7 +112,7 @@ class RightOfWay:
         """Return the places of the links that an actor may be on, or has just been on.
 
         Args:
-            lanes: on which it was, in this order; the same lane may come again.
+            lanes: lanes on which it was, in this order; the same lane may come again.
             x: where it is, in m.
             y: likewise.
         """

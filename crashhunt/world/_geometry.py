@@ -89,13 +89,13 @@ def rectangle_gap(
     half_one: NDArray[np.float64],
     half_two: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the distance between pairs of rectangles; 0 where they overlap.
+    """Return the distance between pairs of rectangles; 0 if they overlap.
 
     Args:
         offset: shape (n, 2), from the centre of the first to that of the second, in the frame of the first, in m.
         turn: shape (n,), heading of the second in the frame of the first, in rad.
         half_one: shape (n, 2), half length and half width of the first, in m.
-        half_two: likewise of the second.
+        half_two: half length and half width of the second.
 
     Returns:
         Shape (n,), in m.
@@ -123,7 +123,7 @@ def time_to_contact(
     half_one: NDArray[np.float64],
     half_two: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return when pairs of rectangles first touch, both going on at constant velocity; infinite where never.
+    """Return when pairs of rectangles first touch, both going on at constant velocity; infinite if never.
 
     On every separating axis the projections overlap during one interval of time; the outlines touch when all four do.
     Source: the swept separating axis test, D. Eberly: Intersection of convex objects, the method of separating axes.
@@ -136,7 +136,7 @@ def time_to_contact(
         half_two: as in `rectangle_gap`.
 
     Returns:
-        Shape (n,), in s; 0 where they overlap already.
+        Shape (n,), in s; 0 if they overlap already.
     """
     cosine, sine = np.cos(turn), np.sin(turn)
     along, across = np.abs(cosine), np.abs(sine)
@@ -240,7 +240,7 @@ def levels(scene: Scene, row: int, *, parts: int = 0) -> list[Level]:
 
 
 def same_level(one: Rectangle, level: Level, two: Rectangle, other_level: Level, lower_m: float) -> bool:
-    """Whether nothing but distance is between two rectangles; False where one is on a bridge above the other.
+    """Whether nothing but distance is between two rectangles; False if one is on a bridge above the other.
 
     Between two that are on one road, it rises about as much as the grades at both of them say.
 

@@ -58,12 +58,12 @@ def safe_speed(
     braking_mps2: float,
     front_braking_mps2: float,
 ) -> float:
-    """Return the greatest speed of the rear vehicle for which a gap is safe, in m/s; 0 where none is.
+    """Return the greatest speed of the rear vehicle for which a gap is safe, in m/s; 0 if none is.
 
     This is the inverse of `safe_distance`, with the same arguments: the positive root of a quadratic equation.
 
     Args:
-        gap_m: between the vehicles, in m.
+        gap_m: gap between the vehicles, in m.
         front_mps: as in `safe_distance`.
         response_s: as in `safe_distance`.
         acceleration_mps2: as in `safe_distance`.
@@ -83,10 +83,10 @@ def time_to_drive(distance_m: float, speed_mps: float, acceleration_mps2: float,
     """Return the time in which a vehicle that accelerates to a top speed drives a distance, in s; infinite if never.
 
     Args:
-        distance_m: in m; 0 or less takes no time.
-        speed_mps: at the beginning, in m/s.
-        acceleration_mps2: until the top speed, in m/s²; at least 0.
-        top_mps: in m/s; a vehicle that is faster keeps its speed.
+        distance_m: distance in m; 0 or less takes no time.
+        speed_mps: speed at the beginning, in m/s.
+        acceleration_mps2: acceleration until the top speed, in m/s²; at least 0.
+        top_mps: top in m/s; a vehicle that is faster keeps its speed.
     """
     if distance_m <= 0:
         return 0.0
@@ -106,7 +106,7 @@ class Neighbor:
 
     Args:
         actor: its identifier; empty for a red light.
-        gap_m: between the bumpers, in m; negative where the vehicles are alongside each other.
+        gap_m: gap between the bumpers, in m; negative where the vehicles are alongside each other.
         speed_mps: its speed along the lane, in m/s.
         braking_mps2: its greatest deceleration, in m/s²; the usual one of its type.
         acceleration_mps2: its greatest acceleration, in m/s².
@@ -127,11 +127,11 @@ class Crossing:
 
     Args:
         actor: its identifier.
-        distance_m: of the agent to the conflict area, in m; negative inside and after it.
-        exit_m: of the agent until its rear has left the area, in m.
-        actor_distance_m: of the actor to the area, in m.
-        actor_exit_m: of the actor until its rear has left the area, in m.
-        speed_mps: of the actor, in m/s.
+        distance_m: distance of the agent to the conflict area, in m; negative inside and after it.
+        exit_m: exit of the agent until its rear has left the area, in m.
+        actor_distance_m: actor distance of the actor to the area, in m.
+        actor_exit_m: actor exit of the actor until its rear has left the area, in m.
+        speed_mps: speed of the actor, in m/s.
         braking_mps2: its greatest deceleration, in m/s².
         has_right_of_way: whether the agent must yield to it.
     """
@@ -166,12 +166,12 @@ class Surroundings:
     """What a careful driver would consider in one step.
 
     Args:
-        speed_mps: of the agent, in m/s.
+        speed_mps: speed of the agent, in m/s.
         acceleration_mps2: its greatest acceleration, in m/s².
         braking_mps2: its deceleration at full braking, in m/s².
         ahead: vehicles and red lights on its path.
         crossing: actors whose paths cross its path.
-        sides: by lane change, 1 to the left and -1 to the right; a missing side is unknown, as inside a junction.
+        sides: sides by lane change, 1 to the left and -1 to the right; a missing side is unknown, as inside a junction.
     """
 
     speed_mps: float

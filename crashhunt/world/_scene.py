@@ -46,9 +46,9 @@ class Actor:
     Args:
         id: unique within the episode; that of a person is ``person``, a blank and its name.
         kind: the simulator's class, such as SUMO's ``passenger``, ``truck``, ``pedestrian``.
-        length: in m.
-        width: in m.
-        height: in m; 0 where the map is flat.
+        length: length in m.
+        width: width in m.
+        height: height in m; 0 if the map is flat.
     """
 
     id: str
@@ -67,8 +67,8 @@ class Contact:
         victim: the actor that was hit.
         kind: the simulator's word for it.
         lane: where.
-        collider_speed: in m/s.
-        victim_speed: in m/s.
+        collider_speed: speed of the collider, in m/s.
+        victim_speed: speed of the other actor, in m/s.
     """
 
     collider: str
@@ -85,7 +85,7 @@ class Lane:
 
     Args:
         id: the simulator's name of it.
-        width: in m.
+        width: width in m.
         shape: its centre line, as (x, y) pairs in m.
     """
 
@@ -153,8 +153,8 @@ class Frame(NamedTuple):
     Args:
         roster: the actors.
         columns: float64, shape (scenes, 4 n): x and y alternating, then all headings, then all speeds.
-        heights: float64, shape (scenes, 2 n): all heights, then all grades; None where the map is flat.
-        spines: of each scene; None where no long vehicle is in a bend.
+        heights: float64, shape (scenes, 2 n): all heights, then all grades; None if the map is flat.
+        spines: spines of each scene; None if no long vehicle is in a bend.
         core: what computes with it faster, where there is such a thing; the results are the same.
     """
 
@@ -183,7 +183,7 @@ class Frame(NamedTuple):
 
 
 def core_of(frames: Sequence[Frame]) -> Core | None:
-    """Return what computes faster with all of some frames; None where there is no such thing."""
+    """Return what computes faster with all of some frames; None if there is no such thing."""
     core = frames[0].core if frames else None
     if any(frame.core is None or frame.heights is not None or frame.spines is not None for frame in frames):
         return None
@@ -202,9 +202,9 @@ def joined_frame(
     """Return scenes of one roster as a frame.
 
     Args:
-        roster: of all of them.
+        roster: roster of all of them.
         columns: as in `Frame`.
-        scenes: each one; None where no actor has a height or bends.
+        scenes: each one; None if no actor has a height or bends.
         core: what computes with it faster.
     """
     heights = spines = None
@@ -222,15 +222,15 @@ class Scene:
 
     Args:
         time_s: simulation time, in s.
-        roster: who the rows are.
+        roster: the actors of the rows.
         points: x and y of the centre of each front bumper, in m.
-        headings: in rad, counter-clockwise from the x axis.
-        speeds: in m/s.
+        headings: headings in rad, counter-clockwise from the x axis.
+        speeds: speeds in m/s.
         contacts: the collisions that the simulator reports for this step.
         off_road: the controlled vehicles that left the road in this step.
-        lanes: the lane of each actor, or empty where this step did not look.
-        heights: z of each front bumper, in m; empty where the map is flat.
-        grades: how far the road rises a metre where each of them is, ahead of it; empty where the map is flat.
+        lanes: the lane of each actor, or empty if this step did not look.
+        heights: z of each front bumper, in m; empty if the map is flat.
+        grades: how far the road rises a metre where each of them is, ahead of it; empty if the map is flat.
         spines: row to centre line, of the long vehicles that are bent.
         swept: whether all actors have driven here from the previous scene along the way that the headings describe.
             Contacts between the two scenes can then be found. A lane change of SUMO, a jump sideways, is at the end.

@@ -63,14 +63,14 @@ class Track(NamedTuple):
     """The way of an agent, each of shape (samples,).
 
     Args:
-        time: in s since the first scene.
+        time: time in s since the first scene.
         x: of the centre of its outline, in m.
         y: likewise.
-        heading: in rad, without jumps by whole turns.
+        heading: heading in rad, without jumps by whole turns.
         z: of its front, in m.
-        half_length: in m.
-        half_width: in m.
-        height: in m.
+        half_length: half length in m.
+        half_width: half width in m.
+        height: height in m.
     """
 
     time: Array
@@ -121,7 +121,7 @@ class Reach(NamedTuple):
     """The part of an agent's way in which other actors matter; actors that do not touch it are irrelevant.
 
     Args:
-        ahead: how far along the way, in m; 0 where all actors matter.
+        ahead: how far along the way, in m; 0 if all actors matter.
         behind: how far back, in m.
         unknown: how far straight on the way is extended at its end, in m.
     """
@@ -139,10 +139,10 @@ def ways(
     Where steps are long, samples between two scenes are interpolated along straight lines.
 
     Args:
-        frames: of an episode.
+        frames: frames of an episode.
         agent: the controlled vehicle.
         within_m: as for `tracks`.
-        step_length_s: in s.
+        step_length_s: step length in s.
         reach: permits the core to skip irrelevant actors, and then to number none.
     """
     between = _between_steps(step_length_s)
@@ -163,7 +163,7 @@ def tracks(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) ->
     Args:
         parts: as `sampled` yields them.
         agent: the controlled vehicle.
-        within_m: between centres; actors slightly further away may be included.
+        within_m: within within between centres; actors slightly further away may be included.
 
     Returns:
         None where the agent is in no scene.
@@ -176,10 +176,10 @@ class _Fronts(NamedTuple):
     """The data of tracks, with fronts in place of centres.
 
     Args:
-        time: in s, shape (samples,).
+        time: time in s, shape (samples,).
         own: shape (7, samples): x, y, heading, z, half the length and the width, and height of the agent.
         theirs: sample and actor number, and the same seven of each near actor, each of shape (pairs,).
-        names: of the numbered actors.
+        names: names of the numbered actors.
     """
 
     time: Array
@@ -363,9 +363,9 @@ class State(NamedTuple):
     Args:
         x: of the centre of the front bumper, in m.
         y: likewise.
-        heading: in rad, counter-clockwise from the x axis.
-        speed: in m/s.
-        z: of the front bumper, in m; 0 where the map is flat.
+        heading: heading in rad, counter-clockwise from the x axis.
+        speed: speed in m/s.
+        z: of the front bumper, in m; 0 if the map is flat.
         grade: rise of the road per metre.
     """
 
@@ -384,7 +384,7 @@ class Path:
     Args:
         actor: its id, kind and size.
         first: the step after which it was first visible; 0 is before the first step.
-        states: after that step and each that followed.
+        states: states after that step and each that followed.
         lanes: its lanes as (step, lane), after the steps for which they were recorded.
         spines: the centre lines of a long vehicle in bends, as (step, centre line).
     """
@@ -433,7 +433,7 @@ class Paths(Serializable):
     Args:
         time_s: simulation time before the first step, in s.
         steps: their number; there is one state more, before the first step.
-        agents: of the controlled vehicles.
+        agents: agents of the controlled vehicles.
         others: of all other actors, in order of appearance.
     """
 
@@ -500,7 +500,7 @@ def paths_of(scenes: Sequence[Scene], agents: Collection[str]) -> Paths:
     """Return the ways of all actors in successive scenes.
 
     Args:
-        scenes: before the first step and after each.
+        scenes: scenes before the first step and after each.
         agents: the ids of the controlled vehicles.
     """
     found: list[_Open] = []

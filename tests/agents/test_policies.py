@@ -236,7 +236,7 @@ class TestStableBaselines3(_Policy):
         algorithm, file = request.node.callspec.params["make"], str(tmp_path / "model.zip")
         with pytest.raises(ValueError, match=r"was trained to act in Discrete\(5\)"):
             StableBaselines3(file, algorithm=algorithm, action_space=spaces.Discrete(9))
-        with pytest.raises(ValueError, match="is no model of"):
+        with pytest.raises(ValueError, match="is not a model of"):
             StableBaselines3(file, algorithm={"PPO": "DQN", "DQN": "PPO"}[algorithm])
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -16,6 +18,7 @@ import pytest
 
 from crashhunt.base.codec import OMIT_DEFAULT, Serializable, null_is
 from crashhunt.base.schemas import describe_type, json_schema
+from crashhunt.cli import make_parser
 from crashhunt.guide._schemas import SCHEMAS, describe_schemas
 
 
@@ -118,9 +121,20 @@ def test_schema_files_are_those_of_the_code():
         jsonschema.Draft202012Validator.check_schema(json.loads(text))
 
 
-def test_reference_links_every_schema():
+def commands_with_json(parser, words=()):
+    """Yield the words of each command that has the option."""
+    for action in parser._actions:
+        if "--json" in action.option_strings:
+            yield "-".join(words)
+        if isinstance(action, argparse._SubParsersAction):
+            for name, command in action.choices.items():
+                yield from commands_with_json(command, (*words, name))
+
+
+def test_every_command_with_json_has_a_schema_that_the_reference_links():
     page = (json_schemas.FOLDER.parent / "json.md").read_text()
-    assert all(f"schemas/{name}.json" in page for name in SCHEMAS)
+    assert {*commands_with_json(make_parser()), "error"} == {*SCHEMAS}
+    assert re.findall(r"\(schemas/(\S+)\.json\)", page) == [*SCHEMAS]
 
 
 def test_output_that_its_schema_refuses_fails():

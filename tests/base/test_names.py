@@ -131,7 +131,7 @@ def test_a_crash_is_named_in_every_way_that_names_one(tmp_path, word):
         ("5", "there is no crash '5'; give one of 000004-collision, 000040-hang, 000041-off_road"),
         ("000004-colision", "did you mean '000004-collision'?"),
         ("00004", "give"),
-        ("0000", "'0000' may be several crashes; give one of 000004-collision, 000040-hang, 000041-off_road"),
+        ("0000", "'0000' matches several crashes; give one of 000004-collision, 000040-hang, 000041-off_road"),
         ("²", "there is no crash"),
     ],
 )

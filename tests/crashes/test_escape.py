@@ -6,6 +6,7 @@ import dataclasses
 import math
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from crashhunt.crashes import find_escape, partner
@@ -94,6 +95,37 @@ def test_the_answer_is_where_one_more_step_is_too_many(gap, said):
         "at 8 m/s², with its brakes," if said == 8.0 else "with its brakes" if said is None else "as hard as it can"
     )
     assert found.how == expected
+
+
+class LaneChange(World):
+    """The ego changes to the other's lane in step 6, in an instant; if it brakes earlier, it stays in its own."""
+
+    def drive(self, after, max_steps):
+        scenes, _ = super().drive(after, max_steps)
+        for step, scene in enumerate(scenes):
+            is_changed = step >= 6 and (after is None or after >= 6)
+            scene.points[0] = scene.points[0][0], 0.0 if is_changed else -3.2
+            if is_changed and scene.points[0][0] > self.gap:
+                return scenes[: step + 1], True
+        return scenes, False
+
+
+@pytest.mark.parametrize(("gap", "changed"), [(60.0, ("ego does not change lanes",)), (110.0, ())])
+def test_braking_run_reports_the_lane_change_that_it_drops(gap, changed):
+    """With the larger gap, braking after the change suffices."""
+    world = LaneChange(gap)
+    borders = [
+        (np.array([(-50.0, y - 1.6), (200.0, y - 1.6)]), np.array([(-50.0, y + 1.6), (200.0, y + 1.6)]))
+        for y in (0.0, -3.2)
+    ]
+    hit = dataclasses.replace(HIT, x=gap, y=0.0)
+    result, recording = world.crash()
+    found = find_escape(
+        dataclasses.replace(result, collision=hit), recording, FullBraking(None, "", 8.0), world.run, lambda: borders
+    )
+    assert found.step == world.truth()
+    assert found.changed == changed
+    assert world.escape().changed == ()  # without a map
 
 
 def test_a_run_continues_for_as_long_as_stopping_takes():

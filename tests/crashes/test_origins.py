@@ -322,7 +322,7 @@ def test_origins_are_removed_by_fingerprint_or_path(place):
     for name in ("abab", "ffffffff", str(place / "three"), ""):
         with pytest.raises(UsageError, match="no such origin"):
             remove_trusted([first.fingerprint, name])
-    with pytest.raises(UsageError, match="may be 2 origins"):
+    with pytest.raises(UsageError, match="matches 2 origins"):
         remove_trusted(["ababab"])
     assert len(list_trusted()) == 2
     assert [origin.runs for origin in remove_trusted([str(place / "two")])] == ["y"]

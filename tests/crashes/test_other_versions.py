@@ -14,9 +14,9 @@ import pytest
 import tomli_w
 from hypothesis import HealthCheck, given, settings, strategies as st
 
+from crashhunt.base.codec import ESSENTIAL, known_part, merged, required_in
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError, ScenarioError
 from crashhunt.base.integrity import describe_files, digest_of_data
-from crashhunt.base.tolerance import ESSENTIAL, known_part, merged, required_in
 from crashhunt.crashes import export_crash, find_bundle, open_archive, read_bundle
 from crashhunt.episode import WorkerSettings
 from crashhunt.plans import HuntSettings, read_settings, with_settings, write_settings
@@ -89,7 +89,7 @@ def test_a_crash_json_of_a_later_version_is_read_and_its_keys_are_kept(hunt, dat
     assert {name: later_keys(again[name]) for name in inside} == inside
     assert read_bundle(bundle.path) == found
     file.write_text(json.dumps({**later, "later x": 1}))
-    with pytest.raises(BundleError, match="it has changed since it was written"):
+    with pytest.raises(BundleError, match="the file has changed since it was written"):
         read_bundle(bundle.path)
     file.write_text(json.dumps(written))
 

@@ -74,12 +74,12 @@ def test_what_only_simulates_is_let_through(sumo, tmp_path):
 
 
 def test_what_would_be_imported_is_refused(sumo, tmp_path):
-    assert "it would import 'evil:Oracle'" in refused(sumo(), settings("overlap", "evil:Oracle"))
+    assert "the configuration imports 'evil:Oracle'" in refused(sumo(), settings("overlap", "evil:Oracle"))
     for table in (
         'simulator = "gym"\n[gym]\nid = "evil:Env-v0"\n',
         'simulator = "highway"\n[highway]\nid = "evil:x-v0"\n',
     ):
-        assert "it would import 'evil'" in refused(plain(tmp_path, table), values={})
+        assert "the configuration imports 'evil'" in refused(plain(tmp_path, table), values={})
 
 
 def test_arguments_of_an_environment_are_refused(tmp_path):

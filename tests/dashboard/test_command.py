@@ -112,7 +112,7 @@ def test_a_missing_extra_names_the_command_that_installs_it(shell):
     assert done.stderr == ("crashhunt: the dashboard needs plotly; run: pip install 'crashhunt[dashboard]'\n")
 
 
-@pytest.mark.parametrize("terminal", [True, False])
+@pytest.mark.parametrize("terminal", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_a_hunt_with_crashes_ends_with_the_command_on_a_terminal_only(toy, terminal):
     words = ["run", "my hunt", "1", "1", "99", "--scenario", "toy", "--arg", "speed=20", "--seed", "1"]
     reader, writer = pty.openpty() if terminal else os.pipe()

@@ -6,6 +6,7 @@ import signal
 import time
 
 import pytest
+from conftest import add_toy
 from dashboard_hunts import hunted
 from served import served
 
@@ -111,8 +112,8 @@ def test_commands_are_started_from_the_page_and_run(toy, page, names):
 def test_a_running_hunt_is_stopped_as_by_ctrl_c(shell):
     root = shell.folder / "runs"
     root.mkdir()
-    words = ("--arg", "speed=5", "--seed", "1", "--keep-going")
-    process = shell.start("run", "runs/one", "1", "3000", "800", *words)
+    words = ("--scenario", "toy", "--set", "step_wall_s=0.001", "--arg", "speed=5", "--seed", "1", "--keep-going")
+    process = add_toy(shell).begin("run", "runs/one", "1", "3000", "99", *words)
     try:
         with served(root, control=True) as dashboard:
             wait_until(lambda: any(row["trials_run"] for row in dashboard.hunts().values()))

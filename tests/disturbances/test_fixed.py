@@ -46,12 +46,12 @@ def test_any_word_is_a_disturbance_or_refused(text):
 @pytest.mark.parametrize(
     ("word", "says"),
     [
-        ("brake@124", "'brake@124' is no disturbance; write KIND@STEP="),
-        ("brake@0=ahead:4:2", "is no disturbance"),
-        ("brake@-1=ahead:4:2", "is no disturbance"),
-        ("brake@9=ahead:4", "is no disturbance"),
-        ("@9=ahead:4:2", "is no disturbance"),
-        ("brake@9=above:4:2", "'above' is no place"),
+        ("brake@124", "'brake@124' is not a disturbance; write KIND@STEP="),
+        ("brake@0=ahead:4:2", "is not a disturbance"),
+        ("brake@-1=ahead:4:2", "is not a disturbance"),
+        ("brake@9=ahead:4", "is not a disturbance"),
+        ("@9=ahead:4:2", "is not a disturbance"),
+        ("brake@9=above:4:2", "'above' is not a place"),
         ("brake@9=ahead:-4:2", "the strength is -4"),
         ("brake@9=ahead:much:2", "the strength is nan"),
         ("brake@9=ahead:4:0", "the duration is 0"),
@@ -69,7 +69,7 @@ def test_what_cannot_be_meant_is_refused(word, says):
 
 
 def test_whose_it_is_must_be_said_where_there_are_several():
-    with pytest.raises(UsageError, match=r"does not say around whom.*ego.stop@…"):
+    with pytest.raises(UsageError, match=r"names no agent.*ego.stop@…"):
         parse_fixed(["stop@20=ahead:6:8"], ("ego", "van.2"))
     assert parse_fixed(["van.2.stop@20=ahead:6:8"], ("ego", "van.2"))[0].agent == "van.2"
     with pytest.raises(UsageError, match="stop begins twice at step 20"):

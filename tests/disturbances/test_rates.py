@@ -51,14 +51,14 @@ def test_any_word_is_a_rate_or_refused(word):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["brake"], "'brake' says no rate"),
-        (["=1"], "'=1' says no rate"),
-        (["brake=much"], "'much' is no rate"),
-        (["brake=-0.1"], "'-0.1' is no rate"),
-        (["brake=nan"], "'nan' is no rate"),
-        (["brake=inf"], "'inf' is no rate"),
+        (["brake"], "'brake' has no rate"),
+        (["=1"], "'=1' has no rate"),
+        (["brake=much"], "'much' is not a rate"),
+        (["brake=-0.1"], "'-0.1' is not a rate"),
+        (["brake=nan"], "'nan' is not a rate"),
+        (["brake=inf"], "'inf' is not a rate"),
         (["brake=1", "brake=1"], "gives 'brake' twice"),
-        (["none", "brake=1"], "none stands alone"),
+        (["none", "brake=1"], "none excludes all others"),
     ],
 )
 def test_what_is_no_rate_is_refused(words, says):
@@ -85,13 +85,13 @@ def fails():
 @pytest.mark.parametrize(
     ("found", "says"),
     [
-        ({"brake": 10.1}, "brake=10.1: more than one a step of 0.1 s"),
+        ({"brake": 10.1}, "brake=10.1: more than one per step of 0.1 s"),
         ({"braek": 1}, "no disturbance 'braek'"),
         ({"cut_in": 1}, "the toy cannot do 'cut_in'"),
         ({"brake": 1, "test_rates:other_brake": 1}, "both about 'brake'"),
         ({"test_rates:DT": 1}, "cannot be called"),
-        ({"test_rates:fails": 1}, "cannot be made: OSError: no such table"),
-        ({"os:getcwd": 1}, "no model of disturbances"),
+        ({"test_rates:fails": 1}, "cannot be created: OSError: no such table"),
+        ({"os:getcwd": 1}, "not a disturbance model"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(found, says):

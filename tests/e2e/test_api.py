@@ -108,7 +108,7 @@ def test_mistakes_are_errors_of_ours(hunt):
         pass
 
     for words, message in (
-        ({"agent": Local}, "in no module that a worker could import"),
+        ({"agent": Local}, "is not in a module that workers can import"),
         ({"agent": "nothing:There"}, "cannot be imported"),
         ({"arguments": {"sped": 3}}, "did you mean"),
         ({"crash_on": ["boom"]}, "'boom' is not a crash"),

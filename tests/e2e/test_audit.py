@@ -63,6 +63,7 @@ def left(toy):
     return json.loads(rows.get("audits_left", "[]"))
 
 
+@pytest.mark.nightly  # by day, the audit that is left over below
 @pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.nightly)])
 def test_audits_of_a_hunt_that_was_stopped_are_made_up_for_when_it_is_resumed(toy, how):
     words = ("run", "h", "1", "6", "20", "--scenario", "toy", "--seed", "4", "--json", "--arg", "speed=5")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 TOY = """
 title = "A toy"
@@ -53,6 +53,7 @@ def test_a_hunt_branches_where_trials_come_near_and_confirms_what_it_finds_from_
     assert f"branches {found['branches']} (moments {found['moments']}), crashed {found['crashed']} (in 1 of 1" in told
 
 
+@pytest.mark.nightly  # by day, the hunt above branches and confirms
 @pytest.mark.long
 def test_a_hunt_stops_at_what_a_branch_has_found(shell):
     """As it does at any other crash: with --deterministic at the same one, and when it is resumed, at once."""

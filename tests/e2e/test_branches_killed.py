@@ -13,7 +13,7 @@ import pytest
 
 from crashhunt.base.processes import children_of
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 HUNT = (
     "run", "h", "1", "1", "60", "--scenario", "toy", "--arg", "speed=9.5", "--set", "step_wall_s=0.005", "--seed", "3",
@@ -56,6 +56,7 @@ def with_copies(process):
 NIGHTLY = [pytest.param(level, marks=pytest.mark.nightly) for level in (1, 2, 3)]
 
 
+@pytest.mark.nightly  # by day, episode/test_branching.py ends copies with their process
 @pytest.mark.long
 @pytest.mark.parametrize("level", [0, *NIGHTLY])  # the hunt, what workers are forked from, a worker, a copy
 def test_the_one_that_is_killed_nothing_continues_and_the_hunt_reaches_its_end(toy, level):

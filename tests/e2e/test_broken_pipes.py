@@ -34,3 +34,10 @@ def test_broken_pipe_between_processes_is_an_error_and_one_of_the_output_is_not(
         assert len(done.stderr.splitlines()) == 1
     else:
         assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_closed_output_is_no_error():
+    script = "import sys\nfrom crashhunt import cli\ncli._run = lambda _: sys.stdout.write('1') - 1\ncli.main([])"
+    command = ["/bin/sh", "-c", 'exec "$0" -c "$1" >&-', sys.executable, script]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -43,7 +43,7 @@ def told(shell, hunt: str, run) -> tuple:
     )
     (crash,) = done.json["crashes"]
     err = re.sub(r"\d+:\d\d \(", "M:SS (", done.err.replace(hunt, "h"))  # how long it took
-    err = re.sub(r"^running: .*\n", "", err, flags=re.MULTILINE)  # how far it was when somebody looked
+    err = re.sub(r"^(running: |confirming ).*\n", "", err, flags=re.MULTILINE)  # how far it was when somebody looked
     run("replay", hunt)
     processes = (FORK_SERVER, f"{FORK_SERVER}-again", f"{FRESH}-again")
     imported = [imported_by(shell, process, hunt) for process in processes]
@@ -55,6 +55,7 @@ def imported_by(shell, process: str, hunt: str) -> list:
     return json.loads((shell.folder / f"{process}.json").read_text().replace(f"/{hunt}/", "/h/"))
 
 
+@pytest.mark.nightly  # of forks of the tests themselves
 def test_its_snapshot_output_and_digests_are_the_same(toy):
     forked, started = told(toy, "forked", toy.crashhunt), told(toy, "started", toy.process)
     # Of what is installed, a fork has imported what other commands need as well.

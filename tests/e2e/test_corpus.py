@@ -177,6 +177,7 @@ def small_case(shell, monkeypatch, number="0"):
     return added.case.path.relative_to(shell.folder)
 
 
+@pytest.mark.nightly  # by day, recording/test_compact.py
 def test_every_documented_command_reads_a_case_with_a_compact_log(kept, monkeypatch):
     case = small_case(kept, monkeypatch)
     (report,) = run_cases([kept.folder / case])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 import time
 from contextlib import closing
@@ -47,8 +48,18 @@ def rates(toy, *words, expect=0):
 HUNT = ("60", "--scenario", "toy", "--seed", "4", "--arg", "speed=8:14", "--set", "gap_m=10:30")
 
 
-def test_rate_counts_trials_and_divides_them_by_an_argument(toy):
-    toy.crashhunt("run", "h", "2", "40", *HUNT, "--keep-going")
+def hunted(shell):
+    """Hunt 40 trials of which some crash, in ``h``; of each type, one crash is confirmed."""
+    shell.crashhunt("run", "h", "2", "40", *HUNT, "--keep-going", "--keep", "1")
+
+
+@pytest.fixture
+def hunt(toy, made_once):
+    return made_once(hunted, toy)
+
+
+def test_rate_counts_trials_and_divides_them_by_an_argument(hunt):
+    toy = hunt
     crashes = sum(trial["outcome"] == "collision" for trial in results(toy.folder / "h"))
     assert crashes > 2
     by_trial, by_hour, by_km = rates(toy, "h")
@@ -66,12 +77,11 @@ def test_rate_counts_trials_and_divides_them_by_an_argument(toy):
     assert len(lines) >= 3
 
 
-def test_bar_decides_the_exit_code(toy):
-    toy.crashhunt("run", "h", "2", "40", *HUNT, "--keep-going")
-    assert rates(toy, "h", "--bar", "0.99/trial")[0]["verdict"] == "below"
-    assert rates(toy, "h", "--bar", "1e-6/trial", expect=1)[0]["verdict"] == "above"
-    (close,) = rates(toy, "h", "--per", "trial")
-    assert rates(toy, "h", "--bar", f"{close['estimate']}/trial", expect=3)[0]["verdict"] == "undecided"
+def test_bar_decides_the_exit_code(hunt):
+    assert rates(hunt, "h", "--bar", "0.99/trial")[0]["verdict"] == "below"
+    assert rates(hunt, "h", "--bar", "1e-6/trial", expect=1)[0]["verdict"] == "above"
+    (close,) = rates(hunt, "h", "--per", "trial")
+    assert rates(hunt, "h", "--bar", f"{close['estimate']}/trial", expect=3)[0]["verdict"] == "undecided"
 
 
 def test_hunt_that_stops_at_its_first_crash_has_an_interval_and_no_estimate(toy):
@@ -91,21 +101,22 @@ def test_workers_change_no_rate(toy):
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (("--bar", "7/mile"), "--bar is 7/mile; give a rate above 0"),
+def test_bad_input_is_one_line(hunt):
+    toy = hunt
+    os.mkfifo(toy.folder / "pipe")
+    for words, says in (
+        (("--bar", "7/mile"), "--bar is 7/mile; give a rate from 1e-12 to 1e12"),
         (("--bar", "2/hour", "--per", "trial"), "give --per hour, or no --per"),
-        (("--confidence", "100"), "--confidence is 100; give percent from 50 to below 100"),
+        (("--confidence", "100"), "--confidence is 100; give percent from 50 to 99.9999"),
         (("--by", "sped"), "--by: there is no argument 'sped'"),
         (("--by", "speed:0"), "'0' bins; give 1 to 50 bins"),
-    ],
-)
-def test_bad_input_is_one_line(toy, words, says):
-    toy.crashhunt("run", "h", "1", "2", *HUNT, "--keep-going")
-    done = toy.crashhunt("rate", "h", *words, expect=2)
-    assert says in done.err
-    assert done.err.count("\n") == 1
+        (("--by", "kind:3"), "kind has no bins; give --by kind"),
+        (("h/hunt.toml",), "'h/hunt.toml' is a file; give the directory of a hunt or a suite"),
+    ):
+        done = toy.crashhunt("rate", "h", *words, expect=2)
+        assert says in done.err
+        assert done.err.count("\n") == 1
+    assert "pipe: is a device or a pipe" in toy.crashhunt("rate", "h", "--html", "pipe", expect=2).err
 
 
 def test_sampler_that_does_not_draw_independently_has_no_rate(toy):
@@ -113,6 +124,8 @@ def test_sampler_that_does_not_draw_independently_has_no_rate(toy):
     (rate,) = rates(toy, "h", "--per", "trial")
     assert rate["certain"] is None
     assert "the sampler halton does not draw trials independently" in rate["why_not"]
+    done = toy.crashhunt("rate", "h", "--bar", "0.1/trial", expect=3)
+    assert "undecided about the bar of 0.10 per trial: there is no rate" in done.out
 
 
 @pytest.mark.nightly
@@ -160,6 +173,7 @@ def test_workers_decide_at_the_same_trial(toy):
     assert found[0][0]["crashes"] > 0
 
 
+@pytest.mark.nightly  # by day, test_gate.py resumes to a verdict, and rates/ decide in any order
 def test_resumed_hunt_decides_as_one_that_was_never_interrupted(toy):
     few = ("--keep", "1")  # every crash with a bundle is confirmed
     whole = until(toy, "whole", "2", "0", "0.005/trial", *few, expect=1)["rate"]
@@ -204,10 +218,10 @@ def test_hunt_with_too_many_invalid_trials_ends_with_a_line(toy):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("--until-rate", "3/trial"), "--until-rate is 3/trial; give a rate above 0"),
-        (("--until-rate", "3/hour", "--sampler", "guided"), "leave --sampler guided out"),
-        (("--until-rate", "3/hour", "--seeds", "2"), "leave --seeds out"),
-        (("--until-rate", "3/hour", "--distinct", "2"), "leave --distinct out"),
+        (("--until-rate", "3/trial"), "--until-rate is 3/trial; give a rate from 1e-12 to 1e12"),
+        (("--until-rate", "3/hour", "--sampler", "guided"), "omit --sampler guided"),
+        (("--until-rate", "3/hour", "--seeds", "2"), "omit --seeds"),
+        (("--until-rate", "3/hour", "--distinct", "2"), "omit --distinct"),
         (("--most", "9"), "--most is 9 without --until-rate"),
     ],
 )
@@ -219,6 +233,7 @@ def test_option_that_contradicts_a_bar_is_refused(toy, words, says):
 RARE = ("60", "--scenario", "toy", "--agent", "crashhunt.agents:CarFollowing", "--disturb", "stop=0.1", "--rare")
 
 
+@pytest.mark.nightly  # by day, hunts/test_rare_hunts.py
 def test_hunt_in_rare_mode_has_no_plain_rate_and_status_reports_its_own(toy):
     report = toy.crashhunt("run", "h", "2", "10", *RARE, "--seed", "3", "--json").json
     assert (report["rare"]["units"], report["rare"]["trials"]) == (2, 8)

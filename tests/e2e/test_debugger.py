@@ -38,6 +38,7 @@ def typed(shell, text: str, *words: str, fork: bool = False, expect: int | None 
     return done.out
 
 
+@pytest.mark.nightly  # starts Python; by day, the same in a fork below
 @pytest.mark.long
 def test_the_debugger_is_in_the_agents_act_at_the_step_before_the_crash(crash):
     out = typed(crash, "p 'at', step, self.step, observation.shape, len(scene.points) > 3\nc\n", "--pdb")
@@ -45,6 +46,10 @@ def test_the_debugger_is_in_the_agents_act_at_the_step_before_the_crash(crash):
     first = (crash.folder / "faulty.py").read_text().splitlines().index("        self.step += 1") + 1
     assert f"code/faulty.py({first})act()" in out
     assert "reproduced: 29 of 29 steps" in out
+
+
+@pytest.mark.nightly  # by day, `back` goes to any step
+def test_it_stops_as_many_steps_before_the_crash_as_asked(crash):
     out = typed(crash, "p 'at', step\nc\n", "--pdb", "--before", "10", fork=True)
     assert "('at', 19)" in out
     assert "reproduced: 19 of 29 steps" in out

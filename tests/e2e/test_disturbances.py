@@ -95,9 +95,10 @@ def test_a_scenario_states_it_and_none_takes_it_back(toy):
     assert "[disturbances]: there is no disturbance 'braek'; did you mean 'brake'" in said
     assert "scenario.toml" in said
     file.write_text(f"{before}\n[disturbances]\nbrake = -1\n")
-    assert "[disturbances] brake=-1.0: '-1.0' is no rate" in hunt_refused(toy)
+    assert "[disturbances] brake=-1.0: '-1.0' is not a rate" in hunt_refused(toy)
 
 
+@pytest.mark.nightly  # by day, test_hunt.py refuses other settings
 def test_another_rate_is_another_hunt_and_a_rerun_keeps_its_own(toy):
     file = toy.folder / "toy" / "scenario.toml"
     hunt(toy, "--disturb", "brake=0.5", trials="1")
@@ -121,12 +122,12 @@ def hunt_refused(shell, *more):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("brake", "'brake' says no rate; write NAME=RATE"),
-        ("brake=-1", "'-1' is no rate"),
-        ("brake=11", "more than one a step of 0.1 s"),
+        ("brake", "'brake' has no rate; write NAME=RATE"),
+        ("brake=-1", "'-1' is not a rate"),
+        ("brake=11", "more than one per step of 0.1 s"),
         ("cut_in=0.1", "cannot do 'cut_in'; it can do brake, late_action"),
-        ("none,brake=1", "none stands alone"),
-        ("brake@101=ahead:4:2", "brake@101: a trial has 9 steps"),
+        ("none,brake=1", "none excludes all others"),
+        ("brake@101=ahead:4:2", "brake@101: a trial has only 9 steps"),
         ("cut_in@5=left:4:2", "cannot do 'cut_in'; it can do brake, late_action"),
     ],
 )
@@ -137,16 +138,16 @@ def test_what_cannot_be_meant_is_one_line_before_the_hunt(toy, words, says):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ("disturbances=some", "'some' is not none"),
-        ("disturbances.0.how_strong=2", "none begins at step '0'"),
-        ("disturbances.{step}.how=2", "'how' is nothing to change"),
+        ("disturbances=some", "'some' cannot be set"),
+        ("disturbances.0.how_strong=2", "no disturbance begins at step '0'"),
+        ("disturbances.{step}.how=2", "'how' cannot be changed"),
         ("disturbances.{step}.how_long=0", "give seconds above 0"),
-        ("disturbances.{step}.who=above", "'above' is no place"),
+        ("disturbances.{step}.who=above", "'above' is not a place"),
         ("disturbances.{step}.who=itself", "brake is not about 'itself'"),
-        ("disturbances.stop@{step}=none", "none begins at step '7'; they begin at brake@7"),
-        ("disturbances.{step}=ahead:4:2", "is not none; write none, or disturbances.KIND@STEP="),
-        ("disturbances.stop@{step}=ahead:4", "is no disturbance; write KIND@STEP="),
-        ("disturbances=brake@{step}=above:4:2", "'above' is no place"),
+        ("disturbances.stop@{step}=none", "no disturbance begins at step '7'; they begin at brake@7"),
+        ("disturbances.{step}=ahead:4:2", "cannot be set; write none, or disturbances.KIND@STEP="),
+        ("disturbances.stop@{step}=ahead:4", "is not a disturbance; write KIND@STEP="),
+        ("disturbances=brake@{step}=above:4:2", "'above' is not a place"),
     ],
 )
 def test_edits_that_cannot_be_meant(toy, change, says):
@@ -241,7 +242,7 @@ def test_what_every_trial_has_in_the_hunt_the_scenario_and_the_replay(toy):
     ):
         assert said in toy.crashhunt("replay", "h", "--set", change, expect=None).out
     for change, said in (
-        ("disturbances.brake@101=ahead:1:1", "brake@101 is never, as the trial has 100 steps"),
+        ("disturbances.brake@101=ahead:1:1", "brake@101 cannot happen: the trial has 100 steps"),
         ("disturbances.cut_in@40=left:1:1", "the toy cannot do the disturbance 'cut_in'; it can do brake, stop"),
     ):
         assert said in toy.crashhunt("replay", "h", "--set", change, expect=2).err

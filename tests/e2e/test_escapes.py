@@ -21,12 +21,13 @@ def told(folder: Path) -> Counter[str]:
     return Counter(check_escape(bundle).verdict for bundle in list_bundles(folder))
 
 
+@pytest.mark.nightly  # by day, test_judging.py compares both ways to find it
 @pytest.mark.long
 def test_a_rear_end_collision_could_be_avoided_until_the_step_that_is_reported(toy):
-    toy.crashhunt("run", "h", "2", "4", "300", "--scenario", "toy", "--arg", "speed=12:14", *KEEP)
+    toy.crashhunt("run", "h", "2", "2", "300", "--scenario", "toy", "--arg", "speed=12:14", *KEEP)
     assert told(toy.folder / "h")["wrong"] == 0
     bundles = list_bundles(toy.folder / "h")
-    assert sum(bundle.result.escape is not None for bundle in bundles) >= 3
+    assert sum(bundle.result.escape is not None for bundle in bundles) == 2
     for bundle in bundles:
         escape = bundle.result.escape
         assert escape is None or escape.step is None or escape.step < bundle.result.steps
@@ -45,6 +46,7 @@ def test_on_sumo_it_brakes_as_hard_as_its_type(shell):
     assert "Braking at 8 m/s², all that its type can do, would have avoided it" in shell.crashhunt("show", "h").out
 
 
+@pytest.mark.nightly  # by day, crashes/test_encounter.py computes escapes at any length
 @pytest.mark.parametrize("length", [pytest.param("0.5", marks=pytest.mark.nightly), "1.0"])
 def test_long_steps(shell, length):
     folder = shell.folder / "slow"

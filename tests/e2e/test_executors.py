@@ -184,7 +184,8 @@ def test_what_there_is_not_is_one_line(mine, name, message):
 
 def test_one_that_cannot_be_made_states_why(mine):
     done = mine.crashhunt(*WORDS, "--executor", "mine:Broken", "--json", expect=2)
-    assert done.json["error"]["message"] == "the executor 'mine:Broken' cannot be made: RuntimeError: no cluster here"
+    message = "the executor 'mine:Broken' cannot be created: RuntimeError: no cluster here"
+    assert done.json["error"]["message"] == message
     assert "mine.py, line" in done.json["error"]["where"]
     done = mine.crashhunt(*WORDS, "--executor", "mine:Refuses", expect=2)
     assert done.err.strip().endswith("crashhunt: nobody answers at 10.0.0.1; start it")

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import resource
+from contextlib import redirect_stdout
 
 import av
 import numpy as np
 import pytest
 from conftest import add_toy
 from PIL import Image
+
+from crashhunt.cli import main
 
 SHOWY = """
 from crashhunt import render
@@ -90,6 +95,7 @@ def test_a_film_from_the_log_runs_no_code_at_all(crash):
     assert "run" not in done.err.replace("crashhunt", "")
 
 
+@pytest.mark.nightly  # by day, render/test_panels.py
 def test_panels_that_fail_are_reported_in_the_film_and_do_not_change_the_verdict(crash):
     crash.crashhunt("run", "b", "1", "1", "60", "--agent", "showy:Showy", "--arg", "broken=true", *WORDS)
     done = crash.crashhunt("replay", "b", "--frames", "f", "--size", "240x160", "--json").json
@@ -138,7 +144,7 @@ def test_a_crash_that_kills_the_process_is_filmed_up_to_it(toy, agent, where):
     assert done["written"] == {"f": 14 + 1 + 10}
 
 
-@pytest.mark.parametrize("number", ["SIGINT", "SIGKILL"])
+@pytest.mark.parametrize("number", [pytest.param("SIGINT", marks=pytest.mark.nightly), "SIGKILL"])
 def test_film_of_a_replay_that_is_killed_once_is_made(toy, number):
     (toy.folder / "killed.py").write_text(
         "import os, signal\nfrom pathlib import Path\nfrom faulty import Raises\n"
@@ -167,8 +173,8 @@ def test_film_of_a_replay_that_is_killed_once_is_made(toy, number):
         (("--video", "a.mp4", "--size", "10x10"), "--size is 10"),
         (("--video", "a.mp4", "--fps", "-1"), "--fps is -1"),
         (("--video", "a.mp4", "--last-seconds", "nan"), "--last-seconds is nan"),
-        (("--video", "a.mp4", "--times", "3"), "--times 3: a film looks at one run"),
-        (("--until", "5", "--times", "3"), "--times 3: --until looks at one run"),
+        (("--video", "a.mp4", "--times", "3"), "--times 3: a film examines one run"),
+        (("--until", "5", "--times", "3"), "--times 3: --until examines one run"),
         (
             ("--video", "a.mp4", "--from-log", "--until", "5"),
             "--until cannot be used with --from-log, which simulates nothing",
@@ -207,17 +213,21 @@ sys.meta_path.insert(0, Hide())
     assert "crashhunt[video]" in done.err
 
 
-@pytest.mark.long
 def test_a_full_disk_leaves_no_half_film(crash):
-    import resource
-
-    # A limit on the size of a file stands in for a disk that is full; it would cut off what Python compiles as well.
-    crash.environment["PYTHONDONTWRITEBYTECODE"] = "1"
-    done = crash.start(
-        "replay", "h", "--from-log", "--video", "a.mp4", "--fps", "100", "--json",
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096)),
-    )  # fmt: skip
-    out, _ = done.communicate(timeout=300)
-    assert done.returncode == 2, out
-    assert "cannot be written" in json.loads(out)["error"]["message"]
+    """A limit on the size of a file stands in for a disk that is full."""
+    out, code = crash.folder / "out.json", 99
+    pid = os.fork()
+    if pid == 0:
+        try:
+            os.chdir(crash.folder)
+            with out.open("w", encoding="utf-8") as file, redirect_stdout(file):
+                resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+                main(["replay", "h", "--from-log", "--video", "a.mp4", "--fps", "100", "--json"])
+        except SystemExit as leaving:
+            code = leaving.code
+        finally:
+            os._exit(code)
+    _, status = os.waitpid(pid, 0)
+    assert os.waitstatus_to_exitcode(status) == 2, out.read_text()
+    assert "cannot be written" in json.loads(out.read_text())["error"]["message"]
     assert not list(crash.folder.glob("*.mp4")) + list(crash.folder.glob(".*.mp4"))

@@ -12,7 +12,6 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from commands import CRASHHUNT
 from conftest import mostly_nightly
 
 import crashhunt
@@ -197,10 +196,7 @@ def test_at_the_terminal_it_is_asked_once(theirs):
         mine, their_end = pty.openpty()
         try:
             os.write(mine, f"{answer}\n".encode())
-            done = subprocess.run(
-                [str(CRASHHUNT), *words], cwd=theirs.folder, env=theirs.environment, stdin=their_end, stderr=their_end,
-                stdout=subprocess.PIPE, text=True, timeout=300, check=False,
-            )  # fmt: skip
+            done = theirs.crashhunt(*words, expect=None, terminal=their_end, streams=(0, 2))
             os.close(their_end)
             said = b""
             while True:
@@ -210,7 +206,7 @@ def test_at_the_terminal_it_is_asked_once(theirs):
                     break
         finally:
             os.close(mine)
-        return done.returncode, said.decode()
+        return done.code, said.decode()
 
     code, said = answered("", "replay", "h")
     assert (code, "[y/N]" in said, "theirs:Agent and crashhunt" in said) == (2, True, True)
@@ -234,6 +230,7 @@ def test_corpus_of_ones_own_repository_needs_no_question(theirs, tmp_path):
     theirs.crashhunt("corpus", "run", "unpacked", "--trust")
 
 
+@pytest.mark.nightly  # by day, test_corpus.py has pytest run cases
 def test_pytest_runs_a_corpus_as_it_runs_the_tests_next_to_it(theirs):
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:randomly", "corpus"],

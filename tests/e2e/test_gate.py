@@ -82,7 +82,7 @@ def test_worse_agent_fails_the_gate_and_the_hunts_stay_for_compare(drivers):
     assert {**again, "base": 0, "head": 0} == {**found, "base": 0, "head": 0}
     assert len(specs(drivers.folder / "kept" / "head")) == trials  # decided before, so nothing runs
     refused = drivers.crashhunt("gate", CALM, TWIN, *TOY, *SEED, "--keep", "kept", expect=2)
-    assert "another gate is there: of other versions, other hunts or another seed" in refused.err
+    assert "the directory has a gate of other versions, hunts or seed" in refused.err
     refused = drivers.crashhunt("gate", CALM, WILD, *TOY, *SEED, "--keep", "kept", "--set", "gap_m=5", expect=2)
     assert "--set" in refused.err  # given twice
 
@@ -101,6 +101,7 @@ def test_equal_agents_pass_the_gate_once_the_difference_is_within_the_margin(dri
     assert found["pairs"] < 20
 
 
+@pytest.mark.nightly  # by day, a gate that was interrupted resumes
 def test_undecided_gate_gives_the_reason_and_resumes_with_more_pairs(drivers):
     done = drivers.crashhunt("gate", CALM, WILD, *TOY, *SEED, "--most", "3", "--keep", "kept", expect=3)
     assert done.out.startswith("undecided: HEAD drivers:Wild, BASE drivers:Calm\n  all 3 pairs have ended; give more")
@@ -141,8 +142,11 @@ def repository(drivers):
 IN_REPOSITORY = ("--scenario", "../toy", "--set", "gap_m=20:30", "--max-steps", "99", "--agent", CALM, *SEED)
 
 
+@pytest.mark.nightly  # by day, test_bisect.py runs commits in work trees
 def test_commits_are_compared_in_work_trees_of_their_own(repository):
-    found = repository.crashhunt("gate", "calm", "HEAD", *IN_REPOSITORY, "--keep", "../kept", "--json", expect=1).json
+    done = repository.crashhunt("gate", "calm", "HEAD", *IN_REPOSITORY, "--keep", "../kept", "--json", expect=1)
+    found = done.json
+    assert "the work tree has changes that are not committed; the gate does not compare them" in done.err
     assert (found["verdict"], found["only_base"], found["only_head"]) == ("worse", 0, 8)
     commit = git(repository.folder, "rev-parse", "wild")[:10]
     assert found["compared"]["head"] == f"HEAD ({commit})"
@@ -172,17 +176,17 @@ def test_crash_that_comes_back_in_the_corpus_of_head_is_worse_without_any_trial(
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("drivers:Calm", "v9"), "'v9' is no agent and no commit"),
+        (("drivers:Calm", "v9"), "'v9' is neither an agent nor a commit"),
         (("drivers:Calm", "HEAD"), "'drivers:Calm' is an agent and 'HEAD' is a commit; give two commits, or two"),
-        (("HEAD", "HEAD", "--agent", "crashhunt.agents:RandomAgent"), "'crashhunt.agents' comes from"),
+        (("HEAD", "HEAD", "--agent", "crashhunt.agents:RandomAgent"), "'crashhunt.agents' is imported from"),
         (("drivers:Calm", "drivers:Nobody"), "HEAD (drivers:Nobody): cannot be hunted: 'drivers:Nobody': drivers has"),
         (("drivers:Calm", "drivers:Wild", "--most", "0"), "--most is 0; give at least 1"),
         (("drivers:Calm", "drivers:Wild", "--margin", "x"), "--margin is x; give a share from 0 to below 1"),
         (("drivers:Calm", "drivers:Wild", "--margin", "-1"), "--margin is -1; give a share from 0 to below 1"),
         (("drivers:Calm", "drivers:Wild", "--confidence", "3"), "--confidence is 3; give percent from 50"),
         (("drivers:Calm", "drivers:Wild", "--for", "soon"), "--for is soon; give a time above 0"),
-        (("drivers:Calm", "drivers:Wild", "--keep", "."), "the folder is not empty and not that of a gate"),
-        (("drivers:Calm", "drivers:Wild", "--corpus", "no"), "--corpus no is no folder of HEAD"),
+        (("drivers:Calm", "drivers:Wild", "--keep", "."), "the folder is not empty and has no gate"),
+        (("drivers:Calm", "drivers:Wild", "--corpus", "no"), "--corpus no is not a folder of HEAD"),
         (("drivers:Calm", "drivers:Wild", "--scenario", "nowhere"), "nowhere"),
         (("drivers:Calm", "drivers:Wild", "--suite", "s.toml"), "--suite and --scenario exclude each other"),
     ],
@@ -204,12 +208,10 @@ def test_gate_whose_time_is_up_is_undecided(drivers):
     assert found["why"].startswith("the time is up; give --for more")
 
 
-def test_hunt_that_ends_on_its_own_is_named_in_the_verdict(drivers):
-    """What kills the process of a hunt leaves no error in its ledger."""
-    text = "import os\n\nos._exit(7)\n"
-    (drivers.folder / "gone.py").write_text(text)
-    done = drivers.crashhunt("gate", CALM, "gone:Driver", *TOY, "--most", "3", expect=3)
-    assert "the hunt of HEAD ended early (queued): no output" in done.out
+def test_agent_whose_module_ends_its_process_is_refused(drivers):
+    (drivers.folder / "gone.py").write_text("import os\n\nos._exit(7)\n")
+    done = drivers.crashhunt("gate", CALM, "gone:Driver", *TOY, "--most", "3", expect=2)
+    assert "HEAD (gone:Driver): cannot be hunted: 'gone:Driver' cannot be imported" in done.err
 
 
 def test_no_valid_trial_exits_with_3(drivers):
@@ -249,7 +251,7 @@ def test_hunts_of_a_suite_are_compared_one_after_the_other(drivers):
     assert [one["pairs"] for one in worse["scenarios"]] == [8, 0, 0]  # which ends it at once
     (drivers.folder / "s.toml").write_text(SUITE.replace("runs = 2", 'sampler = "guided"'))
     refused = drivers.crashhunt("gate", CALM, WILD, "--suite", "s.toml", expect=2)
-    assert "near.0: a gate compares plain trials, one by one, so not with the sampler guided" in refused.err
+    assert "near.0: a gate compares single trials and does not support the sampler guided" in refused.err
 
 
 def trials_of(folder):

@@ -10,6 +10,9 @@ import pytest
 from browsers import needed
 from PIL import ImageGrab
 
+from crashhunt.replays import _debugger
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
+
 ORANGE, RED = (224, 138, 0), (198, 40, 40)
 
 
@@ -79,6 +82,33 @@ def test_no_one_at_the_terminal_is_not_waited_for_and_sleep_slows_it_down(crash,
     assert '"steps_replayed": 5' in out
 
 
+class Closed:
+    """A simulator whose window the user has closed."""
+
+    window_open = False
+
+    def open_window(self):
+        pass
+
+    def follow(self, agent, other):
+        raise RuntimeError("connection closed by SUMO")
+
+
+def test_a_simulator_without_its_window_ends_as_closed(monkeypatch, capfd):
+    def leave(code):
+        raise SystemExit(code)
+
+    monkeypatch.setattr("os._exit", leave)
+    window = _debugger._Window(Closed(), {"agent": "ego", "other": "other"})
+    ended = TrialResult(TrialSpec(0, 1, {}, {}, 9), Outcome.SIMULATOR_ERROR)
+    for call in (lambda: window.begin(None), lambda: window.end(ended)):
+        with pytest.raises(SystemExit) as left:
+            call()
+        assert left.value.code == _debugger._LEFT
+        assert capfd.readouterr().err == "the window was closed\n"
+
+
+@pytest.mark.nightly
 @pytest.mark.long
 def test_a_closed_window_is_no_divergence(crash, screen):
     crash.environment["DISPLAY"] = screen

@@ -17,7 +17,7 @@ import pytest
 
 from crashhunt.base.processes import children_of
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 TOY = """
 title = "A toy"

@@ -68,6 +68,7 @@ def test_exactly_so_many_trials_run(toy, parallel, trials):
     assert not [*(toy.folder / "h").glob(".scratch*")]
 
 
+@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py
 def test_trials_do_not_depend_on_how_many_run_at_once(shell):
     for parallel in ("1", "3"):
         words = ("run", parallel, parallel, "4", "120", "--seed", "11", "--keep-going")
@@ -76,6 +77,7 @@ def test_trials_do_not_depend_on_how_many_run_at_once(shell):
     assert len(set(digests(shell.folder / "1").values())) == 4
 
 
+@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py shows it on the toy
 def test_deterministic_gives_the_same_crash_whatever_the_parallelism(shell):
     found = []
     for parallel in ("1", "3"):
@@ -165,6 +167,7 @@ def test_a_killed_hunt_leaves_no_process_and_continues(toy):
     assert {key: after[key] for key in before} == before
 
 
+@pytest.mark.nightly  # by day, test_stops.py kills the process of a trial
 def test_a_killed_worker_costs_its_own_trial_only(toy):
     words = ("run", "h", "2", "30", *LONG, "--crash-on", "hang", "--json")
     process = toy.begin(*words, start_new_session=True)
@@ -224,6 +227,7 @@ def test_a_finished_hunt_states_again_what_it_found(toy):
     assert toy.crashhunt(*words, "--fail-on-crash", expect=1).json["crashes"] == first["crashes"]
 
 
+@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py and hunts/test_tally.py
 def test_keep_going_collects_all_crashes(toy):
     words = ("run", "h", "2", "5", "60", "--agent", "faulty:Raises", "--scenario", "toy", "--keep-going", "--json")
     report = toy.crashhunt(*words).json
@@ -243,6 +247,7 @@ def test_option_to_recycle_workers_is_still_taken(toy):
     assert toy.crashhunt(*words).json["outcomes"] == {"survived": 6}
 
 
+@pytest.mark.nightly  # by day, test_stops.py limits the size of files
 def test_a_full_disk_is_one_clear_line_and_nothing_is_lost(shell):
     small = shell.folder / "small"
     small.mkdir()
@@ -293,7 +298,7 @@ def test_a_full_disk_is_one_clear_line_and_nothing_is_lost(shell):
         (("run", "h", "2", "3", "10", "--set", "speed=3"), "no argument 'speed'"),
         (("run", "h", "2", "3", "10", "--crash-on", "boredom"), "'boredom'"),
         (("run", "h", "2", "3", "10", "--sampler", "magic"), "'magic'"),
-        (("run", "h", "2", "3", "10", "--sampler", "sweep"), "one argument"),
+        (("run", "h", "2", "3", "10", "--sampler", "sweep"), "exactly one varying argument"),
         (("run", "h", "2", "3", "10", "--timeout", "0"), "--timeout"),
         (("run", "h", "2", "3", "10", "--agent", "recorded"), "--arg log="),
         (("replay", "h"), "does not exist"),

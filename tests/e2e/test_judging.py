@@ -112,7 +112,7 @@ def test_another_failure_is_not_the_same(toy):
     assert search._is_same(replace(result, steps=5))
     assert not search._is_same(replace(result, failure=replace(result.failure, kind="KeyError")))
     assert not search._is_same(replace(result, outcome=Outcome.PROCESS_DIED))
-    with pytest.raises(UsageError, match="is a hang, and every run of it"):
+    with pytest.raises(UsageError, match="is a hang, so every run"):
         judge(replace(bundle, result=replace(result, outcome=Outcome.HANG)), why=9)
     with pytest.raises(UsageError, match="is a near miss"):
         judge(replace(bundle, result=replace(result, outcome=Outcome.SURVIVED, failure=None)), why=9)

@@ -1,10 +1,11 @@
 """Kills at random moments of any process of a command: no row is lost, the command ends well, and nothing is left.
 
 `test_killed.py` kills commands at chosen steps. Here, a signal ends the command itself six times in succession,
-or two of the processes below it, while it hunts on the toy, SUMO and highway-env.
+two of the processes below it, or two commands that run at once, on the toy, SUMO, highway-env and Gymnasium.
 
-``CRASHHUNT_TEST_KILLS`` is the number of cycles for each command (default: 3). ``CRASHHUNT_TEST_KILLS_TABLE`` is a file
-to which each kill appends a line: command, process, signal, whether it was hit, milliseconds since the start.
+``CRASHHUNT_TEST_KILLS`` is the number of cycles for each command (default: 3). ``CRASHHUNT_TEST_KILLS_SIGNALS`` names
+the signals (default: SIGKILL,SIGTERM,SIGINT). ``CRASHHUNT_TEST_KILLS_TABLE`` is a file to which each kill appends a
+line: command, process, signal, whether it was hit, milliseconds since the start.
 """
 
 from __future__ import annotations
@@ -14,12 +15,16 @@ import os
 import random
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
-from contextlib import suppress
+import urllib.request
+from contextlib import contextmanager, suppress
+from http.client import HTTPException
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from conftest import FAULTY, Shell, add_toy
@@ -32,6 +37,8 @@ from crashhunt.base.temporary import owner_in, remove_tree
 from crashhunt.scenario import shipped_folder
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from commands import Begun
 
     Process = Begun | subprocess.Popen[str]
@@ -43,7 +50,9 @@ pytestmark = [
 
 CYCLES = int(os.environ.get("CRASHHUNT_TEST_KILLS", "3"))
 TABLE = os.environ.get("CRASHHUNT_TEST_KILLS_TABLE", os.devnull)
-SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+SIGNALS = [
+    signal.Signals[name] for name in os.environ.get("CRASHHUNT_TEST_KILLS_SIGNALS", "SIGKILL,SIGTERM,SIGINT").split(",")
+]
 INSIDE = ("keeper", "fork server", "template", "supervisor", "zygote", "trial")
 LATEST_S = 300.0  # for a command to end by itself
 
@@ -62,6 +71,15 @@ COMMANDS = {
     "run probes": ("run", "new", "2", "6", "60", "--scenario", "toy", "--seed", "3", "--arg", "speed=9",
                    "--keep-going", *ERRING),
     "run guided": ("run", "new", "2", "20", "60", *AGENT, "--sampler", "guided"),
+    "run rare": ("run", "new", "2", "15", "60", "--scenario", "toy", "--agent", "crashhunt.agents:CarFollowing",
+                 "--disturb", "stop=0.1", "--rare", "--seed", "3"),
+    "run by cause": ("run", "new", "2", "12", "60", *AGENT, "--keep", "1", "--by-cause", "2"),
+    "run deterministic": ("run", "new", "3", "30", "60", "--scenario", "toy", "--arg", "speed=5:12", "--seed", "1",
+                          "--deterministic"),
+    "run fresh": ("run", "new", "2", "5", "60", *AGENT, "--executor", "fresh"),
+    "run Gymnasium": ("run", "new", "2", "12", "60", "--scenario", "cart", "--seed", "1",
+                      "--keep-going", "--keep", "2"),
+    "rerun": ("rerun", "h", "--to", "again", "--set", "trials=5"),
     "suite": ("suite", "run", "suite.toml", "many", "2"),
     "shrink": ("shrink", "h", "--crash", "0", "--budget", "60"),
     "shrink SUMO": ("shrink", "sumo", "--budget", "12"),
@@ -78,6 +96,17 @@ COMMANDS = {
     "film": ("replay", "sumo", "--video", "film.mp4"),
 }  # fmt: skip
 TOLD_ONCE = {"run guided", "run SUMO, guided"}  # what is drawn depends on the order in which trials end
+READER = ("dashboard", ".", "--no-browser", "--port")
+AT_ONCE = {
+    "run": READER,
+    "run probes": READER,
+    "suite": READER,
+    "run highway": COMMANDS["run highway"],
+    "corpus run": COMMANDS["corpus run"],
+    "judge": COMMANDS["shrink"],
+    "report": COMMANDS["judge"],
+    "replay": COMMANDS["salvage"],
+}
 WITHOUT_TRIALS = {"salvage", "export", "report"}
 
 
@@ -85,6 +114,11 @@ def prepared(shell: Shell) -> None:
     """A folder with what the commands on the toy need."""
     (shell.folder / "driver.py").write_text(DRIVER)
     (shell.folder / "suite.toml").write_text(SUITE)
+    (shell.folder / "cart").mkdir()
+    (shell.folder / "cart" / "scenario.toml").write_text(
+        'schema = 1\nsimulator = "gym"\n[gym]\nid = "CartPole-v1"\n'
+        'crash = { termination = true }\n[agents.cart]\nagent = "random"\n'
+    )
     shell.crashhunt("run", "h", "2", "3", "60", *AGENT)
     crashes = map(str, (shell.folder / "h" / "crashes").glob("00000[01]-*"))
     shell.crashhunt("corpus", "add", *crashes, "--to", "kept")
@@ -142,6 +176,9 @@ class Killing:
     def made(self) -> dict[str, object]:
         """What the command has made, where that does not depend on time."""
         found = facts(self.base)
+        if self.name == "run by cause":  # which crash stays depends on which of them was judged first
+            kept = [name for name in found if name.startswith("new/crashes/") and name.endswith("/crash.json")]
+            return {"rows": found["new/ledger.sqlite"], "crashes": len(kept)}
         if self.name not in TOLD_ONCE:
             return found
         ledger = found["new/ledger.sqlite"]
@@ -308,6 +345,84 @@ def test_command_of_which_any_process_is_killed_ends_as_it_does_undisturbed(whol
     assert (code, "Traceback" in said) == (killing.code, False), said
     assert killing.made() == killing.right
     killing.see_that_nothing_is_left()
+
+
+@pytest.mark.parametrize("number", range(CYCLES))
+@pytest.mark.parametrize("name", AT_ONCE)
+def test_two_commands_at_once_are_killed_and_the_next_ones_lose_no_row_and_leave_nothing(whole, name, number):
+    killing: Killing = whole(name)
+    drawn = random.Random(f"{name} {number} at once")
+    rows: dict[str, dict[int, str]] = {}
+    for again in range(3):
+        second = at_once(name)
+        processes = killing.shell.begin(*killing.words), killing.shell.begin(*second)
+        with read_continually(second):
+            for process in drawn.sample(processes, 2):
+                killing.kill(drawn.choice(SIGNALS), process, "command", drawn.uniform(0.1, 0.6) * killing.took_s)
+            for process in processes:
+                _, said = ended(process)
+                assert "Traceback" not in said or "KeyboardInterrupt" in said, said
+        wait_for(lambda: not processes_of(killing.base), timeout_s=20.0)
+        see_that_rows_are_kept(rows, killing.rows())
+        rows = killing.rows()
+        if again:  # else the same commands, which are the next ones, remove what is left
+            killing.see_that_nothing_is_left()
+    second = at_once(name)
+    if second[0] == "dashboard":
+        dashboard = killing.shell.begin(*second)
+        with read_continually(second) as read:
+            code, said = ended(killing.shell.begin(*killing.words))
+            wait_for(lambda: read, timeout_s=60.0)
+            dashboard.kill()
+            ended(dashboard)
+    else:
+        ended(killing.shell.begin(*second))
+        code, said = ended(killing.shell.begin(*killing.words))
+    assert (code, "Traceback" in said) == (killing.code, False), said
+    see_that_rows_are_kept(rows, killing.rows())
+    made = killing.made()
+    assert {name: made.get(name) for name in killing.right} == killing.right
+    killing.see_that_nothing_is_left()
+
+
+def at_once(name: str) -> tuple[str, ...]:
+    """Return the command that runs at the same time as another one; a dashboard with a free port."""
+    words = AT_ONCE[name]
+    if words != READER:
+        return words
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return *words, str(free.getsockname()[1])
+
+
+@contextmanager
+def read_continually(words: tuple[str, ...]) -> Iterator[list[str]]:
+    """Read the pages of a dashboard until the end; yield the addresses that have been answered."""
+    read: list[str] = []
+    if words[0] != "dashboard":
+        yield read
+        return
+    over = threading.Event()
+
+    def get(address: str) -> Any:
+        with urllib.request.urlopen(f"http://127.0.0.1:{words[-1]}/api/{address}", timeout=20) as reply:
+            found = json.load(reply)
+        read.append(address)
+        return found
+
+    def run() -> None:
+        while not over.wait(0.05):
+            with suppress(OSError, ValueError, HTTPException):  # it is killed, or has not begun to listen
+                for hunt in get("hunts")["hunts"]:
+                    for part in ("", "/trials", "/crashes"):
+                        get(f"hunts/{hunt['id']}{part}")
+
+    reader = threading.Thread(target=run)
+    reader.start()
+    try:
+        yield read
+    finally:
+        over.set()
+        reader.join()
 
 
 def test_processes_of_a_command_are_found_by_their_roles(tmp_path):

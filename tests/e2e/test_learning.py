@@ -51,7 +51,8 @@ def trials(hunt):
     return {}
 
 
-@pytest.mark.parametrize("sampler", ["climber:Climber", pytest.param("optuna:tpe", marks=pytest.mark.nightly)])
+@pytest.mark.nightly  # by day, hunts/test_next_trials.py kills hunts that learn, without processes
+@pytest.mark.parametrize("sampler", ["climber:Climber", "optuna:tpe"])
 def test_a_hunt_that_learns_and_is_killed_runs_the_same_trials(own, sampler):
     words = (*HUNT, "--sampler", sampler, "--deterministic")
     own.crashhunt("run", "whole", *words)
@@ -77,6 +78,7 @@ def test_a_hunt_that_learns_and_is_killed_runs_the_same_trials(own, sampler):
     own.crashhunt("check", "killed")
 
 
+@pytest.mark.nightly  # by day, report/test_page_search.py reads parents and origins
 def test_where_trials_come_from_is_in_the_table(own):
     own.crashhunt("run", "h", *HUNT, "--sampler", "climber:Climber")
     head, *lines = own.crashhunt("trials", "h", "--format", "csv").out.splitlines()
@@ -128,6 +130,7 @@ def test_what_is_wrong_with_a_sampler_is_one_line(own):
     assert "climber.py, line" in done.err
 
 
+@pytest.mark.nightly  # by day, test_stops.py writes a missing row
 def test_a_crash_without_a_row_gets_one_that_states_where_it_is_from(own):
     words = ("1", "3", "20", "--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=5", "--keep-going")
     own.crashhunt("run", "h", *words, "--sampler", "climber:Climber")

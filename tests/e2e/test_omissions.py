@@ -31,8 +31,10 @@ def rear_end(shell):
     return hunt(shell, "--scenario", "loop", "--agent", "omitting:NeverBrakes", "--arg", "speed=20:25", "--seed", "1")
 
 
+@pytest.mark.nightly  # by day, episode/test_reference_driver.py and report/test_omission_words.py
 def test_judge_names_the_vehicle_for_which_the_agent_did_not_brake(rear_end, shell):
-    found = judge(rear_end, ReplayOptions(), runs=1, reference=20, parallel=2).reference
+    judgement = judge(rear_end, ReplayOptions(), runs=1, reference=20, parallel=2)
+    found = judgement.reference
     omission, hit = found.omission, rear_end.result.collision
     assert (omission.faculty, omission.kind, omission.actor) == ("longitudinal", "vehicle", hit.other)
     assert omission.instead == "kept its speed"
@@ -42,13 +44,11 @@ def test_judge_names_the_vehicle_for_which_the_agent_did_not_brake(rear_end, she
     assert omission.visible_step is not None
     assert without_crash(rear_end, omission.step, "reference_speed") == 2
     assert without_crash(rear_end, omission.step, "reference_lanes") == 0
-    shell.crashhunt("judge", "h", "--crash", rear_end.id, "--runs", "1", "--why", "0", "--parallel", "2")
+    with_judgement(rear_end, judgement).write()
     said = shell.crashhunt("show", "h", "--crash", rear_end.id).out
     assert f"Cause: ego did not brake for {hit.other}" in said
     assert said.index("Cause: ") < said.index("It could be avoided") if "It could be avoided" in said else True
-    judged = judgement_of(find_bundle(shell.folder / "h", rear_end.id))
-    assert judged.reference == found
-    assert judgement_of(with_judgement(rear_end, judged)) == judged
+    assert judgement_of(find_bundle(shell.folder / "h", rear_end.id)) == judgement
 
 
 @pytest.mark.nightly

@@ -35,7 +35,7 @@ def crash_of(folder: Path) -> dict[str, Any]:
 ON_SUMO = ("Raises", "Segfaults")
 # A hang that holds the interpreter is the harder one, and so is an exit that says that all is well. What else is no
 # action, tests of the actions know.
-AT_NIGHT = ("Hangs", "Exits3", "OutOfSpace", "ReturnsNone")
+AT_NIGHT = ("ExitsPython", "Hangs", "Exits3", "OutOfSpace", "ReturnsNone")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 TOY = """
 title = "A toy"
@@ -24,6 +24,7 @@ default = 15.0
 """
 
 
+@pytest.mark.nightly  # by day, episode/test_fork.py probes, and test_branches.py confirms
 @pytest.mark.long
 def test_a_hunt_reports_how_little_it_would_take_and_confirms_it_from_the_start(shell):
     (shell.folder / "toy.toml").write_text(TOY)
@@ -71,7 +72,7 @@ def test_a_hunt_reports_how_little_it_would_take_and_confirms_it_from_the_start(
 def test_how_often_has_to_be_a_time(shell):
     for text in ("0", "often"):
         done = shell.crashhunt("run", "h", "1", "3", "60", f"--probe={text}", expect=2)
-        assert done.err == f"crashhunt: --probe is {text}; give a time above 0, such as 4s, or leave it out\n"
+        assert done.err == f"crashhunt: --probe is {text}; give a time above 0, such as 4s, or omit the option\n"
 
 
 THREADS = """
@@ -98,8 +99,8 @@ def test_an_agent_that_cannot_be_copied_is_refused_at_its_first_step(shell):
     (shell.folder / "threads.py").write_text(THREADS)
     words = ("--scenario", "toy.toml", "--agent", "threads:Threads", "--seed", "1", "--probe", "1s", "--overwrite")
     done = shell.crashhunt("run", "h", "1", "2", "30", *words, expect=2)
-    why = "threads have no copy, and 1 runs besides the first"
-    said = f"--probe: trials with threads:Threads cannot be copied: {why}; mend threads:Threads, or leave --probe out"
+    why = "a fork copies no threads, and 1 runs besides the first"
+    said = f"--probe: trials with threads:Threads cannot be copied: {why}; correct threads:Threads, or omit --probe"
     assert said in done.err
     done = shell.crashhunt("run", "h", "1", "2", "30", *words, "--arg", "after=15", "--json")
     assert done.json["trials_run"] == 2

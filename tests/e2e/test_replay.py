@@ -154,7 +154,7 @@ def _flip(data: bytes) -> bytes:
 
 
 def test_replay_takes_the_crash_with_the_fewest_steps(toy):
-    words = ("run", "h", "2", "4", "200", "--agent", "faulty:Raises", "--arg", "at=5:60", "--scenario", "toy")
+    words = ("run", "h", "2", "2", "200", "--agent", "faulty:Raises", "--arg", "at=5:60", "--scenario", "toy")
     report = toy.crashhunt(*words, "--keep-going", "--json").json
     steps = [crash["step"] for crash in report["crashes"]]
     assert steps == sorted(steps)
@@ -201,7 +201,7 @@ def test_another_value_is_no_longer_the_recorded_trial(crash):
     )
     for words, says in (
         (("--set", "sped=9"), "did you mean 'ego.speed'"),
-        (("--set", "speed=9:10"), "not one value"),
+        (("--set", "speed=9:10"), "not a single value"),
         (("--set", "speed=fast"), "fast"),
         (("--set", "speed=9", "--from-log"), "--code snapshot"),
         (("--times", "0"), "--times"),

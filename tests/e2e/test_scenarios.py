@@ -163,6 +163,7 @@ def test_a_mistake_in_a_highway_scenario_is_one_line(shell, table, says):
     assert "snapshots" not in done.err  # the file to mend is the one that was given
 
 
+@pytest.mark.nightly  # by day, simulators/test_accelerator.py compares every bit, and test_golden.py the digests
 def test_the_accelerator_changes_nothing_but_the_time(shell):
     words = ("2", "2", "30", "--scenario", "highway", "--seed", "1", "--keep-going")
     shell.crashhunt("run", "fast", *words)
@@ -181,6 +182,7 @@ def test_the_accelerator_changes_nothing_but_the_time(shell):
         assert shell.crashhunt("replay", "fast", "--no-accelerate", "--json").json["verdict"] == "reproduced"
 
 
+@pytest.mark.nightly  # by day, test_check.py replays a crash in another scenario
 def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     words = ("--scenario", "highway", "--agent", "keep-lane", "--arg", "speed=30", "--seed", "1", "--deterministic")
     shell.crashhunt("run", "h", "2", "20", "150", *words)
@@ -198,8 +200,8 @@ def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     for more, says in (
         ("--from-log", "recorded actions belong"),
         ("--scenario=loop-two-agents", "2 controlled"),
-        ("--frames=f", "a film is for the scenario of the crash"),
-        ("--until=3", "--until is for the scenario of the crash"),
+        ("--frames=f", "a film applies to the scenario of the crash"),
+        ("--until=3", "--until applies to the scenario of the crash"),
     ):
         refused = shell.crashhunt("replay", "h", "--scenario", "motorway", more, expect=2)
         assert says in refused.err

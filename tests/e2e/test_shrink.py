@@ -27,6 +27,7 @@ def hunt(toy, made_once, monkeypatch):
     return toy
 
 
+@pytest.mark.nightly  # by day, shrinking/test_shrink_bundle.py
 def test_arguments_become_plain_and_the_rest_stays(hunt):
     was = find_bundle(hunt.folder / "h")
     told = hunt.crashhunt("shrink", "h", "--json").json
@@ -54,6 +55,7 @@ def test_arguments_become_plain_and_the_rest_stays(hunt):
     assert hunt.crashhunt("corpus", "run", "kept", "--json").json["cases"][0]["got"] == "still"
 
 
+@pytest.mark.nightly  # by day, shrinking/test_shrink_bundle.py resumes
 def test_a_budget_that_is_too_small_leaves_the_best_and_is_gone_on_from(hunt):
     bundle = find_bundle(hunt.folder / "h")
     part = shrink(bundle, budget=2, parallel=1)

@@ -244,6 +244,7 @@ def test_a_submodule_comes_along(project):
     assert (snapshot / "code" / "@my project" / "libs" / "library" / "inside.py").is_file()
 
 
+@pytest.mark.nightly
 def test_a_large_work_tree_is_kept_whole(project):
     for number in range(3000):
         folder = project.folder / "many" / str(number % 50)

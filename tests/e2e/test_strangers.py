@@ -9,7 +9,7 @@ import zipfile
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import Shell
+from conftest import Shell, mostly_nightly
 
 from crashhunt.base.sandbox import landlock_version
 from crashhunt.crashes import find_bundle, open_archive
@@ -133,7 +133,7 @@ files.ALWAYS.pop("device.ssm.file", None)
 
 
 @pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
-@pytest.mark.parametrize("attack", ["netstate-dump", "C", "a detector"])
+@pytest.mark.parametrize("attack", mostly_nightly(["netstate-dump", "C", "a detector"], ["netstate-dump"]))
 def test_the_kernel_alone_holds_what_has_got_past_all_else(crash, tmp_path, monkeypatch, attack):
     victim = tmp_path / "victim"
     victim.write_text("mine")
@@ -164,7 +164,7 @@ EVIL = 'from pathlib import Path\nPath("evil was here").touch()\n'
         ("hunt.toml", 'agent = "crashhunt.agents:KeepLaneWithSpeed"', 'agent = "evil:Agent"'),
         pytest.param("hunt.toml", 'sampler = "random"', 'sampler = "evil:Sampler"', marks=pytest.mark.nightly),
         pytest.param("hunt.toml", '"overlap"', '"evil:Oracle"', marks=pytest.mark.nightly),
-        (OPTIONS, 'simulator = "sumo"', 'simulator = "evil:Simulator"'),
+        pytest.param(OPTIONS, 'simulator = "sumo"', 'simulator = "evil:Simulator"', marks=pytest.mark.nightly),
         pytest.param(
             OPTIONS, 'agent = "crashhunt.agents:KeepLaneWithSpeed"', 'agent = "evil:Agent"', marks=pytest.mark.nightly
         ),

@@ -132,7 +132,12 @@ def test_what_failed_runs_again_and_nothing_else(toy):
     assert "No module named" in (toy.folder / again["replaced"][0] / "error.log").read_text()
     assert (toy.folder / "out/slow/0/ledger.sqlite").read_bytes() == finished
     assert states(toy)["a-word/0"] == "error"
-    # All of it: with the same seeds, the same crashes.
+
+
+@pytest.mark.nightly
+def test_all_runs_again_with_the_same_seeds_and_crashes(toy):
+    written(toy, SUITE.replace("runs = 2\n", "") + BROKEN.partition('[[hunts]]\nid = "raises"')[0])
+    toy.crashhunt("suite", "run", "suite.toml", "out", "2", expect=1)
     crash = {path.name for path in (toy.folder / "out/fast/0/crashes").iterdir()}
     everything = toy.crashhunt("rerun", "out", "--all", "--parallel", "1", "--json", expect=1).json
     assert len(everything["replaced"]) == len(everything["hunts"]) == 4
@@ -140,6 +145,7 @@ def test_what_failed_runs_again_and_nothing_else(toy):
     assert toy.crashhunt("replay", "out/fast/0.replaced-0", "--json").json["verdict"] == "reproduced"
 
 
+@pytest.mark.nightly  # by day, test_hunt.py kills a hunt, and Ctrl-C stops a suite
 @pytest.mark.long
 def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
     written(toy, SLOW.replace("80", "16"))
@@ -175,6 +181,7 @@ def test_a_damaged_plan_leaves_the_others_untouched(toy):
     assert "no request.json" in toy.crashhunt("logs", "out", "--errors-only").out
 
 
+@pytest.mark.nightly  # by day, hunts/test_directory.py has several claim a directory
 @pytest.mark.long
 def test_two_at_once_do_not_disturb_each_other(toy):
     written(toy, SLOW.replace("80", "10").replace('[[hunts]]\nid = "c"\n', ""))
@@ -196,7 +203,7 @@ def digests(shell, hunt: str) -> dict[int, tuple[str, str]]:
 
 def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
     written(toy, SLOW.replace("80", "5000"))  # so that none ends before it is looked at, on no machine
-    process = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
+    process = toy.begin("suite", "run", "suite.toml", "out", "2", "--json")
     wait_for(lambda: (toy.folder / "out/b/0/ledger.sqlite").exists() and len(numbers(toy, "out/b/0")) > 3)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=300)
@@ -227,9 +234,9 @@ def _results(shell, hunt: str) -> list[dict]:
     [
         ("", "the key 'hunts' is missing"),
         ("hunts = []", "there are no hunts"),
-        ("[[hunts]]\nid = 'a'\n[[hunts]]\nid = 'A'", "the id 'A' is there twice"),
+        ("[[hunts]]\nid = 'a'\n[[hunts]]\nid = 'A'", "the id 'A' is used twice"),
         ("[[hunts]]\nscenario = 'toy'", "hunts[0].id = ''"),
-        ("[[hunts]]\nid = '../a'", "'../a' is no name for a folder"),
+        ("[[hunts]]\nid = '../a'", "'../a' is not a valid folder name"),
         ("[[hunts]]\nid = 'a'\nspeed = 3", "unknown key 'speed'"),
         ("[[hunts]]\nid = 'a'\ntrials = 'many'", "trials = 'many'"),
         ("[[hunts]]\nid = 'a'\nruns = 0", "hunts.a.runs = 0"),
@@ -268,7 +275,7 @@ def test_a_suite_that_has_changed_is_refused(toy):
     written(toy, SUITE.replace("speed = 4", "speed = 5").replace("runs = 2", "runs = 3"))
     toy.crashhunt("suite", "run", "suite.toml", "out", expect=2)
     assert not (toy.folder / "out/fast/2").exists()
-    assert "a hunt is there" in toy.crashhunt("suite", "run", "suite.toml", "single", expect=2).err
+    assert "the directory has a hunt" in toy.crashhunt("suite", "run", "suite.toml", "single", expect=2).err
     written(toy, SUITE.replace("seed = 3", "seed = 3\nsnapshot_roots = ['toy']"))
     assert "other settings" in toy.crashhunt("suite", "run", "suite.toml", "out", expect=2).err
     assert "cannot be read" in toy.crashhunt("suite", "run", "nowhere.toml", "out", expect=2).err

@@ -34,4 +34,4 @@ def test_hunt_ends_and_keeps_by_cause(toy):
     assert [part["cause"]["what"] for part in group["causes"]] == ["ego.speed"]
     assert len(group["causes"][0]["judged"]) == 1  # the bundle that stayed is one with the runs
     said = toy.crashhunt("run", "d", "2", "60", *trials, "--distinct", "1", "--by-cause", "2").out
-    assert "Found 1 crash types by cause (--distinct 1)." in said
+    assert "Found 1 crash type, 1 by cause (--distinct 1)." in said

@@ -13,7 +13,7 @@ import pytest
 
 from crashhunt.executors import worker_environment
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 
 @pytest.fixture

@@ -249,7 +249,7 @@ def test_a_kind_that_the_simulator_cannot_do_makes_the_trial_invalid(run, tmp_pa
     )
     box.close()
     assert result.outcome is Outcome.INVALID
-    assert "cannot do the disturbance 'fly'" in result.failure.message
+    assert "does not support the disturbance 'fly'" in result.failure.message
 
 
 def test_a_trial_and_its_result_survive_json():

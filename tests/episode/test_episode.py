@@ -349,4 +349,4 @@ def test_who_empties_sys_modules_is_to_blame_for_what_fails_next(tmp_path):
     os.waitpid(child, 0)
     assert (outcome, steps) == ("agent_error", "4")
     # What fails is the toy, or before it NumPy, where this process has not used yet what NumPy imports later.
-    assert message.startswith("somebody has emptied sys.modules, upon which this fails: ")
+    assert message.startswith("the code has emptied sys.modules, upon which this fails: ")

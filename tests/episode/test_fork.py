@@ -13,7 +13,7 @@ import pytest
 
 from crashhunt.executors import worker_environment
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 
 class Words(str):
@@ -63,11 +63,11 @@ def test_a_copy_and_a_copy_of_it_continue_to_the_same_bits(ask, scenario):
 def test_what_has_no_copy_is_named(ask):
     assert ask("refused") == {
         "nothing": "",
-        "thread": "threads have no copy, and 1 runs besides the first",
-        "process": "a process that was started has no copy",
-        "socket": Words("a connection to others has no copy: socket:"),
-        "pipe": Words("a connection to others has no copy: pipe:"),
-        "memory": "memory that is shared with others has no copy: /dev/zero (deleted)",
+        "thread": "a fork copies no threads, and 1 runs besides the first",
+        "process": "a fork copies no child processes",
+        "socket": Words("a fork cannot copy a connection to others: socket:"),
+        "pipe": Words("a fork cannot copy a connection to others: pipe:"),
+        "memory": "a fork copies no memory that is shared with other processes: /dev/zero (deleted)",
     }
 
 
@@ -108,7 +108,7 @@ def test_probes_find_the_mildest_that_crashes_and_change_nothing(ask):
     assert found["by itself"]["margin"] == 0.0
     assert found["by itself"]["disturbance"] is None
     stress, why_not = found["thread"]
-    assert why_not == "threads have no copy, and 1 runs besides the first"
+    assert why_not == "a fork copies no threads, and 1 runs besides the first"
     assert (stress["margin"], stress["why_unasked"]) == (None, why_not)
     assert (stress["moments"], stress["moments_asked"], stress["probes"]) == (5, 0, 0)
 

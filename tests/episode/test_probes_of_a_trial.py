@@ -370,14 +370,14 @@ def test_an_answer_between_failures_keeps_the_asking_going():
 def test_what_has_no_copy_is_reported_and_its_time_counts():
     class Refused(Road):
         def fork(self, work, *, observed=True):
-            raise CannotForkError("threads have no copy", fix="none")
+            raise CannotForkError("a fork copies no threads", fix="none")
 
     asker, waited = prober()
     asker.ask(Refused({}))
-    assert asker.why_not == "threads have no copy"
+    assert asker.why_not == "a fork copies no threads"
     assert len(waited) == 1
     stress = stress_of(asker)
-    assert (stress.margin, stress.extent, stress.why_unasked) == (None, "asked 0 of 1", "threads have no copy")
+    assert (stress.margin, stress.extent, stress.why_unasked) == (None, "asked 0 of 1", "a fork copies no threads")
     assert not stress.may_be_asked_again
 
 

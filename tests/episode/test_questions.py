@@ -94,9 +94,9 @@ def test_answer_begins_the_count_again():
 def test_what_cannot_be_copied_is_not_tried_again():
     told = []
     questions = Questions("probes", told.append)
-    attempt, rest = attempts(CannotForkError("threads have no copy"), ANSWER)
+    attempt, rest = attempts(CannotForkError("a fork copies no threads"), ANSWER)
     assert questions.ask(attempt) is None
-    assert (questions.why_not, questions.why_unanswered) == ("threads have no copy", "threads have no copy")
+    assert (questions.why_not, questions.why_unanswered) == ("a fork copies no threads", "a fork copies no threads")
     assert (len(rest), questions.may_be_answered, told) == (1, False, [])
 
 

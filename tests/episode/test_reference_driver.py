@@ -127,6 +127,17 @@ def test_it_refuses_a_lane_change_into_a_gap_that_is_not_safe(side, kind):
     assert driver(road, "lateral", (20.0, -1)).act(None) == (20.0, -1)
 
 
+def test_each_vehicle_of_an_unsafe_gap_is_noted():
+    """The collision partner need not be the vehicle with the least safe gap."""
+    ahead = Neighbor(actor="near", gap_m=-2.0, speed_mps=27.0, braking_mps2=BRAKING)
+    behind = Neighbor(actor="fast", gap_m=5.0, speed_mps=30.0, braking_mps2=BRAKING)
+    road = Road(sides={1: Side(exists=True, ahead=ahead, behind=behind)})
+    made = driver(road, "lateral", (20.0, 1))
+    assert made.act(None) == (20.0, 0)
+    noted = {(one["kind"], one["actor"]) for one in made.responses if one["faculty"] == "lateral"}
+    assert noted == {("alongside left", "near"), ("behind left", "fast")}
+
+
 def crossing(*, right_of_way, distance=30.0, other=30.0, speed=12.0, **more):
     return Crossing(
         actor="cross", distance_m=distance, exit_m=distance + 8, actor_distance_m=other, actor_exit_m=other + 8,
@@ -170,5 +181,5 @@ def test_a_simulator_that_knows_no_surroundings_is_refused():
         def __init__(self):
             self.actions = {"ego": SpeedAndLaneChange()}
 
-    with pytest.raises(InvalidEpisodeError, match="its simulator knows no surroundings"):
+    with pytest.raises(InvalidEpisodeError, match="its simulator reports no surroundings"):
         driver(Blind(), "none")

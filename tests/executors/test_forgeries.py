@@ -37,7 +37,7 @@ EXPECTED: dict[str, tuple[str, str | None, str]] = {
     "report_by_own_classes": NOT_OURS,
     "report_and_goes_on": SURVIVED,  # and its own report is the last
     "report_of_endless_length": (
-        "agent_error", "the process could not report what came of it, as it is damaged", "ego",
+        "agent_error", "the process could not report the result, as it is damaged", "ego",
     ),
     "report_of_negative_length": NOT_OURS,
     "report_by_child_that_stays": NO_PROLOGUE,

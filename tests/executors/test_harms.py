@@ -46,7 +46,7 @@ EXPECTED["hangs"] = {
     **{moment: (HANG if outcome == DIED else outcome, named) for moment, (outcome, named) in EXPECTED["dies"].items()},
     "thread": (SURVIVED, False),
 }
-_DAMAGED = dict.fromkeys(harms.MOMENTS[:-2], (ERROR, NAMED))  # the process cannot report what came of its trial
+_DAMAGED = dict.fromkeys(harms.MOMENTS[:-2], (ERROR, NAMED))  # the process cannot report the results trial
 SHOWN_IN_STACK = (
     "segfaults",
     "aborts",
@@ -190,6 +190,7 @@ def test_there_are_more_than_300_kinds():
     assert len(TABLE) + len(ATTACKS) > 300
 
 
+@pytest.mark.nightly  # by day, test_harm.py
 def test_harm_costs_its_own_trial_and_is_named(run):
     trials = [*sample(3), ("raises_long_message", "fifth act"), ("stops_itself", "fifth act"), ("sleeps", "close")]
     check(trials, run(trials, timeout_s=2.0))

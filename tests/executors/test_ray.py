@@ -93,7 +93,7 @@ def collect(executor, count, *, until_s=DEADLINE_S):
     return found
 
 
-@pytest.mark.nightly  # by day, a hunt on a cluster has to be the same as on one machine
+@pytest.mark.nightly  # as all that needs a cluster
 class TestRayExecutor(ExecutorContract):
     @pytest.fixture
     def make(self, cluster):
@@ -274,13 +274,15 @@ def test_a_cluster_that_can_run_nothing_states_why(begin, settings, cluster):
     executor = RayExecutor(lacking, argument=cluster.address)
     said = refusal(executor)
     executor.close()
-    assert "'nowhere:Agent' cannot be imported: No module named 'nowhere'; install there what is here" in said
+    assert "'nowhere:Agent' cannot be imported: No module named 'nowhere'; install the same packages there" in said
     assert said.count("\n") == 0
 
     first = begin()
     first.submit(spec(0))
     collect(first, 1)
-    assert f"the Ray cluster at {cluster.address} can run nothing: none of its 2 CPUs is free; wait" in refusal(begin())
+    assert f"the Ray cluster at {cluster.address} cannot run trials: none of its 2 CPUs is free; wait" in refusal(
+        begin()
+    )
 
 
 def test_what_is_too_large_to_travel_is_refused(settings, tmp_path):
@@ -303,6 +305,7 @@ def rows(shell, hunt):
     return [{key: value for key, value in row.items() if key not in passing} for row in found]
 
 
+@pytest.mark.nightly  # by day, test_ray_bridge.py and test_ray_store.py run both ends without a cluster
 @pytest.mark.long
 def test_a_hunt_is_the_same_as_on_one_machine(toy, cluster):
     """The same rows, and the same first crash with everything that belongs to it."""

@@ -67,13 +67,13 @@ def listener(answer):
     ("argument", "message"),
     [
         ("127.0.0.1:1", "--executor ray:127.0.0.1:1: no cluster answers there (Connection refused); start one with"),
-        ("nowhere", "--executor ray:nowhere is no address HOST:PORT; write --executor ray:nowhere:6379"),
-        ("a:b", "--executor ray:a:b is no address HOST:PORT; write --executor ray:a:6379"),
+        ("nowhere", "--executor ray:nowhere is not an address HOST:PORT; write --executor ray:nowhere:6379"),
+        ("a:b", "--executor ray:a:b is not an address HOST:PORT; write --executor ray:a:6379"),
         (".x:1", "--executor ray:.x:1: no machine can have that name; start one with"),
-        ("ray://x:10001", "--executor ray:ray://x:10001 is an address of the Ray Client, which a hunt does not use"),
+        ("ray://x:10001", "--executor ray:ray://x:10001 is an address of the Ray Client, which hunts do not support"),
         (
             "http://x:8265",
-            "--executor ray:http://x:8265 is an address of a service such as Ray's dashboard, which a hunt",
+            "--executor ray:http://x:8265 is an address of a service such as Ray's dashboard, which hunts",
         ),
         ("auto", "--executor ray:auto: no Ray cluster runs on this machine; start one"),
     ],
@@ -143,7 +143,7 @@ def test_a_token_goes_to_no_one_but_a_cluster_that_runs_here(monkeypatch, tmp_pa
         monkeypatch.setenv("RAY_AUTH_MODE", "token")
         assert cluster_of("") == (address, {}, {})
         (tmp_path / ".ray" / "auth_token").unlink()
-        with pytest.raises(UsageError, match="RAY_AUTH_MODE=token, and there is no token; put the one that"):
+        with pytest.raises(UsageError, match="RAY_AUTH_MODE is token, but there is no token; put the one that"):
             cluster_of("")
     monkeypatch.delenv("RAY_ADDRESS")
     assert cluster_of("").address == "", "one that has ended is none"

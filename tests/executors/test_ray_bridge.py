@@ -230,7 +230,9 @@ def test_an_actor_whose_cpus_another_got_is_taken_back(begin):
     cluster.late = True
     after(2)
     cluster.others["a"] = 2
-    with pytest.raises(UsageError, match="can run nothing: none of its 2 CPUs is free; wait until others are done"):
+    with pytest.raises(
+        UsageError, match="cannot run trials: none of its 2 CPUs is free; wait until other jobs are done"
+    ):
         after(40)
     assert not any(actor.alive for actor in cluster.actors)
 
@@ -241,7 +243,9 @@ def test_the_one_that_loses_a_race_of_two_hunts_is_reported_soon(begin):
     cluster.late = True
     after(3)
     cluster.others["a"] = cluster.hunts["a"] = 2
-    with pytest.raises(UsageError, match="can run nothing: none of its 2 CPUs is free; wait until others are done"):
+    with pytest.raises(
+        UsageError, match="cannot run trials: none of its 2 CPUs is free; wait until other jobs are done"
+    ):
         after(5)
     assert not any(actor.alive for actor in cluster.actors)
 
@@ -418,7 +422,7 @@ def test_a_disk_that_is_full_here_is_reported_from_a_cluster_that_is_lost(begin,
         raise OSError(28, "No space left on device", str(folder))
 
     monkeypatch.setattr(_bridge, "unpacked", full)
-    with pytest.raises(RecorderError, match=r"trial-000000: what came back from a cannot be written here: No space"):
+    with pytest.raises(RecorderError, match=r"trial-000000: the results from a cannot be written here: No space"):
         after()
 
 

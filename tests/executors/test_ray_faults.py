@@ -105,7 +105,7 @@ def eventually(what, said=""):
 
 
 def rows(toy, hunt):
-    """Number to what came of it, as the ledger has it; each number once."""
+    """Number to the result, as the ledger has it; each number once."""
     path = toy.folder / hunt / "ledger.sqlite"
     if not path.exists():
         return {}
@@ -287,10 +287,10 @@ def test_a_token_is_shown_to_a_cluster_that_asks_for_it(toy):
             toy.crashhunt(words[0], "shown", *words[1:])
             token.write_text("9876543210" * 4)
             err = toy.crashhunt(words[0], "wrong", *words[1:], expect=2).err
-            assert f"the Ray cluster at 127.0.0.1:{port} takes another token than this one; put the one" in err
+            assert f"the Ray cluster at 127.0.0.1:{port} expects another token; put the one" in err
             token.unlink()
             err = toy.crashhunt(words[0], "none", *words[1:], expect=2).err
-            assert f"the Ray cluster at 127.0.0.1:{port} asks for a token; set RAY_AUTH_MODE=token, and put" in err
+            assert f"the Ray cluster at 127.0.0.1:{port} needs a token; set RAY_AUTH_MODE=token, and put" in err
 
 
 BEATING = """

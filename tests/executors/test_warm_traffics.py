@@ -18,7 +18,7 @@ from crashhunt.recording import Recording, read_black_box
 from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
 from crashhunt.trial import Outcome, TrialSpec
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 HERE = Path(__file__).parent
 
@@ -137,7 +137,7 @@ def test_traffic_that_cannot_be_forked_is_not_shared(pool):
         notes = sharing.notes()
     assert [(one.outcome, one.setup_steps) for one in found] == [(Outcome.SURVIVED, 40)] * 3
     (note,) = notes
-    assert note.startswith("trials in the same traffic do not share its warm-up: threads have no copy")
+    assert note.startswith("trials in the same traffic do not share its warm-up: a fork copies no threads")
 
 
 def deepest_process_below(pid):

@@ -130,7 +130,7 @@ def test_a_process_that_damaged_itself_is_an_error_of_its_only_agent(begun, phas
 def test_a_trial_that_is_killed_from_outside_runs_again_alone(begun, monkeypatch):
     steps = iter([3, 5, 9])
     monkeypatch.setattr(
-        _postmortem, "where_it_is", lambda scratch, number: type("Header", (), {"step": next(steps)})()
+        _postmortem, "where_it_is", lambda *_: SimpleNamespace(step=next(steps), phase=Phase.ACT)
     )  # fmt: skip
     attempt = Attempt(SPEC)
     assert not attempt.alone
@@ -152,6 +152,14 @@ def test_a_trial_that_is_killed_from_outside_runs_again_alone(begun, monkeypatch
         "(SIGKILL after step 3, SIGTERM after step 5, SIGKILL after step 9)"
     )
     assert result.kept
+
+
+@pytest.mark.parametrize("header", [None, SimpleNamespace(step=0, phase=Phase.SETUP)])
+def test_a_trial_that_is_killed_twice_before_its_first_step_has_a_third_attempt(begun, monkeypatch, header):
+    """What forks the processes of trials may have been killed once: both attempts end with it."""
+    monkeypatch.setattr(_postmortem, "where_it_is", lambda *_: header)
+    attempt = Attempt(SPEC)
+    assert [bool(attempt.again(begun, KILL)) for _ in range(3)] == [True, True, False]
 
 
 def test_a_trial_that_is_killed_twice_at_one_step_did_it_itself(begun, tmp_path):
@@ -207,7 +215,7 @@ def test_an_executor_that_cannot_be_made_is_one_line(monkeypatch):
     with pytest.raises(UsageError, match="no cluster"):
         _protocol.make_executor("w", None, parallel=1, recycle_after=0)
     monkeypatch.setattr(_protocol, "executor_of", factory(ValueError("no cluster")))
-    with pytest.raises(PluginError, match="the executor 'w' cannot be made"):
+    with pytest.raises(PluginError, match="the executor 'w' cannot be created"):
         _protocol.make_executor("w", None, parallel=1, recycle_after=0)
 
 

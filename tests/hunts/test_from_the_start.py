@@ -10,8 +10,7 @@ import pytest
 from crashhunt.base.errors import SimulatorError
 from crashhunt.disturbances import disturber_of, parse_rates
 from crashhunt.hunts._fork_results import CopiedCrashes
-from crashhunt.hunts._phases import PhaseClock
-from crashhunt.hunts._progress import Progress
+from crashhunt.hunts._progress import PhaseClock, Progress
 from crashhunt.hunts._verification import Found, VerificationRuns
 from crashhunt.trial import Branch, Branches, Disturbance, Outcome, Stress, TrialResult, TrialSpec
 

@@ -9,8 +9,8 @@ import pytest
 
 from crashhunt.base.errors import UsageError
 from crashhunt.crashes import Cause, Factor, Judgement, LeftOut, Why
-from crashhunt.hunts import _progress
-from crashhunt.hunts._progress import Judged, Kinds
+from crashhunt.hunts import _crashes
+from crashhunt.hunts._crashes import Judged, Kinds
 from crashhunt.hunts._reports import kind_data
 from crashhunt.plans import RunSettings
 from crashhunt.trial import Collision, Failure, Outcome, TrialResult, TrialSpec
@@ -53,14 +53,14 @@ def test_the_last_new_kind_is_not_the_last_crash(monkeypatch):
 
 
 def test_a_screen_does_not_wait_for_groups_that_take_long(monkeypatch):
-    now, group = [0.0], _progress.groups_of
+    now, group = [0.0], _crashes.groups_of
 
     def slowly(*given):
         now[0] += 1.0
         return group(*given)
 
-    monkeypatch.setattr(_progress, "groups_of", slowly)
-    monkeypatch.setattr(_progress, "time", SimpleNamespace(monotonic=lambda: now[0], time=lambda: now[0]))
+    monkeypatch.setattr(_crashes, "groups_of", slowly)
+    monkeypatch.setattr(_crashes, "time", SimpleNamespace(monotonic=lambda: now[0], time=lambda: now[0]))
     kinds = Kinds(0, [crash(1, "KeyError")])
     assert kinds.groups(running=True)[0].count == 1
     kinds.add(crash(2, "KeyError"), 1)
@@ -76,10 +76,10 @@ def test_of_each_kind_the_shortest_few_are_kept_and_all_count():
     kinds = Kinds(2)
     for number, (kind, steps) in enumerate([("KeyError", 9), ("KeyError", 4), ("IndexError", 7), ("KeyError", 4)]):
         kinds.add(crash(number, kind, steps), number)
-    assert [bundle.id for bundle in kinds.surplus(1)] == ["c3", "c0"]
-    assert kinds.surplus(1) == []
+    assert [bundle.id for bundle in kinds.drop_excess(1)] == ["c3", "c0"]
+    assert kinds.drop_excess(1) == []
     kinds.add(crash(5, "KeyError", 2), 5)
-    assert [bundle.id for bundle in kinds.surplus(1)] == ["c1"]
+    assert [bundle.id for bundle in kinds.drop_excess(1)] == ["c1"]
     assert [(group.count, group.first.id, group.shortest.id) for group in kinds.groups()] == [
         (4, "c5", "c5"), (1, "c2", "c2"),
     ]  # fmt: skip
@@ -94,17 +94,17 @@ def test_of_each_kind_the_shortest_few_are_kept_and_all_count():
 def test_who_is_killed_while_giving_bundles_up_counts_none_twice():
     crashes = [crash(1, "KeyError", 4), crash(2, "KeyError", 9)]
     kinds = Kinds(0, crashes)
-    assert [bundle.id for bundle in kinds.surplus(1)] == ["c2"]
+    assert [bundle.id for bundle in kinds.drop_excess(1)] == ["c2"]
     again = Kinds(0, crashes, dropped=kinds.dropped)  # the ledger was told, and the bundle is there
     assert again.groups()[0].count == 2
-    assert [bundle.id for bundle in again.surplus(1)] == ["c2"]
+    assert [bundle.id for bundle in again.drop_excess(1)] == ["c2"]
     assert (again.dropped, again.groups()[0].count) == (kinds.dropped, 2)
 
 
 def test_what_was_hunted_for_is_kept_before_what_is_shorter(monkeypatch):
-    monkeypatch.setattr(_progress, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id != "c1"))
+    monkeypatch.setattr(_crashes, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id != "c1"))
     kinds = Kinds(1, [crash(1, "KeyError", 4), crash(2, "KeyError", 9), crash(3, "KeyError", 6)], only_at_fault=True)
-    assert [bundle.id for bundle in kinds.surplus(1)] == ["c2", "c1"]
+    assert [bundle.id for bundle in kinds.drop_excess(1)] == ["c2", "c1"]
     assert (kinds.at_fault, kinds.dropped_at_fault) == ((2, 3), [2])  # with or without a bundle
     again = Kinds(
         1, [crash(3, "KeyError", 6)], only_at_fault=True, dropped=kinds.dropped, dropped_at_fault=kinds.dropped_at_fault
@@ -120,7 +120,7 @@ def test_the_one_that_wants_several_kinds_continues_after_the_first_crash():
 
 
 def test_only_the_agents_own_crashes_count_where_that_was_asked(monkeypatch):
-    monkeypatch.setattr(_progress, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id in ("c4", "c6")))
+    monkeypatch.setattr(_crashes, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id in ("c4", "c6")))
     kinds = Kinds(1, only_at_fault=True)
     kinds.add(crash(3, "KeyError"), 1)
     assert (kinds.until, kinds.at_fault) == (None, ())
@@ -143,8 +143,8 @@ def collision(number, steps=5, judgement=None):
 @pytest.fixture
 def one_type(monkeypatch):
     """All collisions have one signature, and features that nothing distinguishes."""
-    monkeypatch.setattr(_progress, "signature_of", lambda bundle, _: bundle.result.outcome)
-    monkeypatch.setattr(_progress, "features_of", lambda bundle, _: (float(bundle.result.spec.number),))
+    monkeypatch.setattr(_crashes, "signature_of", lambda bundle, _: bundle.result.outcome)
+    monkeypatch.setattr(_crashes, "features_of", lambda bundle, _: (float(bundle.result.spec.number),))
 
 
 def settle(kinds, bundle, what, **more):
@@ -172,16 +172,16 @@ def test_keep_retains_each_cause_once_it_is_known(one_type):
     kinds = Kinds(0, by_cause=2)
     for number, steps in enumerate([9, 8, 7, 6, 5, 4]):
         kinds.add(collision(number, steps), 1)
-    assert kinds.surplus(1) == []  # nothing is known yet
+    assert kinds.drop_excess(1) == []  # nothing is known yet
     settle(kinds, kinds.next_to_judge(), "vehicle")
     rare = kinds.next_to_judge()
     assert rare.id == "c0"  # the longest, furthest from the shortest
     settle(kinds, rare, None, is_stopped=True)
     assert kinds.next_to_judge() is rare
-    assert kinds.surplus(1) == []
+    assert kinds.drop_excess(1) == []
     settle(kinds, rare, "red light")
     # Of each cause, the crash that was judged stays, and the shortest of the others.
-    assert {bundle.id for bundle in kinds.surplus(1)} == {"c1", "c2", "c3", "c4"}
+    assert {bundle.id for bundle in kinds.drop_excess(1)} == {"c1", "c2", "c3", "c4"}
     assert {bundle.id for group in kinds.groups() for bundle in group.bundles} == {"c5", "c0"}
     assert kinds.groups()[0].count == 6
 
@@ -191,8 +191,8 @@ def test_crashes_that_were_never_judged_are_pruned_at_the_end(one_type):
     for number, steps in ((1, 9), (2, 4)):
         kinds.add(collision(number, steps), 1)
         settle(kinds, kinds.next_to_judge(), "vehicle")
-    assert kinds.surplus(1) == []  # more crashes may come, to be judged
-    assert [bundle.id for bundle in kinds.surplus(1, final=True)] == ["c1"]
+    assert kinds.drop_excess(1) == []  # more crashes may come, to be judged
+    assert [bundle.id for bundle in kinds.drop_excess(1, final=True)] == ["c1"]
 
 
 def test_resumed_hunt_counts_causes_that_bundles_contain(one_type):
@@ -205,7 +205,7 @@ def test_resumed_hunt_counts_causes_that_bundles_contain(one_type):
 def test_software_faults_need_no_runs_for_their_cause():
     kinds = Kinds(2, [crash(1, "KeyError"), crash(2, "IndexError")], by_cause=8)
     assert (kinds.until, kinds.next_to_judge(), kinds.types_by_cause) == (2, None, 2)
-    assert [bundle.id for bundle in Kinds(0, [crash(1, "A"), crash(2, "A")], by_cause=8).surplus(1)] == ["c2"]
+    assert [bundle.id for bundle in Kinds(0, [crash(1, "A"), crash(2, "A")], by_cause=8).drop_excess(1)] == ["c2"]
 
 
 @pytest.mark.parametrize(

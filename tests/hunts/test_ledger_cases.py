@@ -248,9 +248,9 @@ def test_in_a_ledger_without_digests_two_places_may_not_contradict_each_other(pa
             database.execute(f"ALTER TABLE {table} DROP COLUMN digest")
         database.execute("PRAGMA user_version = 1")
         database.execute(f"UPDATE trials SET {change}")
-    with closing(Ledger(path)) as reader, pytest.raises(HuntDirectoryError, match="its columns say something else"):
+    with closing(Ledger(path)) as reader, pytest.raises(HuntDirectoryError, match="its columns and its text differ"):
         list(reader.results())
-    with pytest.raises(HuntDirectoryError, match="its columns say something else"):
+    with pytest.raises(HuntDirectoryError, match="its columns and its text differ"):
         Ledger(path, writable=True)
 
 

@@ -159,7 +159,9 @@ def test_a_ledger_of_later_is_read_where_it_states_so_and_never_written(tmp_path
         assert [trial.spec.number for trial in ledger.results()] == [0, 1, 2, 4, 5, 6, 7, 8, 9]
         assert ledger.result(4) == result(4)
         assert len(list(ledger.table())) == 9
-    with pytest.raises(HuntDirectoryError, match=f"a ledger of version 99, and this crashhunt writes version {today}"):
+    with pytest.raises(
+        HuntDirectoryError, match=f"the ledger has version 99, but this crashhunt writes version {today}"
+    ):
         Ledger(path, writable=True)
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("UPDATE trials SET mood = 0.4 WHERE number = 4")
@@ -172,7 +174,7 @@ def test_a_ledger_of_later_that_asks_for_more_is_refused(tmp_path):
     write(path)
     newer(path, reader=98)
     for writable in (False, True):
-        with pytest.raises(HuntDirectoryError, match="of version 99, and this crashhunt reads the versions up to"):
+        with pytest.raises(HuntDirectoryError, match="of version 99, but this crashhunt reads versions up to"):
             Ledger(path, writable=writable)
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 import pytest
 from climber import Climber
 from columns import FEWER_COLUMNS
+from conftest import examples
 from hypothesis import given, settings as how, strategies as st
 
 from crashhunt.base.integrity import digest_of_row
@@ -109,7 +110,7 @@ def specs(path):
 KILLS = st.lists(st.integers(0, 40), max_size=4)
 
 
-@how(max_examples=25)
+@how(max_examples=examples(25))
 @given(st.integers(0, 2**32), KILLS, st.integers(1, 8), st.booleans())
 def test_a_deterministic_hunt_runs_the_same_trials_however_often_it_is_killed(
     tmp_path_factory, seed, kills, parallel, power
@@ -122,7 +123,7 @@ def test_a_deterministic_hunt_runs_the_same_trials_however_often_it_is_killed(
     assert any(spec.parent for spec in specs(path))
 
 
-@how(max_examples=25)
+@how(max_examples=examples(25))
 @given(st.integers(0, 2**32), KILLS, st.integers(1, 8))
 def test_what_a_killed_hunt_had_started_is_what_runs_after(tmp_path_factory, seed, kills, parallel):
     folder = tmp_path_factory.mktemp("hunt")
@@ -282,7 +283,7 @@ def test_a_ledger_of_before_continues_with_a_sampler_that_learns(tmp_path):
     ("argument", "says"),
     [
         ("unmade", "cannot be made: KeyError: 'nothing to sample'"),
-        ("independent", "says that it learns, and that its draws are independent"),
+        ("independent", "declares both learns and independent"),
         ("raises", "fails when it is asked for trial 0: ZeroDivisionError: division by zero"),
         ("list", "proposes for trial 0 list, not arguments"),
         ("missing", "proposes for trial 0 no value for missing"),

@@ -14,7 +14,7 @@ import pytest
 
 from crashhunt.estimation import compare
 from crashhunt.hunts import PhaseStatus, hunt_state
-from crashhunt.hunts._phases import PhaseClock, RemainingTime
+from crashhunt.hunts._progress import PhaseClock, RemainingTime
 from crashhunt.hunts._state import ledger_owner
 from crashhunt.ledger import Ledger
 from crashhunt.report import describe_phase, format_pace
@@ -165,7 +165,7 @@ def test_confirmation_is_seen_while_it_runs_and_resumed_after_an_interrupt(toy):
         assert process.poll() is None, process.communicate()
         if (toy.folder / "h" / "ledger.sqlite").exists():
             states.append(hunt_state(toy.folder / "h"))
-        time.sleep(0.01)
+        time.sleep(0.05)
     state = states[-1]
     assert (state.state, state.trials_run, state.phase["name"], state.phase["total"]) == ("running", 8, "confirming", 8)
     assert "confirming" in toy.crashhunt("status", "h").out

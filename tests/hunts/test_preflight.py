@@ -33,7 +33,7 @@ def test_what_fails_in_every_trial_in_the_same_way_is_refused():
 
 
 def test_a_hunt_of_one_trial_is_refused_after_one():
-    with pytest.raises(ArgumentError, match="there is no file 'x'; mend the agent"):
+    with pytest.raises(ArgumentError, match="there is no file 'x'; correct the agent"):
         Preflight(settings_of(speed="15"), 1).filter_setup_failures(result(0))
 
 

@@ -12,13 +12,13 @@ import pytest
 import crashhunt
 from crashhunt.disturbances import DisturbanceSampler, brake
 from crashhunt.errors import UsageError
-from crashhunt.hunts import _rare as rare_module, hunt_state
-from crashhunt.hunts._rare import Forcings, RareWatch
+from crashhunt.hunts import _rates as rare_module, hunt_state
+from crashhunt.hunts._rates import Forcings, RareWatch
 from crashhunt.ledger import Ledger
 from crashhunt.rates import BLOCK, TRIALS_PER_ROOT, is_root
 from crashhunt.trial import CRASHES, Disturbance, Forced, ForcedCopy, Forcing, Outcome, TrialResult, TrialSpec
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 TOY = """
 title = "A toy"
@@ -160,6 +160,22 @@ def test_crashes_of_plain_trials_count_for_the_undisturbed_part_and_for_the_cert
     running = rule.running()
     assert running["certain"] == {"low": found.certain[0], "high": found.certain[1]}
     assert (running["method"], running["units"], running["crashes"]) == ("rare", 60, 5)
+
+
+def test_too_many_invalid_plain_trials_leave_no_estimate():
+    rows = rows_of([root(number, "collision" if number % 2 else "") for number in range(50)])
+    rows[0] = root(0, unanswered=1, why_unanswered="a copy was killed")  # its plain trials count in any case
+    for number in range(1, 55, 5):  # of 200 plain trials, 11
+        rows[number] = plain(number, Outcome.INVALID)
+    rule = RareWatch(settings(), rows, SAMPLER)
+    rule.read()
+    found = rule.estimate()
+    assert found.why_not == "11 of 200 plain trials are invalid, more than 5%: the rest is other traffic than described"
+    assert (found.estimate, found.certain, found.estimated) == (None, None, None)
+    rows[51] = plain(51)
+    rule = RareWatch(settings(), rows, SAMPLER)
+    rule.read()
+    assert rule.estimate().estimate > 0
 
 
 def test_plain_trials_that_contradict_the_copies_withhold_the_interval():

@@ -113,7 +113,7 @@ def test_trials_that_were_drawn_independently_are_known(hunt):
 
 def test_files_of_two_hunts_are_refused(hunt):
     edit(hunt, "\nseed = 1\n", "\nseed = 2\n")
-    with pytest.raises(HuntDirectoryError, match="says seed 2, and the trials are those of seed 1"):
+    with pytest.raises(HuntDirectoryError, match="has seed 2, but the trials have seed 1"):
         _ = load(hunt).settings
     (hunt / "ledger.sqlite").unlink()
     with pytest.warns(UnfinishedWarning):

@@ -9,9 +9,7 @@ from crashhunt.trial import Outcome, TrialResult, TrialSpec
 def told(progress, danger, origin="", *, crashed=False):
     spec = TrialSpec(0, 1, {}, {}, max_steps=1, origin=origin)
     result = TrialResult(spec, Outcome.COLLISION if crashed else Outcome.SURVIVED, danger=danger)
-    progress.count(result, crashed=crashed)
-    if not crashed:
-        progress.take(result)
+    progress.count(result, crashed=crashed, planned=9)
 
 
 def test_shares_and_mean_dangers_are_those_of_the_trials_and_a_crash_counts_as_one():

@@ -101,9 +101,10 @@ def test_what_not_every_hunt_has_is_in_its_json_only_where_it_has_it(hunt):
     assert plain["dir"] == str(hunt)
     assert {"disturbed", "core", "nodes", "probes", "branches", "kinds", "newest_kind_s"}.isdisjoint(plain)
     kind = {"words": "w", "count": 2, "first": "a", "shortest": "b"}
-    note(hunt, disturb=["brake=0.1"], core="used", kinds=[kind], newest_kind=time.time() - 30)
+    note(hunt, disturb=["brake=0.1"], core="used", kinds=[kind], newest_kind=time.time() - 30, types_by_cause=3)
     more = hunt_state(hunt).to_json()
-    assert more.keys() - plain.keys() == {"disturbed", "core", "kinds", "newest_kind_s"}
+    assert more.keys() - plain.keys() == {"disturbed", "core", "kinds", "newest_kind_s", "types_by_cause"}
+    assert more["types_by_cause"] == 3
     assert (more["disturbed"], more["core"], more["kinds"]) == (0, "used", [kind])
     assert more["newest_kind_s"] == pytest.approx(30, abs=5)
 
@@ -202,13 +203,13 @@ def near(number, ttc_s):
 def test_the_trial_that_came_nearest_is_kept():
     progress = Progress()
     for one in (near(0, 5.0), near(1, 2.0), near(2, 3.0)):
-        progress.count(one, crashed=False)
-        progress.take(one)
-    progress.count(result(3, Outcome.COLLISION), crashed=True)
-    progress.take(result(4, failure=Failure("ValueError", "no")))
+        progress.count(one, crashed=False, planned=9)
+    progress.count(result(3, Outcome.COLLISION), crashed=True, planned=9)
+    progress.count(result(4, failure=Failure("ValueError", "no")), crashed=False, planned=9)
     assert progress.nearest.spec.number == 1
-    assert progress.ended_here == 4
-    assert progress.outcomes == {"survived": 3, "collision": 1}
+    assert progress.ended_here == 5
+    assert progress.outcomes == {"survived": 4, "collision": 1}
+    assert progress.found.keys() == {3}
     assert progress.not_fully_asked == 0
     assert progress.time_left_s == math.inf
     assert Progress(until=time.monotonic() + 9).time_left_s == pytest.approx(9, abs=3)

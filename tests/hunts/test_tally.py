@@ -10,9 +10,9 @@ from contextlib import closing
 import pytest
 
 from crashhunt.crashes import list_bundles
-from crashhunt.hunts import HuntResults, _tally as tally_module, find_crashes, hunt_state
+from crashhunt.hunts import HuntResults, _crashes as tally_module, find_crashes, hunt_state
+from crashhunt.hunts._crashes import tally_crashes
 from crashhunt.hunts._progress import Progress
-from crashhunt.hunts._tally import tally_crashes
 from crashhunt.ledger import Ledger
 from crashhunt.trial import Disturbance, Failure, Outcome, TrialResult, TrialSpec
 

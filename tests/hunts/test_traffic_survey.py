@@ -11,6 +11,7 @@ import time
 import tomllib
 
 import pytest
+from conftest import mostly_nightly
 
 from crashhunt.base.processes import children_of
 from crashhunt.base.reaper import Kept
@@ -203,7 +204,10 @@ def kill_surveys(monkeypatch, number, *, first, child=False):
     return begun
 
 
-@pytest.mark.parametrize(("number", "child"), [(signal.SIGKILL, False), (signal.SIGKILL, True), (signal.SIGTERM, True)])
+@pytest.mark.parametrize(
+    ("number", "child"),
+    mostly_nightly([(signal.SIGKILL, False), (signal.SIGKILL, True), (signal.SIGTERM, True)], [(signal.SIGKILL, True)]),
+)
 def test_survey_that_is_killed_from_outside_is_run_again(town, monkeypatch, number, child):
     undisturbed = surveyed(town.folder, seed=1)
     begun = kill_surveys(monkeypatch, number, first=2, child=child)
@@ -227,7 +231,7 @@ def test_survey_that_fails_by_itself_is_run_once(town, monkeypatch):
     assert len(begun) == 1
 
 
-@pytest.mark.parametrize("has_snapshot", [True, False])
+@pytest.mark.parametrize("has_snapshot", [pytest.param(True, marks=pytest.mark.nightly), False])
 def test_resumed_hunt_keeps_the_candidates_with_which_it_began_although_its_survey_was_killed(
     town, monkeypatch, has_snapshot
 ):

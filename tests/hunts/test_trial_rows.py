@@ -38,7 +38,7 @@ def test_plain_data_has_every_value_of_a_result():
     assert TrialResult.from_json(json.loads(json.dumps(RESULT.to_json()))) == RESULT
     for part in (RESULT.collision, RESULT.failure, RESULT.escape, RESULT.event, RESULT.closest):
         names = [item.name for item in dataclasses.fields(part)]
-        left_out = {name for name in ("party", "place", "why_not", "cell") if not getattr(part, name, None)}
+        left_out = {name for name in ("party", "place", "why_not", "cell", "changed") if not getattr(part, name, None)}
         assert list(part.to_json()) == [name for name in names if name not in left_out]
 
 

@@ -129,7 +129,7 @@ def test_pbf_is_the_same_map(tmp_path):
     assert len(made.network.drivable()) == 6
     (tmp_path / "bad.osm.pbf").write_bytes((tmp_path / "town.osm.pbf").read_bytes()[:-20])
     (tmp_path / "again").mkdir()
-    with pytest.raises(ScenarioError, match="osmium refuses"):
+    with pytest.raises(ScenarioError, match="osmium cannot read"):
         converted(MapSource(kind="osm", path=tmp_path / "bad.osm.pbf"), tmp_path / "again")
 
 

@@ -109,7 +109,7 @@ def refusal(path, kind="osm"):
         ("a.osm", b"<net></net>", "begins with <net>"),
         ("a.osm.gz", b"\x1f\x8b\x08garbage", "cannot be unpacked"),
         ("a.osm.gz", gzip.compress(b"<net/>", mtime=0), "begins with <net>"),
-        ("a.osm.pbf", OSM, "no OpenStreetMap PBF"),
+        ("a.osm.pbf", OSM, "not an OpenStreetMap PBF"),
         ("a.pdf", OSM, "does not have the ending of OpenStreetMap"),
     ],
 )

@@ -87,6 +87,29 @@ def test_the_same_are_within_reach(scenes):
         assert ours == theirs
 
 
+@settings(deadline=None, max_examples=60)
+@given(two_scenes(), some.randoms(use_true_random=False), some.integers(0, 3))
+def test_the_same_are_within_reach_where_actors_come_and_go(scenes, rng, missing):
+    first, scene = scenes
+    rows = rng.sample(range(len(first.points)), max(0, len(first.points) - missing))
+    roster = Roster(tuple(first.roster.actors[row] for row in rows))
+    columns = [[values[row] for row in rows] for values in (first.points, first.headings, first.speeds)]
+    previous = Scene(first.time_s, roster, *columns, swept=True)
+    scene.follow(previous)
+    for row in range(len(scene.points)):
+        ours, theirs = both_ways(scene, lambda row=row: _within_reach(scene, previous, row))
+        assert ours == theirs
+
+
+def test_earlier_rows_are_checked():
+    pair = lists_of([1.0, 2.0])
+    for rows, error in (([0], TypeError), ((0, 1), TypeError), ([0, 2], IndexError), ([0, -2], IndexError)):
+        with pytest.raises(error):
+            core.within_reach(pair, pair, 0, 0.1, 10.0, rows)
+    with pytest.raises(TypeError):
+        core.within_reach(pair, pair, 0, 0.1, 10.0, [0, "1"])
+
+
 def test_a_heading_beyond_north_is_no_turn_around():
     # Seen from SUMO's angles, north is where headings jump by a whole turn; nobody there reaches further for it.
     roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name in "ab"))
@@ -113,7 +136,7 @@ def test_an_actor_is_within_reach():
     was = Scene(0.0, roster, [(0.0, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0])
     now = Scene(0.1, roster, [(3.1, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0], core=core)
     was.columns, now.columns = columns_of(was), columns_of(now)
-    assert core.within_reach(now.columns, was.columns, 0, 0.1, 10.0) == [1]
+    assert core.within_reach(now.columns, was.columns, 0, 0.1, 10.0, None) == [1]
     assert _within_reach(now, was, 0) == [1]
 
 
@@ -370,8 +393,8 @@ def test_what_the_core_does_not_know_is_left_to_python(odd):
     if odd is math.nan:
         strange = core.columns(sizes, [(0.0, 0.0), (odd, 0.0)], numbers, numbers)
         assert core.observe(strange, 0, 4, 1.0, 1.0, 0.0) is None
-        assert core.within_reach(strange, plain, 0, 0.1, 10.0) is None
-        assert core.within_reach(plain, strange, 0, 0.1, 10.0) == []
+        assert core.within_reach(strange, plain, 0, 0.1, 10.0, None) is None
+        assert core.within_reach(plain, strange, 0, 0.1, 10.0, None) == []
         assert core.least_change(lists_of(numbers), lists_of([1.0, odd])) is None
     else:
         assert core.columns(sizes, [(0.0, 0.0), (odd, 0.0)], numbers, numbers) is None
@@ -386,14 +409,14 @@ def test_what_the_core_does_not_know_is_left_to_python(odd):
                 core.Vehicles((), *[rows if place == other else numbers for other in range(3)])
     alone = core.columns(sizes, points[:1], [1.0], [1.0])  # of two, whose sizes are known
     assert core.observe(alone, 0, 4, 1.0, 1.0, 0.0) is None
-    assert core.within_reach(alone, alone, 0, 0.1, 10.0) is None
-    assert core.within_reach(alone, lists_of([1.0]), 0, 0.1, 10.0) is None
-    assert core.within_reach(lists_of([1.0]), alone, 0, 0.1, 10.0) is None
-    assert core.within_reach(plain, lists_of([1.0]), 0, 0.1, 10.0) is None
+    assert core.within_reach(alone, alone, 0, 0.1, 10.0, None) is None
+    assert core.within_reach(alone, lists_of([1.0]), 0, 0.1, 10.0, None) is None
+    assert core.within_reach(lists_of([1.0]), alone, 0, 0.1, 10.0, None) is None
+    assert core.within_reach(plain, lists_of([1.0]), 0, 0.1, 10.0, None) is None
     assert core.least_change(alone, plain) is None
     for row in (-1, 2):
         assert core.observe(plain, row, 4, 1.0, 1.0, 0.0) is None
-        assert core.within_reach(plain, plain, row, 0.1, 10.0) is None
+        assert core.within_reach(plain, plain, row, 0.1, 10.0, None) is None
     for wrong in (None, sizes, [plain]):
         with pytest.raises(TypeError, match="columns"):
             core.least_change(plain, wrong)

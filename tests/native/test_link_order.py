@@ -316,6 +316,7 @@ needs_allocator = pytest.mark.skipif(
 )
 
 
+@pytest.mark.nightly  # by day, the orders of the tests below
 @needs_allocator
 def test_other_addresses_give_the_same_result(heap_orders, tmp_path):
     """Without the fixed order they give two results, of which the fixed order has that of an ordinary process."""

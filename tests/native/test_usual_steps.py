@@ -14,7 +14,7 @@ from saying import Says
 
 from crashhunt.base.errors import RecorderError
 from crashhunt.crashes import own_frames
-from crashhunt.episode import Episode, Nearness, Observer, Recorder
+from crashhunt.episode import FastEpisode, Nearness, Observer, Recorder
 from crashhunt.native import ANSWERED, ASK, DONE, REFUSED, SIMULATED
 from crashhunt.oracles import OffRoad, Overlap, RedLight, ReportedCollision, TooClose
 from crashhunt.recording import BlackBox, Tag
@@ -54,7 +54,7 @@ class Street:
 
     def episode(self, answer, *, at_once=True, steps=90, oracles=(), crash_on=CRASHES, observers=(), seed=1):
         self.box.begin(pid=1, trial=0, started=0.0)
-        episode = Episode(
+        episode = FastEpisode(
             TrialSpec(0, seed, {}, {}, steps), simulator=self.simulator, make_agent=lambda *_: Says(answer),
             oracles=[ReportedCollision(), Overlap(), OffRoad(), *oracles], crash_on=crash_on,
             observers=[Recorder(self.box, self.simulator), Nearness(self.box.take_frames), *observers],
@@ -385,7 +385,7 @@ def test_another_simulator_is_reported_of(street, tmp_path):
         return 8.0, 0
 
     result, *_ = street.both(meddle)
-    assert "another simulator of this process has been reset" in result
+    assert "another simulator in this process has been reset" in result
     other.box.close()
     other.simulator.close()
 

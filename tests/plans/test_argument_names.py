@@ -124,6 +124,7 @@ def asked(shell, hunt):
     }
 
 
+@pytest.mark.nightly  # by day, the tests of each name below
 @pytest.mark.long
 def test_run_rerun_suite_and_replay_mean_the_same(two):
     where = ("--scenario", "toys", "--seed", "1", "--crash-on", "collision")

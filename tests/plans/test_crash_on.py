@@ -40,10 +40,10 @@ def test_names_and_limits():
         (["redlight"], "did you mean 'red_light'?"),
         (["survived"], "'survived' is not a crash"),
         (["teleport:3"], "teleport has no limit; not_moving and hard_braking have one"),
-        (["not_moving:"], "'' is no limit; give s above 0, such as not_moving:30"),
-        (["not_moving:0"], "'0' is no limit"),
-        (["hard_braking:nan"], "'nan' is no limit; give m/s² above 0"),
-        (["hard_braking:soft"], "'soft' is no limit"),
+        (["not_moving:"], "'' is not a limit; give s above 0, such as not_moving:30"),
+        (["not_moving:0"], "'0' is not a limit"),
+        (["hard_braking:nan"], "'nan' is not a limit; give m/s² above 0"),
+        (["hard_braking:soft"], "'soft' is not a limit"),
         ([], "names no outcome"),
     ],
 )
@@ -72,14 +72,14 @@ def test_limits_reach_the_simulator_and_the_file(tmp_path):
 
 def test_what_a_simulator_never_reports(tmp_path):
     with pytest.raises(
-        UsageError, match="the simulator 'highway' never reports that; it reports wrong_way, not_moving"
+        UsageError, match="the simulator 'highway' cannot report that; it reports wrong_way, not_moving"
     ):
         plan(Request(trials=1, max_steps=10, scenario="highway", crash_on=("red_light",)))
     scenario, _ = plan(Request(trials=1, max_steps=10, scenario="highway", crash_on=("red_light", "collision")))
     assert "the simulator 'highway' never reports red_light" in scenario.notes
 
 
-@pytest.mark.parametrize(("key", "message"), [("red_light = 3", "has no limit"), ("not_moving = 0", "is no limit")])
+@pytest.mark.parametrize(("key", "message"), [("red_light = 3", "has no limit"), ("not_moving = 0", "is not a limit")])
 def test_limits_of_a_scenario(tmp_path, key, message):
     text = (shipped_folder() / "loop" / "scenario.toml").read_text()
     for file in (shipped_folder() / "loop").iterdir():

@@ -13,7 +13,7 @@ from crashhunt.errors import ArgumentError, HuntDirectoryError, ScenarioError, U
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.plans import HuntOptions, Request, hunt_options, plan, read_settings, request_of, write_settings
 from crashhunt.plans._plan import Owners, Takes, agent_of, takes_of
-from crashhunt.plans._request import executor_of, parallel_here, sizes_itself
+from crashhunt.plans._settings import executor_of, parallel_here, sizes_itself
 
 EXECUTORS = """
 class Cluster:
@@ -115,7 +115,7 @@ def test_an_option_states_what_it_means_and_whether_it_may_be_excluded():
     assert options["timeout_s"].help.endswith("; default: 60")
     assert options["sampler"].help.endswith("; default: random")
     assert "default" not in options["keep_going"].help
-    assert options["seed"].line == "seed: of the hunt; by default a new one, which is printed."
+    assert options["seed"].line == "seed: seed of the hunt; by default a new one, which is printed."
     for option in options.values():
         default = option.default
         kinds = {
@@ -168,7 +168,7 @@ def test_what_an_agent_needs_has_to_be_given(folder):
         ({"agents": {"other": "drives:Agent"}}, "other"),
         ({"action": "meta"}, "--action meta is for"),
         ({"branch": True}, "--branch needs disturbances, and there are none"),
-        ({"disturb": ["brake@101=ahead:4:2"]}, "--disturb brake@101: a trial has 100 steps"),
+        ({"disturb": ["brake@101=ahead:4:2"]}, "--disturb brake@101: a trial has only 100 steps"),
         ({"crash_on": ["red-light"]}, "did you mean 'red_light'"),
     ],
 )
@@ -238,7 +238,7 @@ def test_no_trials_are_fine_with_a_time_and_drivers_have_to_be_importable(folder
 
     elsewhere = type("Here", (), {"__module__": "__main__"})
     for who in (Local, elsewhere, lambda: None):
-        with pytest.raises(UsageError, match="is in no module that a worker could import"):
+        with pytest.raises(UsageError, match="is not in a module that workers can import"):
             request_of(HuntOptions(agent=who), trials=1, max_steps=1)
 
 
@@ -312,7 +312,7 @@ def test_a_command_is_one_line_of_the_settings(folder):
 
 
 def test_settings_that_cannot_be_read_say_where_and_why(folder):
-    with pytest.raises(HuntDirectoryError, match=r"it has no hunt\.toml; give the directory that crashhunt run"):
+    with pytest.raises(HuntDirectoryError, match=r"it has no hunt\.toml; give the directory of a hunt"):
         read_settings(folder / "hunt.toml")
     with pytest.raises(HuntDirectoryError, match=r"'.*nowhere' does not exist"):
         read_settings(folder / "nowhere" / "hunt.toml")

@@ -216,7 +216,7 @@ def test_written_rates_are_read_back(rate, per, form):
 )  # fmt: skip
 def test_what_is_no_rate_is_refused_with_examples(text):
     assert "such as 1e-3/trial" in check_rate(text)
-    with pytest.raises(ValueError, match=r"is no rate|is out of range"):
+    with pytest.raises(ValueError, match=r"is not a rate|is out of range"):
         rate_of(text)
 
 

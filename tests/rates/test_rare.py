@@ -36,7 +36,7 @@ def test_roots_estimate_both_parts_without_bias(model):
     assert all(root.copies <= root.bound for root in roots)
 
 
-@pytest.mark.parametrize("scale", [1.0, 20.0])  # of 20: most copies have several onsets
+@pytest.mark.parametrize("scale", [pytest.param(1.0, marks=pytest.mark.nightly), 20.0])  # 20: mostly several onsets
 def test_forced_second_onsets_have_no_bias(scale):
     model = Model({name: scale * chance for name, chance in TWO.items()})
     sampler, spacing = model.sampler(), first_forcing(model.sampler(), model.steps).spacing
@@ -104,11 +104,11 @@ def test_estimate_with_a_hidden_mode_leaves_it_to_the_certain_bound():
 
 def test_certain_bounds_close_in_on_the_rate():
     model = Model(DENSE)
-    few, many = (rare_estimate(run_roots(model, n, 3), least_bound=least_bound(model)).certain for n in (32, 384))
+    few, many = (rare_estimate(run_roots(model, n, 3), least_bound=least_bound(model)).certain for n in (32, 192))
     truth = sum(model.truth())
     assert few[0] <= many[0] <= truth <= many[1] <= few[1]
     assert many[0] > 0
-    assert many[1] - many[0] < 0.7 * (few[1] - few[0])
+    assert many[1] - many[0] < 0.8 * (few[1] - few[0])
 
 
 def least_bound(model):
@@ -132,6 +132,14 @@ def test_forcing_stays_the_first_one_without_earlier_roots():
     assert learn_forcing([Forced(1.0, {})], start) is start
 
 
+@pytest.mark.parametrize("scale", [1e-2, 1e-13, 1e-200])
+def test_first_roots_have_eight_copies_at_most_whatever_the_chances(scale):
+    sampler = Model({"stop": scale}).sampler()
+    assert first_forcing(sampler, 101).spacing == pytest.approx(
+        (1 - (1 - scale) ** 100 if scale > 1e-3 else 100 * scale) / 8
+    )
+
+
 def roots(*values):
     return [Root(0.0, value, bound=1.0) for value in values]
 
@@ -140,7 +148,7 @@ def roots(*values):
     ("some", "says"),
     [
         (roots(*[0.0] * 50), "none of 50 roots has a crash"),
-        (roots(*[0.0] * 50, *[1e-3] * 10), "10 roots have a crash"),
+        (roots(*[0.0] * 50, *[1e-3] * 10), "roots with a crash: 10 "),
         (roots(*[1e-3] * 30, 0.1), "of the sum (at most 20%)"),
         (roots(*[1e-3] * 30, 0.1), "effective sample size is 1.7"),
     ],

@@ -172,6 +172,7 @@ console.log(JSON.stringify(topics));
 """
 
 
+@pytest.mark.nightly  # installs from the network; by day, the reader of the package mcap agrees
 def test_an_independent_reader_agrees(tmp_path):
     """The npm package @mcap/core, Foxglove's own reader, finds the same messages to the byte."""
     import hashlib

@@ -55,7 +55,7 @@ def test_a_log_whose_evidence_is_missing_is_refused(recording, tmp_path, place):
         return [message for message in messages if message is not gone]
 
     rewrite(path, without)
-    with pytest.raises(BundleError, match=r"message \d+ of the evidence is missing") as caught:
+    with pytest.raises(BundleError, match=r"message \d+ of the log is missing") as caught:
         read_log(path)
     assert caught.value.where == str(path)
     assert caught.value.fix
@@ -73,7 +73,7 @@ def test_without_any_evidence_or_its_end_it_is_another_recording(recording, tmp_
     assert read_log(path).digest != recording.digest
     write_log(path, recording)
     rewrite(path, lambda messages: [*messages, evidence(messages)[3]])  # twice
-    with pytest.raises(BundleError, match="message 5 of the evidence is missing"):
+    with pytest.raises(BundleError, match="message 5 of the log is missing"):
         read_log(path)
 
 

@@ -121,7 +121,7 @@ def test_a_type_that_cannot_be_read_is_refused(tmp_path, monkeypatch):
         write_log(tmp_path / "log.mcap", recorded(tmp_path / "box"))
     with pytest.raises(BundleError, match="a type that this version does not know") as refused:
         read_log(tmp_path / "log.mcap")
-    assert refused.value.fix == "use the version that wrote it"
+    assert refused.value.fix == "use the version that wrote the trial"
 
 
 def test_a_prologue_of_a_later_version_is_read(tmp_path):

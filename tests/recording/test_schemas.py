@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from crashhunt.recording._mcap import MESSAGES, to_ns
+from crashhunt.recording._foxglove import MESSAGES, to_ns
 from crashhunt.recording.records._agents import message_of
 
 

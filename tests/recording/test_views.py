@@ -28,7 +28,7 @@ from crashhunt.recording import (
     read_lanes,
     write_log,
 )
-from crashhunt.recording._mcap import MESSAGES
+from crashhunt.recording._foxglove import MESSAGES
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Actor, Event, Lane, Roster, Scene
 

@@ -47,7 +47,7 @@ def test_whatever_an_agent_shows_becomes_a_picture_or_one_clear_error(panel, siz
     try:
         picture = panel.draw(*size, label="any")
     except ValueError as error:
-        assert "needed" in str(error) or "parts" in str(error)
+        assert "give " in str(error) or "parts" in str(error)
         return
     assert picture.shape == (size[1], size[0], 3)
     assert picture.dtype == np.uint8
@@ -181,7 +181,7 @@ def test_a_panel_of_ones_own_draws_itself():
             return np.full((height, width, 3), (255, 0, 0), np.uint8)
 
     assert colors(Red().draw()) == {(255, 0, 0): 240 * 160}
-    with pytest.raises(TypeError, match="Panel does not say how it is drawn"):
+    with pytest.raises(TypeError, match="Panel has no method that draws it"):
         Panel().draw()
 
 

@@ -130,6 +130,7 @@ def test_it_is_driven_by_keyboard_and_plays(hunt, browser):
     assert step(browser) == 3
 
 
+@pytest.mark.nightly  # by day, keys work without one
 def test_keys_work_after_a_click(hunt, browser):
     hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
     opened(browser, hunt.folder / "report.html")
@@ -162,6 +163,7 @@ def test_keys_work_after_a_click(hunt, browser):
     assert step(browser) == 1
 
 
+@pytest.mark.nightly
 def test_dots_say_which_trial_they_are_and_lead_to_it(hunt, browser):
     hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
     opened(browser, hunt.folder / "report.html")
@@ -204,6 +206,7 @@ def telephone(browser):
     browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
+@pytest.mark.nightly
 def test_nothing_is_wider_than_a_telephone(hunt, telephone):
     hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
     opened(telephone, hunt.folder / "report.html")
@@ -217,7 +220,7 @@ def test_nothing_is_wider_than_a_telephone(hunt, telephone):
     assert {"speed (m/s)", "crash rate"} <= set(labels)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", [pytest.param("light", marks=pytest.mark.nightly), "dark"])
 def test_light_and_dark_differ_and_can_be_read(hunt, browser, scheme):
     hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
     media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}

@@ -100,6 +100,8 @@ def test_kinds_of_crashes_and_when_the_last_new_one_came():
         assert any(line.startswith("2 crash types (last new type: 1 trial") for line in lines)
     assert any("(last new type: 1 trial / 3:12 ago): 2 rear end, the" in line for line in lines)
     assert describe_kinds(replace(found, newest_kind_trials=None)).endswith("(last new type: 3:12 ago)")
+    by_cause = replace(found, newest_kind_s=None, types_by_cause=5)  # --by-cause 8
+    assert describe_kinds(by_cause) == "2 crash types, 5 by cause"
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from crashhunt.crashes import Attempt, Judgement, LaneMap, Omission, Reference, ReferenceRun
 from crashhunt.crashes._contact import record_in
 from crashhunt.report._verdict import describe_contact, verdict_of
-from crashhunt.trial import Collision
+from crashhunt.trial import Collision, Escape
 from crashhunt.world import Actor, Roster, Scene
 
 DT = 0.1
@@ -143,11 +143,11 @@ def omitted(**more):
     [
         ({}, f"{TOUCHED}."),
         (
-            {"escape": SimpleNamespace(step=30, why_not="", too_late=31)},
+            {"escape": Escape(30, 31)},
             f"{TOUCHED}; if ego brakes 1.0 s before, there is no crash.",
         ),
-        ({"escape": SimpleNamespace(step=30, why_not="the run differed", too_late=None)}, f"{TOUCHED}."),
-        ({"escape": SimpleNamespace(step=None, why_not="", too_late=0)}, f"{TOUCHED}."),
+        ({"escape": Escape(why_not="the run differed")}, f"{TOUCHED}."),
+        ({"escape": Escape(None, 0)}, f"{TOUCHED}."),
         ({"judgement": Judgement((attempt(25),))}, f"{TOUCHED}; if ego brakes 1.5 s before, there is no crash."),
         (
             {"judgement": Judgement((attempt(25, changed=("ego does not change lanes",)),))},
@@ -174,9 +174,18 @@ def test_verdict_reports_only_what_was_run(given, words):
 
 
 def test_braking_is_no_answer_where_the_agent_changed_lanes():
-    """The run that brakes also drops the lane change, and the hunt has not recorded which of both helps."""
-    found = verdict_of(story(escape=SimpleNamespace(step=39, why_not="", too_late=None), poses=jump(-1, 4.0)))
+    """An earlier version has not recorded that the run drops the lane change as well."""
+    found = verdict_of(story(escape=Escape(39), poses=jump(-1, 4.0)))
     assert found == "ego changed to the left lane into x; x was alongside."
+    found = verdict_of(story(escape=Escape(39, changed=("ego does not change lanes",)), poses=jump(-1, 4.0)))
+    words = "if ego brakes 0.1 s before and does not change lanes, there is no crash"
+    assert found == f"ego changed to the left lane into x; x was alongside; {words}."
+
+
+def test_contact_that_the_outlines_contradict_is_not_described():
+    apart = story(poses=lambda time_s: [(20 * time_s, 0.0, 0.0, 20.0), (6.4 + 12 * time_s, 0.0, 0.0, 12.0)])
+    apart.contact = replace(apart.contact, reported_collider="x")
+    assert verdict_of(apart) == f"{apart.bundle.result.summary}."
 
 
 def test_lane_change_of_the_reference_runs_gives_the_gap():

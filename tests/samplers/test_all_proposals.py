@@ -163,7 +163,7 @@ def test_a_sampler_that_contradicts_itself_is_refused(scripted, monkeypatch):
     assert NamedSampler("theirs", ONE, points=3).learns
     assert not NamedSampler("theirs", ONE, points=3).independent
     monkeypatch.setattr(Scripted, "independent", True)
-    with pytest.raises(PluginError, match="says that it learns, and that its draws are independent"):
+    with pytest.raises(PluginError, match="declares both learns and independent"):
         NamedSampler("theirs", ONE, points=3)
     monkeypatch.setattr(Scripted, "learns", False)
     assert NamedSampler("theirs", ONE, points=3).independent
@@ -178,9 +178,9 @@ def test_a_grid_and_a_sweep_refuse_what_they_cannot_do():
             NamedSampler(name, ONE, points=0)
     rng = np.random.default_rng(1)
     assert len({NamedSampler("grid", ONE, points=1).ask(number, rng).arguments["ego", "x"] for number in range(3)}) == 1
-    with pytest.raises(UsageError, match=r"what varies is: nothing"):
+    with pytest.raises(UsageError, match=r"varying argument, not: nothing"):
         NamedSampler("sweep", {("ego", "x"): Constant(1)}, points=3)
-    with pytest.raises(UsageError, match=r"what varies is: n, w, ego\.x, ego\.y"):
+    with pytest.raises(UsageError, match=r"varying argument, not: n, w, ego\.x, ego\.y"):
         NamedSampler("sweep", SPACE, points=3)
 
 

@@ -41,7 +41,7 @@ def made(name, space=UNIT, seed=1):
 
 
 def talk(name, space, danger_of, trials, *, lag=4, seed=1):
-    """Ask and tell as a hunt does; returns what was asked and what came of it."""
+    """Ask and tell as a hunt does; returns what was asked and the result."""
     sampler, asked, results = made(name, space, seed), [], []
     for number in range(trials):
         if number >= lag:
@@ -144,9 +144,9 @@ def test_what_optuna_states_is_not_shown_and_its_own_settings_stay(capfd, recwar
     [
         ("optuna:TPSampler", PluginError, "Optuna has no sampler 'TPSampler'; did you mean 'TPESampler'"),
         ("optuna:", PluginError, "Optuna has no sampler ''; give one of CmaEsSampler"),
-        ("optuna:grid", UsageError, "'optuna:grid' is not for hunts; --sampler grid"),
-        ("optuna:BruteForceSampler", UsageError, "is not for hunts; --sampler grid"),
-        ("optuna:PartialFixed", UsageError, "is not for hunts; --arg NAME=VALUE"),
+        ("optuna:grid", UsageError, "'optuna:grid' cannot be used for hunts; --sampler grid"),
+        ("optuna:BruteForceSampler", UsageError, "cannot be used for hunts; --sampler grid"),
+        ("optuna:PartialFixed", UsageError, "cannot be used for hunts; --arg NAME=VALUE"),
     ],
 )
 def test_a_name_that_is_none_is_one_line(name, kind, says):

@@ -160,7 +160,7 @@ def test_a_hunt_that_continues_looks_for_other_crashes():
         near = min(np.linalg.norm(x - 0.2), np.linalg.norm(x - 0.8))
         return 1.0 if near < 0.08 else 0.95 - float(near) / 2
 
-    asked, results = hunt(GuidedSampler(UNIT), two, 1200, keep_going=True)
+    asked, results = hunt(GuidedSampler(UNIT), two, 800, keep_going=True)
     found = [values(one).mean() for one, result in zip(asked, results, strict=True) if result.danger == 1.0]
     assert min(found) < 0.5 < max(found)
     assert len(found) < 200

@@ -229,8 +229,8 @@ def test_options_under_any_name(town, text, says):
     ("text", "says"),
     [
         ('<net value="net.net.xml"/>', "given twice"),
-        ('<step-length value="0"/>', "no time step"),
-        ('<step-length value="0.0001"/>', "no time step"),
+        ('<step-length value="0"/>', "not a time step"),
+        ('<step-length value="0.0001"/>', "not a time step"),
         ('<b value="1:0"/><e value="30"/>', "before begin"),
         ('<a value="gone.add.xml"/>', "additional-files: the file"),
         ('<a value="${NOWHERE_AT_ALL}/r.rou.xml"/>', "NOWHERE_AT_ALL} is not set"),

@@ -134,7 +134,7 @@ STAGED = "/some/where/.scratch/stage-17"
             f"expected end of tag 'routs' In file '{STAGED}/traffic.rou.xml' At line/column 14/3.",
             "",
             "traffic.rou.xml, line 14",
-            "SUMO says: expected end of tag 'routs'; mend it there",
+            "SUMO says: expected end of tag 'routs'; correct it there",
         ),
         (
             "Process Error",
@@ -146,7 +146,7 @@ STAGED = "/some/where/.scratch/stage-17"
             "'number' is needed in flow 'left'.",
             "",
             "traffic.rou.xml, line 11",
-            "is needed in flow 'left'; mend it there",
+            "is needed in flow 'left'; correct it there",
         ),
         ("something new", "", "scenario.toml", "SUMO says: something new; see [sumo]"),
     ],

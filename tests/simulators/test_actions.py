@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from conftest import examples
 from gymnasium import spaces
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
@@ -59,7 +60,7 @@ anything = st.one_of(
 
 
 @pytest.mark.parametrize("name", FORMS)
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(action=anything)
 def test_an_action_is_taken_as_it_is_or_refused(name, action):
     form = FORMS[name]

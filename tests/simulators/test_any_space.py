@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import gymnasium
 import numpy as np
 import pytest
+from conftest import examples
 from gymnasium import spaces
 from hypothesis import HealthCheck, given, settings, strategies as st
 
@@ -99,7 +100,7 @@ NESTED = st.recursive(
     ),
     max_leaves=6,
 )
-FEW = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+FEW = settings(max_examples=examples(150), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 def same(one, other):

@@ -137,7 +137,7 @@ def test_episode_ends_with_the_learner(tmp_path, leaves_at):
 @pytest.mark.parametrize(
     ("name", "options", "says"),
     [
-        ("Chase", {"learner": "runer"}, "gym.learner = 'runer' is no agent; did you mean 'runner'?"),
+        ("Chase", {"learner": "runer"}, "gym.learner = 'runer' is not an agent; did you mean 'runner'?"),
         ("InTurns", {}, "this factory returned a InTurns, whose agents take turns; name its parallel_env"),
     ],
 )
@@ -157,5 +157,5 @@ def test_learner_of_an_environment_with_one_agent_is_refused(tmp_path):
 
 def test_learner_that_comes_later_makes_the_trial_invalid(tmp_path):
     simulator = simulator_of(tmp_path, late=True)
-    with pytest.raises(Exception, match="the learner 'runner' does not take part from the beginning"):
+    with pytest.raises(Exception, match="the learner 'runner' is not in the environment from the first step"):
         simulator.reset(seed=1)

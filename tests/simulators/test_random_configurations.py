@@ -50,6 +50,8 @@ DRIVERS += [f"{__name__}.Hurried", f"{__name__}.Nervous"]
 
 
 def observation(rng):
+    if rng.random() < 0.2:
+        return {"type": "TimeToCollision", "horizon": int(rng.integers(3, 12))}
     features = [str(name) for name in rng.choice(FEATURES, rng.integers(1, 8), replace=False)]
     if rng.random() < 0.5:
         return {
@@ -58,6 +60,7 @@ def observation(rng):
             "vehicles_count": int(rng.integers(2, 12)),
             **{name: bool(rng.random() < 0.5) for name in ("absolute", "normalize", "clip", "see_behind")},
             "include_obstacles": bool(rng.random() < 0.7),
+            "observe_intentions": bool(rng.random() < 0.7),
             "order": str(rng.choice(["sorted", "shuffled"])),
         }
     size = float(rng.choice([15.0, 27.5, 40.0]))

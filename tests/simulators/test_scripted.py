@@ -81,5 +81,5 @@ def test_where_an_agent_is_to_begin_must_be_known(simulator, recorded):
     nowhere = paths.cut(3, STEPS, 0.1)  # fine: its lane is that of a step before
     driven(simulator, 3, 4, script=nowhere)
     for wrong in (paths_of(recorded[0][3:], ("ego",)),):
-        with pytest.raises(InvalidEpisodeError, match="is not known"):
+        with pytest.raises(InvalidEpisodeError, match="is unknown"):
             driven(simulator, script=wrong)

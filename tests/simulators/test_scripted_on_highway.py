@@ -83,7 +83,7 @@ def test_it_begins_later_without_most_and_continues_after_the_recorded_end(mergi
 def test_where_an_agent_begins_must_be_known_on_highway_env(merging, merged):
     paths = paths_of(merged[0], ("ego",)).placing()
     late = replace(paths, agents=(replace(paths.agents[0], first=1),))
-    with pytest.raises(InvalidEpisodeError, match="'ego' is to begin is not known"):
+    with pytest.raises(InvalidEpisodeError, match="start position of 'ego' is unknown"):
         driven(merging, script=late)
 
 

@@ -134,7 +134,7 @@ def test_who_has_departed_in_the_warm_up_is_reported_of(town, tmp_path):
 
 def test_two_agents_cannot_take_one_place(town, tmp_path):
     (setup,) = load_scenario(town.folder / "town.sumocfg", ego="any").agents.values()
-    with pytest.raises(InvalidEpisodeError, match=r"a and b both take the place of the vehicle 'odd.name#1.2'"):
+    with pytest.raises(InvalidEpisodeError, match=r"a and b both replace the vehicle 'odd.name#1.2'"):
         entered(town, tmp_path, "odd.name#1.2", agents={"a": setup, "b": setup})
 
 
@@ -165,7 +165,7 @@ def test_what_is_simulated_before_the_first_step_is_counted(town, tmp_path, only
         assert simulator.setup_steps == 0
 
 
-@pytest.mark.parametrize("damage", ["</net", "<net><edge"])
+@pytest.mark.parametrize("damage", ["</net", pytest.param("<net><edge", marks=pytest.mark.nightly)])
 def test_a_malformed_network_is_no_crash(town, damage):
     (town.folder / "net.net.xml").write_text(damage)
     done = town.crashhunt("run", "h", "1", "40", "100", "--scenario", "town.sumocfg", "--json", expect=3)

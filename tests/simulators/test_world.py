@@ -44,7 +44,7 @@ class Constant:
 
 @pytest.fixture
 def drive(tmp_path):
-    """Runs one episode in this process; returns what came of it."""
+    """Runs one episode in this process; returns the result."""
     simulators = []
 
     def run(net, routes, *, speed=15.0, steps=300, step_s=0.1, options="", ego="existing = true", observation=""):

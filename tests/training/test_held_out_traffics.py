@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import shutil
 from contextlib import closing
+from dataclasses import replace
 
 import pytest
 from conftest import Shell
@@ -110,7 +111,7 @@ def test_the_command_prints_the_parts(place, shell):
     done = shell.crashhunt("split", "before", "--part", "test")
     assert done.out.splitlines() == [one["path"] for one in found["held_out"]]
     assert "--test is 1; give a share" in shell.crashhunt("split", "before", "--test", "1", expect=2).err
-    assert "'gone' is no directory" in shell.crashhunt("split", "gone", expect=2).err
+    assert "'gone' is not a directory" in shell.crashhunt("split", "gone", expect=2).err
 
 
 # The record of a training.
@@ -144,7 +145,7 @@ def test_processes_that_write_at_once_lose_nothing(tmp_path):
 def test_a_record_of_another_split_or_a_damaged_one_is_refused(tmp_path):
     file = tmp_path / "trained_on.json"
     _write(file, 1)
-    with pytest.raises(UsageError, match=r"with test=0.5, and this one has test=0.2"):
+    with pytest.raises(UsageError, match=r"with test=0.5, but this training has test=0.2"):
         TrainedOn(test=0.2).write(file)
     for text in ("", "[]", "{}", '{"schema": 1, "test": 2, "seeds": [], "hunt_seeds": []}'):
         file.write_text(text)
@@ -162,6 +163,10 @@ def test_in_a_hunt_that_was_trained_on_only_the_hash_decides():
     assert {seed for seed in range(40) if HeldOutTraffics(4, (record,)).has(seed)} == test
     elsewhere = HeldOutTraffics(5, (record,))
     assert {seed for seed in range(40) if not elsewhere.has(seed)} == {3} - test
+    assert not HeldOutTraffics(4, (record,)).is_empty
+    whole = replace(record, test=0.0)
+    assert HeldOutTraffics(4, (record, whole)).is_empty
+    assert not HeldOutTraffics(5, (record, whole)).is_empty
 
 
 def test_compare_counts_held_out_traffics_only(place):
@@ -198,6 +203,7 @@ def test_a_rate_in_traffic_that_was_trained_on_is_no_evidence(place):
     assert pair.test == "intervals"
 
 
+@pytest.mark.nightly  # by day, compare counts the same pairs
 def test_gate_counts_held_out_traffics_only(place, shell):
     shell.folder = place
     for name, speed in (("gate_before", 12), ("gate_after", 2)):
@@ -212,5 +218,10 @@ def test_gate_counts_held_out_traffics_only(place, shell):
     assert found.json["pairs"] <= held_out
     assert found.json["trained_on"] > 0
     assert "pairs do not count: an agent was trained on traffics of this part" in found.err
-    elsewhere = shell.crashhunt(*words, "--max-steps", "60", "--most", "4", "--seed", "5", expect=None).json
-    assert (elsewhere["pairs"], elsewhere["trained_on"]) == (4, 0)
+    elsewhere = shell.crashhunt(*words, "--max-steps", "60", "--most", "2", "--seed", "5", expect=None).json
+    assert (elsewhere["pairs"], elsewhere["trained_on"]) == (2, 0)
+    record = place / "gate_after" / "trained_on.json"
+    record.write_text(json.dumps({**json.loads(record.read_text()), "test": 1e-9}))  # among 4 pairs, none is held out
+    refused = shell.crashhunt(*words, "--max-steps", "60", "--most", "4", "--seed", "4", expect=2).json["error"]
+    assert refused["message"] == "an agent was trained on all 4 traffics of this gate"
+    assert refused["fix"] == "give another --seed, or train with a test share"

@@ -226,20 +226,26 @@ def refused(crashes, **options):
 
 def test_bad_input_is_one_line(crashes, tmp_path):
     assert "crashes is empty" in refused([])
-    assert "'nowhere' is no directory" in refused("nowhere")
+    assert "'nowhere' is not a directory" in refused("nowhere")
     assert "no crash was saved here" in refused(tmp_path)
     for name, value in (
         ("before_s", 0.0), ("after_s", float("nan")), ("share", 1.5), ("test", 1.0), ("max_steps", 0),
         ("crash_reward", float("inf")),
     ):  # fmt: skip
         assert f"{name} is " in refused(crashes, **{name: value}), name
+    # As from a configuration file.
+    wrong = {"before_s": "5", "after_s": None, "share": "x", "test": None, "crash_reward": "a", "max_steps": 1.5}
+    for name, value in {**wrong, "agent": 3, "trained_on": "a\0b"}.items():
+        assert f"{name} is {value!r}" in refused(crashes, **{name: value})
+    for places in (7, [None], b"falls"):
+        assert f"crashes is {places!r}" in refused(places)
     assert "no controlled vehicle 'other'" in refused(crashes, agent="other")
     assert "crashes is in the training part (test=0.999999)" in refused(crashes, test=0.999999)
 
 
 def test_crashes_of_other_scenarios_and_spaces_are_refused(crashes, tmp_path):
     other = hunt(tmp_path, "other", scenario="another", trials=2)
-    assert "the crashes are of two scenarios: 'toy.toml' and 'another.toml'" in refused([crashes, other], test=0.0)
+    assert "the crashes belong to two scenarios: 'toy.toml' and 'another.toml'" in refused([crashes, other], test=0.0)
     continuous = hunt(tmp_path, "continuous", action="continuous", trials=2)
     assert "the action spaces differ: Discrete(5) and " in refused([crashes, continuous], test=0.0)
 

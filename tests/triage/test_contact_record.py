@@ -137,7 +137,7 @@ def test_jump_into_the_next_lane_is_the_fault_of_the_jumper(step_s, angle, side,
     jumps, stays = drives(10.0, y=-side, changes_s=0.0), drives(its, x=along)
     found = same_in_every_view(record(jumps, stays, step_s=step_s), angle)
     assert found[:5] == ("side swipe", "ego", "", ("ego",), "ego")
-    assert "ego moved sideways into other, which was beside it" in found[5][0].words
+    assert "ego moved sideways into other, which was next to it" in found[5][0].words
     found = same_in_every_view(record(stays, jumps, step_s=step_s), angle)
     assert found[:5] == ("side swipe", "other", "", ("other",), "the other")
 
@@ -202,3 +202,15 @@ def test_red_light_ends_where_the_vehicle_has_left_the_junction():
     assert case.is_past(red, -1.0)  # 10 m further, and it is 5 m long
     assert not case.is_past(red, 0.0)
     assert not case.is_past(inside, -1.0)
+
+
+@pytest.mark.parametrize(
+    ("gap_m", "reported", "verdict"), [(1.4, "other", False), (1.4, "ego", True), (0.9, "other", True)]
+)
+def test_reported_collision_that_the_outlines_contradict_has_no_verdict(gap_m, reported, verdict):
+    """SUMO reports collisions of vehicles whose outlines do not touch, here with the vehicle ahead as the collider."""
+    case = record(drives(15.0), drives(8.0, x=5.0 + gap_m), step_s=0.2, reported_collider=reported)
+    assert case.touch.gap_m == pytest.approx(gap_m, abs=0.01)
+    assert (case.manner == "rear end") is verdict
+    assert (fault_in(case).verdict == "ego") is verdict
+    assert bool(case.follower) is verdict

@@ -83,7 +83,7 @@ def test_recorded_prefix_ends_where_the_first_change_begins():
 
 def test_excluded_actors_must_have_entered():
     assert LeaveOut(actors=("b",)).taking_part(("a", "b", "c")) == ("a", "c")
-    with pytest.raises(UsageError, match="--leave-out 'd': no such actor enters"):
+    with pytest.raises(UsageError, match="--leave-out 'd': there is no such actor"):
         LeaveOut(actors=("d",)).taking_part(("a", "b"))
 
 

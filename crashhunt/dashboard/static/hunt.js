@@ -432,7 +432,12 @@ async function showWeights() {
   }));
 }
 let trialsSeen = -1, crashesSeen = "", mapSeen = "";
+const getTrials = () => get(`${API}/trials?since=${cursor}`, { always: true }), getCrashes = () => get(`${API}/crashes`);
 async function refresh() {
+  /* The first time all are asked for at once, as none needs the answer of another. An error is told where it is awaited.
+     These answers may be older than that of the hunt, so that the next turn asks for what is new in them. */
+  const [trialsAsked, crashesAsked] = trialsSeen < 0 ? [getTrials(), getCrashes()] : [];
+  for (const one of [trialsAsked, crashesAsked]) one?.catch(() => {});
   let data;
   try { data = await get(API); } catch (error) {
     if (error instanceof Refused && error.status === 404) { setText($("state"), "gone"); $("state").className = "state error"; }
@@ -446,22 +451,22 @@ async function refresh() {
   if (!hunt) return;
   let changed = Boolean(data);
   if (hunt.trials_run !== trialsSeen || hunt.damaged) {
-    const found = await get(`${API}/trials?since=${cursor}`, { always: true });
+    const found = await (trialsAsked ?? getTrials());
     if (found.replace) { points = []; byNumber.clear(); }
     points.push(...found.points);
     for (const one of found.points) byNumber.set(one.number, one);
     cursor = found.cursor;
     shares = found;
-    trialsSeen = hunt.trials_run;
-    changed = true;
+    trialsSeen = trialsAsked ? 0 : hunt.trials_run;
+    changed ||= found.replace || found.points.length > 0;
   }
   const key = `${hunt.crashes} ${hunt.state} ${hunt.trials_run}`;
   if (key !== crashesSeen) {
-    const found = await get(`${API}/crashes`);
+    const found = await (crashesAsked ?? getCrashes());
     if (found) {
       crashes = found.crashes;
       setText($("pending"), found.pending ? `${plural(found.pending, "crash is", "crashes are")} still being analysed` : "");
-      if (!found.pending) crashesSeen = key;
+      if (!found.pending && !crashesAsked) crashesSeen = key;
       showCrashes();
       showKinds();
       changed = true;

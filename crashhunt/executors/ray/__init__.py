@@ -1,4 +1,4 @@
-"""Trials on all machines of a Ray cluster; Ray itself is imported in a process of its own."""
+"""Trials on all machines of a Ray cluster; Ray itself is imported in its own process."""
 
 import lazy_loader
 

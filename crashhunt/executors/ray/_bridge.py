@@ -77,7 +77,7 @@ class Trial:
 
     @property
     def alone(self) -> bool:
-        """Whether it gets a node of its own."""
+        """Whether it gets its own node."""
         return self.losses >= _TRIAL_LOSSES
 
 
@@ -88,8 +88,8 @@ class Node:
     Args:
         id: of this part.
         machine: Ray's.
-        name: of the machine, for people.
-        slots: how many trials at a time.
+        name: name of the machine, for people.
+        slots: number of trials at a time.
         actor: that stands there.
         stood: since when, as of `time.monotonic`.
         doing: what it was asked last, and has not answered yet.
@@ -392,14 +392,14 @@ class Bridge:
         if able and all(name in self._refused for name in able):
             raise UsageError(
                 f"no node of the cluster can run the trials: {next(iter(self._refused.values()))}",
-                fix="install there what is here, and run the same command again",
+                fix="install the same packages there, and run the same command again",
             )
         if not self._ever_ready and time.monotonic() - self._began > _FREE_S:
             cpus = sum(found.cpus for found in able.values())
             why = f"none of its {cpus} CPUs is free" if cpus else "none of its nodes has a CPU for work"
             raise UsageError(
-                f"the Ray cluster at {self._cluster.address} can run nothing: {why}",
-                fix="wait until others are done, or add a node with 'ray start --address=...'",
+                f"the Ray cluster at {self._cluster.address} cannot run trials: {why}",
+                fix="wait until other jobs are done, or add a node with 'ray start --address=...'",
             )
         if self._ever_ready and not self._alone:
             self._alone = True
@@ -502,7 +502,7 @@ class Bridge:
                 unpacked({layout.MAP: common}, folder if (scratch / layout.MAP).exists() else scratch)
         except OSError as error:
             raise RecorderError(
-                f"what came back from {node.name} cannot be written here: {error.strerror or error}",
+                f"the results from {node.name} cannot be written here: {error.strerror or error}",
                 fix="free some space and run the same command again",
                 where=str(error.filename or ""),
             ) from error

@@ -119,12 +119,12 @@ def cluster_of(argument: str) -> Meant:
     if "://" in wanted:
         what = "the Ray Client" if wanted.startswith("ray://") else "a service such as Ray's dashboard"
         raise UsageError(
-            f"{whence} is an address of {what}, which a hunt does not use",
-            fix="run the hunt on a machine of the cluster, with the address that 'ray start' was given there",
+            f"{whence} is an address of {what}, which hunts do not support",
+            fix="run the hunt on a machine of the cluster, with the address given to 'ray start'",
         )
     host, colon, port = wanted.rpartition(":")
     if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise UsageError(f"{whence} is no address HOST:PORT", fix=f"write --executor ray:{host or wanted}:6379")
+        raise UsageError(f"{whence} is not an address HOST:PORT", fix=f"write --executor ray:{host or wanted}:6379")
     why = silent(wanted)
     if why:
         raise UsageError(f"{whence}: {why}", fix=_START)
@@ -132,7 +132,7 @@ def cluster_of(argument: str) -> Meant:
 
 
 def silent(address: str) -> str:
-    """Return why no cluster answers at an address; empty where one may, which takes a few seconds at most."""
+    """Return why no cluster answers at an address; empty if one may, which takes a few seconds at most."""
     host, _, port = address.rpartition(":")
     said: queue.SimpleQueue[str] = queue.SimpleQueue()
 
@@ -153,7 +153,7 @@ def silent(address: str) -> str:
 
 
 def _greeting(connection: socket.socket) -> str:
-    """Return why the listening process is no head of Ray, which speaks HTTP/2; empty where it may be one."""
+    """Return why the listening process is no head of Ray, which speaks HTTP/2; empty if it may be one."""
     if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):
         return ""
     found = b""
@@ -179,7 +179,7 @@ def _joined(address: str) -> Meant:
     there_is = there_is or Path("~/.ray/auth_token").expanduser().exists()
     mode = os.environ.get("RAY_AUTH_MODE", "")
     if mode == "token" and not there_is:
-        raise UsageError("RAY_AUTH_MODE=token, and there is no token", fix=TOKEN)
+        raise UsageError("RAY_AUTH_MODE is token, but there is no token", fix=TOKEN)
     return Meant(address, {}, {"RAY_AUTH_MODE": "token"} if not mode and there_is and _here(address) else {})
 
 
@@ -228,8 +228,8 @@ class Found:
 
     Args:
         id: Ray's.
-        name: for people.
-        cpus: for work.
+        name: name for people.
+        cpus: cpus for work.
         free: those that are not in use.
     """
 
@@ -243,8 +243,8 @@ class Cluster:
     """A connection to a cluster, of which a process has one.
 
     Args:
-        address: of it; empty for one of our own, which ends with this process.
-        cpus: of one of our own.
+        address: address of the cluster; empty for one of our own, which ends with this process.
+        cpus: cpus of one of our own.
         temporary: the folder for files of one of our own.
 
     Raises:
@@ -383,7 +383,7 @@ class Cluster:
         Args:
             actors: all that were started.
             ready: those that run trials.
-            wait_s: for the ready ones to end their work, in s.
+            wait_s: wait for the ready ones to end their work, in s.
         """
         with suppress(Exception):
             closed = [self.order(actor, "close") for actor in ready]
@@ -420,11 +420,11 @@ def _greet(address: str) -> None:
     if type(error).__name__ == "AuthenticationError":  # which older ones lack, as they lack tokens
         shown = os.environ.get("RAY_AUTH_MODE") == "token"
         raise TokenError(
-            f"the Ray cluster at {address} {'takes another token than this one' if shown else 'asks for a token'}",
+            f"the Ray cluster at {address} {'expects another token' if shown else 'needs a token'}",
             fix=TOKEN if shown else f"set RAY_AUTH_MODE=token, and {TOKEN}",
         )
     raise UnreachableError(
-        f"what answers at {address} is not the head of a Ray cluster: {_in_short(error)}",
+        f"the server at {address} is not the head of a Ray cluster: {_in_short(error)}",
         fix="give the address that 'ray start --head' has printed; its port is 6379 unless another was chosen",
     )
 

@@ -41,7 +41,7 @@ class Parcel:
     Args:
         files: place in the parcel to file.
         folders: folder or file here to its place in the parcel, for `settings_in`.
-        home: the place of the current folder; empty where none does.
+        home: the place of the current folder; empty if none does.
     """
 
     files: dict[str, Path]
@@ -73,9 +73,10 @@ class Parcel:
         if total > LIMIT_MB:
             largest = max(sizes, key=lambda path: sizes[path])
             raise UsageError(
-                f"scenario and code have {total:.0f} MB, above the {LIMIT_MB} MB that travel well to other machines; "
+                f"scenario and code have {total:.0f} MB, above the {LIMIT_MB} MB that crashhunt sends to other "
+                "machines; "
                 f"the largest file is {largest} ({sizes[largest] / _MEGABYTE:.0f} MB)",
-                fix="make it smaller, or have git ignore what the agent does not need",
+                fix="make it smaller, or list unneeded files in .gitignore",
             )
         return cls(files, folders, next((folders[folder] for folder in settings.code if _is_here(Path(folder))), ""))
 
@@ -104,7 +105,7 @@ def settings_in(settings: WorkerSettings, folders: dict[str, str], root: Path, s
     """Return the settings of a hunt as they are where a parcel has been unpacked.
 
     Args:
-        settings: of the hunt, on the machine where it was begun.
+        settings: settings of the hunt, on the machine where it was begun.
         folders: those of the parcel.
         root: where it lies here.
         scratch: the folder in which workers write here.
@@ -135,7 +136,7 @@ def unpack(packed: bytes, digest: str, root: Path) -> None:
             for entry in archive.infolist():
                 place = PurePosixPath(os.fsdecode(entry.filename.encode("latin-1")))
                 if place.is_absolute() or ".." in place.parts:
-                    raise ValueError(f"the name {entry.filename!r} leads out of it")
+                    raise ValueError(f"the path {entry.filename!r} leads out of the archive")
                 path = root / place
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(archive.read(entry))
@@ -143,9 +144,9 @@ def unpack(packed: bytes, digest: str, root: Path) -> None:
                     path.chmod(0o755)
                 found[entry.filename] = _described(path)
         if digest_of_data(found) != digest:
-            raise ValueError("its digest is another one")
+            raise ValueError("its digest does not match")
     except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
-        raise BundleError(f"the parcel {digest} is damaged: {error}", fix="have it sent again") from None
+        raise BundleError(f"the code archive {digest} is damaged: {error}", fix="run the hunt again") from None
 
 
 def _is_here(folder: Path) -> bool:
@@ -184,7 +185,7 @@ class Folder:
     """A new folder with a short name, of letters that Ray knows; those whose owners are gone are removed first.
 
     Args:
-        parent: of it; the folder for temporary files by default, where its name is such.
+        parent: parent of it; the folder for temporary files by default, where its name is such.
     """
 
     def __init__(self, parent: Path | None = None) -> None:
@@ -235,7 +236,7 @@ class Store:
     """The folder of this user on this machine, which all its nodes share.
 
     Args:
-        folder: of it; one below the folder for temporary files by default.
+        folder: folder of the store; one below the folder for temporary files by default.
         kept_bytes: how much of parcels is kept; the ones that were used last.
     """
 
@@ -252,7 +253,7 @@ class Store:
             self._folder = Path(tempfile.mkdtemp(prefix="crashhunt-"))
 
     def find(self, digest: str) -> bytes | None:
-        """Return a parcel, or None where it is not there; the unpacking detects damage."""
+        """Return a parcel, or None if it is not there; the unpacking detects damage."""
         file = self._file(digest)
         try:
             packed = file.read_bytes()
@@ -307,7 +308,7 @@ class Place:
     """The folder of one hunt on a node, which is its own as long as this process lives.
 
     Args:
-        path: of it.
+        path: path of it.
     """
 
     def __init__(self, path: Path) -> None:

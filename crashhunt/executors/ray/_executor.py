@@ -42,16 +42,16 @@ _numbers = itertools.count()
 
 
 class RayExecutor:
-    """Runs trials on all machines of a Ray cluster, on each in a pool of its own.
+    """Runs trials on all machines of a Ray cluster, on each in its own pool.
 
     A separate process, the bridge (``_bridge.py``), uses Ray and may be lost. Every submitted trial without a result
     is then submitted again to the next bridge.
 
     Args:
-        settings: of the hunt.
-        parallel: how many trials at a time over the whole cluster; 0 for all of its CPUs, now and later.
+        settings: settings of the hunt.
+        parallel: number of trials at a time over the whole cluster; 0 for all of its CPUs, now and later.
         recycle_after: trials after which a worker is replaced by a fresh one; 0 for never.
-        argument: of ``--executor ray:ADDRESS``: see `cluster_of`.
+        argument: argument of ``--executor ray:ADDRESS``: see `cluster_of`.
 
     Raises:
         PluginError: Ray is not installed.
@@ -275,7 +275,7 @@ class RayExecutor:
         if not self._ever_up or (not self._address and self._losses >= _LOSSES):
             lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             raise CrashhuntError(
-                f"Ray has ended on its own{f': {lines[-1]}' if lines else ''}",
+                f"Ray has ended unexpectedly{f': {lines[-1]}' if lines else ''}",
                 fix="raise the limits on memory (ulimit -v) and processes (ulimit -u), and run the same command again",
             )
         self._notes.add(f"the Ray cluster was lost{f' ({why})' if why else ''}; the hunt waits until it is back")

@@ -56,7 +56,7 @@ class ToBridge(TypedDict, total=False):
 
 
 class Figures(TypedDict):
-    """A node for people who watch: how many trials at a time, how many have ended, and how many a second."""
+    """A node for people who watch: number of trials at a time, how many have ended, and how many a second."""
 
     name: str
     parallel: int
@@ -87,10 +87,10 @@ class Ended(NamedTuple):
     """A trial that has ended on a node.
 
     Attributes:
-        ticket: under which it was submitted.
-        number: of the trial.
+        ticket: ticket under which it was submitted.
+        number: number of the trial.
         line: the message for the hunt, which no process in between reads.
-        files: of its scratch folder where it is kept, by name, compressed.
+        files: files of its scratch folder where it is kept, by name, compressed.
     """
 
     ticket: int
@@ -104,10 +104,10 @@ class News(NamedTuple):
 
     Attributes:
         ended: trials.
-        where: number of a running trial to where it is; None where it was not requested.
-        notes: for people.
-        error: why no trial can be run here; None where they can.
-        map: of all trials, when the first one is kept; compressed.
+        where: number of each running trial to where it is; None if it was not requested.
+        notes: notes for people.
+        error: why no trial can be run here; None if they can.
+        map: map of all trials, when the first one is kept; compressed.
     """
 
     ended: list[Ended]

@@ -25,7 +25,7 @@ class Site:
         self._work: Any = None
 
     def differs(self, versions: dict[str, str], code: str) -> str:
-        """Say what is installed here in another version than where the hunt runs; empty where nothing is.
+        """Say what is installed here in another version than where the hunt runs; empty if nothing is.
 
         Args:
             versions: name to version of what results depend on.
@@ -69,7 +69,7 @@ class Site:
         self._work.submit(trials)
 
     def cancel(self, above: int, before: int) -> None:
-        """Give up trials, also those that come later on another way than this does."""
+        """Cancel trials, also those that arrive after this message."""
         self._work.cancel(above, before)
 
     def take(self, wait_s: float, trials: list[tuple[int, dict[str, Any]]]) -> Any:

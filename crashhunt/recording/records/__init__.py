@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["RECORD_TYPES", "Tag"]
 
-# In the order in which those of one step are compared: what an agent saw and did, what came of it.
+# In the order in which those of one step are compared: what an agent saw and did, the result.
 RECORD_TYPES: dict[int, RecordType] = {
     kind.tag: kind
     for kind in (

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.recording._divergence import Divergence, first_difference
+from crashhunt.recording._reading import Divergence, first_difference
 from crashhunt.recording._values import describe_value, is_opaque
 from crashhunt.recording.records._type import Form, RecordType, TextForm
 
@@ -66,7 +66,7 @@ class ArrayForm(Form):
     def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
         """Return their bytes."""
         if prologue is None:
-            raise ValueError("an array comes before the beginning")
+            raise ValueError("an array precedes the beginning of the recording")
         return np.array(list(message.values), getattr(prologue.agents[aux], self._what)).tobytes()
 
 
@@ -125,7 +125,7 @@ def _array_record(tag: int, what: str) -> RecordType:
     """Return the type of a record of one array per agent and step, as raw bytes; ``aux`` is the agent's number.
 
     Args:
-        tag: of the record.
+        tag: tag of the record.
         what: ``observation`` or ``action``, as in the fields of `AgentChannel` and `StepRecord`.
     """
 

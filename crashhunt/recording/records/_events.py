@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any, TypedDict
 
-from crashhunt.recording._divergence import Divergence
+from crashhunt.recording._reading import Divergence
 from crashhunt.recording.records._type import RecordType, TextForm, scene_texts
 from crashhunt.trial import Disturbance
 from crashhunt.world import Contact, Event

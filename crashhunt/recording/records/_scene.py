@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.recording._divergence import Divergence, first_difference
-from crashhunt.recording._reading import StepRecord
+from crashhunt.recording._reading import Divergence, StepRecord, first_difference
 from crashhunt.recording.records._type import SCENE, Form, RecordType, TextForm, scene_texts
 from crashhunt.world import Actor, Roster, Scene
 
@@ -161,13 +160,13 @@ def _read_step(reading: Reading, _aux: int, payload: bytes) -> None:
     rewards, values = values[: len(agents)], values[len(agents) :]
     count = len(reading.roster)
     if step != len(steps) or len(rewards) != len(agents) or len(values) != 4 * count:
-        raise ValueError(f"step {step} follows {len(steps) - 1}")
+        raise ValueError(f"step {step} follows step {len(steps) - 1}")
     points = list(zip(values[: 2 * count : 2], values[1 : 2 * count : 2], strict=True))
     headings, speeds = values[2 * count : 3 * count], values[3 * count :]
     parts: SceneParts = {"heights": [], "grades": [], **reading.scene}
     scene = current.scene = Scene(time_s, reading.roster, points, headings, speeds, **parts)
     if len(scene.heights) not in (0, count) or any(row >= count for row in scene.spines):
-        raise ValueError(f"step {step} is about more actors than there are")
+        raise ValueError(f"step {step} has more actors than the recording")
     scene.events = reading.events
     scene.previous = steps[-1].scene if steps else None
     current.step = step
@@ -339,8 +338,8 @@ def select_actors(tag: int, payload: bytes, mask: NDArray[np.bool_], agents: int
     """Return the payload of a record about some of the actors of its roster; of another type, the payload as it is.
 
     Args:
-        tag: of the record.
-        payload: of the record, about all actors of the roster.
+        tag: tag of the record.
+        payload: payload of the record, about all actors of the roster.
         mask: whether to keep each actor of the roster, shape (actors,).
         agents: number of controlled vehicles.
     """

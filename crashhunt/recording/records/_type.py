@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from crashhunt.recording._divergence import Divergence
+from crashhunt.recording._reading import Divergence
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -73,7 +73,7 @@ class BytesForm(Form):
     messages: Mapping[str, Mapping[str, str]] = {"Bytes": {"data": "bytes"}}
 
     def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
-        """Return it as it is."""
+        """Return the argument unchanged."""
         return "Bytes", {"data": payload}
 
     def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
@@ -88,14 +88,15 @@ class RecordType:
 
     Args:
         tag: its number in the black box; from `FIRST_ASIDE` on it is no evidence. Never given twice.
-        name: for people, and for the place of a value.
-        topic: of its messages in a log; ``{agent}`` is replaced by the agent whose number is the record's ``aux``.
+        name: name for people, and for the place of a value.
+        topic: topic of its messages in a log; ``{agent}`` is replaced by the agent whose number is the record's
+            ``aux``.
         form: how it looks there. A type that came after the first eleven is text or bytes, so that a crashhunt that
             does not know it can read the record and count it in the digest; what people want to see of it is a view.
         read: adds a record, given as ``aux`` and payload, to what has been read so far.
         difference: the first difference between what two equal steps hold of it; of one agent, where ``{agent}`` is in
-            the topic. None where it is never compared, or with another type.
-        value: of the agent or actor of a divergence, the value at an index, for the steps around.
+            the topic. None if it is never compared, or with another type.
+        value: value of the agent or actor of a divergence, the value at an index, for the steps around.
     """
 
     tag: int

@@ -45,9 +45,9 @@ class GymSetup:
 
     Args:
         id: as `gymnasium.make` takes it, or ``module:factory``, which is called with ``kwargs``.
-        kwargs: of the environment.
+        kwargs: keyword arguments of the environment.
         crash: what counts as a crash.
-        learner: of a parallel environment of PettingZoo, the agent that is tested; empty for the first.
+        learner: learner of a parallel environment of PettingZoo, the agent that is tested; empty for the first.
         others: of a parallel environment, ``module:function``, which is called with name, observation, action space and
             random generator of each other agent and returns its action. Empty for random actions.
         danger: the criticality of a step without a scene. ``info.KEY`` is a number of the info from 0 to 1.
@@ -74,7 +74,7 @@ def _check(scenario: Scenario, where: str) -> None:
     danger = scenario.table(GymSetup).danger
     if danger and not re.fullmatch(r"-?info\..+", danger):
         fix = "write info.KEY, or -info.KEY of a number that is less the more dangerous it is"
-        raise ScenarioError(f"gym.danger = {danger!r} names nothing", fix=fix, where=where)
+        raise ScenarioError(f"gym.danger = {danger!r} does not exist", fix=fix, where=where)
 
 
 def _modules(scenario: Scenario) -> Iterable[str]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ACCELERATED", "BACKEND", "HighwaySetup"]
 
-ACCELERATED = {"1.12.1": "744f46c99845090f"}
+ACCELERATED = {"1.12.1": "dee681ce9465e0ef"}
 """The versions of highway-env that the accelerator knows, and the digest of the modules in which it replaces
 something."""
 _KERNEL = "_crashhunt_highway"  # the compiled module of the accelerator

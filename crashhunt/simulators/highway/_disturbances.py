@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance
 
 
-__all__ = ["HighwayDisturbances", "crosses", "place_of"]
+__all__ = ["HighwayDisturbances", "crosses", "lanes_ahead", "place_of"]
 
 
 # Paths of vehicles through a junction: which paths cross the agent's path.
@@ -61,7 +61,7 @@ def _way(network: RoadNetwork, vehicle: Any) -> tuple[set[_Road], NDArray[np.flo
     """Return the roads of a vehicle's path, and the points of the path, 2 m apart."""
     along = float(vehicle.lane.local_coordinates(vehicle.position)[0])
     roads, points, driven = set(), [vehicle.position], 0.0
-    for index in _lanes(network, vehicle):
+    for index in lanes_ahead(network, vehicle):
         roads.add(index[:2])
         lane = network.get_lane(index)
         while along < lane.length and driven < _REACH_M:
@@ -73,12 +73,19 @@ def _way(network: RoadNetwork, vehicle: Any) -> tuple[set[_Road], NDArray[np.flo
     return roads, np.array(points)
 
 
-def _lanes(network: RoadNetwork, vehicle: Any) -> Iterator[tuple[str, str, int]]:
+def lanes_ahead(
+    network: RoadNetwork, vehicle: Any, index: tuple[str, str, int] | None = None
+) -> Iterator[tuple[str, str, int]]:
     """Yield a vehicle's lane and the lanes after it, up to a fork for which the vehicle has no route.
 
     At such a fork, `RoadNetwork.next_lane` would draw a lane at random and change the simulation.
+
+    Args:
+        network: of the road.
+        vehicle: with its route, where it has one.
+        index: of the first lane; None for that of the vehicle.
     """
-    start, end, number = vehicle.lane_index
+    start, end, number = index or vehicle.lane_index
     # Only a ControlledVehicle has a planned route.
     route = vehicle.route if isinstance(vehicle, ControlledVehicle) else None
     planned = {road[0]: road[1] for road in route or ()}

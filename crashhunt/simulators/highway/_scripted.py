@@ -100,7 +100,7 @@ class Puppets:
         begins = {path.actor.id: path.states[0] for path in script.agents if path.first == 0}
         for agent, vehicle in agents.items():
             if agent not in begins:
-                raise InvalidEpisodeError(f"where {agent!r} is to begin is not known")
+                raise InvalidEpisodeError(f"the start position of {agent!r} is unknown")
             _place(vehicle, begins[agent], late=script.time_s > 0)
         self.things: list[tuple[Path, RoadObject]] = [
             (path, _thing(road, path, sub_steps, step_length_s)) for path in script.others

@@ -38,6 +38,7 @@ from crashhunt.simulators.highway._config import configured, mistake, restore_cl
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances
 from crashhunt.simulators.highway._scene import Hidden, HighwayEvents, TakingPart, contact_of, lanes_of
 from crashhunt.simulators.highway._scripted import Puppet, Puppets
+from crashhunt.simulators.highway._surroundings import surroundings_of
 from crashhunt.world import Actor, Lane, Roster, Scene
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.simulators._protocol import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Contact, Event, Paths
+    from crashhunt.world import Contact, Event, Paths, Surroundings
 
 __all__ = ["HighwaySimulator"]
 
@@ -195,6 +196,12 @@ class HighwaySimulator:
         if isinstance(kind, DiscreteMetaAction) and "SLOWER" in kind.actions_indexes:
             return FullBraking(kind.actions_indexes["SLOWER"], "by answering SLOWER in every step")
         return None
+
+    def surroundings(self, agent: str) -> Surroundings:
+        """Return what a careful driver of an agent's vehicle would consider."""
+        vehicle = self._controlled[agent]
+        others = (thing for thing in self._objects() if thing is not vehicle)
+        return surroundings_of(self._env.road.network, vehicle, others, lambda thing: self._actor(thing).id)
 
     def resolve_target(self, disturbance: Disturbance) -> str:
         """Return the identifier of the vehicle at the disturbance's place around its agent; empty if none is there."""

@@ -36,8 +36,8 @@ def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]
         vehicle = str(arguments.get(setup.replaces, ""))
         if vehicle in found:
             raise InvalidEpisodeError(
-                f"{found[vehicle]} and {agent} both take the place of the vehicle {vehicle!r}",
-                fix="let them draw from different vehicles",
+                f"{found[vehicle]} and {agent} both replace the vehicle {vehicle!r}",
+                fix="give each its own candidates",
             )
         found[vehicle] = agent
     return found
@@ -105,7 +105,7 @@ def enter(
     if gone:
         raise InvalidEpisodeError(
             f"the vehicle {min(gone)!r} had left again before all controlled vehicles were on the road",
-            fix="let them enter closer together",
+            fix="let all vehicles enter within a shorter time",
         )
     for agent, setup in setups.items():
         sumo.vehicle_setSpeedMode(agent, setup.speed_mode)
@@ -119,7 +119,7 @@ def _add(agent: str, setup: AgentSetup) -> None:
         if len(edges) == 2:
             edges = list(libsumo.simulation.findRoute(edges[0], edges[1], setup.type).edges)
             if not edges:
-                raise InvalidEpisodeError(f"there is no way from {setup.edges[0]!r} to {setup.edges[1]!r}")
+                raise InvalidEpisodeError(f"there is no route from {setup.edges[0]!r} to {setup.edges[1]!r}")
         route = f"crashhunt.{agent}"
         libsumo.route.add(route, edges)
     depart = "now" if setup.depart_s is None else str(max(setup.depart_s, libsumo.simulation.getTime()))

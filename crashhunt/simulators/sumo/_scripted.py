@@ -102,7 +102,7 @@ def place_agents(script: Paths) -> None:
     for path in script.agents:
         agent, state = path.actor.id, path.states[0]
         if path.first > 0 or not path.lanes or path.lanes[0][0] > 0 or agent not in sumo.vehicle_getIDList():
-            raise InvalidEpisodeError(f"where {agent!r} is to begin is not known")
+            raise InvalidEpisodeError(f"the start position of {agent!r} is unknown")
         lane = path.lanes[0][1]
         libsumo.vehicle.moveTo(agent, lane, _along(lane, (state.x, state.y)))
         libsumo.vehicle.setPreviousSpeed(agent, state.speed)

@@ -1,6 +1,6 @@
 """Simulates the plain traffic of a scenario, without a controlled vehicle, and reports which vehicles enter and when.
 
-libsumo holds one simulation per process, so this module runs in a process of its own, with this command:
+libsumo holds one simulation per process, so this module runs in its own process, with this command:
 ``python -m crashhunt.simulators.sumo._traffic_survey JOB``. It reads the job from the JSON file JOB and writes the
 answer to another JSON file. SUMO's own output goes to standard output.
 """

@@ -1,4 +1,4 @@
-"""Who is controlled in a bare ``.sumocfg``: a vehicle that ``--ego`` names or adds, or another one in each trial."""
+"""The controlled vehicle of a bare ``.sumocfg``: one that ``--ego`` names or adds, or another in each trial."""
 
 from __future__ import annotations
 
@@ -100,12 +100,12 @@ def seconds(text: str, path: Path) -> float:
 
 
 def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
-    """Return who is controlled.
+    """Return the controlled vehicles.
 
     Args:
         ego: ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty: any, if one departs.
         files: routes and additional files.
-        begin: of the simulation, in s.
+        begin: start of the simulation, in s.
         path: the configuration, for errors.
 
     Raises:
@@ -136,7 +136,7 @@ def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
             arguments={},
         )
     raise ScenarioError(
-        f"--ego {ego!r} is not understood", fix="write VEHICLE, route=ID, edges=FROM,TO or any", where=str(path)
+        f"--ego {ego!r} is not valid", fix="write VEHICLE, route=ID, edges=FROM,TO or any", where=str(path)
     )
 
 
@@ -159,7 +159,7 @@ def draw_among(
     Args:
         known: the vehicles, at least one, by time.
         why: the beginning of the note.
-        verb: of the note: what the vehicles do at their times.
+        verb: verb of the note: what the vehicles do at their times.
         few: with fewer candidates than this in the window of times, all of ``known`` are candidates.
         keep_agent: the id that the controlled vehicle keeps, where that is possible; empty to choose one.
     """
@@ -287,7 +287,7 @@ def _elements(files: list[Path], *tags: str) -> list[ET.Element]:
                 elif element.tag not in ("routes", "additional"):
                     element.clear()
         except (ET.ParseError, LookupError, ValueError) as error:
-            raise ScenarioError(f"not valid XML: {error}", fix="mend the file", where=str(file)) from None
+            raise ScenarioError(f"not valid XML: {error}", fix="correct the file", where=str(file)) from None
     return found
 
 
@@ -344,7 +344,7 @@ def refine(scenario: Scenario, answer: Json) -> Scenario:
     """Return the scenario with the vehicles that entered in every run as candidates, and with notes on the traffic.
 
     Args:
-        scenario: of a ``.sumocfg``, with the candidates that its route files promise.
+        scenario: scenario of a ``.sumocfg``, with the candidates that its route files promise.
         answer: the runs, at least one, as `SurveyedRun`.
 
     Raises:
@@ -382,7 +382,7 @@ def refine(scenario: Scenario, answer: Json) -> Scenario:
 
 
 def restore(scenario: Scenario, kept: Scenario) -> Scenario | None:
-    """Return the scenario with the candidates of the hunt that kept ``kept``; None where that hunt drew none."""
+    """Return the scenario with the candidates of the hunt that kept ``kept``; None if that hunt drew none."""
     agent, *others = kept.agents
     before = kept.agents[agent]
     if others or before.replaces != EGO_VEHICLE or EGO_VEHICLE not in kept.arguments:

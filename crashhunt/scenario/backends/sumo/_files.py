@@ -70,11 +70,11 @@ class Reference:
     """An attribute of an XML file that names another file.
 
     Args:
-        tag: of the element.
-        attribute: of it.
-        value: the name, as it is there.
+        tag: tag of the element.
+        attribute: name of the attribute.
+        value: the name in the file.
         kind: whether SUMO reads or writes it.
-        offset: of the element in the file, in bytes.
+        offset: offset of the element in the file, in bytes.
     """
 
     tag: str
@@ -100,10 +100,10 @@ def read_xml(path: Path) -> bytes:
             with gzip.open(path) as packed:
                 content = packed.read(_MAX_BYTES + 1)
         if len(content) > _MAX_BYTES:
-            raise EOFError("it has more than a gigabyte")
+            raise EOFError("the file is larger than 1 GB")
     except (OSError, EOFError, zlib.error) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise ScenarioError(f"cannot be read: {reason}", fix="mend the file", where=str(path)) from None
+        raise ScenarioError(f"cannot be read: {reason}", fix="correct the file", where=str(path)) from None
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         text = re.sub(r"(<\?xml[^>]*?)\s+encoding\s*=\s*(\"[^\"]*\"|'[^']*')", r"\1", content.decode("utf-16"), count=1)
         return text.encode()
@@ -147,7 +147,7 @@ def references(content: bytes, where: str) -> list[Reference]:
     try:
         parser.Parse(content, True)
     except (expat.ExpatError, ValueError) as error:
-        raise ScenarioError(f"not valid XML: {error}", fix="mend the file", where=where) from None
+        raise ScenarioError(f"not valid XML: {error}", fix="correct the file", where=where) from None
     return found
 
 
@@ -160,7 +160,7 @@ def rewritten(content: bytes, found: list[Reference], name: Callable[[Reference]
     """Return an XML file in which attributes name other files; all else stays as it is.
 
     Args:
-        content: of the file.
+        content: content of the file.
         found: what `references` has found in it.
         name: what each is to name; what it does already changes nothing.
     """
@@ -187,7 +187,7 @@ def _place(content: bytes, reference: Reference) -> tuple[int, int] | None:
 
 
 def movable(path: Path) -> bytes | None:
-    """Return the content of a file as it is right wherever its folder goes; None where it is so already.
+    """Return the content of a file as it is right wherever its folder goes; None if it is so already.
 
     Raises:
         ScenarioError: it cannot be read.
@@ -206,7 +206,7 @@ def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) 
     """Return the files that some files have SUMO read, and those that these do, relative to the folder.
 
     Args:
-        folder: of the scenario.
+        folder: folder of the scenario.
         names: files in it.
         inside: refuse what lies outside the folder, before it is looked at.
 
@@ -228,7 +228,7 @@ def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) 
 
 
 def written_by(folder: Path, names: tuple[str, ...]) -> list[str]:
-    """Return what files would have SUMO write, in words; nothing where they would not."""
+    """Return what files would have SUMO write, in words; nothing if they would not."""
     found = [
         f"{name}: {reference}"
         for name in dict.fromkeys((*names, *nested_files(folder, names)))
@@ -267,7 +267,7 @@ def _targets(path: Path, _mtime_ns: int, _size: int) -> tuple[str, ...]:
         # As SUMO does it: relative to the file that names it, and ${NAME} is no variable here.
         target = os.path.normpath(path.parent / reference.value)
         if not os.path.isfile(target):  # noqa: PTH113
-            fix = "name one file; an argument cannot choose it" if "${" in target else "mend the path"
+            fix = "name one file; an argument cannot choose it" if "${" in target else "correct the path"
             raise ScenarioError(f"{reference}: there is no file {target!r}", fix=fix, where=str(path))
         targets.append(target)
     return tuple(targets)
@@ -285,7 +285,7 @@ class StagedFiles:
 
     Args:
         scenario: whose files.
-        folder: to stage them in; must exist.
+        folder: folder to stage them in; must exist.
     """
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
@@ -319,7 +319,7 @@ class StagedFiles:
                 text = _substitute(template, values)
             except (KeyError, ValueError) as error:
                 raise InvalidEpisodeError(
-                    f"{path.name} asks for the scenario argument {error}",
+                    f"{path.name} uses the scenario argument {error}",
                     fix="declare it under [arguments]",
                     where=self._scenario.origin,
                 ) from None

@@ -24,8 +24,8 @@ def load_map(path: Path, ego: str) -> Scenario:
         ScenarioError: the map cannot be used, or a vehicle is named.
     """
     if ego:
-        fix = "leave it out, or make the scenario yourself: crashhunt init DIR"
-        raise ScenarioError(f"--ego {ego!r} does not go with a map", fix=fix, where=str(path))
+        fix = "omit the option, or make the scenario yourself: crashhunt init DIR"
+        raise ScenarioError(f"--ego {ego!r} cannot be used with a map", fix=fix, where=str(path))
     folder = cached_scenario(path)
     scenario = load_scenario(folder)
     note = f"the scenario of {path.name} is {folder}; crashhunt init makes one that you can edit"

@@ -39,7 +39,7 @@ def check_names(scenario: Scenario, ego: str = "") -> None:
         ego: as it was given on the command line, for the message.
 
     Raises:
-        ScenarioError: with what was probably meant.
+        ScenarioError: a name is unknown; the message has the most similar one.
     """
     demand = [read_xml(scenario.folder / name) for name in scenario.texts()]
     open_ended = any(_SECRETIVE.search(text) for text in demand)
@@ -58,7 +58,7 @@ def check_names(scenario: Scenario, ego: str = "") -> None:
 
 
 def line_of(name: str, files: Iterable[Path]) -> str:
-    """Return ``FILE, line N`` of the first definition of an id; empty where there is none."""
+    """Return ``FILE, line N`` of the first definition of an id; empty if there is none."""
     for file in files:
         text = read_xml(file)
         found = _definition(name).search(text)
@@ -129,7 +129,7 @@ def _ids(tags: bytes, texts: list[bytes]) -> list[str]:
 # SUMO's complaints about an episode that it could not set up, as file, key and value that the user can correct.
 
 _RAISED = "SUMO could not set up the episode: "
-_MENDED = "mend it there"
+_MENDED = "correct it there"
 # SUMO raises one of these, and says on its output what it means.
 _VAGUE = ("Process Error", "Could not parse commandline options.")
 _STAGED = re.compile(r"/\S*?/stage-\d+/")
@@ -143,12 +143,12 @@ _DEFINED = re.compile(r"(?:flow|vType|vehicle type|vehicle|trip|route|edge|lane|
 
 
 def explained(message: str, output: str, scenario: Scenario) -> ScenarioError | None:
-    """Return what is wrong with a scenario in which no episode could be set up; None where SUMO is not to blame.
+    """Return what is wrong with a scenario in which no episode could be set up; None if SUMO is not to blame.
 
     Args:
-        message: of the exception in the worker.
+        message: message of the exception in the worker.
         output: what SUMO printed last.
-        scenario: as it was loaded, not the copy in which the worker ran.
+        scenario: the loaded scenario, not the copy of the worker.
     """
     said, errors = message.removeprefix(_RAISED), _errors(output)
     died = message.startswith("the process died") and errors

@@ -242,8 +242,8 @@ class SumoSetup:
         routes: route files.
         additional: additional files.
         options: further options of SUMO without their dashes, such as ``lateral-resolution``. Where there is no
-            ``time-to-teleport``, it is -1: no vehicle is removed, and a jam stays one. What they would have SUMO write
-            is not written.
+            ``time-to-teleport``, it is -1: no vehicle is removed, and a jam stays one. SUMO writes none of their output
+            files.
         native: whether the compiled core may be used; it changes no bit.
         fix_link_order: whether SUMO processes the links of the network in the order of their construction.
             Otherwise it uses the order of their memory addresses, which differs between processes.

@@ -23,7 +23,7 @@ _SILENT = ("unregulated", "internal", "dead_end", "rail_signal", "rail_crossing"
 
 
 def right_of_way(scenario: Scenario) -> RightOfWay | None:
-    """Return the ways across the junctions of a scenario; None where its network cannot be read."""
+    """Return the ways across the junctions of a scenario; None if its network cannot be read."""
     path = scenario.folder / scenario.table(SumoSetup).net
     try:
         return _read(path, path.stat().st_mtime_ns)

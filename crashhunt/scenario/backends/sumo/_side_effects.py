@@ -101,11 +101,11 @@ LABELS = frozenset({"origId", "origFrom", "origTo", "ref", "destination", "name"
 
 
 class _SideEffectError(Exception):
-    """With what it is, in words."""
+    """The message describes it."""
 
 
 def side_effect(scenario: Scenario, values: Mapping[str, Value], _specifications: Iterable[str]) -> str:
-    """Return what else SUMO would do with the options and files of a scenario; empty where that is nothing."""
+    """Return what else SUMO would do with the options and files of a scenario; empty if that is nothing."""
     sumo = scenario.table(SumoSetup)
     options = [*sumo.options, *(setup.option for setup in scenario.arguments.values() if setup.option)]
     for option in options:
@@ -127,7 +127,7 @@ def side_effect(scenario: Scenario, values: Mapping[str, Value], _specifications
 
 
 def _check_text(file: str, content: bytes, *, reads: bool) -> None:
-    """Refuse an XML file that has anything but what is known to simulate.
+    """Refuse an XML file with elements other than those known to simulate.
 
     Args:
         file: its name.
@@ -150,7 +150,7 @@ def _check_text(file: str, content: bytes, *, reads: bool) -> None:
             raise _SideEffectError(f"{file} has the parameter {key} = {value!r}, which might name a file")
 
     def doctype(*_: object) -> None:
-        raise _SideEffectError(f"{file} has a document type, with which it may say anything")
+        raise _SideEffectError(f"{file} has a document type, which may change its content")
 
     parser.StartElementHandler = start
     parser.StartDoctypeDeclHandler = doctype

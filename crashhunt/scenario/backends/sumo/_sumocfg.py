@@ -58,7 +58,7 @@ def read_config(path: Path) -> tuple[dict[str, str], list[str]]:
     try:
         root = ET.parse(path).getroot()
     except (ET.ParseError, UnicodeDecodeError, LookupError, ValueError) as error:
-        raise ScenarioError(f"not valid XML: {error}", fix="mend the file", where=str(path)) from None
+        raise ScenarioError(f"not valid XML: {error}", fix="correct the file", where=str(path)) from None
     except OSError as error:
         raise ScenarioError(f"cannot be read: {error.strerror}", where=str(path)) from None
     options: dict[str, str] = {}
@@ -138,8 +138,8 @@ _PATIENCE_S = 300.0
 def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
     """Turn a SUMO configuration into a scenario.
 
-    Its network, routes, additional files and options are kept. What it would write is not written, and what a trial
-    decides itself is ignored (the seed, the number of threads); the notes say so. The demand becomes the scenario
+    Its network, routes, additional files and options are kept. Its output files are not written. Options that a trial
+    sets itself (the seed, the number of threads) are ignored. The notes list both. The demand becomes the scenario
     argument ``scale``.
 
     Args:
@@ -204,13 +204,13 @@ def _files(options: dict[str, str], path: Path, unset: str) -> tuple[Path, dict[
         for name in split_names(options.pop(key)):
             file = os.path.normpath(base / name)
             if not os.path.isfile(file):  # noqa: PTH113
-                fix = f"set it ({unset})" if unset else "mend the path"
+                fix = f"set it ({unset})" if unset else "correct the path"
                 raise ScenarioError(f"{key}: the file {file!r} does not exist", fix=fix, where=str(path))
             named.setdefault(key, []).append(file)
     for key in sorted(key for key in options if key.endswith(("-file", "-files"))):
         raise ScenarioError(
-            f"the option {key} = {options[key]!r} names a file that a trial would not archive",
-            fix="move what it needs into the additional-files, or remove it",
+            f"the option {key} = {options[key]!r} names a file that crashhunt does not archive",
+            fix="move its content into the additional-files, or remove the option",
             where=str(path),
         )
     if len(named["net-file"]) != 1:
@@ -227,11 +227,11 @@ def _times(options: dict[str, str], path: Path) -> tuple[float, float]:
     begin = seconds(options.get("begin", "0"), path)
     end = seconds(options.get("end", "-1"), path)
     if 0 <= end < begin:
-        raise ScenarioError(f"end = {end:g} is before begin = {begin:g}", fix="mend one of the two", where=str(path))
+        raise ScenarioError(f"end = {end:g} is before begin = {begin:g}", fix="correct one of the two", where=str(path))
     # SUMO counts in whole milliseconds.
     step_length = round(seconds(options.get("step-length", "1"), path), 3)
     if not 0 < step_length < float("inf"):
         raise ScenarioError(
-            f"step-length = {options['step-length']!r} is no time step", fix="give at least 0.001", where=str(path)
+            f"step-length = {options['step-length']!r} is not a time step", fix="give at least 0.001", where=str(path)
         )
     return begin, step_length

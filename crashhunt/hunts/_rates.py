@@ -1,10 +1,6 @@
-"""Rare mode of a hunt: every fifth trial is a root, whose copies have forced first onsets; the others are plain trials.
+"""Which trials of a hunt count for its crash rate, the rate of a running hunt, and rare mode.
 
-The forcing of a root depends on its number and on the results of earlier blocks alone. So the roots are the same with
-any number of workers, and after the hunt was killed and resumed.
-
-``--until-error`` ends the hunt at the first full block at which the interval is narrow enough. Roots above that block
-may have ended by then. They do not count, because that they have ended depends on the number of workers.
+Cost: constant for each trial. A resumed hunt reads the number and the outcome of each earlier trial once.
 """
 
 from __future__ import annotations
@@ -13,20 +9,114 @@ import math
 from typing import TYPE_CHECKING
 
 from crashhunt.disturbances import first_forcing
-from crashhunt.plans import share_of
-from crashhunt.rates import BLOCK, TRIALS_PER_ROOT, Paced, RareCounter, is_root, learn_forcing, root_of, with_plain
+from crashhunt.plans import rate_of, share_of
+from crashhunt.rates import (
+    BLOCK,
+    TRIALS_PER_ROOT,
+    BarWatch,
+    CountingRule,
+    Paced,
+    RareCounter,
+    RateWatch,
+    TrialFacts,
+    is_root,
+    learn_forcing,
+    root_of,
+    with_plain,
+)
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from crashhunt.disturbances import DisturbanceSampler
-    from crashhunt.ledger import Ledger, RunningRate
+    from crashhunt.ledger import Facts, Ledger, RunningRate
     from crashhunt.plans import HuntSettings
     from crashhunt.rates import RareEstimate
     from crashhunt.trial import Forced, ForcedCopy, Forcing, TrialResult
 
-__all__ = ["Forcings", "RareWatch", "crashed_copies", "greatest_weight"]
+
+__all__ = [
+    "Forcings",
+    "RareWatch",
+    "bar_watch",
+    "counting_rule",
+    "crashed_copies",
+    "greatest_weight",
+    "rate_watch",
+    "why_no_interval",
+]
+
+
+def counting_rule(settings: HuntSettings, facts: Facts) -> CountingRule:
+    """Return how the trials of a hunt count."""
+    independent = bool(facts.get("independent", settings.sampler == "random"))
+    origin = "" if independent or settings.seeds else facts.get("plain_origin") or ""
+    return CountingRule(
+        max_steps=settings.max_steps,
+        agents=max(1, len(settings.agents)),
+        plain_origin=origin,
+        traffics=settings.seeds,
+        planned=settings.trials,
+    )
+
+
+def why_no_interval(settings: HuntSettings, facts: Facts) -> str:
+    """Return why the trials of a hunt say nothing about a rate; empty if they do."""
+    if settings.rare:
+        return "in rare mode, one of five trials runs without disturbances; crashhunt status reports the rate"
+    if settings.seeds:
+        if settings.sampler != "random":
+            return f"the sampler {settings.sampler} does not draw trials independently"
+        if settings.trials < settings.seeds:
+            return "no number of trials was fixed ahead for each traffic (--seeds): TRIALS must be at least --seeds"
+        return ""
+    if facts.get("independent", settings.sampler == "random") or facts.get("plain_origin"):
+        return ""
+    return f"the sampler {settings.sampler} does not draw trials independently"
+
+
+def bar_watch(settings: HuntSettings, ledger: Ledger) -> BarWatch | None:
+    """Return what watches the rate, with the trials that ended in earlier runs; None if there is no bar."""
+    if not settings.run.until_rate:
+        return None
+    bar, per = rate_of(settings.run.until_rate)
+    rule = CountingRule(max_steps=settings.max_steps, agents=max(1, len(settings.agents)), planned=settings.trials)
+    watch = BarWatch(rule, bar, per, settings.crash_on)
+    for data in ledger.plain_results():
+        watch.add(data)
+    return watch
+
+
+def rate_watch(settings: HuntSettings, ledger: Ledger) -> RateWatch | None:
+    """Return what counts the trials per trial, with those of earlier runs; None if they bound no rate."""
+    facts = ledger.facts()
+    if why_no_interval(settings, facts):
+        return None
+    watch = RateWatch(counting_rule(settings, facts), "trial", settings.crash_on)
+    for number, outcome, origin, was_killed in ledger.endings():
+        trial = TrialFacts(
+            number=number,
+            has_ended=not was_killed,
+            valid=outcome != Outcome.INVALID,
+            crashed=outcome in settings.crash_on,
+            steps=0,
+            driven_s=None,
+            driven_m=None,
+            step_length_s=None,
+            origin=origin,
+        )
+        watch.add_facts(trial)
+    return watch
+
+
+# Rare mode of a hunt: every fifth trial is a root, whose copies have forced first onsets; the others are plain trials.
+#
+# The forcing of a root depends on its number and on the results of earlier blocks alone. So the roots are the same with
+# any number of workers, and after the hunt was killed and resumed.
+#
+# ``--until-error`` ends the hunt at the first full block at which the interval is narrow enough. Roots above that block
+# may have ended by then. They do not count, because that they have ended depends on the number of workers.
 
 _WEIGHTIEST = 5  # roots; a crash of a copy is a crash only where it comes again from the start
 
@@ -35,9 +125,9 @@ class Forcings:
     """The forcing of each root, learned from the blocks before the previous one.
 
     Args:
-        settings: of the hunt.
-        ledger: of the hunt.
-        sampler: of its disturbances.
+        settings: settings of the hunt.
+        ledger: ledger of the hunt.
+        sampler: sampler of its disturbances.
     """
 
     def __init__(self, settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler) -> None:
@@ -75,12 +165,12 @@ class RareWatch:
     A root counts once its plain trials have ended as well.
 
     Args:
-        settings: of the hunt.
-        ledger: of the hunt.
-        sampler: of its disturbances.
+        settings: settings of the hunt.
+        ledger: ledger of the hunt.
+        sampler: sampler of its disturbances.
 
     Attributes:
-        weightiest: of the roots with a crash of a copy, those with the greatest weights, the greatest first.
+        weightiest: the greatest weights of roots with a crash of a copy, in descending order.
         is_met: whether the interval is narrow enough; no trial is read after that.
     """
 
@@ -120,7 +210,8 @@ class RareWatch:
         crash_on = self._settings.crash_on
         root = root_of(first, crash_on, self._hazard)
         if root is None:
-            self._counter.add(None, (one.outcome in crash_on for one in plain if one.outcome is not Outcome.INVALID))
+            valid = [one for one in plain if one.outcome is not Outcome.INVALID]
+            self._counter.add(None, (one.outcome in crash_on for one in valid), len(plain) - len(valid))
         else:
             self._counter.add(with_plain(root, plain, crash_on))
             if any(crashed_copies(first)):

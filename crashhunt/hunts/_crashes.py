@@ -1,0 +1,485 @@
+"""The crashes of a hunt: their number, whether or not bundles are kept; their types; which bundles are kept."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError
+from crashhunt.base.temporary import remove_at_once
+from crashhunt.crashes import (
+    SIGNATURE_VERSION,
+    Division,
+    Group,
+    cause_of,
+    crash_folders,
+    fault_of,
+    features_of,
+    group_crashes,
+    groups_of,
+    judgement_of,
+    list_bundles,
+    read_bundle,
+    signature_of,
+)
+from crashhunt.ledger import Ledger, has_begun
+from crashhunt.plans import read_settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from crashhunt.crashes import Bundle, Cause, Signature
+    from crashhunt.ledger import Facts, KindData
+    from crashhunt.trial import TrialResult
+
+__all__ = [
+    "CrashTally",
+    "FoundCrashes",
+    "Judged",
+    "Kinds",
+    "dropped_crashes",
+    "find_crashes",
+    "outcomes_of_crashes",
+    "prune_bundles",
+    "tally_crashes",
+]
+
+_SHARE_OF_TIME = 0.05  # that grouping crashes for a screen may take
+_MOST_LOGS = 200  # of crashes that are read for their types; a log takes 0.05 s
+
+
+@dataclass(slots=True)
+class CrashTally:
+    """Counts the crashes of all trials of a hunt.
+
+    Args:
+        found: number of crashes.
+        disturbed: number of crashes with disturbances.
+        likeliest: identifier of the crash with disturbances that has the greatest log-likelihood; empty for none.
+        log_likelihood: log likelihood of that crash.
+    """
+
+    found: int = 0
+    disturbed: int = 0
+    likeliest: str = ""
+    log_likelihood: float = -math.inf
+
+    def add(self, result: TrialResult) -> None:
+        """Count a crash."""
+        self.found += 1
+        if not result.disturbed:
+            return
+        self.disturbed += 1
+        if result.log_likelihood is not None and result.log_likelihood > self.log_likelihood:
+            self.likeliest = layout.crash_folder(result.spec.number, result.outcome)
+            self.log_likelihood = result.log_likelihood
+
+
+def tally_crashes(ledger: Ledger, crash_on: Sequence[str], *, disturbed: bool) -> CrashTally:
+    """Return the counts of the crashes of a ledger.
+
+    Args:
+        ledger: ledger of the hunt.
+        crash_on: the outcomes that count as a crash.
+        disturbed: whether the hunt has disturbances, so that those are counted.
+    """
+    outcomes = ledger.outcomes()
+    found = CrashTally(sum(outcomes.get(name, 0) for name in crash_on))
+    if disturbed and found.found:
+        found.disturbed, likeliest = ledger.disturbed_crashes(tuple(crash_on))
+        if likeliest is not None:
+            number, outcome, found.log_likelihood = likeliest
+            found.likeliest = layout.crash_folder(number, outcome)
+    return found
+
+
+def outcomes_of_crashes(directory: Path, facts: Facts) -> Sequence[str] | None:
+    """Return the outcomes that count as a crash in a hunt; None if neither its ledger nor its settings say."""
+    noted = facts.get("crash_on")
+    if noted is not None:
+        return noted
+    try:
+        return read_settings(directory / layout.HUNT).crash_on
+    except CrashhuntError:
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class FoundCrashes:
+    """The crashes of a hunt: how many, of which types, and those to show.
+
+    Args:
+        tally: counts over all trials.
+        saved: number of crashes that have a bundle.
+        types: number of crashes of each type, in words, over all trials, the most frequent type first.
+        shortest: identifier of the shortest saved crash of each of these types.
+        untyped: number of crashes whose type is not determined, because a log is missing or not read yet.
+        shown: the crashes to show: the shortest of each type, then the shortest of all.
+    """
+
+    tally: CrashTally
+    saved: int
+    types: Mapping[str, int]
+    shortest: Mapping[str, str]
+    untyped: int
+    shown: tuple[Bundle, ...]
+
+
+def find_crashes(directory: Path, limit: int) -> FoundCrashes:
+    """Return the crashes of a hunt; reads at most `limit` bundles where the ledger has the types of all crashes.
+
+    Args:
+        directory: directory of the hunt; its ledger may be missing, as in an exported crash.
+        limit: number of crashes to show, at most.
+
+    Raises:
+        BundleError: a crash that is to be shown is damaged.
+        HuntDirectoryError: the ledger is damaged.
+    """
+    folders = {folder.name: folder for folder in crash_folders(directory)}
+    if not has_begun(directory / layout.LEDGER):
+        bundles = list_bundles(directory)
+        types, shortest = _types_of(bundles, {})
+        tally = CrashTally(len(bundles))
+        return FoundCrashes(
+            tally=tally,
+            saved=len(bundles),
+            types=types,
+            shortest=shortest,
+            untyped=len(bundles) - sum(types.values()),
+            shown=_shown(folders, _by_steps(bundles), shortest, limit),
+        )
+    with closing(Ledger(directory / layout.LEDGER)) as ledger:
+        facts = ledger.facts()
+        dropped = {words: len(numbers) for words, numbers in (facts.get("dropped") or {}).items()}
+        crash_on = outcomes_of_crashes(directory, facts) or ()
+        tally = tally_crashes(ledger, crash_on, disturbed=bool(facts.get("disturb")))
+        tally.found = max(tally.found, len(folders) + sum(dropped.values()))  # a bundle is written before its row
+        steps = {number: steps for number, _, name, steps, _ in ledger.table() if name in crash_on}
+    noted = _noted_types(facts)
+    if noted is None or (sum(kind["count"] for kind in noted) != tally.found and len(folders) <= _MOST_LOGS):
+        types, shortest = _types_of(list_bundles(directory), dropped)
+    else:
+        types = {kind["words"]: kind["count"] for kind in noted}
+        shortest = {kind["words"]: kind["shortest"] for kind in noted}
+    names = sorted(folders, key=lambda name: (steps.get(_number(name), math.inf), _number(name)))
+    return FoundCrashes(
+        tally=tally,
+        saved=len(folders),
+        types=types,
+        shortest=shortest,
+        untyped=max(0, tally.found - sum(types.values())),
+        shown=_shown(folders, names, shortest, limit),
+    )
+
+
+def _noted_types(facts: Facts) -> Sequence[KindData] | None:
+    """Return the crash types that the hunt has noted; None if another version has determined them."""
+    return facts.get("kinds") if facts.get("kinds_version") == SIGNATURE_VERSION else None
+
+
+def _types_of(bundles: Sequence[Bundle], dropped: Mapping[str, int]) -> tuple[dict[str, int], dict[str, str]]:
+    """Return the crash types of bundles, from their logs, with those of crashes without a bundle."""
+    groups = group_crashes(bundles, dropped, faults=False).groups
+    types = {**dropped, **{str(group.signature): group.count for group in groups}}
+    ranked = sorted(types.items(), key=lambda entry: -entry[1])
+    return dict(ranked), {str(group.signature): group.shortest.id for group in groups}
+
+
+def _by_steps(bundles: Sequence[Bundle]) -> list[str]:
+    ordered = sorted(bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
+    return [bundle.id for bundle in ordered]
+
+
+def _number(name: str) -> int:
+    digits = name.partition("-")[0]
+    return int(digits) if digits.isdecimal() else -1
+
+
+def _shown(
+    folders: Mapping[str, Path], by_steps: Sequence[str], shortest: Mapping[str, str], limit: int
+) -> tuple[Bundle, ...]:
+    examples = [name for name in shortest.values() if name in folders][:limit]
+    names = dict.fromkeys([*examples, *by_steps])
+    chosen = [name for name in names if name in folders][:limit]
+    bundles = [read_bundle(folders[name]) for name in chosen]
+    return tuple(sorted(bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number)))
+
+
+# Which kinds of crashes a hunt has found, while it runs.
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A crash whose cause was searched for.
+
+    Args:
+        bundle: the crash, with its judgement.
+        cause: the cause; None if the crash cannot be run again.
+        is_stopped: whether the search was interrupted, so that nothing is known.
+    """
+
+    bundle: Bundle
+    cause: Cause | None = None
+    is_stopped: bool = False
+
+
+class Kinds:
+    """The kinds of the crashes that a hunt has saved.
+
+    Args:
+        wanted: how many kinds are enough; 0 for never.
+        crashes: that were saved before.
+        newest: when the last new kind came, in s since the epoch; None if that is unknown.
+        only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
+        dropped: for each crash type, in words, the trials whose bundles were given up before.
+        dropped_at_fault: of these trials, the ones whose crashes are the agent's own fault.
+        by_cause: how many crashes of each type to judge, so that each cause of a type counts; 0: types count.
+    """
+
+    def __init__(
+        self,
+        wanted: int,
+        crashes: Sequence[Bundle] = (),
+        newest: float | None = None,
+        *,
+        only_at_fault: bool = False,
+        dropped: Mapping[str, Sequence[int]] | None = None,
+        dropped_at_fault: Sequence[int] = (),
+        by_cause: int = 0,
+    ) -> None:
+        self._by_cause = by_cause
+        self._divisions: dict[Signature, Division] = {}
+        self._only_at_fault = only_at_fault
+        self._at_fault: set[int] = set()
+        self._wanted = wanted
+        self._signed: dict[int, tuple[Signature, Bundle]] = {}  # by the number of the trial
+        self._seen: set[Signature] = set()
+        self._first: dict[tuple[Signature, Cause | None], int] = {}  # of what counts, its trial of the least number
+        self._groups: tuple[Group, ...] | None = None
+        self._shown: tuple[Group, ...] = ()
+        self._due = 0.0
+        self.newest = newest
+        self.newest_trial: int | None = None
+        there = {bundle.result.spec.number for bundle in crashes}  # it was killed before it had removed them
+        self.dropped = {
+            words: [number for number in numbers if number not in there] for words, numbers in (dropped or {}).items()
+        }
+        self._dropped_at_fault = {number for number in dropped_at_fault if number not in there}
+        for bundle in crashes:
+            self._sign(bundle)
+
+    def add(self, bundle: Bundle, ended: int) -> None:
+        """Take in a crash that has been saved.
+
+        Args:
+            bundle: the crash.
+            ended: how many trials have ended by now.
+        """
+        if self._sign(bundle):
+            self.newest, self.newest_trial = time.time(), ended
+
+    def groups(self, *, running: bool = False) -> tuple[Group, ...]:
+        """Return what there is, the most frequent kind first, each with its crashes in the order of their trials.
+
+        Args:
+            running: for a screen, which asks ten times a second: the groups of some moments ago, where new ones
+                would take too much of the time, as with 10,000 crashes.
+        """
+        began = time.monotonic()
+        if running and self._groups is None and began < self._due:
+            return self._shown
+        if self._groups is None:
+            dropped = {words: len(numbers) for words, numbers in self.dropped.items()}
+            self._groups = groups_of((self._signed[number] for number in sorted(self._signed)), dropped)
+            ended = time.monotonic()
+            self._shown, self._due = self._groups, ended + (ended - began) / _SHARE_OF_TIME
+        return self._groups
+
+    def drop_excess(self, keep: int, *, final: bool = False) -> list[Bundle]:
+        """Return the crashes beyond the `keep` shortest of each crash type, or of each cause, and forget them.
+
+        They still count, but are no members any more. A type whose crashes are still being judged keeps all of them.
+
+        Args:
+            keep: how many stay.
+            final: whether no more crashes are judged.
+        """
+        found = []
+        for group in groups_of(self._signed.values()):
+            for bundles in self._parts(group, final=final):
+                ordered = sorted(bundles, key=self._worth)
+                judged = self._divisions[group.signature].judged if group.signature in self._divisions else frozenset()
+                # The runs that show the cause are in the bundle of a judged crash, so one of them stays.
+                shown = next((place for place, one in enumerate(ordered) if one.result.spec.number in judged), 0)
+                if keep <= shown:
+                    ordered.insert(keep - 1, ordered.pop(shown))
+                for bundle in ordered[keep:]:
+                    number = bundle.result.spec.number
+                    del self._signed[number]
+                    if number in self._at_fault:
+                        self._at_fault.discard(number)
+                        self._dropped_at_fault.add(number)
+                    self.dropped.setdefault(str(group.signature), []).append(number)
+                    found.append(bundle)
+        if found:
+            self._groups = None
+        return found
+
+    def _parts(self, group: Group, *, final: bool) -> list[list[Bundle]]:
+        """Return the crashes of a type by cause; none where that is not known yet."""
+        division = self._divisions.get(group.signature)
+        if division is None:
+            return [list(group.bundles)]
+        if not division.is_complete and not final:
+            return []
+        causes = division.causes()
+        parts: dict[Cause, list[Bundle]] = {}
+        for bundle in group.bundles:
+            parts.setdefault(causes[bundle.result.spec.number], []).append(bundle)
+        return list(parts.values())
+
+    def next_to_judge(self) -> Bundle | None:
+        """Return the next crash whose cause is wanted; None if there is none for now."""
+        for division in self._divisions.values():
+            if (number := division.choose()) is not None:
+                return self._signed[number][1]
+        return None
+
+    def count_to_judge(self) -> int:
+        """Return how many crashes are to be judged."""
+        return sum(division.left for division in self._divisions.values())
+
+    def settle(self, judged: Judged) -> None:
+        """Take in the cause of a crash."""
+        number = judged.bundle.result.spec.number
+        if judged.is_stopped:
+            self._divisions[self._signed[number][0]].postpone(number)
+        else:
+            self._settle(number, judged.cause)
+
+    def _settle(self, number: int, cause: Cause | None) -> None:
+        signature = self._signed[number][0]
+        self._divisions[signature].settle(number, cause)
+        self._count(number, signature, cause)
+
+    @property
+    def types_by_cause(self) -> int | None:
+        """How many causes there are, each type on its own; None if types count."""
+        return len(self._counted()) if self._by_cause else None
+
+    def _count(self, number: int, signature: Signature, cause: Cause | None) -> None:
+        if number in self._at_fault or not self._only_at_fault:
+            known = None if cause is None or cause.kind == "unknown" else cause
+            self._first[signature, known] = min(number, self._first.get((signature, known), number))
+
+    def _counted(self) -> list[int]:
+        """Return the first trials of what counts: a type without a known cause counts once."""
+        caused = {signature for signature, cause in self._first if cause is not None}
+        return sorted(
+            number for (signature, cause), number in self._first.items() if cause is not None or signature not in caused
+        )
+
+    def _worth(self, bundle: Bundle) -> tuple[bool, int, int]:
+        """What is kept first: what was hunted for, and of that the shortest."""
+        result = bundle.result
+        return self._only_at_fault and result.spec.number not in self._at_fault, result.steps, result.spec.number
+
+    @property
+    def until(self) -> int | None:
+        """The least number of a trial up to which there are enough kinds; None if there are not."""
+        firsts = self._counted()
+        return firsts[self._wanted - 1] if 0 < self._wanted <= len(firsts) else None
+
+    @property
+    def at_fault(self) -> tuple[int, ...] | None:
+        """The trials whose crashes are the agent's own fault, also without a bundle; None if that was not asked."""
+        return tuple(sorted(self._at_fault | self._dropped_at_fault)) if self._only_at_fault else None
+
+    @property
+    def dropped_at_fault(self) -> list[int]:
+        """Of the trials whose bundles were deleted, those whose crashes are the agent's own fault."""
+        return sorted(self._dropped_at_fault)
+
+    def refresh(self, crashes: Sequence[Bundle]) -> None:
+        """Take the crashes as they are now: they have been confirmed."""
+        for bundle in crashes:
+            number = bundle.result.spec.number
+            if number in self._signed:
+                self._signed[number] = self._signed[number][0], bundle
+        self._groups = None
+
+    def _sign(self, bundle: Bundle) -> bool:
+        """Take in a crash; return whether it is of a kind that has not been there."""
+        number = bundle.result.spec.number
+        collided = bundle.result.collision is not None
+        try:
+            # All look at it, and reading a log takes longer than looking.
+            recording = bundle.recording() if collided and (self._only_at_fault or self._by_cause) else None
+            signature = signature_of(bundle, recording)
+            if self._only_at_fault and fault_of(bundle, recording).is_egos:
+                self._at_fault.add(number)
+            if self._by_cause and not bundle.result.outcome.is_software_fault:
+                division = self._divisions.setdefault(signature, Division(self._by_cause))
+                division.add(number, bundle.result.steps, features_of(bundle, recording))
+        except BundleError:
+            return False  # it has no crash type, and crashhunt check reports it
+        is_new = signature not in self._seen
+        self._seen.add(signature)
+        self._signed[number] = signature, bundle
+        self._groups = None
+        self._count(number, signature, None)
+        judgement = judgement_of(bundle) if signature in self._divisions else None
+        if judgement is not None and not judgement.is_interrupted:
+            cause = cause_of(bundle, judgement)
+            if cause.kind != "unknown":
+                self._settle(number, cause)
+        return is_new
+
+
+# ``--keep N``: of each crash type, the bundles of the shortest N crashes stay, and the rows of all crashes.
+#
+# The deletion is written to the ledger first, so `check` can distinguish a deleted bundle from a missing one.
+
+
+def prune_bundles(
+    ledger: Ledger, kinds: Kinds | None, crashes: list[Bundle], keep: int, *, final: bool = False
+) -> list[Bundle]:
+    """Remove the bundles of crashes of which there are enough that are shorter; return the crashes that stay.
+
+    Args:
+        ledger: of the hunt.
+        kinds: The crash types of the hunt, which forget the removed crashes; None where the first crash ends the hunt.
+        crashes: The crashes with a bundle.
+        keep: Number of bundles that stay of each crash type; 0 for all.
+        final: whether no more crashes are judged.
+
+    Raises:
+        HuntDirectoryError: the ledger cannot be written.
+    """
+    excess = kinds.drop_excess(keep, final=final) if kinds is not None and keep else []
+    if not excess or kinds is None:
+        return crashes
+    ledger.note(dropped=kinds.dropped, dropped_at_fault=kinds.dropped_at_fault)
+    for bundle in excess:
+        remove_at_once(bundle.path)  # half a bundle would be a damaged one
+    gone = {bundle.id for bundle in excess}
+    return [bundle for bundle in crashes if bundle.id not in gone]
+
+
+def dropped_crashes(hunts: Iterable[Path]) -> dict[str, int]:
+    """Return of each kind of crash, in words, how many are in the ledgers of some hunts only."""
+    found: Counter[str] = Counter()
+    for hunt in hunts:
+        if not (hunt / layout.LEDGER).is_file():
+            continue
+        with suppress(HuntDirectoryError), closing(Ledger(hunt / layout.LEDGER)) as ledger:
+            dropped = ledger.facts().get("dropped") or {}
+            found.update({words: len(numbers) for words, numbers in dropped.items()})
+    return dict(found)
