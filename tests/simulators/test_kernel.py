@@ -9,11 +9,11 @@ import os
 import struct
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from itertools import combinations, pairwise
 from types import SimpleNamespace
 
 # First: this imports highway-env without what takes most of that time.
-from crashhunt.simulators.highway import HighwaySimulator
+from crashhunt.simulators.highway import HighwaySimulator, restore_classes
 
 # isort: split
 
@@ -21,13 +21,16 @@ import gymnasium
 import numpy as np
 import pytest
 from compiled import needs_kernel
+from conftest import examples
+from highway_env.envs.common import observation
 from highway_env.road.lane import CircularLane, SineLane, StraightLane
+from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import AggressiveVehicle, DefensiveVehicle, IDMVehicle, LinearVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
-from highway_env.vehicle.objects import Landmark, Obstacle
+from highway_env.vehicle.objects import Landmark, Obstacle, RoadObject
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.accelerator import _kernel, _roads, switch_off, switch_on
@@ -45,10 +48,12 @@ NUMBERS = st.floats(-1e6, 1e6)
 
 @pytest.fixture
 def plain_highway_env():
-    """highway-env as it was before, and after."""
+    """highway-env as it was before, and after: an intersection changes the class of all drivers."""
+    restore_classes()
     switch_off()
     yield
     switch_off()
+    restore_classes()
 
 
 def bits(number):
@@ -74,11 +79,15 @@ def test_other_functions_have_the_bits_of_numpy(x, y, z, exponent):
 def test_products_and_remainders_have_the_bits_of_numpy_and_python(a, b, c, d):
     compute = _kernel.kernel().compute
     assert bits(compute("dot", a, b, c, d)) == bits(np.dot(np.array([a, b]), np.array([c, d])))
+    matrix, outline = np.array([[a, -b], [b, a]]), np.array([[c, d], [d, c], [-c, d], [-d, c]])
+    # The kernel adds a position, which removes the sign of a zero.
+    assert bits(compute("product", b, a, d, c) + 0.0) == bits((matrix @ outline.T)[1, 1] + 0.0)
     assert bits(compute("remainder", a, 2 * math.pi)) == bits(np.float64(a) % (2 * math.pi)) == bits(a % (2 * math.pi))
 
 
 @pytest.mark.parametrize(
-    "name", ["sin", "cos", "tan", "arctan", "arcsin", "arctan2", "power", "remainder", "dot", "dot3", "square"]
+    "name",
+    ["sin", "cos", "tan", "arctan", "arcsin", "arctan2", "power", "remainder", "dot", "dot3", "product", "square"],
 )
 def test_a_function_with_one_other_bit_disables_the_kernel(name, monkeypatch):
     right = _kernel.kernel().compute
@@ -96,7 +105,7 @@ def test_a_function_with_one_other_bit_disables_the_kernel(name, monkeypatch):
     ("error", "reason"),
     [
         (lambda name: (_ for _ in ()).throw(ImportError(name)), "it is not built"),
-        (lambda name: type("Old", (), {"INTERFACE": 0}), "it is of another version of crashhunt (0 instead of 2)"),
+        (lambda name: type("Old", (), {"INTERFACE": 0}), "it is of another version of crashhunt (0 instead of 3)"),
     ],
 )
 def test_without_the_kernel_there_is_a_reason(error, reason, monkeypatch):
@@ -163,6 +172,13 @@ def network(rng):
     return net
 
 
+class Cone(RoadObject):
+    """An object of a user's that collisions push."""
+
+    def __init__(self, road, position):
+        super().__init__(road, position)
+
+
 LINEAR = (LinearVehicle, AggressiveVehicle, DefensiveVehicle)
 KINDS = (IDMVehicle, IDMVehicle, ControlledVehicle, MDPVehicle, Vehicle, BicycleVehicle, *LINEAR)
 
@@ -183,7 +199,8 @@ def crowded(seed):
             road, lane.position(s, float(rng.normal())), heading, np.float64(speed) if rng.random() < 0.5 else speed
         )
         if kind in (Vehicle, BicycleVehicle):
-            made.act({"steering": float(rng.normal() * 0.2), "acceleration": float(rng.normal() * 3)})
+            number = float if rng.random() < 0.7 else np.float32  # as an action space has it
+            made.act({"steering": number(rng.normal() * 0.2), "acceleration": number(rng.normal() * 3)})
         else:
             made.target_speed = float(rng.choice([made.target_speed, rng.uniform(-1, 40)]))
         if isinstance(made, IDMVehicle):
@@ -200,10 +217,11 @@ def crowded(seed):
         made.crashed = bool(rng.random() < 0.05)
         if rng.random() < 0.05:
             made.impact = rng.normal(size=2)
+        made.solid = bool(rng.random() < 0.95)
         made.check_collisions, made.collidable = bool(rng.random() < 0.9), bool(rng.random() < 0.9)
         road.vehicles.append(made)
-    for _ in range(rng.integers(3)):
-        kind = Obstacle if rng.random() < 0.6 else Landmark
+    for _ in range(rng.integers(5)):
+        kind = (Obstacle, Landmark, Cone)[rng.integers(3)]
         lane = net.get_lane(net.random_lane_index(road.np_random))
         road.objects.append(kind(road, lane.position(float(rng.uniform(0, lane.length)), 0)))
     return road
@@ -244,7 +262,7 @@ def played(seed, steps=12):
     return found
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(seed=st.integers(0, 2**31))
 def test_every_bit_and_type_is_that_of_highway_env_on_random_roads(seed):
     switch_off()
@@ -256,6 +274,42 @@ def test_every_bit_and_type_is_that_of_highway_env_on_random_roads(seed):
         switch_off()
     for number, (one, two) in enumerate(zip(slow, fast, strict=True)):
         assert one == two, number
+
+
+def grids(seed):
+    road = crowded(seed)
+    observers = [vehicle for vehicle in road.vehicles if isinstance(vehicle, MDPVehicle)]
+    env = SimpleNamespace(road=road, vehicle=observers[0] if observers else None)
+    return [exact(observation.compute_ttc_grid(env, 0.5, 6, observer)) for observer in observers]
+
+
+def test_times_to_collision_are_those_of_highway_env():
+    slow = list(map(grids, range(3)))
+    assert not switch_on()
+    assert list(map(grids, range(3))) == slow
+    assert _roads.look(crowded(1)) is not None
+
+
+def conflicts(seed):
+    """A road with vehicles whose paths cross; the conflicts that the kernel finds, and those that highway-env finds."""
+    road = crowded(seed)
+    road.vehicles = [vehicle for vehicle in road.vehicles if isinstance(vehicle, ControlledVehicle)][:8]
+    state = _roads.look(road)
+    sure = state.traffic.conflicts({}) if state is not None else None
+    if sure is None:
+        return None
+    pairs = combinations(range(len(road.vehicles)), 2)
+    possible = {pair for pair in pairs if RegulatedRoad.is_conflict_possible(*map(road.vehicles.__getitem__, pair))}
+    return {pair[:2] for pair in sure if pair[2]}, possible, {pair[:2] for pair in sure}
+
+
+def test_conflicts_are_those_of_highway_env():
+    assert not switch_on()
+    found = [both for both in map(conflicts, range(8)) if both is not None]
+    assert all(sure <= possible <= all_found for sure, possible, all_found in found)
+    # highway-env decides about few pairs, and there are conflicts.
+    assert sum(len(possible) for _, possible, _ in found) > 2
+    assert sum(len(all_found - sure) for sure, _, all_found in found) <= 2
 
 
 def test_an_error_of_highway_env_leaves_what_highway_env_leaves():

@@ -22,6 +22,25 @@ def test_in_a_hook_of_another_repository_a_folder_is_still_of_its_own(tmp_path, 
     assert git(tmp_path / "here", "rev-parse", "--absolute-git-dir") == f"{tmp_path}/here/.git\n".encode()
 
 
+def test_git_is_asked_once_for_each_folder_of_a_project(tmp_path, monkeypatch):
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    for name in ("driver_one", "driver_two"):
+        (tmp_path / f"{name}.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    asked = []
+
+    def counting(folder, *arguments):
+        if folder == tmp_path:  # other tests have imported modules from their own folders
+            asked.append(arguments[0])
+        return git(folder, *arguments)
+
+    monkeypatch.setattr("crashhunt.snapshots._take.git", counting)
+    kept = find_sources([], ["driver_one", "driver_two"]).files
+    base = f"code/@{tmp_path.name}"
+    assert {f"{base}/driver_one.py", f"{base}/driver_two.py"} <= set(kept)
+    assert asked == ["rev-parse", "ls-files"]
+
+
 @pytest.mark.nightly
 def test_a_name_that_would_be_folders_elsewhere_is_excluded_and_reported(tmp_path):
     """A snapshot is refused that has one, as it might be unpacked anywhere; a hunt is not, as its project has one."""
