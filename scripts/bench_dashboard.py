@@ -205,7 +205,9 @@ def frames_per_second(opened: Any, url: str, seconds: float = 5.0) -> float:
     # At 10 steps a second of the simulation, 10 times as fast is a new step in each frame of a screen and more.
     opened.execute_script("go(0); document.getElementById('rate').value = '20'; crashhuntView.frames = 0; play();")
     time.sleep(1.0)
-    began = opened.execute_script("crashhuntView.frames = 0; return performance.now()")
+    # From one frame to another: the parts of a frame before and after would count as time without one.
+    at_frame = "const done = arguments[0]; requestAnimationFrame(at => done([crashhuntView.frames, at]))"
+    first, began = opened.execute_async_script(at_frame)
     time.sleep(seconds)
-    frames, ended = opened.execute_script("return [crashhuntView.frames, performance.now()]")
-    return float(frames / (ended - began) * 1000)
+    last, ended = opened.execute_async_script(at_frame)
+    return float((last - first) / (ended - began) * 1000)

@@ -165,7 +165,7 @@ def _serve(control: socket.socket) -> None:
             pid, reply = running.pop(ended)
             _, status = os.waitpid(pid, 0)
             os.close(ended)
-            with reply, suppress(OSError):  # whoever asked has gone
+            with reply, suppress(OSError):  # the process that asked has ended
                 reply.send(str(os.waitstatus_to_exitcode(status)).encode())
         if control not in ready:
             continue
@@ -188,7 +188,7 @@ def _serve(control: socket.socket) -> None:
         for descriptor in streams:
             os.close(descriptor)
         reply = socket.socket(fileno=asker)
-        with suppress(OSError):  # whoever asked has gone
+        with suppress(OSError):  # the process that asked has ended
             reply.send(str(pid).encode())
         running[os.pidfd_open(pid)] = pid, reply
 

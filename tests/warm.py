@@ -42,7 +42,7 @@ _SET_LATER = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX")
 _OF_SIMULATORS = {"gym": "gymnasium", "highway": "crashhunt.simulators.highway._lean", "sumo": "libsumo"}
 _MESSAGE = 1 << 20
 _FREE = 500  # where a process has no files of its own
-# Whoever interrupts a session, such as `timeout`, sends these to its whole group. A hunt that a test runs takes that as
+# What interrupts a session, such as `timeout`, sends these to its whole group. A hunt that a test runs takes that as
 # a request to stop, and the test goes on: what serves it must not have ended by then.
 OF_THE_GROUP = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM)
 
@@ -323,7 +323,7 @@ def _serve(control: socket.socket, simulator: str = "") -> None:
             if pid == 0:
                 _be_keeper(request, descriptors[1:])
             reply = socket.socket(fileno=os.dup(descriptors[0]))
-            with suppress(OSError):  # whoever asked was killed meanwhile, which the keeper sees as well
+            with suppress(OSError):  # the process that asked was killed meanwhile; the keeper sees it too
                 reply.send(str(pid).encode())
             running[os.pidfd_open(pid)] = pid, reply
         for descriptor in descriptors:

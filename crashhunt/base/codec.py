@@ -4,7 +4,7 @@ The annotations of a dataclass say how each field is converted, so that every sh
 differs from the annotations is declared in the metadata of the field: `OMIT_DEFAULT`, `null_is`, `written_if`.
 
 Invariants: keys are written in the order of `Serializable.json_keys`, which is part of the file formats. A missing key
-means the default of its field. A key that this version does not know is ignored; `crashhunt.base.codec` keeps it
+means the default of its field. A key that this version does not know is ignored; `known_part` and `merged` keep it
 where a file is written again.
 
 Why not a library: cattrs and pydantic support all of this, and add 30 and 60 ms to the start of every command. msgspec

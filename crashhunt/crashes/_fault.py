@@ -52,7 +52,6 @@ _OFF_M = 2.5  # lateral distance from a car's axis; a nearer person may be on th
 _WALKS = 3.0  # m/s; a slower vehicle can stop for any actor
 _CLEARS_S = 3.0
 _RED_S = 8.0  # after a red light, a junction is left by then
-_EARLY_S = 1.0  # what crashes so soon was put there
 
 
 @dataclass(frozen=True, slots=True)

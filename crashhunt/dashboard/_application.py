@@ -48,7 +48,6 @@ _MAX_COMPARED = 8
 _NO_STORE = {"cache-control": "no-store"}
 _TYPES = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
 _SCRIPTS = ("common.js", "list.js", "hunt.js", "crash.js", "compare.js", "style.css")
-_PAGES = ("list", "hunt", "crash", "compare")
 
 
 class Application(NamedTuple):

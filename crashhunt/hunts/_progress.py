@@ -166,7 +166,7 @@ class HuntStatus:
         kinds: kinds of crashes, the most frequent first; None if the first crash ends the hunt.
         newest_kind_s: how long ago the last new one came, in s; None if that is unknown.
         newest_kind_trials: how many trials have ended since; None if it came in an earlier run of the hunt.
-        types_by_cause: number of causes, each type on its own; None where types count.
+        types_by_cause: number of causes, each type on its own; None if types count.
         time_left_s: time until no more trials begin, in s of wall time; infinite without a limit.
         disturbed: how many of the crashes had disturbances; None if the hunt has none.
         stressed: the trial with the least stress margin; None if no copy was asked, or if no copy crashed.

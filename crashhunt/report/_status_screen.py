@@ -260,7 +260,7 @@ def describe_types(count: int, by_cause: int | None, noun: str = "type") -> str:
 
     Args:
         count: number of types.
-        by_cause: number of causes, each type on its own; None where types count.
+        by_cause: number of causes, each type on its own; None if types count.
         noun: for a type.
     """
     words = f"{count} {noun}{'' if count == 1 else 's'}"

@@ -43,7 +43,7 @@ def told(shell, hunt: str, run) -> tuple:
     )
     (crash,) = done.json["crashes"]
     err = re.sub(r"\d+:\d\d \(", "M:SS (", done.err.replace(hunt, "h"))  # how long it took
-    err = re.sub(r"^(running: |confirming ).*\n", "", err, flags=re.MULTILINE)  # how far it was when somebody looked
+    err = re.sub(r"^(running: |confirming ).*\n", "", err, flags=re.MULTILINE)  # progress, which depends on the time
     run("replay", hunt)
     processes = (FORK_SERVER, f"{FORK_SERVER}-again", f"{FRESH}-again")
     imported = [imported_by(shell, process, hunt) for process in processes]
