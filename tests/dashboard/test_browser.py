@@ -220,3 +220,22 @@ def test_charts_draw_what_the_api_returns(hunts, page):
         )
         assert sorted(shown) == sorted(point["id"] for point in where["points"])
         assert where["lanes"]
+
+
+@pytest.mark.nightly
+def test_charts_out_of_sight_are_drawn_when_they_come_near(hunts, page):
+    with served(hunts) as dashboard:
+        page.size(1280, 600)
+        page.open(f"{dashboard.url}/hunts/{dashboard.hunts()['one']['id']}")
+        assert page.run("return document.getElementById('discovery').data.length > 0")
+        page.wait("document.getElementById('map').data")  # never drawn before: without scrolling, when there is time
+        page.run(
+            "window.jobs = []; import('/static/common.js').then(({ drawWhenNear }) => {"
+            "for (const id of ['discovery', 'map'])"
+            "for (const turn of [1, 2]) drawWhenNear(document.getElementById(id), () => jobs.push(id + turn)); })"
+        )
+        page.wait("jobs.length >= 2")
+        assert page.run("return jobs") == ["discovery1", "discovery2"]
+        page.run("document.getElementById('map').scrollIntoView()")
+        page.wait("jobs.includes('map2')")
+        assert page.run("return jobs.filter((one) => one.startsWith('map'))") == ["map2"]  # the last data alone

@@ -163,9 +163,37 @@ export function layout(more = {}) {
   };
 }
 export const CONFIG = { responsive: true, displayModeBar: false, displaylogo: false, doubleClick: "reset" };
-export function draw(node, traces, more, name) {
+/* A chart that is out of sight waits: the first view is complete earlier, and a running hunt, whose charts change every
+   few seconds, costs little for charts that nobody looks at. A chart that was never drawn is drawn as soon as there is
+   time, so that scrolling shows it at once. */
+const NEAR_PX = 200, waiting = new Map();
+const sight = new IntersectionObserver((seen) => { for (const one of seen) if (one.isIntersecting) drawNow(one.target); }, { rootMargin: `${NEAR_PX}px` });
+function drawNow(node) {
+  const job = waiting.get(node);
+  waiting.delete(node);
+  sight.unobserve(node);
+  node.dataset.drawn = "true";
+  job?.();
+}
+export function drawWhenNear(node, job) {
+  const { top, bottom } = node.getBoundingClientRect();
+  waiting.set(node, job);
+  if (bottom > -NEAR_PX && top < innerHeight + NEAR_PX) drawNow(node); else sight.observe(node);
+}
+/* One at a time, so that the page answers in between. */
+export function drawTheRest() {
+  const node = [...waiting.keys()].find((one) => one.dataset.drawn !== "true");
+  if (node) setTimeout(() => { if (waiting.has(node)) drawNow(node); drawTheRest(); }, 50);
+}
+addEventListener("beforeprint", () => { for (const node of [...waiting.keys()]) drawNow(node); });
+
+export function draw(node, traces, more, name, onClick) {
   node.setAttribute("role", "img");
   node.setAttribute("aria-label", name);
-  return Plotly.react(node, traces, layout({ uirevision: "keep", ...more }), CONFIG);
+  drawWhenNear(node, () => {
+    const isFirst = !node.on;
+    Plotly.react(node, traces, layout({ uirevision: "keep", ...more }), CONFIG);
+    if (isFirst && onClick) node.on("plotly_click", (event) => onClick(event.points));
+  });
 }
 export function onScheme(redraw) { matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw); }

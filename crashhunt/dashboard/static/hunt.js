@@ -1,5 +1,5 @@
 /* The page of one hunt. */
-import { $, PALETTE, Refused, copyButton, count, css, draw, get, interval, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, spelled, tell } from "/static/common.js";
+import { $, PALETTE, Refused, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, interval, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, spelled, tell } from "/static/common.js";
 
 const ID = location.pathname.split("/")[2], API = `/api/hunts/${ID}`;
 const COLORS = { "traffic crash": "--crash", "traffic event": "--crash", "software fault": "--fault", "no crash": "--fine" };
@@ -184,7 +184,7 @@ function drawTrials() {
     });
     const crashed = measured.filter((one) => one.crash);
     traces.push({ type: "scatter", mode: "markers", name: "crash", x: crashed.map((one) => one.number), y: crashed.map(() => 1.05), customdata: crashed.map((one) => one.number), text: crashed.map(about), hovertemplate: "%{text}<extra></extra>", marker: { color: css("--crash"), size: 7, symbol: "x-thin", line: { color: css("--crash"), width: 1.5 } } });
-    draw($("criticality"), traces, { xaxis: { title: "trial" }, yaxis: { title: "criticality", range: [-0.03, 1.1] } }, `Criticality of ${plural(measured.length, "trial", "trials")} over their numbers`);
+    draw($("criticality"), traces, { xaxis: { title: "trial" }, yaxis: { title: "criticality", range: [-0.03, 1.1] } }, `Criticality of ${plural(measured.length, "trial", "trials")} over their numbers`, pickOf);
   }
   $("origins-figure").hidden = origins.length < 2;
   if (origins.length > 1) {
@@ -218,8 +218,8 @@ function drawArguments() {
   const traces = byDanger
     ? [trace(drawn, { name: "criticality", showlegend: false, marker: { size: 6, color: drawn.map((one) => (one.crash ? 1 : one.danger ?? 0)), cmin: 0, cmax: 1, colorscale: "Cividis", colorbar: { title: { text: "criticality" }, thickness: 12 } } })]
     : Object.keys(COLORS).reverse().map((category) => [category, drawn.filter((one) => one.category === category)]).filter(([, own]) => own.length).map(([category, own]) => trace(own, { name: category, marker: { color: css(COLORS[category]), size: category === "no crash" ? 5 : 8, opacity: category === "no crash" ? 0.55 : 0.95, symbol: category === "no crash" ? "circle" : category === "software fault" ? "diamond" : "x" } }));
-  draw($("scatter"), traces, { xaxis: axis(across), yaxis: axis(up) }, `${plural(drawn.length, "trial", "trials")} by ${across} and ${up}, coloured by ${byDanger ? "criticality" : "outcome"}`);
-  drawParallel(names);
+  draw($("scatter"), traces, { xaxis: axis(across), yaxis: axis(up) }, `${plural(drawn.length, "trial", "trials")} by ${across} and ${up}, coloured by ${byDanger ? "criticality" : "outcome"}`, pickOf);
+  drawWhenNear($("parallel"), () => drawParallel(names));
 }
 
 /* Parallel coordinates on a canvas: those of plotly need WebGL and a script made from text, which the page forbids. */
@@ -352,6 +352,8 @@ function pick(number) {
   panel.scrollIntoView({ block: "nearest" });
 }
 
+function pickOf([one]) { if (one?.customdata !== undefined) pick(one.customdata); }
+
 /* Where the crashes were */
 function drawMap() {
   $("where-section").hidden = !road || !road.points.length;
@@ -369,7 +371,10 @@ function drawMap() {
   const dots = (own, more) => ({ type: "scatter", mode: "markers", x: own.map((one) => one.x), y: own.map((one) => one.y), customdata: own.map((one) => one.id), text: own.map((one) => spelled(`${one.id}: ${one.type ?? one.outcome}`)), hovertemplate: "%{text}<extra></extra>", ...more });
   types.forEach((type, place) => traces.push(dots(crashed.filter((one) => (one.type ?? one.outcome) === type), { name: spelled(type), marker: { color: place ? css(PALETTE[place % PALETTE.length]) : css("--crash"), size: 10, symbol: ["circle", "square", "diamond", "triangle-up", "cross"][place % 5], line: { color: css("--card"), width: 1 } } })));
   if ($("near").checked && near.length) traces.push(dots(near, { name: "near misses", marker: { color: css("--faint"), size: 8, symbol: "circle-open" } }));
-  draw($("map"), traces, { xaxis: { title: "x in m", showgrid: false, zeroline: false }, yaxis: { title: "y in m", scaleanchor: "x", showgrid: false, zeroline: false }, dragmode: "pan" }, `Map of ${plural(crashed.length, "crash", "crashes")}`);
+  draw($("map"), traces, { xaxis: { title: "x in m", showgrid: false, zeroline: false }, yaxis: { title: "y in m", scaleanchor: "x", showgrid: false, zeroline: false }, dragmode: "pan" }, `Map of ${plural(crashed.length, "crash", "crashes")}`, (clicked) => {
+    const crash = clicked.find((one) => one.customdata)?.customdata;
+    if (crash) location.href = link(crash).href;
+  });
 }
 function zoomMap(factor) {
   const { xaxis, yaxis } = $("map")._fullLayout, scaled = (range) => { const middle = (range[0] + range[1]) / 2; return range.map((end) => middle + (end - middle) * factor); };
@@ -399,20 +404,12 @@ $("stop").onclick = async () => {
 
 /* Live */
 const loaded = window.Plotly ? Promise.resolve() : new Promise((resolve) => { document.querySelector('script[src^="/static/plotly.js"]').addEventListener("load", resolve); });
-let bound = false;
-function bind() {
-  if (bound || !$("scatter").on) return;
-  bound = true;
-  for (const id of ["scatter", "criticality"]) $(id).on?.("plotly_click", (event) => { const number = event.points[0]?.customdata; if (number !== undefined) pick(number); });
-  $("map").on?.("plotly_click", (event) => { const crash = event.points.find((one) => one.customdata)?.customdata; if (crash) location.href = link(crash).href; });
-}
 function drawAll() {
   if (!hunt || !window.Plotly) return;
   drawProgress();
   drawTrials();
   drawArguments();
   drawMap();
-  bind();
 }
 async function showWeights() {
   const found = await get(`${API}/importance`);
@@ -481,6 +478,7 @@ async function refresh() {
     await loaded;
     drawAll();
   }
+  if (document.body.dataset.complete !== "true" || changed) drawTheRest();
   document.body.dataset.complete = "true";
 }
 let weighedAt = 0;
