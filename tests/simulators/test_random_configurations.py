@@ -142,9 +142,9 @@ def trace(name, config, seed, steps):
 def compare(name, number, steps):
     """Compare one configuration; return whether highway-env ran it without an error."""
     rng = np.random.default_rng((IDS.index(name), number))
-    config, seed = configuration(name, rng), int(rng.integers(2**31))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+        warnings.simplefilter("ignore")  # Gymnasium warns of environments with a newer version
+        config, seed = configuration(name, rng), int(rng.integers(2**31))
         switch_off()
         slow = trace(name, config, seed, steps)
         assert not switch_on()
