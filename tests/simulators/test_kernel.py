@@ -312,6 +312,75 @@ def test_conflicts_are_those_of_highway_env():
     assert sum(len(all_found - sure) for sure, _, all_found in found) <= 2
 
 
+class Lorry(ControlledVehicle):
+    """Without own methods, so that the kernel knows it."""
+
+    LENGTH = 20.0
+
+
+def crossing(*vehicles):
+    """Two lanes from a to b, two on to c, one that crosses them, and two narrow ones beside them.
+
+    Vehicles are given by class, lane, place in m, speed and route.
+    """
+    net = RoadNetwork()
+    for number in range(2):
+        net.add_lane("a", "b", StraightLane([0, 4 * number], [20, 4 * number]))
+        net.add_lane("b", "c", StraightLane([20, 4 * number], [120, 4 * number]))
+    net.add_lane("d", "e", StraightLane([35, -50], [35, 50]))
+    for y in (1.7, 1.9):
+        net.add_lane("f", "g", StraightLane([20, -y], [120, -y], width=1.0))
+    road = RegulatedRoad(net, np_random=np.random.default_rng(1))
+    for kind, key, s, speed, route in vehicles:
+        lane = net.get_lane(key)
+        made = kind(road, lane.position(s, 0), lane.heading_at(s), speed)
+        made.lane_index = made.target_lane_index = key
+        made.route = route
+        road.vehicles.append(made)
+    return road
+
+
+ON = ("b", "c", 0)
+ROUTE = [("a", "b", 0), ("b", "c", None)]
+CROSSINGS = {
+    "on the next part of a route": (
+        (ControlledVehicle, ("a", "b", 0), 15.0, 10.0, ROUTE),
+        (ControlledVehicle, ("d", "e", 0), 40.0, 5.0, None),
+    ),
+    "in the own lane of an open part": (
+        (ControlledVehicle, ("a", "b", 1), 15.0, 10.0, [("a", "b", 1), ("b", "c", None)]),
+        (ControlledVehicle, ("b", "c", 1), 10.0, 0.0, None),
+    ),
+    "in the other lane of an open part": (
+        (ControlledVehicle, ("a", "b", 1), 15.0, 10.0, [("a", "b", 1), ("b", "c", None)]),
+        (ControlledVehicle, ("b", "c", 0), 10.0, 0.0, None),
+    ),
+    "the other is inside": ((Lorry, ON, 20.0, 0.0, None), (ControlledVehicle, ON, 27.5, 0.0, None)),
+    "inside the other": ((ControlledVehicle, ON, 24.5, 0.0, None), (Lorry, ON, 20.0, 0.0, None)),
+    "side by side": ((ControlledVehicle, ON, 20.0, 0.0, None), (ControlledVehicle, ("f", "g", 0), 20.0, 0.0, None)),
+    "side by side, apart": (
+        (ControlledVehicle, ON, 20.0, 0.0, None),
+        (ControlledVehicle, ("f", "g", 1), 20.0, 0.0, None),
+    ),
+    "one behind the other": ((Lorry, ON, 20.0, 0.0, None), (ControlledVehicle, ON, 39.5, 0.0, None)),
+}
+
+
+@pytest.mark.parametrize("name", CROSSINGS)
+def test_a_conflict_of_two_vehicles_is_that_of_highway_env(name):
+    assert not switch_on()
+    road = crossing(*CROSSINGS[name])
+    expected = RegulatedRoad.is_conflict_possible(*road.vehicles)
+    assert _roads.look(road).traffic.conflicts({}) == ([(0, 1, True)] if expected else [])
+
+
+def test_vehicles_conflict_in_some_crossings_and_not_in_all():
+    found = {name: RegulatedRoad.is_conflict_possible(*crossing(*case).vehicles) for name, case in CROSSINGS.items()}
+    assert [name for name in found if not found[name]] == [
+        "in the other lane of an open part", "side by side, apart", "one behind the other",
+    ]  # fmt: skip
+
+
 def test_an_error_of_highway_env_leaves_what_highway_env_leaves():
     """A vehicle in the middle of the list has no road ahead, and an unusual part in its route."""
 
@@ -367,6 +436,34 @@ def test_fork_computes_the_same_bits():
     assert os.read(outlet, 100) == digest()
     os.close(outlet)
     os.close(inlet)
+
+
+@pytest.mark.parametrize("speed", [-40.0, 40.0, -40.5, 40.5])
+def test_an_action_at_the_limit_of_speed_stays(speed):
+    def moved():
+        road = Road(RoadNetwork.straight_road_network(2), np_random=np.random.default_rng(1))
+        for place in (0.0, 300.0):
+            road.vehicles.append(Vehicle(road, [place, 0.0], 0.0, speed))
+            road.vehicles[-1].act({"steering": 0.0, "acceleration": math.copysign(3.0, speed)})
+        road.step(0.1)
+        return state(road)
+
+    slow = moved()
+    assert not switch_on()
+    assert moved() == slow
+
+
+def test_another_vehicle_of_equal_speed_has_no_time_to_collision():
+    def grid():
+        road = Road(RoadNetwork.straight_road_network(2), np_random=np.random.default_rng(1))
+        road.vehicles.append(MDPVehicle(road, [0.0, 0.0], 0.0, 25.0))
+        road.vehicles.append(IDMVehicle(road, [12.0, 0.0], 0.9, 25.0))  # along the lane, it is slower
+        env = SimpleNamespace(road=road, vehicle=road.vehicles[0])
+        return exact(observation.compute_ttc_grid(env, 0.5, 6, road.vehicles[0]))
+
+    slow = grid()
+    assert not switch_on()
+    assert grid() == slow
 
 
 def test_linear_vehicle_collects_the_same_data():
