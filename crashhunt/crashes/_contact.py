@@ -89,7 +89,7 @@ class ContactRecord:
         right_of_way: right of way of the map, where it says.
         lane: The lane of the agent at the contact; empty if it is unknown.
         swept: whether actors drive from scene to scene, and change lanes in an instant, as in `Scene`.
-        reported_collider: The collider according to the result of the trial; empty if it is unknown.
+        reported: The collision in the result of the trial; None if it is unknown.
     """
 
     agent: str
@@ -102,7 +102,7 @@ class ContactRecord:
     right_of_way: RightOfWay | None = None
     lane: str = ""
     swept: bool = True
-    reported_collider: str = ""
+    reported: Collision | None = None
 
     @cached_property
     def before(self) -> list[Scene]:
@@ -226,7 +226,7 @@ class ContactRecord:
         They did not touch, and by their positions the other actor would be the collider. No rule can decide then.
         """
         apart = self.touch.gap_m >= MAX_CONTACT_GAP_M
-        return apart and self.reported_collider not in ("", self.collider)
+        return apart and self.reported is not None and self.reported.collider != self.collider
 
     @property
     def jumpers(self) -> tuple[str, ...]:
@@ -235,7 +235,15 @@ class ContactRecord:
         return tuple(actor for actor, jumped in jumps if jumped)
 
     def speed_at_contact(self, actor: str) -> float:
-        """Return the speed of an actor at the contact, in m/s."""
+        """Return the speed of an actor at the contact, in m/s.
+
+        highway-env slows crashed vehicles down within the step. The scene after it has their later speeds.
+        """
+        hit = self.reported
+        if not self.swept and hit is not None:
+            reported = hit.collider_speed if actor == hit.collider else hit.victim_speed
+            if math.isfinite(reported):
+                return reported
         return self.touch.speed if actor == self.agent else self.touch.other_speed
 
     @property
@@ -497,7 +505,7 @@ def record_in(scenes: Sequence[Scene], hit: Collision) -> ContactRecord | None:
         began_s=scenes[0].time_s,
         lanes=lanes,
         swept=hit.kind != _NOT_SWEPT,
-        reported_collider=hit.collider,
+        reported=hit,
     )
 
 
@@ -540,7 +548,7 @@ def contact_record(bundle: Bundle, recording: Recording | None = None) -> Contac
         events=events,
         # Earlier versions wrote the lane of SUMO's report, which may be the other actor's.
         swept=hit.kind != _NOT_SWEPT,
-        reported_collider=hit.collider,
+        reported=hit,
         lane=(last.lanes[last.roster.index[hit.agent]] if last.lanes else "") or hit.lane,
     )
 

@@ -17,7 +17,7 @@ from crashhunt.crashes import (
     most_dangerous,
 )
 from crashhunt.recording import describe_value, is_opaque
-from crashhunt.report._status_screen import format_arguments
+from crashhunt.report._status_screen import format_inputs
 from crashhunt.report._table import NEAREST, aligned, steps_table
 from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import (
@@ -160,7 +160,7 @@ class Story:
     def describe(self) -> str:
         """Return words and table."""
         lines = [f"{self.bundle.id}  ({self.bundle.result.outcome.category})"]
-        lines.append(f"  seed {self.bundle.result.spec.seed}, {format_arguments(self.bundle.result)}")
+        lines.append(f"  {format_inputs(self.bundle.result)}")
         lines += _shrunk(self.bundle)
         verdict = verdict_of(self)
         is_new = verdict != f"{self.bundle.result.summary}."  # the words begin with the summary

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from crashhunt.hunts import HuntStatus, PhaseStatus, SearchStatus
     from crashhunt.trial import TrialResult, Value
 
-__all__ = ["Watcher", "describe_phase", "format_arguments", "format_pace", "format_seconds"]
+__all__ = ["Watcher", "describe_phase", "format_arguments", "format_inputs", "format_pace", "format_seconds"]
 
 _LINE_EVERY_S = 5.0  # where lines cannot be overwritten, such as in a CI log
 _LEAST_BAR = 8  # columns; a shorter bar is unreadable, and the words need the space
@@ -206,6 +206,11 @@ def format_arguments(result: TrialResult) -> str:
     return " ".join(f"{name}={_short(value)}" for name, value in pairs)
 
 
+def format_inputs(result: TrialResult) -> str:
+    """Return the seed and the arguments of a trial in one line."""
+    return ", ".join(filter(None, (f"seed {result.spec.seed}", format_arguments(result))))
+
+
 def _short(value: Value) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
@@ -311,7 +316,8 @@ def _stressed(result: TrialResult) -> str:
     assert stress is not None
     what = stress.disturbance.words if stress.disturbance is not None else ""
     margin = f"{stress.least:.2f}" if stress.margin is not None else f"at most {stress.least:.2f} ({stress.extent})"
-    return f"least stress margin: {margin}, trial {result.spec.number}, {what}, {format_arguments(result)}"
+    parts = (f"least stress margin: {margin}", f"trial {result.spec.number}", what, format_arguments(result))
+    return ", ".join(filter(None, parts))
 
 
 def _strategies(search: SearchStatus) -> str:
@@ -338,5 +344,5 @@ def _near(result: TrialResult) -> str:
         how = f"{closest.time_to_collision_s:.2f} s from a collision"
     else:
         how = "never on a collision course"
-    danger = "" if result.danger is None else f"danger {result.danger:.2f}, "
-    return f"trial {result.spec.number}, {danger}{how}, {format_arguments(result)}"
+    danger = "" if result.danger is None else f"danger {result.danger:.2f}"
+    return ", ".join(filter(None, (f"trial {result.spec.number}", danger, how, format_arguments(result))))

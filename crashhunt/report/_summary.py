@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.text import in_lines
 from crashhunt.report._rate import describe_rates
-from crashhunt.report._status_screen import describe_types, format_arguments, format_seconds
+from crashhunt.report._status_screen import describe_types, format_arguments, format_inputs, format_seconds
 from crashhunt.report._words import (
     by_likelihood,
     describe_branches,
@@ -218,7 +218,7 @@ def describe_replay(report: ReplayReport) -> str:
     was = bundle.result
     lines = [
         f"{bundle.id}: {was.summary}",
-        f"  seed {was.spec.seed}, {format_arguments(was)}",
+        f"  {format_inputs(was)}",
         f"  driven by {drivers[rerun.code]}",
     ]
     lines += [f"  warning: {warning}" for warning in rerun.warnings]
@@ -294,7 +294,7 @@ def _describe_crash(bundle: Bundle) -> list[str]:
         f"{bundle.id}  ({result.outcome.category})",
         f"  {result.summary}",
         f"  after {result.steps} steps, simulation time {result.sim_time_s:.1f} s",
-        f"  seed {result.spec.seed}, {format_arguments(result)}",
+        f"  {format_inputs(result)}",
     ]
     lines += [f"  {line}" for line in (*_evidence(result), *list_disturbances(result))]
     lines.append(f"  saved in {bundle.path}")

@@ -15,7 +15,7 @@ from crashhunt.executors import NodeFigures
 from crashhunt.hunts import HuntStatus, SearchStatus, StrategyStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher, describe_running
-from crashhunt.report._status_screen import _line, describe_kinds
+from crashhunt.report._status_screen import _line, _near, describe_kinds, format_inputs
 from crashhunt.trial import Disturbance, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -74,6 +74,14 @@ def test_the_least_stress_margin_is_shown_where_there_is_room():
             console.print(Watcher(console, TITLE)._screen(replace(found, stressed=stressed)))
         line = "least stress margin: 0.38, trial 123, the actor ahead of ego brakes with 2.25 m/s² for 3 s"
         assert (line in captured.get()) is shown
+
+
+@pytest.mark.parametrize(("arguments", "words"), [({}, ""), ({"ego": {"speed": 2.5}}, ", speed=2.5")])
+def test_line_of_a_trial_without_arguments_ends_after_its_seed(arguments, words):
+    spec = TrialSpec(number=3, seed=5, arguments=arguments, scenario_arguments={}, max_steps=9)
+    result = TrialResult(spec, Outcome.SURVIVED)
+    assert format_inputs(result) == f"seed 5{words}"
+    assert _near(result) == f"trial 3, never on a collision course{words}"
 
 
 def test_margin_that_is_not_fully_asked_is_shown_as_such():

@@ -184,7 +184,7 @@ def test_braking_is_no_answer_where_the_agent_changed_lanes():
 
 def test_contact_that_the_outlines_contradict_is_not_described():
     apart = story(poses=lambda time_s: [(20 * time_s, 0.0, 0.0, 20.0), (6.4 + 12 * time_s, 0.0, 0.0, 12.0)])
-    apart.contact = replace(apart.contact, reported_collider="x")
+    apart.contact = replace(apart.contact, reported=replace(apart.contact.reported, collider="x"))
     assert verdict_of(apart) == f"{apart.bundle.result.summary}."
 
 

@@ -13,6 +13,7 @@ from test_fault import LANES, Map, rotated
 from crashhunt.crashes._contact import ContactRecord
 from crashhunt.crashes._fault import fault_in
 from crashhunt.crashes._lanes import LaneMap
+from crashhunt.trial import Collision
 from crashhunt.world import Actor, Event, Roster, Scene
 
 ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "passenger", 5.0, 2.0)))
@@ -204,12 +205,32 @@ def test_red_light_ends_where_the_vehicle_has_left_the_junction():
     assert not case.is_past(inside, -1.0)
 
 
+def collision(collider, *speeds):
+    role, victim = ("collider", "other") if collider == "ego" else ("victim", "ego")
+    return Collision("ego", role, collider, victim, ("reported",), "collision", 0.0, 0.0, "", *speeds)
+
+
+@pytest.mark.parametrize("collider", ["ego", "other"])
+def test_speeds_at_a_contact_within_a_step_are_those_reported(collider):
+    """After highway-env's contacts, the vehicles brake until the step ends."""
+    speeds = {"ego": 30.0, "other": 20.0}
+    hit = collision(collider, *sorted(speeds.values(), reverse=collider == "ego"))
+    slowed = {"ego": drives(26.0), "other": drives(17.0, x=5.0)}
+    case = record(*slowed.values(), step_s=0.2, swept=False, reported=hit)
+    assert {actor: case.speed_at_contact(actor) for actor in speeds} == speeds
+    for unknown in (None, replace(hit, collider_speed=math.nan, victim_speed=math.nan)):
+        case = record(*slowed.values(), step_s=0.2, swept=False, reported=unknown)
+        assert [case.speed_at_contact(actor) for actor in speeds] == [26.0, 17.0]
+    swept = record(drives(26.0), drives(17.0, x=5.0), step_s=0.2, reported=hit)
+    assert swept.speed_at_contact("ego") == 26.0
+
+
 @pytest.mark.parametrize(
     ("gap_m", "reported", "verdict"), [(1.4, "other", False), (1.4, "ego", True), (0.9, "other", True)]
 )
 def test_reported_collision_that_the_outlines_contradict_has_no_verdict(gap_m, reported, verdict):
     """SUMO reports collisions of vehicles whose outlines do not touch, here with the vehicle ahead as the collider."""
-    case = record(drives(15.0), drives(8.0, x=5.0 + gap_m), step_s=0.2, reported_collider=reported)
+    case = record(drives(15.0), drives(8.0, x=5.0 + gap_m), step_s=0.2, reported=collision(reported))
     assert case.touch.gap_m == pytest.approx(gap_m, abs=0.01)
     assert (case.manner == "rear end") is verdict
     assert (fault_in(case).verdict == "ego") is verdict
