@@ -219,14 +219,21 @@ class ContactRecord:
         """The actor that drove into the other."""
         return self.agent if self.touch.drives_into else self.other
 
-    @property
+    @cached_property
     def is_disputed(self) -> bool:
-        """Whether the simulator reported a collision that the outlines contradict.
+        """Whether the scenes contradict the collision that the simulator reported. No rule can decide then.
 
-        They did not touch, and by their positions the other actor would be the collider. No rule can decide then.
+        Either the outlines did not touch, and by the positions the other actor would be the collider. Or the simulator
+        collided within a step, after which the scene shows what followed: another collider, or a slower vehicle that
+        drives into the back of a faster one.
         """
-        apart = self.touch.gap_m >= MAX_CONTACT_GAP_M
-        return apart and self.reported is not None and self.reported.collider != self.collider
+        hit = self.reported
+        if hit is None:
+            return False
+        if hit.collider != self.collider and (not self.swept or self.touch.gap_m >= MAX_CONTACT_GAP_M):
+            return True
+        follower = "" if self.swept else self._follower
+        return bool(follower) and self.speed_at_contact(follower) < self.speed_at_contact(self.partner(follower))
 
     @property
     def jumpers(self) -> tuple[str, ...]:
@@ -296,7 +303,11 @@ class ContactRecord:
     @cached_property
     def follower(self) -> str:
         """The actor whose front touched the other's rear, in the same direction; empty if there was none."""
-        if not self.same_way or self.touch.is_sideways or self.is_disputed:
+        return "" if self.is_disputed else self._follower
+
+    @cached_property
+    def _follower(self) -> str:
+        if not self.same_way or self.touch.is_sideways:
             return ""
         faces = self.touch.face, self.touch.other_face
         return self.agent if faces == ("front", "rear") else self.other if faces == ("rear", "front") else ""

@@ -226,6 +226,24 @@ def test_speeds_at_a_contact_within_a_step_are_those_reported(collider):
 
 
 @pytest.mark.parametrize(
+    ("collider", "speeds", "swept", "verdict"),
+    [
+        ("ego", (30.0, 20.0), False, True),
+        ("ego", (20.0, 30.0), False, False),  # a slower one does not drive into the back of a faster one
+        ("ego", (20.0, 20.0), False, True),
+        ("other", (20.0, 30.0), False, False),
+        ("other", (20.0, 30.0), True, True),  # within a step of SUMO, the scenes say more than its report
+    ],
+)
+def test_contact_within_a_step_that_the_scene_after_it_contradicts_has_no_verdict(collider, speeds, swept, verdict):
+    hit = collision(collider, *speeds)
+    case = record(drives(26.0), drives(17.0, x=5.0), step_s=0.2, swept=swept, reported=hit)
+    assert case.is_disputed is not verdict
+    assert (case.manner == "rear end") is verdict
+    assert (fault_in(case).verdict == "ego") is verdict
+
+
+@pytest.mark.parametrize(
     ("gap_m", "reported", "verdict"), [(1.4, "other", False), (1.4, "ego", True), (0.9, "other", True)]
 )
 def test_reported_collision_that_the_outlines_contradict_has_no_verdict(gap_m, reported, verdict):
