@@ -67,16 +67,19 @@ class CrashhuntError(Exception):
     """An error with the mistake, the fix, and where it is.
 
     Args:
-        message: what is wrong, with the offending value.
+        message: what is wrong, with the offending value; or an error to copy.
         fix: what to do about it, as an imperative.
         where: the file, key or option with the problem.
     """
 
     exit_code = 2
 
-    def __init__(self, message: str, *, fix: str = "", where: str = "") -> None:
+    def __init__(self, message: str | CrashhuntError, *, fix: str = "", where: str = "") -> None:
+        if isinstance(message, CrashhuntError):  # Gymnasium's AsyncVectorEnv raises `type(error)(error)`
+            copied: tuple[str, str, str] = message.args
+            message, fix, where = copied[0], fix or copied[1], where or copied[2]
         super().__init__(message, fix, where)
-        self.message = message
+        self.message: str = message
         self.fix = fix
         self.where = where
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-__all__ = ["did_you_mean", "encodable", "in_lines", "listed", "near_path", "one_line", "one_of", "visible"]
+__all__ = ["did_you_mean", "encodable", "in_lines", "listed", "near_path", "one_line", "one_of", "out_of", "visible"]
 
 
 # Control and format characters, lone surrogates, and separators of lines that are no newline.
@@ -105,6 +105,17 @@ def one_of(name: str, known: Iterable[str], *, give: str = "give one of", none: 
     """
     names = list(known)
     return f"{did_you_mean(name, names)} {give} {listed(names, none=none)}".lstrip()
+
+
+def out_of(done: int, planned: int, separator: str = " of ") -> str:
+    """Return how many of the planned trials have ended: ``3 of 8``.
+
+    Args:
+        done: number of trials that have ended.
+        planned: number of planned trials; 0 for no limit. A resumed hunt may have fewer of them than have ended.
+        separator: text between the two numbers.
+    """
+    return f"{done}{separator}{planned}" if planned and done <= planned else str(done)
 
 
 def _plain(name: str) -> str:

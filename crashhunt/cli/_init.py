@@ -39,9 +39,7 @@ def add_init(commands: Commands) -> None:
     maps.add_argument("--grid", metavar="NxM", default="", help="a generated grid of N by M junctions, such as 4x4")
     maps.add_argument("--spider", metavar="NxM", default="", help="a generated web of N arms and M rings, such as 5x3")
     how = init.add_argument_group("what is made of it")
-    how.add_argument(
-        "--bbox", metavar="W,S,E,N", default="", help="only this part of the map, in degrees; write --bbox=W,S,E,N"
-    )
+    how.add_argument("--bbox", metavar="W,S,E,N", help="only this part of the map, in degrees; write --bbox=W,S,E,N")
     how.add_argument(
         "--demand", metavar="LOW:HIGH", default="0.2:1.5",
         help="range of the factor that scales the traffic (default: %(default)s); the traffic does not jam at HIGH",
@@ -49,7 +47,7 @@ def add_init(commands: Commands) -> None:
     how.add_argument("--people", action="store_true", help="add persons on foot, on sidewalks and crossings")
     how.add_argument("--bicycles", action="store_true", help="add cyclists, and lanes for bicycles")
     how.add_argument("--lefthand", action="store_true", help="traffic keeps to the left")
-    how.add_argument("--agent", metavar="NAME", default="", help="the agent that drives (default: car-following)")
+    how.add_argument("--agent", metavar="NAME", help="the agent that drives (default: car-following)")
     how.add_argument("--workflow", choices=["github"], default="", help="add a workflow for this CI")
     add_json(how)
     init.set_defaults(command=_init)
@@ -59,15 +57,15 @@ def _init(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.maps import MapOptions, describe_place, make_scenario, parse_bbox
 
     asked = MapOptions(
-        bbox=parse_bbox(options.bbox) if options.bbox else None,
+        bbox=parse_bbox(options.bbox) if options.bbox is not None else None,
         demand=_demand(options.demand),
         people=options.people,
         bicycles=options.bicycles,
         left_hand=options.lefthand,
-        agent=options.agent,
+        agent=options.agent or "",
         workflow=options.workflow,
     )
-    if options.agent:
+    if options.agent is not None:
         _check_agent(options.agent)
 
     def tell(text: str) -> None:
@@ -121,10 +119,29 @@ def _demand(text: str) -> tuple[float, float]:
 _MAX_DEMAND = 100.0
 
 
-def _check_agent(name: str) -> None:
-    from crashhunt.base.plugins import locate
+_IMPORT_S = 60.0
 
-    locate("agents", name)
+
+def _check_agent(name: str) -> None:
+    """Refuse an agent that no trial could make, before the map takes its time.
+
+    Raises:
+        PluginError: there is no such agent, or its module cannot be imported.
+        UsageError: it needs an argument.
+    """
+    from crashhunt.base.apart import work_apart
+    from crashhunt.base.plugins import is_foreign, locate
+    from crashhunt.trial import signature_of
+
+    def needed() -> list[str]:
+        return list(signature_of(locate("agents", name)).required)
+
+    # A module of the user may end or stop the process that imports it.
+    task = f"{name!r} cannot be imported"
+    required = work_apart(needed, task=task, timeout_s=_IMPORT_S) if is_foreign("agents", name) else needed()
+    if required:
+        fix = "give it a default: the new scenario has no value for it"
+        raise UsageError(f"--agent {name}: it needs the argument {required[0]!r}", fix=fix)
 
 
 def _try_out(folder: Path, steps: int) -> PlainTrial:

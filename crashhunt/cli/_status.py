@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.base.text import one_line
+from crashhunt.base.text import one_line, out_of
 from crashhunt.cli._common import BAD_INPUT, DONE, add_json
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def states_table(states: list[HuntState]) -> Table:
         table.add_row(
             Text(one_line(state.dir)),
             Text(_state(state), style=_COLORS.get(state.state, ""), no_wrap=True),
-            f"{state.trials_run}/{state.trials_planned}" if state.trials_planned else str(state.trials_run),
+            out_of(state.trials_run, state.trials_planned, "/"),
             format_pace(state.rate_per_s) if state.rate_per_s else "-",
             format_seconds(state.seconds_left) if state.seconds_left is not None else "-",
             _crashes(state),

@@ -19,6 +19,7 @@ from crashhunt.estimation import counts_suffice, rate_of_counts, rate_of_trials
 from crashhunt.hunts import HuntState, hunt_state, state_of_facts, sums_of_branches, sums_of_probes
 from crashhunt.ledger import Ledger, damaged, has_begun
 from crashhunt.plans import read_settings
+from crashhunt.training import held_out_traffics
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Facts, KindData
     from crashhunt.plans import HuntSettings
     from crashhunt.rates import CrashRate
+    from crashhunt.training import HeldOutTraffics
 
 __all__ = ["HuntView", "read_tail"]
 
@@ -66,6 +68,8 @@ class HuntView:
         self._rate: JsonObject | None = None
         self._rate_key: object = None
         self._rate_due = 0.0
+        self._held_out_rule: HeldOutTraffics | None = None
+        self._held_out_key: object = None
 
     @property
     def path(self) -> Path:
@@ -230,15 +234,28 @@ class HuntView:
         settings, counts = self.settings, self.counts
         if settings is None or counts is None or not counts.trials:
             return None
-        if counts_suffice(settings, self.facts):
+        try:
+            held_out = self._held_out(settings)
+        except CrashhuntError as error:
+            return {"why_not": str(error)[:_DETAIL]}
+        if counts_suffice(settings, self.facts, held_out):
             key = counts.prefix
             if key != self._rate_key:
                 found = rate_of_counts(self.path, settings, self.facts, **key._asdict())
                 self._rate, self._rate_key = _rate_data(found), key
             return self._rate
-        return self._rate_of_all(state, settings, counts)
+        return self._rate_of_all(state, settings, counts, held_out)
 
-    def _rate_of_all(self, state: HuntState, settings: HuntSettings, counts: TrialCounts) -> JsonObject | None:
+    def _held_out(self, settings: HuntSettings) -> HeldOutTraffics:
+        """Return the rule for the traffics that count; snapshots are read once."""
+        key = _sign(self.path / layout.SNAPSHOTS)
+        if self._held_out_rule is None or self._held_out_key != key:
+            self._held_out_rule, self._held_out_key = held_out_traffics(settings, [self.path]), key
+        return self._held_out_rule
+
+    def _rate_of_all(
+        self, state: HuntState, settings: HuntSettings, counts: TrialCounts, held_out: HeldOutTraffics
+    ) -> JsonObject | None:
         """Measure a rate that needs all trials, within its share of time."""
         if counts.trials > _MAX_TRIALS_READ:
             why = f"it reads all trials, of which there are more than {_MAX_TRIALS_READ:,}"
@@ -248,7 +265,7 @@ class HuntView:
         if key != self._rate_key and (began >= self._rate_due or state.state != "running"):
             ledger = Ledger(self.path / layout.LEDGER, read_only=True)
             try:
-                found = rate_of_trials(self.path, settings, self.facts, ledger.plain_results())
+                found = rate_of_trials(self.path, settings, self.facts, ledger.plain_results(), held_out)
                 self._rate, self._rate_key = _rate_data(found), key
             except HuntDirectoryError as error:
                 self._rate, self._rate_key = {"why_not": str(error)}, key

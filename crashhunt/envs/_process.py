@@ -1,4 +1,4 @@
-"""Episodes in a their own process: libsumo has one simulation per process.
+"""Episodes in their own process: libsumo has one simulation per process.
 
 Such a process can be forked between two steps (`RemoteEpisodes.branch`). SUMO's `loadState` does not continue as the
 original run did, and a fork does: it has all of SUMO's memory. The copy serves its own connection, so that the
@@ -11,10 +11,12 @@ Invariant: a process ends when its connection is closed, and when the user's pro
 from __future__ import annotations
 
 import os
+import pickle
 import select
 import signal
 import subprocess
 import sys
+import threading
 import weakref
 from contextlib import suppress
 from multiprocessing.connection import Connection, Pipe
@@ -69,7 +71,8 @@ class RemoteEpisodes:
             start_new_session=True,  # Ctrl-C must reach the user's program only
         )
         there.close()
-        self._pipe, self._name, self.pid = here, "the environment", self._process.pid
+        self._connect(here)
+        self._name, self.pid = "the environment", self._process.pid
         self._end = weakref.finalize(self, _end, self._process, here, os.getpid())
         found = self._ask("made", self.served, *words)
         self.observation_space: Space[object] = found["observation_space"]
@@ -121,7 +124,8 @@ class RemoteEpisodes:
         copy: RemoteEpisodes = object.__new__(RemoteEpisodes)
         copy.__dict__.update(self.__dict__)
         copy._process = _Fork(pid)
-        copy._pipe, copy._name, copy.pid = here, f"{name} (process {pid})", pid
+        copy._connect(here)
+        copy._name, copy.pid = f"{name} (process {pid})", pid
         copy._end = weakref.finalize(copy, _end, copy._process, here, os.getpid())
         copy._ask("agent_name")  # it has begun to serve
         return copy
@@ -131,27 +135,67 @@ class RemoteEpisodes:
         found: NDArray[np.generic] = self._ask("picture")
         return found
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether the process has ended, so that there are no further episodes."""
+        return self._pipe.closed
+
     def close(self) -> None:
         """End the process."""
         self._end()
 
+    def _connect(self, pipe: Ours) -> None:
+        self._pipe = pipe
+        self._why_closed = "the environment has been closed"
+        self._lock = threading.Lock()  # messages of two threads must not mix
+        self._asked = 0
+        self._answers = select.poll()
+        self._answers.register(pipe.fileno(), select.POLLIN)
+
     def _ask(self, name: str, *words: object, passes: int = -1) -> Any:
-        if self._pipe.closed:
-            raise SimulatorError("the environment has been closed", fix="make a new environment")
+        with self._lock:
+            if self._pipe.closed:
+                raise SimulatorError(self._why_closed, fix="make a new environment")
+            fine, answer = self._exchange(name, words, passes)
+        if not fine:
+            raise answer
+        return answer
+
+    def _exchange(self, name: str, words: tuple[object, ...], passes: int) -> tuple[bool, Any]:
+        """Send a request, and return its answer.
+
+        Ctrl-C nearly always arrives during the wait. Its request is still answered later, and that answer is skipped:
+        the next request must not be given the answer to an earlier one. In the middle of a message Ctrl-C ends the
+        process, because the rest of the stream cannot be read.
+        """
+        is_in_message = False
         try:
-            self._pipe.send((name, words))
+            self._asked += 1
+            self._pipe.send((self._asked, name, words))
             if passes >= 0:
+                is_in_message = True
                 send_handle(self._pipe, passes, None)
-            fine, answer = self._pipe.recv()
+                is_in_message = False
+            while True:
+                self._answers.poll()
+                is_in_message = True
+                answer = self._pipe.recv_bytes()
+                is_in_message = False
+                number, fine, found = pickle.loads(answer)  # from our own process
+                if number == self._asked:
+                    return fine, found
         except (EOFError, ConnectionError) as error:
             self._end()
             code = self._process.returncode
             how = "" if code is None else f" by signal {-code}" if code < 0 else f" with exit code {code}"
             what = f"the process of {self._name}" if isinstance(self._process, subprocess.Popen) else self._name
-            raise SimulatorError(f"{what} ended{how}", fix="make a new environment") from error
-        if not fine:
-            raise answer
-        return answer
+            self._why_closed = f"{what} ended{how}"
+            raise SimulatorError(self._why_closed, fix="make a new environment") from error
+        except BaseException:
+            if is_in_message:
+                self._why_closed = f"{self._name} was interrupted in the middle of a message"
+                self._end()
+            raise
 
 
 class _Fork:
@@ -215,7 +259,7 @@ def _serve(pipe: Ours, is_orphan: Callable[[], bool], episodes: Episodes | None)
             while not pipe.poll(_LOOK_EVERY_S):
                 if is_orphan():
                     return episodes
-            name, words = pipe.recv()
+            number, name, words = pipe.recv()
             answer: object
             try:
                 if episodes is None:
@@ -229,9 +273,9 @@ def _serve(pipe: Ours, is_orphan: Callable[[], bool], episodes: Episodes | None)
                 else:
                     answer = getattr(episodes, name)(*words)
             except Exception as error:
-                _fail(pipe, error)
+                _fail(pipe, number, error)
             else:
-                pipe.send((True, answer))
+                pipe.send((number, True, answer))
     return episodes
 
 
@@ -262,11 +306,11 @@ def _fork(pipe: Ours, episodes: Episodes, seed: int | None, owner: int) -> tuple
         os.close(end)
 
 
-def _fail(pipe: Ours, error: Exception) -> None:
+def _fail(pipe: Ours, number: int, error: Exception) -> None:
     try:
-        pipe.send((False, error))
+        pipe.send((number, False, error))
     except Exception:  # the error cannot be pickled
-        pipe.send((False, SimulatorError(f"{type(error).__name__}: {error}")))
+        pipe.send((number, False, SimulatorError(f"{type(error).__name__}: {error}")))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,9 @@
-from ._comparison import Comparison as Comparison, HuntFigures as HuntFigures, compare as compare
+from ._comparison import (
+    Comparison as Comparison,
+    HuntFigures as HuntFigures,
+    compare as compare,
+    held_out_of as held_out_of,
+)
 from ._gate import (
     GateCase as GateCase,
     GateReport as GateReport,

@@ -11,7 +11,7 @@ import csv
 import json
 import math
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
@@ -28,15 +28,16 @@ from crashhunt.training import held_out_traffics
 from crashhunt.trial import Constant, Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from crashhunt.plans import HuntSettings
     from crashhunt.rates import CrashRate, TrialFacts
+    from crashhunt.training import HeldOutTraffics
 
-__all__ = ["Comparison", "HuntFigures", "Pair", "compare", "why_unpaired"]
+__all__ = ["Comparison", "HuntFigures", "Pair", "compare", "held_out_of", "why_unpaired"]
 
 _CONFIDENCE = 0.95
 _ALPHA = 1 - _CONFIDENCE
@@ -64,6 +65,8 @@ class HuntFigures:
             unguided trials show a crash rate. Empty if all trials count.
         disturbed: how many of the crashes had disturbances; None if the hunt has none.
         excluded: how many trials have ended, but not all of lower numbers; they do not count.
+        exclusions: reason to number of trials that do not count. Reason ``trained_on``: an agent of this hunt, or of
+            a compared hunt with the same seed, was trained on their traffic.
     """
 
     dir: str
@@ -80,6 +83,7 @@ class HuntFigures:
     counted: str = ""
     disturbed: int | None = None
     excluded: int = 0
+    exclusions: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +185,7 @@ class Comparison:
     def to_json(self) -> dict[str, object]:
         """Return the shape that ``compare --json`` prints; what is no finite number is null."""
         return {
-            "hunts": [finite_values(asdict(hunt)) for hunt in self.hunts],
+            "hunts": [_plain_figures(hunt) for hunt in self.hunts],
             "pairs": [_plain(pair) for pair in self.pairs],
         }
 
@@ -200,6 +204,12 @@ class Comparison:
     def __repr__(self) -> str:
         rates = ", ".join(f"{hunt.dir}: {hunt.crashes} of {hunt.trials}" for hunt in self.hunts)
         return f"<comparison {rates}>"
+
+
+def _plain_figures(hunt: HuntFigures) -> dict[str, object]:
+    found = finite_values(asdict(hunt))
+    found["left_out"] = found.pop("exclusions")  # as rate --json has it
+    return found
 
 
 def _plain(pair: Pair) -> dict[str, object]:
@@ -221,19 +231,49 @@ def compare(*directories: Path | str) -> Comparison:
     for hunt in hunts:
         if hunt.state.damaged:
             raise HuntDirectoryError(hunt.state.detail)
-    figures = [_figures(hunt) for hunt in hunts]
+    sides = [_Side(hunt, held_out_of(hunt, hunts)) for hunt in hunts]
+    figures = [_figures(side) for side in sides]
     pairs = tuple(
-        _pair(hunts[0], figures[0], hunt, figure) for hunt, figure in zip(hunts[1:], figures[1:], strict=True)
+        _pair(sides[0], figures[0], side, figure) for side, figure in zip(sides[1:], figures[1:], strict=True)
     )
     return Comparison(tuple(figures), pairs)
+
+
+def held_out_of(hunt: HuntResults, compared: Sequence[HuntResults]) -> HeldOutTraffics:
+    """Return the rule for the trials of a hunt that count in a comparison: the same for all hunts with its seed.
+
+    Raises:
+        HuntDirectoryError: the record of a training is damaged.
+        BundleError: a snapshot is damaged.
+    """
+    alike = [other.directory for other in compared if other.settings.seed == hunt.settings.seed]
+    return held_out_traffics(hunt.settings, alike)
+
+
+@dataclass(frozen=True, slots=True)
+class _Side:
+    """A hunt in a comparison.
+
+    Args:
+        hunt: the hunt.
+        held_out: rule for its trials that count.
+    """
+
+    hunt: HuntResults
+    held_out: HeldOutTraffics
+
+    def rate(self, confidence: float = 100 * _CONFIDENCE) -> CrashRate:
+        """Return the rate per trial."""
+        found = measure_rates(self.hunt.directory, per="trial", confidence=confidence, held_out=self.held_out)
+        return found[0]
 
 
 # One hunt in numbers.
 
 
-def _figures(hunt: HuntResults) -> HuntFigures:
-    rate = _rate(hunt)
-    table = _table(hunt)
+def _figures(side: _Side) -> HuntFigures:
+    hunt, rate = side.hunt, side.rate()
+    table = _table(side)
     valid = table[table["valid"]]
     crashed, fine = valid[valid["crash"]], valid[~valid["crash"]]
     return HuntFigures(
@@ -244,18 +284,15 @@ def _figures(hunt: HuntResults) -> HuntFigures:
         crashes=rate.crashes,
         crash_rate=_share(hunt, rate),
         interval=None if rate.certain is None else (rate.certain.low, rate.certain.high),
-        why_not=rate.why_not if rate.trials else "there is no valid trial",
+        why_not=rate.why_not if rate.trials or rate.excluded.get("trained_on") else "there is no valid trial",
         median_steps_to_crash=float(np.median(crashed["steps"])) if len(crashed) else float("nan"),
         median_time_to_collision_s=float(np.median(fine["ttc"])) if len(fine) else float("nan"),
         outcomes=hunt.state.outcomes,
         counted=hunt.plain_origin,
         disturbed=_disturbed(hunt, set(crashed["number"].tolist())) if hunt.settings.disturb else None,
         excluded=rate.excluded.get("after_unfinished", 0),
+        exclusions=rate.excluded,
     )
-
-
-def _rate(hunt: HuntResults, confidence: float = 100 * _CONFIDENCE) -> CrashRate:
-    return measure_rates(hunt.directory, per="trial", confidence=confidence)[0]
 
 
 def _share(hunt: HuntResults, rate: CrashRate) -> float:
@@ -269,17 +306,19 @@ def _share(hunt: HuntResults, rate: CrashRate) -> float:
     return math.nan
 
 
-def _table(hunt: HuntResults) -> NDArray[np.void]:
+def _table(side: _Side) -> NDArray[np.void]:
     """Number, steps, least time to collision, whether it counts and whether it crashed, in order of numbers.
 
-    Of a hunt that guided its trials, those that it did not.
+    Of a hunt that guided its trials, those that it did not. Trials on training traffic are excluded.
     """
+    hunt, held_out = side.hunt, side.held_out
     crash_on = hunt.settings.crash_on
     fields = [("number", "i8"), ("steps", "i8"), ("ttc", "f8"), ("valid", "?"), ("crash", "?")]
     with closing(Ledger(hunt.directory / layout.LEDGER)) as ledger:
         rows = (
             (number, steps, np.inf if ttc is None else ttc, name != Outcome.INVALID, name in crash_on)
-            for number, _, name, steps, ttc in ledger.table()
+            for number, seed, name, steps, ttc in ledger.table()
+            if held_out.has(seed)
         )
         table = np.fromiter(rows, fields)
     if hunt.plain_origin:
@@ -296,13 +335,14 @@ def _disturbed(hunt: HuntResults, crashed: set[int]) -> int:
 # Two hunts.
 
 
-def _pair(first: HuntResults, figures: HuntFigures, second: HuntResults, other: HuntFigures) -> Pair:
+def _pair(one: _Side, figures: HuntFigures, two: _Side, other: HuntFigures) -> Pair:
+    first, second = one.hunt, two.hunt
     counts = (figures.crashes, figures.trials, other.crashes, other.trials)
     why_not = why_unpaired(first.settings, second.settings)
     if not why_not:
         sequence, test, trained_on = _paired(first, second)
         if test.pairs and not sequence.why_not:
-            found = _by_pairs(first, second, sequence, test, counts)
+            found = _by_pairs(one, two, sequence, test, counts)
             return replace(
                 found,
                 caution="; ".join(filter(None, (found.caution, _only_held_out(trained_on, test.trials)))),
@@ -325,18 +365,19 @@ def _pair(first: HuntResults, figures: HuntFigures, second: HuntResults, other: 
             )
         else:
             why_not = "they have no pair of trials yet"
-    return _by_intervals(first, second, why_not, counts)
+    return _by_intervals(one, two, why_not, counts)
 
 
 def _by_pairs(
-    first: HuntResults, second: HuntResults, sequence: PairSequence, test: PairTest, counts: tuple[int, int, int, int]
+    one: _Side, two: _Side, sequence: PairSequence, test: PairTest, counts: tuple[int, int, int, int]
 ) -> Pair:
+    first, second = one.hunt, two.hunt
     log_evidence = test.log_evidence
     answer = "undecided"
     if log_evidence >= -math.log(_ALPHA):
         answer = "first" if test.only_second > test.only_first else "second"
     p_value = None
-    if _is_fixed_ahead(first) and _is_fixed_ahead(second):
+    if _is_fixed_ahead(one) and _is_fixed_ahead(two):
         from scipy.stats import binomtest
 
         discordant = test.only_first + test.only_second
@@ -365,17 +406,19 @@ def _only_held_out(trained_on: int, counted: int) -> str:
     return f"only {counted} held-out pairs count: an agent was trained on traffics of the other {trained_on}"
 
 
-def _by_intervals(first: HuntResults, second: HuntResults, why_not: str, counts: tuple[int, int, int, int]) -> Pair:
+def _by_intervals(one: _Side, two: _Side, why_not: str, counts: tuple[int, int, int, int]) -> Pair:
     """Compare hunts without common traffic; each interval has half of the error probability."""
-    trained = [hunt for hunt in (first, second) if not _is_new_traffic(hunt)]
-    if trained:
-        why_not += f"; {trained[0].directory} has no rate, because its agent was trained on this --seed"
-    a, b = (_rate(hunt, 100 * (1 - _ALPHA / 2)).certain if hunt not in trained else None for hunt in (first, second))
+    first, second = one.hunt, two.hunt
+    rates = [side.rate(100 * (1 - _ALPHA / 2)) for side in (one, two)]
+    for rate in rates:
+        if rate.certain is None and rate.excluded.get("trained_on"):
+            why_not += f"; {rate.dir} has no rate: {rate.why_not}"
+    a, b = (rate.certain for rate in rates)
     p_value, difference, answer = None, None, ""
     if a is not None and b is not None:
         difference = Interval(b.low - a.high, b.high - a.low)
         answer = "first" if difference.low > 0 else "second" if difference.high < 0 else "undecided"
-        if _is_fixed_ahead(first) and _is_fixed_ahead(second):
+        if _is_fixed_ahead(one) and _is_fixed_ahead(two):
             from scipy.stats import fisher_exact
 
             crashes, trials, other, other_trials = counts
@@ -397,16 +440,10 @@ def _by_intervals(first: HuntResults, second: HuntResults, why_not: str, counts:
     )
 
 
-def _is_new_traffic(hunt: HuntResults) -> bool:
-    """Return whether the agents of a hunt were not trained on the traffics of its seed."""
-    records = held_out_traffics(hunt.settings, [hunt.directory]).records
-    return not any(hunt.settings.seed in record.hunt_seeds for record in records)
-
-
-def _is_fixed_ahead(hunt: HuntResults) -> bool:
+def _is_fixed_ahead(side: _Side) -> bool:
     """Return whether the number of trials did not depend on the crashes, so that a test with one look is valid."""
-    settings = hunt.settings
-    return not (settings.seeds or settings.run.until_rate) and _rate(hunt).estimate is not None
+    settings = side.hunt.settings
+    return not (settings.seeds or settings.run.until_rate) and side.rate().estimate is not None
 
 
 def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, PairTest, int]:

@@ -22,6 +22,7 @@ from crashhunt.crashes import fault_of, signature_of
 from crashhunt.hunts import HuntResults, counting_rule, why_no_interval
 from crashhunt.ledger import Ledger
 from crashhunt.rates import PERS, RateCounter, RatePart, UnitSequence, check_confidence, facts_of_plain, make_rate
+from crashhunt.training import held_out_traffics
 from crashhunt.trial import Choice, Range
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Facts
     from crashhunt.plans import HuntSettings
     from crashhunt.rates import CountingRule, CrashRate, Interval, Per, TrialFacts, Unit
+    from crashhunt.training import HeldOutTraffics
     from crashhunt.trial import Distribution
 
 __all__ = ["counts_suffice", "measure_rates", "rate_of_counts", "rate_of_trials"]
@@ -50,6 +52,7 @@ def measure_rates(
     confidence: float = 95.0,
     by: str = "",
     bar: float | None = None,
+    held_out: HeldOutTraffics | None = None,
 ) -> tuple[CrashRate, ...]:
     """Return how often the agents of a hunt crash: per trial, per hour and per 1,000 km.
 
@@ -60,19 +63,23 @@ def measure_rates(
         by: ``kind``, ``fault``, ``disturbance`` or an argument, perhaps with a number of bins, as in ``speed:5``: what
             divides the rate into parts.
         bar: a rate, to compare with; needs `per`.
+        held_out: rule for the traffics that count, where the hunt is compared with others; None for those that the
+            hunt's own agents were not trained on.
 
     Raises:
         UsageError: a value is not allowed.
-        HuntDirectoryError: it is not the directory of a hunt, or its ledger is damaged.
+        HuntDirectoryError: it is not the directory of a hunt, or its ledger or the record of a training is damaged.
+        BundleError: a snapshot is damaged.
     """
     check_confidence(confidence)
     hunt = HuntResults(directory)
     if hunt.state.damaged:
         raise HuntDirectoryError(hunt.state.detail)
     settings = hunt.settings
+    held_out = held_out_traffics(settings, [hunt.directory]) if held_out is None else held_out
     with closing(Ledger(hunt.directory / layout.LEDGER)) as ledger:
         facts = ledger.facts()
-        rule = counting_rule(settings, facts)
+        rule = counting_rule(settings, facts, held_out)
         divide = _division(by, hunt, settings, facts)
         sequence = UnitSequence(rule)
         units: list[Unit] = []
@@ -98,10 +105,11 @@ def measure_rates(
     return tuple(found)
 
 
-def counts_suffice(settings: HuntSettings, facts: Facts) -> bool:
+def counts_suffice(settings: HuntSettings, facts: Facts, held_out: HeldOutTraffics) -> bool:
     """Whether the rate per trial follows from counts of the first trials alone, without reading each of them."""
-    rule = counting_rule(settings, facts)
-    return not rule.traffics and not rule.plain_origin and not facts.get("until_rate")
+    rule = counting_rule(settings, facts, held_out)
+    is_each = not rule.traffics and not rule.plain_origin and rule.is_held_out is None
+    return is_each and not facts.get("until_rate")
 
 
 def rate_of_counts(
@@ -142,7 +150,12 @@ def rate_of_counts(
 
 
 def rate_of_trials(
-    directory: Path | str, settings: HuntSettings, facts: Facts, trials: Iterable[JsonObject], confidence: float = 95.0
+    directory: Path | str,
+    settings: HuntSettings,
+    facts: Facts,
+    trials: Iterable[JsonObject],
+    held_out: HeldOutTraffics,
+    confidence: float = 95.0,
 ) -> CrashRate:
     """Return the rate per trial that `measure_rates` returns, without parts, from trials that the caller reads.
 
@@ -151,9 +164,10 @@ def rate_of_trials(
         settings: settings of the hunt.
         facts: facts of its ledger.
         trials: plain data of all trials, in the order of their numbers.
+        held_out: rule for the traffics that count.
         confidence: confidence of the certain interval, in percent.
     """
-    rule = counting_rule(settings, facts)
+    rule = counting_rule(settings, facts, held_out)
     sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")
     bar_of_hunt = facts.get("until_rate")
     decided = bar_of_hunt["decided_at"] if bar_of_hunt else None

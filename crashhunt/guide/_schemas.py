@@ -67,7 +67,13 @@ class RatePartData(TypedDict):
     certain: Bounds | None
 
 
-class RateEntry(TypedDict):
+class CountedTrials(TypedDict):
+    """Which trials do not count for a rate: reason to number."""
+
+    left_out: dict[str, int]
+
+
+class RateEntry(CountedTrials):
     """How often the agents of a hunt crash."""
 
     dir: str
@@ -81,7 +87,6 @@ class RateEntry(TypedDict):
     certain: Bounds | None
     estimated: Bounds | None
     why_not: str
-    left_out: dict[str, int]
     parts: list[RatePartData]
     steps: int
     plain_equivalent_steps: float | None
@@ -562,7 +567,7 @@ class SplitData(TypedDict):
     software_faults: int
 
 
-class ComparedHunt(TypedDict):
+class ComparedHunt(CountedTrials):
     """One hunt of a comparison."""
 
     dir: str

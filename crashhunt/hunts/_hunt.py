@@ -21,7 +21,7 @@ from crashhunt.hunts._fork_results import CopiedCrashes, keep_near_misses, verif
 from crashhunt.hunts._next_trials import GREATEST_LAG, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
 from crashhunt.hunts._progress import HuntStatus, PhaseClock, PhaseStatus, Progress, RemainingTime
-from crashhunt.hunts._rates import Forcings, RareWatch, bar_watch, rate_watch
+from crashhunt.hunts._rates import Forcings, RareWatch, bar_watch, rate_watch, refuse_training_traffic
 from crashhunt.hunts._reports import HuntReport, StoppedBecause
 from crashhunt.hunts._state import (
     HEARTBEAT_S,
@@ -37,6 +37,7 @@ from crashhunt.ledger import Ledger
 from crashhunt.plans import core_of, disturber, parallel_here, sampler_of
 from crashhunt.rates import make_rate
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
+from crashhunt.training import held_out_traffics
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
@@ -160,7 +161,9 @@ class Hunt:
         progress.resume(list_bundles(self.directory), settings.run, before)
         progress.tally = tally_crashes(ledger, settings.crash_on, disturbed=self._disturber is not None)
         self._resume_counts(ledger, progress, before, settings)
-        progress.rate = bar_watch(settings, ledger)
+        held_out = held_out_traffics(settings, [self.directory])
+        refuse_training_traffic(settings, held_out)
+        progress.rate = bar_watch(settings, ledger, held_out)
         (lag, lag_grows), alike = self._lag(before), not finished or draws_independently(before, settings)
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
         self._audits_left = AuditsLeft(ledger, before, worker_settings)
@@ -203,7 +206,7 @@ class Hunt:
             phase=None,
             ends_at=None,
         )
-        progress.counted = progress.rate or rate_watch(settings, ledger)
+        progress.counted = progress.rate or rate_watch(settings, ledger, held_out)
         if progress.rare is not None:
             progress.rare.read(trials.upcoming)
         self._progress = progress
@@ -544,7 +547,10 @@ def _rate_of(directory: Path, watch: BarWatch | None, stopped: StoppedBecause) -
         str(directory), watch.per, watch.counter, watch.sequence, confidence=100 * (1 - watch.alpha),
         why_no_estimate=why_not, bar=watch.bar,
     )  # fmt: skip
-    return replace(found, verdict=watch.verdict, why_undecided=watch.why_undecided)
+    excluded = found.excluded
+    if watch.decided_at is not None:  # which later trials have ended depends on the workers
+        excluded = {reason: count for reason, count in excluded.items() if reason != "after_unfinished"}
+    return replace(found, excluded=excluded, verdict=watch.verdict, why_undecided=watch.why_undecided)
 
 
 def _under_way(parallel: int) -> int:

@@ -209,7 +209,7 @@ class HuntStatus:
             return self.time_left_s
         if self.trials_left_s is not None:
             return min(self.trials_left_s, self.time_left_s)
-        left = (self.planned - self.done) / self.rate_per_s if self.rate_per_s else math.inf
+        left = max(0, self.planned - self.done) / self.rate_per_s if self.rate_per_s else math.inf
         return min(left, self.time_left_s)
 
     @property

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from crashhunt.base.errors import UsageError
 from crashhunt.disturbances import first_forcing
 from crashhunt.plans import rate_of, share_of
 from crashhunt.rates import (
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Facts, Ledger, RunningRate
     from crashhunt.plans import HuntSettings
     from crashhunt.rates import RareEstimate
+    from crashhunt.training import HeldOutTraffics
     from crashhunt.trial import Forced, ForcedCopy, Forcing, TrialResult
 
 
@@ -44,12 +46,19 @@ __all__ = [
     "crashed_copies",
     "greatest_weight",
     "rate_watch",
+    "refuse_training_traffic",
     "why_no_interval",
 ]
 
 
-def counting_rule(settings: HuntSettings, facts: Facts) -> CountingRule:
-    """Return how the trials of a hunt count."""
+def counting_rule(settings: HuntSettings, facts: Facts, held_out: HeldOutTraffics | None = None) -> CountingRule:
+    """Return how the trials of a hunt count.
+
+    Args:
+        settings: settings of the hunt.
+        facts: facts of its ledger.
+        held_out: rule for the traffics that agents were trained on; None if the caller excludes them itself.
+    """
     independent = bool(facts.get("independent", settings.sampler == "random"))
     origin = "" if independent or settings.seeds else facts.get("plain_origin") or ""
     return CountingRule(
@@ -58,7 +67,21 @@ def counting_rule(settings: HuntSettings, facts: Facts) -> CountingRule:
         plain_origin=origin,
         traffics=settings.seeds,
         planned=settings.trials,
+        is_held_out=held_out.has if held_out is not None and held_out.records else None,
     )
+
+
+def refuse_training_traffic(settings: HuntSettings, held_out: HeldOutTraffics) -> None:
+    """Refuse a hunt that ends with a rate, if the training of its agents leaves it without such a rate.
+
+    Raises:
+        UsageError: an agent was trained on these traffics.
+    """
+    fix = "give another --seed"
+    if settings.rare and any(settings.seed in record.hunt_seeds for record in held_out.records):
+        raise UsageError(f"--rare: an agent was trained on traffics of --seed {settings.seed}", fix=fix)
+    if settings.run.until_rate and held_out.is_empty:
+        raise UsageError(f"--until-rate: an agent was trained on all traffics of --seed {settings.seed}", fix=fix)
 
 
 def why_no_interval(settings: HuntSettings, facts: Facts) -> str:
@@ -76,25 +99,30 @@ def why_no_interval(settings: HuntSettings, facts: Facts) -> str:
     return f"the sampler {settings.sampler} does not draw trials independently"
 
 
-def bar_watch(settings: HuntSettings, ledger: Ledger) -> BarWatch | None:
+def bar_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics) -> BarWatch | None:
     """Return what watches the rate, with the trials that ended in earlier runs; None if there is no bar."""
     if not settings.run.until_rate:
         return None
     bar, per = rate_of(settings.run.until_rate)
-    rule = CountingRule(max_steps=settings.max_steps, agents=max(1, len(settings.agents)), planned=settings.trials)
+    rule = CountingRule(
+        max_steps=settings.max_steps,
+        agents=max(1, len(settings.agents)),
+        planned=settings.trials,
+        is_held_out=held_out.has if held_out.records else None,
+    )
     watch = BarWatch(rule, bar, per, settings.crash_on)
     for data in ledger.plain_results():
         watch.add(data)
     return watch
 
 
-def rate_watch(settings: HuntSettings, ledger: Ledger) -> RateWatch | None:
+def rate_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics) -> RateWatch | None:
     """Return what counts the trials per trial, with those of earlier runs; None if they bound no rate."""
     facts = ledger.facts()
     if why_no_interval(settings, facts):
         return None
-    watch = RateWatch(counting_rule(settings, facts), "trial", settings.crash_on)
-    for number, outcome, origin, was_killed in ledger.endings():
+    watch = RateWatch(counting_rule(settings, facts, held_out), "trial", settings.crash_on)
+    for number, seed, outcome, origin, was_killed in ledger.endings():
         trial = TrialFacts(
             number=number,
             has_ended=not was_killed,
@@ -105,6 +133,7 @@ def rate_watch(settings: HuntSettings, ledger: Ledger) -> RateWatch | None:
             driven_m=None,
             step_length_s=None,
             origin=origin,
+            seed=seed,
         )
         watch.add_facts(trial)
     return watch

@@ -19,7 +19,7 @@ from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.temporary import temporary_beside, temporary_folder, temporary_name
-from crashhunt.base.text import one_of
+from crashhunt.base.text import one_of, out_of
 from crashhunt.crashes import Bundle, describe_code, is_hunt_trusted, list_bundles
 from crashhunt.episode import Parts, WorkerSettings
 from crashhunt.hunts._state import HuntState, draws_independently, find_hunts, hunt_state
@@ -225,7 +225,7 @@ class HuntResults:
     def __repr__(self) -> str:
         state = self.state
         return (
-            f"<hunt {str(self.directory)!r}: {state.state}, {state.trials_run} of {state.trials_planned} trials, "
+            f"<hunt {str(self.directory)!r}: {state.state}, {out_of(state.trials_run, state.trials_planned)} trials, "
             f"{state.crashes} crash{'' if state.crashes == 1 else 'es'}>"
         )
 

@@ -336,7 +336,7 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
         outcomes=outcomes,
         errors=sum(n for name, n in outcomes.items() if name == Outcome.INVALID or Outcome(name).is_software_fault),
         rate_per_s=rate,
-        seconds_left=_seconds_left(facts, planned - run, rate) if state == "running" else None,
+        seconds_left=_seconds_left(facts, max(0, planned - run), rate) if state == "running" else None,
         phase=_phase(facts) if state == "running" else None,
         owner_alive=alive,
         core=facts.get("core"),

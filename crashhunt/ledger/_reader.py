@@ -83,6 +83,8 @@ class RunningRate(TypedDict):
         why_not: why there is no certain interval, or no estimated one; empty if there is.
         bar: rate that the hunt is compared with; None for none.
         verdict: ``below``, ``above`` or ``undecided``; empty without a bar.
+        trained_on: number of trials that do not count, because an agent was trained on their traffic; missing if all
+            count.
     """
 
     method: Literal["plain", "rare"]
@@ -98,6 +100,7 @@ class RunningRate(TypedDict):
     why_not: str
     bar: float | None
     verdict: str
+    trained_on: NotRequired[int]
 
 
 class Noted(TypedDict, total=False):
@@ -403,18 +406,21 @@ class LedgerReader:
             if count != sum(said.values()) and self._seal() == seal:
                 raise damaged(self._path, f"it has {count} such trials, and {sum(said.values())} were written")
 
-    def endings(self) -> Iterator[tuple[int, str, str, bool]]:
+    def endings(self) -> Iterator[tuple[int, int, str, str, bool]]:
         """Yield how trials ended, in the order of their numbers, without reading their rows as a whole.
 
-        Each is number, outcome, origin, and whether its process was killed from outside.
+        Each is number, seed, outcome, origin, and whether its process was killed from outside.
         """
         of = "iif(json_valid(result), result, '{}')"
         rows = self._select(
-            f"SELECT number, outcome, json_extract({of}, '$.spec.origin'), json_extract({of}, '$.failure.kind') = ? "
-            "FROM trials ORDER BY number",
+            f"SELECT number, seed, outcome, json_extract({of}, '$.spec.origin'), "
+            f"json_extract({of}, '$.failure.kind') = ? FROM trials ORDER BY number",
             (KILLED,),
         )
-        return ((number, outcome, origin or "", bool(was_killed)) for number, outcome, origin, was_killed in rows)
+        return (
+            (number, seed, outcome, origin or "", bool(was_killed))
+            for number, seed, outcome, origin, was_killed in rows
+        )
 
     def intact_rows(self, numbers: Iterable[int]) -> Iterator[tuple[int, Row | None]]:
         """Yield the rows of trials, whatever has become of the others: None for one that is not as it was written."""

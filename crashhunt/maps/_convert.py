@@ -24,6 +24,8 @@ NET = "map.net.xml"
 _RAIL = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
 _LEFT_HAND = re.compile(rb"""\brule\s*=\s*["']LHT["']""")
 _LANELET = re.compile(rb"""\bv\s*=\s*["']lanelet["']""")
+_AT_LINE = re.compile(r"^\s*At line/column", re.MULTILINE)
+"""What the programs add to an error of the XML itself, in contrast to one of its content."""
 _COMMENT = re.compile(r"<!--.*?-->\s*", re.DOTALL)
 _HEAD_BYTES = 1 << 20
 
@@ -94,7 +96,10 @@ def convert(source: MapSource, options: ConvertOptions, tools: Tools, folder: Pa
     else:
         notes += _make(source, options, tools, folder)
         _strip_comment(folder / NET)
-    network = read_network(folder / NET)
+    try:
+        network = read_network(folder / NET)
+    except ScenarioError as error:
+        raise ScenarioError(error.message, fix=error.fix, where=_where(source)) from None
     if not network.drivable():
         raise _no_road(source, options, tools, folder)
     return Converted(network, tuple(notes))
@@ -185,6 +190,8 @@ def _make(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path
     if "o nodes loaded" in error or "o edges loaded" in error or "could not be found" in error:
         raise _no_road(source, options, tools, folder)
     fix = "correct the map, or choose a part of it with --bbox W,S,E,N" if source.kind == "osm" else "correct the map"
+    if _AT_LINE.search(done.output):
+        fix = "download or export the map again: it is incomplete, or not valid XML"
     raise ScenarioError(f"{program} cannot read the map: {error}", fix=fix, where=_where(source))
 
 

@@ -28,12 +28,16 @@ ENDINGS: dict[str, tuple[str, ...]] = {
     "net": (".net.xml", ".net.xml.gz"),
 }
 """Kind of a map to the endings of its files."""
+_AGAIN = "download or export the map again"
+_GZIP = b"\x1f\x8b"
 _TITLES = {"osm": "OpenStreetMap", "opendrive": "OpenDRIVE", "net": "a SUMO network"}
 _ROOTS = {"osm": "osm", "OpenDRIVE": "opendrive", "net": "net"}
 _MAX_BYTES = 500_000_000
 """Of a file: netconvert needs 3 to 6 bytes of memory for each, and hours for a country."""
 _MAX_PBF_BYTES = 50_000_000  # about a tenth of the same map in XML
 _SMALLEST_SHAPE, _LARGEST_SHAPE = 2, 40
+_MAX_DIGITS = 20  # Python refuses to convert thousands
+_CHUNK_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,7 +91,7 @@ def parse_shape(text: str, option: str) -> tuple[int, int]:
     """
     parts = text.lower().split("x")
     fix = f"give two numbers from {_SMALLEST_SHAPE} to {_LARGEST_SHAPE}, such as {option} 4x4"
-    if len(parts) != 2 or not all(part.isdecimal() and part.isascii() and len(part) < 4 for part in parts):
+    if len(parts) != 2 or not all(part.isdecimal() and part.isascii() and len(part) < _MAX_DIGITS for part in parts):
         raise UsageError(f"{option} {text!r} is not of the form NxM", fix=fix)
     first, second = int(parts[0]), int(parts[1])
     if not all(_SMALLEST_SHAPE <= number <= _LARGEST_SHAPE for number in (first, second)):
@@ -108,7 +112,9 @@ def parse_bbox(text: str) -> BBox:
         west, south, east, north = (float(part) for part in text.split(","))
     except ValueError:
         raise UsageError(f"--bbox {text!r} is not four numbers", fix=fix) from None
-    if not all(map(math.isfinite, (west, south, east, north))) or max(abs(west), abs(east)) > 180:
+    if not all(map(math.isfinite, (west, south, east, north))):
+        raise UsageError(f"--bbox {text!r} is not four finite numbers", fix=fix)
+    if max(abs(west), abs(east)) > 180:
         raise UsageError(f"--bbox {text!r} has a longitude beyond 180 degrees", fix=fix)
     if max(abs(south), abs(north)) > 90:
         raise UsageError(f"--bbox {text!r} has a latitude beyond 90 degrees", fix=fix)
@@ -131,6 +137,9 @@ def check_source(source: MapSource) -> None:
         raise ScenarioError(
             "is a folder, not a map", fix=f"give a file that ends in {' or '.join(allowed)}", where=where
         )
+    if not path.is_file() and (path.exists() or path.is_symlink()):
+        fix = "give the path of a regular file"
+        raise ScenarioError("is a device, a pipe or a broken link, not a map", fix=fix, where=where)
     if not path.is_file():
         fix = f"{near_path(path, *allowed)}give the path of an existing file"
         raise ScenarioError("there is no such map", fix=fix, where=where)
@@ -145,41 +154,62 @@ def check_source(source: MapSource) -> None:
     except OSError as error:
         raise ScenarioError(f"cannot be read: {error.strerror}", fix="check its permissions", where=where) from None
     if size == 0:
-        raise ScenarioError("the file is empty", fix="download or export the map again", where=where)
+        raise ScenarioError("the file is empty", fix=_AGAIN, where=where)
     most = _MAX_PBF_BYTES if path.name.lower().endswith(".pbf") else _MAX_BYTES
     if size > most:
-        fix = "cut out a part first: osmium extract --bbox W,S,E,N" if source.kind == "osm" else "cut out a part first"
-        raise ScenarioError(
-            f"the map has {size / 1e6:,.0f} MB (allowed: up to {most / 1e6:,.0f} MB)", fix=fix, where=where
-        )
+        raise _too_large(source, f"the map has {size / 1e6:,.0f} MB (allowed: up to {most / 1e6:,.0f} MB)")
     if path.name.lower().endswith(".pbf"):
         if b"OSMHeader" not in head:
             fix = "download the map again, or give it the ending of its format"
             raise ScenarioError("the file is not an OpenStreetMap PBF", fix=fix, where=where)
         return
     _check_root(source, head)
+    if head.startswith(_GZIP):
+        _check_unpacked(source, path)
+
+
+def _too_large(source: MapSource, message: str) -> ScenarioError:
+    fix = "cut out a part first: osmium extract --bbox W,S,E,N" if source.kind == "osm" else "cut out a part first"
+    return ScenarioError(message, fix=fix, where=str(source.path))
+
+
+def _check_unpacked(source: MapSource, path: Path) -> None:
+    """Refuse a packed map that is too large or damaged, before it fills memory or the disk."""
+    size = 0
+    try:
+        with gzip.open(path) as file:
+            while chunk := file.read(_CHUNK_BYTES):
+                size += len(chunk)
+                if size > _MAX_BYTES:
+                    message = f"the map has over {_MAX_BYTES / 1e6:,.0f} MB when it is unpacked, which is the most"
+                    raise _too_large(source, message)
+    except (OSError, EOFError, zlib.error) as error:
+        raise _not_unpacked(path, error) from None
+
+
+def _not_unpacked(path: Path, error: Exception) -> ScenarioError:
+    return ScenarioError(f"cannot be unpacked: {error}", fix=_AGAIN, where=str(path))
 
 
 def _check_root(source: MapSource, head: bytes) -> None:
     path = source.path
     assert path is not None
-    fix = "download or export the map again"
     try:
         with _opened(path, head) as file:
             root = next(element.tag for _, element in ET.iterparse(file, events=("start",)))
     except (ET.ParseError, UnicodeDecodeError, LookupError, ValueError, StopIteration) as error:
         detail = f": {error}" if str(error) else ""
-        raise ScenarioError(f"not valid XML{detail}", fix=fix, where=str(path)) from None
+        raise ScenarioError(f"not valid XML{detail}", fix=_AGAIN, where=str(path)) from None
     except (OSError, EOFError, zlib.error) as error:
-        raise ScenarioError(f"cannot be unpacked: {error}", fix=fix, where=str(path)) from None
+        raise _not_unpacked(path, error) from None
     root = root.rpartition("}")[2]  # some tools write a name space
     kind = _ROOTS.get(root)
     if kind != source.kind:
-        known = f"give it with --{kind}" if kind else fix
+        known = f"give it with --{kind}" if kind else _AGAIN
         raise ScenarioError(
             f"the file begins with <{root[:40]}>, and {_TITLES[source.kind]} does not", fix=known, where=str(path)
         )
 
 
 def _opened(path: Path, head: bytes) -> BinaryIO:
-    return gzip.open(path) if head.startswith(b"\x1f\x8b") else path.open("rb")  # type: ignore[return-value]
+    return gzip.open(path) if head.startswith(_GZIP) else path.open("rb")  # type: ignore[return-value]

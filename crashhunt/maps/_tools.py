@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -22,6 +23,9 @@ __all__ = ["Outcome", "Tools", "find_tools", "first_error"]
 
 _TIME_LIMIT_S = 1800.0
 """Of one program. netconvert takes 3 s for a town of 6,000 roads; a whole country is no place to hunt in."""
+
+_LEAST_FREE_BYTES = 1 << 16
+"""With less, what a program has written may be incomplete, and programs of SUMO do not report that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +62,7 @@ class Tools:
             folder: folder in which it runs; names in its arguments are relative to it.
 
         Raises:
-            ScenarioError: it cannot be started, or it takes too long.
+            ScenarioError: it cannot be started, takes too long, is killed, or has filled the disk.
         """
         command = [str(self.home / "bin" / program), *words]
         if program.endswith(".py"):
@@ -83,6 +87,12 @@ class Tools:
         except OSError as error:
             fix = "install it again: pip install --force-reinstall 'crashhunt[maps]'"
             raise ScenarioError(f"{program} cannot be started: {error.strerror}", fix=fix) from None
+        if shutil.disk_usage(folder).free < _LEAST_FREE_BYTES:
+            fix = "free some space, or set TMPDIR to a folder on another disk"
+            raise ScenarioError(f"{program} has no space left for temporary files", fix=fix, where=str(folder.parent))
+        if code < 0:
+            fix = "free memory and disk space, or choose a smaller map"
+            raise ScenarioError(f"{program} was ended by signal {-code}", fix=fix)
         return Outcome(code, log.read_text(encoding="utf-8", errors="replace"))
 
 

@@ -158,7 +158,7 @@ def make_rate(
     """
     why_not = why_no_interval or counter.why_not
     if not why_not and not counter.units:
-        why_not = "no valid trial counts yet"
+        why_not = sequence.why_empty
     if not why_not and sequence.invalid_share > MAX_INVALID_SHARE:
         many = f"{sequence.invalid} of {sequence.invalid + sequence.valid} trials are invalid"
         why_not = f"{many}, more than {MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
@@ -168,6 +168,7 @@ def make_rate(
     if bar is not None and certain is not None and counter.test is not None:
         verdict = counter.test.verdict(bar, alpha)
     excluded = {
+        "trained_on": sequence.trained_on,
         "invalid": sequence.invalid,
         "not_random": sequence.not_random,
         "after_unfinished": sequence.excluded,

@@ -99,17 +99,18 @@ class RateWatch:
         Args:
             now: whether that of some moments ago will not do, where a new one takes too much of the time.
         """
-        version = self.sequence.valid + self.sequence.invalid + self.sequence.not_random
+        sequence = self.sequence
+        version = sequence.valid + sequence.invalid + sequence.not_random + sequence.trained_on
         return self._paced(version, now=now)
 
     def _running(self) -> RunningRate:
         counter, sequence = self.counter, self.sequence
-        why = counter.why_not or ("" if counter.units else "no trial counts yet")
+        why = counter.why_not or ("" if counter.units else sequence.why_empty)
         if not why and sequence.invalid_share > MAX_INVALID_SHARE:
             why = f"{sequence.invalid} of {sequence.invalid + sequence.valid} trials are invalid"
         found = None if why else self.interval()
         high = None if found is None or not math.isfinite(found.high) else found.high
-        return {
+        rate: RunningRate = {
             "method": "plain",
             "per": self.per,
             "confidence": 100 * (1 - self.alpha),
@@ -124,6 +125,9 @@ class RateWatch:
             "bar": None,
             "verdict": "",
         }
+        if sequence.trained_on:
+            rate["trained_on"] = sequence.trained_on
+        return rate
 
 
 class BarWatch(RateWatch):

@@ -67,6 +67,7 @@ class TrialFacts(NamedTuple):
         step_length_s: step length of the simulator; None if it is not known.
         origin: the strategy that proposed it; empty for none.
         tags: what it belongs to, such as the bin of an argument; for parts of a rate.
+        seed: seed of its traffic.
     """
 
     number: int
@@ -79,6 +80,7 @@ class TrialFacts(NamedTuple):
     step_length_s: float | None
     origin: str
     tags: tuple[str, ...] = ()
+    seed: int = 0
 
 
 Unit: TypeAlias = tuple[TrialFacts, ...]
@@ -97,6 +99,7 @@ def facts_of(result: TrialResult, crash_on: Sequence[str]) -> TrialFacts:
         driven_m=result.driven_m,
         step_length_s=result.step_length_s,
         origin=result.spec.origin,
+        seed=result.spec.seed,
     )
 
 
@@ -114,6 +117,7 @@ def facts_of_plain(data: Mapping[str, Any], crash_on: Sequence[str], tags: tuple
         step_length_s=data.get("step_length_s"),
         origin=spec.get("origin", ""),
         tags=tags,
+        seed=spec["seed"],
     )
 
 
@@ -127,6 +131,7 @@ class CountingRule:
         plain_origin: the origin of the trials that were drawn independently; empty if all were.
         traffics: how many traffics the hunt has; 0 if each trial has its own.
         planned: how many trials; 0 for no limit.
+        is_held_out: returns whether no agent was trained on the traffic of a seed; None if no agent was trained on any.
     """
 
     max_steps: int
@@ -134,6 +139,7 @@ class CountingRule:
     plain_origin: str = ""
     traffics: int = 0
     planned: int = 0
+    is_held_out: Callable[[int], bool] | None = None
 
     @property
     def trials_per_unit(self) -> int:
@@ -162,7 +168,7 @@ class UnitSequence:
         self._waiting: dict[int, TrialFacts] = {}
         self._traffics: dict[int, list[TrialFacts]] = {}
         self._next = 0  # trial, or traffic
-        self.valid = self.invalid = self.not_random = 0  # of the trials in the sequence
+        self.valid = self.invalid = self.not_random = self.trained_on = 0  # of the trials in the sequence
         self.hopeless_at: int | None = None  # the first trial with which too many are invalid, see has_too_many_invalid
 
     def add(self, trial: TrialFacts) -> Iterator[Unit]:
@@ -203,8 +209,12 @@ class UnitSequence:
         """Return the trials that count."""
         origin = self._rule.plain_origin
         plain = [trial for trial in trials if not origin or trial.origin == origin]
-        counted = tuple(trial for trial in plain if trial.valid)
         self.not_random += len(trials) - len(plain)
+        if (is_held_out := self._rule.is_held_out) is not None:
+            held_out = [trial for trial in plain if is_held_out(trial.seed)]
+            self.trained_on += len(plain) - len(held_out)
+            plain = held_out
+        counted = tuple(trial for trial in plain if trial.valid)
         self.invalid += len(plain) - len(counted)
         self.valid += len(counted)
         if self.hopeless_at is None and has_too_many_invalid(self.invalid, self.valid):
@@ -220,6 +230,16 @@ class UnitSequence:
     def excluded(self) -> int:
         """How many trials have ended, but a trial of a lower number has not."""
         return len(self._waiting) + sum(map(len, self._traffics.values()))
+
+    @property
+    def why_empty(self) -> str:
+        """Why no trial counts, for a sequence without a valid trial."""
+        if self.trained_on and not self.invalid:
+            return (
+                f"an agent was trained on the traffic of all {self.trained_on} trials; run another --seed, or train "
+                "with a test share"
+            )
+        return "no valid trial counts yet"
 
     @property
     def invalid_share(self) -> float:

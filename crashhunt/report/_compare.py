@@ -10,7 +10,9 @@ import numpy as np
 
 from crashhunt.base.files import whole_file
 from crashhunt.base.text import in_lines
+from crashhunt.estimation import held_out_of
 from crashhunt.hunts import FACTS, HuntResults, columns_of
+from crashhunt.report._rate import count_training_trials
 from crashhunt.report._table import aligned, argument_units
 from crashhunt.trial import Outcome, in_order
 
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 
     from crashhunt.estimation import Comparison, HuntFigures
     from crashhunt.hunts import Cell
+    from crashhunt.training import HeldOutTraffics
 
 __all__ = ["comparison_page", "describe_comparison"]
 
@@ -75,6 +78,8 @@ def describe_comparison(found: Comparison) -> str:
         if hunt.why_not:
             missing = "no interval" if hunt.interval is None else "no crash rate"
             lines.append(f"{hunt.dir}: {missing}: {hunt.why_not}")
+        if trained_on := hunt.exclusions.get("trained_on"):
+            lines.append(f"{hunt.dir}: {count_training_trials(trained_on)}")
         if hunt.excluded:
             lines.append(f"{hunt.dir}: not counted: {hunt.excluded} trials after one that has not ended")
     for pair in found.pairs:
@@ -122,6 +127,8 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
         said = share if np.isfinite(hunt.crash_rate) else f"{hunt.crashes} of {hunt.trials}"
         if hunt.disturbed is not None:
             said += f", {hunt.disturbed} of them disturbed"
+        if trained_on := hunt.exclusions.get("trained_on"):
+            said += f", {count_training_trials(trained_on)}"
         bar = f'<span style="left:0;width:{rate * scale:.2f}%;background:{colors[hunt.dir]}"></span>'
         if hunt.counted:
             said += f", of origin {html.escape(hunt.counted)} only, as the hunt guided all others"
@@ -152,22 +159,27 @@ def _outcomes(hunts: Sequence[HuntFigures]) -> str:
 def _argument_plots(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> list[str]:
     values: dict[str, dict[str, tuple[NDArray[np.generic], NDArray[np.generic]]]] = {}
     units: dict[str, str] = {}
-    for hunt in hunts:
-        for name, pair in _arguments(HuntResults(hunt.dir)).items():
+    compared = [HuntResults(hunt.dir) for hunt in hunts]
+    for hunt, results in zip(hunts, compared, strict=True):
+        for name, pair in _arguments(results, held_out_of(results, compared)).items():
             values.setdefault(name, {})[hunt.dir] = pair
-        for (agent, name), unit in argument_units(Path(hunt.dir), HuntResults(hunt.dir).settings).items():
+        for (agent, name), unit in argument_units(Path(hunt.dir), results.settings).items():
             units[f"{agent or 'scenario'}.{name}"] = unit
     labels = {name: name.partition(".")[2] + (f" ({units[name]})" if name in units else "") for name in values}
     return [_argument_plot(name, labels[name], of, colors) for name, of in values.items()]
 
 
-def _arguments(hunt: HuntResults) -> dict[str, tuple[NDArray[np.generic], NDArray[np.generic]]]:
+def _arguments(
+    hunt: HuntResults, held_out: HeldOutTraffics
+) -> dict[str, tuple[NDArray[np.generic], NDArray[np.generic]]]:
     """Every argument that varies: its values, and whether the trial crashed."""
     names = [name for name in columns_of(hunt.settings) if name not in FACTS]
     columns: dict[str, list[Cell]] = {name: [] for name in names}
     crashed: list[bool] = []
     crash_on = hunt.settings.crash_on
     for row in hunt.rows():
+        if not held_out.has(int(str(row["seed"]))):
+            continue
         if row["outcome"] == Outcome.INVALID or (hunt.plain_origin and row["origin"] != hunt.plain_origin):
             continue
         crashed.append(row["outcome"] in crash_on)

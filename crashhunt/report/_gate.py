@@ -8,7 +8,7 @@ from xml.etree import ElementTree as Xml
 
 from crashhunt.base.files import whole_file
 from crashhunt.base.text import in_lines, one_line, visible
-from crashhunt.report._rate import format_interval
+from crashhunt.report._rate import count_training_trials, format_interval
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,7 +29,7 @@ def describe_gate(found: GateReport) -> str:
         lines.append(f"  {found.why}")
     lines += [f"  {line}" for line in _evidence(found)]
     if found.trained_on:
-        lines.append(f"  {found.trained_on:,} pairs do not count: an agent was trained on traffics of this part")
+        lines.append(f"  {_training_pairs(found)}")
     if found.rates is not None:
         lines += [f"  {name}: {_rate(rate)}" for name, rate in zip(("BASE", "HEAD"), found.rates, strict=True)]
     if len(found.scenarios) > 1:
@@ -68,8 +68,14 @@ def _evidence(found: GateReport) -> list[str]:
     return lines
 
 
+def _training_pairs(found: GateReport) -> str:
+    return f"{found.trained_on:,} pairs do not count: an agent was trained on traffics of this part"
+
+
 def _rate(rate: CrashRate) -> str:
     crashes = f"{rate.crashes} {'crash' if rate.crashes == 1 else 'crashes'} in {rate.trials:,} trials"
+    if trained_on := rate.excluded.get("trained_on"):
+        crashes += f" ({count_training_trials(trained_on)})"
     if rate.certain is None:
         return f"{crashes}, no rate: {rate.why_not}"
     return f"{crashes}, {format_interval(rate.certain)} per trial"
@@ -107,6 +113,8 @@ def gate_summary(found: GateReport) -> str:
         low, high = found.difference
         confidence = f"{found.confidence:g} %, valid whenever you look"
         lines += [f"Difference: **{low:+.2%} to {high:+.2%}** crashes per trial (HEAD minus BASE, {confidence}).", ""]
+    if found.trained_on:
+        lines += [f"{_training_pairs(found)}.", ""]
     if found.rates is not None:
         lines += [f"- {name}: {_rate(rate)}" for name, rate in zip(("BASE", "HEAD"), found.rates, strict=True)]
         lines.append("")

@@ -19,9 +19,18 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Bounds, RunningRate
     from crashhunt.rates import CrashRate, RatePart
 
-__all__ = ["describe_rates", "describe_running", "format_interval", "format_rate", "rates_page", "write_rates_csv"]
+__all__ = [
+    "count_training_trials",
+    "describe_rates",
+    "describe_running",
+    "format_interval",
+    "format_rate",
+    "rates_page",
+    "write_rates_csv",
+]
 
 _PER = {"trial": "per trial", "hour": "per hour", "1000km": "per 1,000 km"}
+_TRAINED_ON = "trained_on"
 _REASONS = {
     "invalid": "invalid",
     "not_random": "not drawn at random",
@@ -55,6 +64,11 @@ def format_rate(rate: float) -> str:
     return f"{mantissa}e{int(power)}"
 
 
+def count_training_trials(count: int) -> str:
+    """Return how many trials do not count, because an agent was trained on their traffic."""
+    return f"{_count(count, 'trial', 'trials')} on training traffic {'is' if count == 1 else 'are'} excluded"
+
+
 def format_interval(interval: Interval) -> str:
     """Return an interval in words: ``at least 0.19, at most 0.52``."""
     least = f"at least {format_rate(interval.low)}, " if interval.low > 0 else ""
@@ -70,6 +84,8 @@ def describe_running(rate: RunningRate) -> str:
         return f"rate: not known yet ({rate['why_not']}){bar}"
     trials = f"{_count(rate['crashes'], 'crash', 'crashes')} in {_count(rate['trials'], 'trial', 'trials')}"
     trials += " drawn at random" if rate["origin"] else ""
+    if trained_on := rate.get("trained_on"):
+        bar += f"; {count_training_trials(trained_on)}"
     return f"rate: {_certain(rate['certain'])} {_PER[rate['per']]} ({trials}, {rate['confidence']:g} %){bar}"
 
 
@@ -120,8 +136,10 @@ def _of_hunt(rates: list[CrashRate]) -> list[str]:
         missing = "no rate" if concerned[0].certain is None else "no estimate"
         which = "" if len(concerned) == len(rates) else f" {' and '.join(_PER[rate.per] for rate in concerned)}"
         lines.append(f"  {missing}{which}: {why}")
-    if first.excluded:
-        each = [f"{count} {_REASONS[reason]}" for reason, count in first.excluded.items()]
+    if trained_on := first.excluded.get(_TRAINED_ON):
+        lines.append(f"  {count_training_trials(trained_on)}")
+    each = [f"{count} {_REASONS[reason]}" for reason, count in first.excluded.items() if reason != _TRAINED_ON]
+    if each:
         lines.append(f"  not counted: {', '.join(each)}")
     lines += [line for rate in rates for line in _part_lines(rate)]
     lines += [f"  {_verdict(rate, rate.bar)}" for rate in rates if rate.bar is not None]
@@ -163,7 +181,7 @@ def _count(count: int, one: str, many: str) -> str:
 
 _COLUMNS = (
     "dir", "per", "by", "part", "units", "trials", "crashes", "hours", "km", "estimate", "low", "high", "confidence",
-    "bar", "verdict", "why_not",
+    "bar", "verdict", "why_not", "trained_on",
 )  # fmt: skip
 
 
@@ -174,6 +192,7 @@ def write_rates_csv(rates: Sequence[CrashRate], out: TextIO) -> None:
     for rate in rates:
         data = rate.to_json()
         data |= {"hours": data["exposure"]["hours"], "km": data["exposure"]["km"], "trials": rate.trials}
+        data[_TRAINED_ON] = rate.excluded.get(_TRAINED_ON)
         writer.writerow(_cells(data, rate.certain))
         for part in rate.parts:
             named = {"dir": rate.dir, "per": rate.per, "part": part.name, "confidence": rate.confidence}
@@ -195,7 +214,9 @@ def rates_page(rates: Sequence[CrashRate], path: Path) -> None:
     rows = []
     for rate in rates:
         exposure = f"{rate.trials:,} trials, {rate.driven_s / 3600:,.2f} h, {rate.driven_m / 1000:,.1f} km"
-        rows.append((rate.dir, _PER[rate.per], str(rate.crashes), exposure, *_numbers(rate), rate.why_not))
+        trained_on = rate.excluded.get(_TRAINED_ON)
+        remarks = filter(None, (rate.why_not, count_training_trials(trained_on) if trained_on else ""))
+        rows.append((rate.dir, _PER[rate.per], str(rate.crashes), exposure, *_numbers(rate), "; ".join(remarks)))
         for part in rate.parts:
             name = f"{part.by} {part.name}" if part.by != part.name else part.name
             rows.append((rate.dir, f"{_PER[rate.per]}, {name}", str(part.crashes), f"{part.trials:,} trials",

@@ -12,7 +12,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from crashhunt.base.text import one_line
+from crashhunt.base.text import one_line, out_of
 from crashhunt.recording import Phase
 from crashhunt.report._rate import describe_running
 from crashhunt.trial import Outcome, without_folder
@@ -292,8 +292,7 @@ def _line(status: HuntStatus) -> str:
     if (after := status.progress) is not None:
         return describe_phase(after.name, after.done, after.total, after.seconds_left)
     phase = "running" if status.phase == "hunting" else status.phase
-    count = f"{status.done} of {status.planned}" if status.planned else str(status.done)
-    line = f"{phase}: {count} trials finished" + (f" ({outcomes})" if outcomes else "")
+    line = f"{phase}: {out_of(status.done, status.planned)} trials finished" + (f" ({outcomes})" if outcomes else "")
     if status.phase == "hunting" and status.done:
         line += f", {format_pace(status.rate_per_s)}, {format_seconds(status.seconds_left)} left"
     if status.disturbed is not None and status.crashes:
@@ -308,7 +307,7 @@ def _line(status: HuntStatus) -> str:
 
 
 def _count(status: HuntStatus) -> str:
-    return f"{status.done}/{status.planned}" if status.planned else str(status.done)
+    return out_of(status.done, status.planned, "/")
 
 
 def _stressed(result: TrialResult) -> str:

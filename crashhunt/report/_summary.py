@@ -7,7 +7,7 @@ import shlex
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.text import in_lines
+from crashhunt.base.text import in_lines, out_of
 from crashhunt.report._rate import describe_rates
 from crashhunt.report._status_screen import describe_types, format_arguments, format_inputs, format_seconds
 from crashhunt.report._words import (
@@ -117,9 +117,8 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     """Return the result of a hunt: each crash, how it came about, its directory, and the command that replays it."""
     ran = sum(report.outcomes.values())
     outcomes = ", ".join(f"{name} {count}" for name, count in report.outcomes.items()) or "none"
-    planned = report.settings.trials
     total = f" ({report.steps_total} simulated in all)" if report.steps_total > report.trial_steps else ""
-    count = f"{ran}{f' of {planned}' if planned else ''} trials, {report.trial_steps} steps{total}"
+    count = f"{out_of(ran, report.settings.trials)} trials, {report.trial_steps} steps{total}"
     lines = [f"{count}, {format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"]
     if report.stopped_because == "no_valid_trial":
         lines.append(f"No trial was valid: {report.reason}")

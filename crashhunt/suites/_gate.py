@@ -43,6 +43,7 @@ from crashhunt.suites._processes import (
     slots_of,
     write_request,
 )
+from crashhunt.training import held_out_traffics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -556,8 +557,10 @@ class _Run:
         (paired, *others) = self._hunts
         if others or not all((folder / layout.HUNT).exists() for folder in paired.folders) or not paired.counts.pairs:
             return None
+        held_out = held_out_traffics(read_settings(paired.folders[0] / layout.HUNT), paired.folders)
         base, head = (
-            measure_rates(folder, per="trial", confidence=self._gate.confidence)[0] for folder in paired.folders
+            measure_rates(folder, per="trial", confidence=self._gate.confidence, held_out=held_out)[0]
+            for folder in paired.folders
         )
         return base, head
 

@@ -206,7 +206,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
             try:
                 observation, info = self._episodes.reset_to_plain(hunt, seed)
             except SimulatorError:
-                if attempt == _MAX_INVALID - 1:
+                if attempt == _MAX_INVALID - 1 or self._episodes.is_closed:
                     raise
                 continue
             return observation, {**info, "crash": "", "seed": seed}

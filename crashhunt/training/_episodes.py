@@ -65,10 +65,13 @@ class CrashEpisodes:
         action_space: The action space of the vehicle.
         step_length_s: Simulation time of a step, in s.
         agent: The controlled vehicle.
+        is_closed: Whether there can be no further episodes: never, since no other process is involved.
 
     Raises:
         CrashhuntError: A crash cannot be run again, or the crashes have different scenarios or spaces.
     """
+
+    is_closed = False
 
     def __init__(self, crashes: Sequence[str], agent: str, before_s: float, after_s: float, max_steps: int) -> None:
         self._bundles = [read_bundle(Path(path)) for path in crashes]

@@ -1,7 +1,7 @@
 """``trained_on.json``: which traffics a policy was trained on. It lies next to the policy, and snapshots carry it.
 
 A comparison on these traffics shows what the policy has learned by heart. `held_out_traffics` returns the rule by which
-`crashhunt compare` and `crashhunt gate` keep only the traffics of the test part, whatever their outcome.
+`crashhunt compare`, `gate` and `rate` keep only the traffics of the test part, whatever their outcome.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import parse_object, typed
-from crashhunt.snapshots import Snapshot, latest_snapshot
+from crashhunt.snapshots import Snapshot
 from crashhunt.training._split import is_test_traffic
 
 if TYPE_CHECKING:
@@ -143,16 +143,18 @@ class HeldOutTraffics:
 
 
 def held_out_traffics(settings: HuntSettings, hunts: Iterable[Path]) -> HeldOutTraffics:
-    """Return the rule by which hunts with common traffic are compared.
+    """Return the rule by which hunts with common traffic are compared, and by which the trials of a rate count.
 
     Args:
         settings: settings of one of the hunts; all have the same seed.
-        hunts: their directories.
+        hunts: their directories; one for the rate of a single hunt.
 
     Raises:
         HuntDirectoryError: a record is damaged.
     """
-    records = [record for hunt in hunts if (found := latest_snapshot(hunt)) for record in _records_of(found)]
+    # Earlier snapshots count as well: after a change of the agent, a resumed hunt has trials of both agents.
+    snapshots = [Snapshot(path) for hunt in hunts for path in sorted((hunt / layout.SNAPSHOTS).glob(layout.SHOWN))]
+    records = dict.fromkeys(record for snapshot in snapshots for record in _records_of(snapshot))
     return HeldOutTraffics(settings.seed, tuple(records))
 
 

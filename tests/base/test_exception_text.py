@@ -11,6 +11,7 @@ import traceback
 import pytest
 
 from crashhunt.base.exceptions import MAX_TRACEBACK_CHARACTERS, class_name, format_error, in_words, message_of
+from crashhunt.errors import CallError, SimulatorError, UsageError
 
 MANY = 50_000
 LONG = 30_000_000  # characters
@@ -208,3 +209,12 @@ def test_class_and_message_are_those_of_the_exception():
     assert message_of(ValueError(1, "b" * 3)) == "(1, 'bbb')"
     assert message_of(ValueError({}, [0] * 200_000)) == "(list of 200000 elements)"
     assert in_words(ValueError("two\n lines")) == "ValueError: two lines"
+
+
+@pytest.mark.parametrize("kind", [UsageError, SimulatorError, CallError])
+def test_copy_of_an_error_has_its_text(kind):
+    # Gymnasium's AsyncVectorEnv raises `type(error)(error)` in the main process.
+    error = kind("speed is 3", fix="give 2", where="hunt.toml")
+    assert str(kind(error)) == str(error) == "hunt.toml: speed is 3; give 2"
+    assert str(kind(error, fix="give 1")) == "hunt.toml: speed is 3; give 1"
+    assert kind(error).to_json() == error.to_json()

@@ -17,6 +17,7 @@ from crashhunt.dashboard._hunt import HuntView
 from crashhunt.dashboard._trials import Sample, TrialCounts
 from crashhunt.estimation import counts_suffice, measure_rates, rate_of_counts
 from crashhunt.ledger import Ledger
+from crashhunt.training import HeldOutTraffics, TrainedOn
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
 CRASH_ON = (Outcome.COLLISION, Outcome.HANG)
@@ -191,7 +192,10 @@ def test_the_rate_from_counts_is_the_rate_that_crashhunt_rate_reports(shell, mad
     view.refresh()
     assert view.settings is not None
     assert view.counts is not None
-    assert counts_suffice(view.settings, view.facts)
+    nothing = HeldOutTraffics(0)
+    assert counts_suffice(view.settings, view.facts, nothing)
+    record = TrainedOn(test=0.5)
+    assert not counts_suffice(view.settings, view.facts, replace(nothing, records=(record,)))
     (said,) = measure_rates(hunt, per="trial")
     counted = rate_of_counts(hunt, view.settings, view.facts, **view.counts.prefix._asdict())
     assert replace(counted, dir="", driven_s=0.0, driven_m=0.0) == replace(said, dir="", driven_s=0.0, driven_m=0.0)

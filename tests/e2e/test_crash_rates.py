@@ -264,3 +264,16 @@ def test_status_reports_the_certain_interval_of_any_hunt_that_has_one(toy):
 def test_rare_mode_and_a_bar_exclude_each_other(toy):
     done = toy.crashhunt("run", "h", "2", "4", *RARE, "--until-rate", "1e-3/trial", expect=2)
     assert done.err == "crashhunt: --rare and --until-rate exclude each other; omit --until-rate\n"
+
+
+def test_hunt_resumed_with_fewer_trials_than_have_ended_shows_no_share(toy):
+    first = (*HUNT, "--keep-going", "--keep", "1")
+    toy.crashhunt("run", "h", "1", "6", *first)
+    done = toy.crashhunt("run", "h", "1", "2", *first)
+    assert "\n6 trials, " in f"\n{done.out}"
+    assert "of 2" not in done.out + done.err
+    toy.crashhunt("report", "h")
+    said = toy.crashhunt("status", "h")
+    assert "6/2" not in said.out
+    assert " 6 " in said.out
+    assert toy.crashhunt("status", "h", "--json").json["hunts"][0]["trials_planned"] == 2

@@ -24,6 +24,13 @@ needs_programs = pytest.mark.skipif(
         (("--grid", "2x2", "--demand", "0:1"), "--demand '0:1' is not a range"),
         (("--grid", "2x2", "--demand", "nan"), "--demand 'nan' is not a range"),
         (("--grid", "2x2", "--agent", "faulty:Nobody"), "Nobody"),
+        (("--osm", "none.osm", "--bbox="), "--bbox '' is not four numbers"),
+        (("--grid", "2x2", "--agent="), "'' is not a registered name of agents"),
+        (
+            ("--grid", "2x2", "--agent", "json:loads"),
+            "--agent json:loads: it needs the argument 's'; give",
+        ),
+        (("--grid", "2x2", "--agent", "ending:Driver"), "'ending:Driver' cannot be imported: its process exited"),
         (("--net", "empty.osm", "--lefthand"), "--lefthand cannot be used with --net"),
         ((), "one of the arguments --osm"),
         (("--grid", "2x2", "--spider", "5x2"), "not allowed with"),
@@ -31,6 +38,7 @@ needs_programs = pytest.mark.skipif(
 )
 def test_wrong_input_is_one_line_and_leaves_nothing(shell, words, message):
     (shell.folder / "empty.osm").touch()
+    (shell.folder / "ending.py").write_text("import os\nos._exit(0)\n")
     before = sorted(shell.folder.iterdir())
     done = shell.crashhunt("init", "place", *words, expect=2)
     assert message in done.err

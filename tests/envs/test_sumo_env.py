@@ -156,7 +156,7 @@ def test_a_process_that_dies_is_reported():
     os.kill(env._episodes._process.pid, signal.SIGKILL)
     with pytest.raises(SimulatorError, match="ended by signal 9; make a new environment"):
         env.step((8.0, 0))
-    with pytest.raises(SimulatorError, match="has been closed"):
+    with pytest.raises(SimulatorError, match="ended by signal 9; make a new environment"):
         env.step((8.0, 0))
     env.close()
     env.close()

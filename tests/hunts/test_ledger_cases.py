@@ -74,8 +74,8 @@ def test_endings_are_in_the_order_of_trials_and_name_what_was_killed(ledger):
     for one in (result(2, Outcome.COLLISION), random, killed, result(5, Outcome.INVALID)):
         ledger.record(one, snapshot="")
     assert list(ledger.endings()) == [
-        (0, "invalid", "", True), (1, "survived", "random", False), (2, "collision", "", False),
-        (5, "invalid", "", False),
+        (0, 0, "invalid", "", True), (1, 7, "survived", "random", False), (2, 14, "collision", "", False),
+        (5, 35, "invalid", "", False),
     ]  # fmt: skip
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 import string
 import tomllib
 import types
 import xml.etree.ElementTree as ET
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,12 +16,14 @@ import yaml
 from hypothesis import given, strategies as st
 
 from crashhunt.errors import ScenarioError
-from crashhunt.maps import read_network
+from crashhunt.maps import MapSource, read_network
+from crashhunt.maps._convert import ConvertOptions, convert
 from crashhunt.maps._demand import Demand, Route, _ego_routes, _entry_capacity, route_file
 from crashhunt.maps._folder import agent_module, arguments_of, next_commands, readme, scenario_toml, workflow
 from crashhunt.maps._network import Edge, Lane, Network
 from crashhunt.maps._picture import draw_map, drawable
 from crashhunt.maps._plain_run import PlainRun
+from crashhunt.maps._tools import Tools
 from crashhunt.scenario import scenario_from_dict, shipped_folder
 
 
@@ -90,6 +94,40 @@ def test_damaged_network_is_refused(tmp_path, text):
 
 
 # The traffic.
+
+
+def test_damaged_network_is_named_as_the_user_gave_it(tmp_path):
+    path = tmp_path / "town.net.xml"
+    path.write_text('<!DOCTYPE net [<!ENTITY a "&b;">]><net><edge id="&a;"/></net>')
+    (tmp_path / "work").mkdir()
+    with pytest.raises(ScenarioError, match="not a valid network") as caught:
+        convert(MapSource(kind="net", path=path), ConvertOptions(), Tools(tmp_path, "1"), tmp_path / "work")
+    assert caught.value.where == str(path)
+
+
+@pytest.fixture
+def tools(tmp_path):
+    """Programs, of which one ends by a signal and one succeeds."""
+    (tmp_path / "bin").mkdir()
+    for name, line in (("killed", "kill -9 $$"), ("fine", "true")):
+        program = tmp_path / "bin" / name
+        program.write_text(f"#!/bin/sh\n{line}\n")
+        program.chmod(0o755)
+    return Tools(tmp_path, "1")
+
+
+def test_program_that_was_killed_is_named_with_its_signal(tools, tmp_path):
+    with pytest.raises(ScenarioError, match="killed was ended by signal 9") as caught:
+        tools.run("killed", [], tmp_path)
+    assert "memory" in caught.value.fix
+
+
+def test_full_disk_under_a_program_is_reported(tools, tmp_path, monkeypatch):
+    assert tools.run("fine", [], tmp_path).code == 0
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=4096))
+    with pytest.raises(ScenarioError, match="fine has no space left for temporary files") as caught:
+        tools.run("fine", [], tmp_path)
+    assert "TMPDIR" in caught.value.fix
 
 
 def test_rates_add_up_and_follow_weights():

@@ -85,8 +85,9 @@ def test_map_without_a_road_for_cars_is_refused_with_what_it_has(tmp_path, tags,
 def test_first_error_of_netconvert_is_quoted(tmp_path):
     source = osm(tmp_path)
     source.path.write_text(source.path.read_text()[:-30])
-    with pytest.raises(ScenarioError, match=r"netconvert refuses the map: .+"):
+    with pytest.raises(ScenarioError, match=r"netconvert cannot read the map: .+") as caught:
         converted(source, tmp_path)
+    assert caught.value.fix == "download or export the map again: it is incomplete, or not valid XML"
 
 
 def xodr(folder, rule=""):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import gzip
 import math
+import os
 
 import pytest
 from hypothesis import given, strategies as st
 
 from crashhunt.errors import CrashhuntError, ScenarioError, UsageError
-from crashhunt.maps import MapSource, check_source, parse_bbox, parse_shape
+from crashhunt.maps import MapSource, _source, check_source, parse_bbox, parse_shape
 from crashhunt.maps._source import _MAX_BYTES, kind_of_file
 
 OSM = b'<?xml version="1.0"?><osm version="0.6"></osm>'
@@ -87,6 +88,17 @@ def test_shape_of_other_form_is_refused(text):
         parse_shape(text, "--grid")
 
 
+@pytest.mark.parametrize("text", ["1x1", "0x4", "10000x10000", "2x99999999999"])
+def test_shape_of_any_size_is_out_of_range_and_not_of_another_form(text):
+    with pytest.raises(UsageError, match="is out of range"):
+        parse_shape(text, "--grid")
+
+
+def test_bbox_that_is_not_finite_is_named_so():
+    with pytest.raises(UsageError, match="is not four finite numbers"):
+        parse_bbox("nan,1,2,3")
+
+
 def test_web_of_two_arms_is_refused():
     with pytest.raises(UsageError, match="2 arms"):
         parse_shape("2x3", "--spider")
@@ -132,6 +144,23 @@ def test_huge_map_is_refused_unread(tmp_path):
     with (tmp_path / "b.osm").open("wb") as file:
         file.truncate(_MAX_BYTES)  # read, and refused for its content
     assert "MB" not in refusal(tmp_path / "b.osm").message
+
+
+def test_packed_map_is_refused_before_it_fills_the_disk(tmp_path, monkeypatch):
+    monkeypatch.setattr(_source, "_MAX_BYTES", 5_000_000)
+    packed = gzip.compress(b"<osm>" + b" " * 5_000_000 + b"</osm>", mtime=0)
+    (tmp_path / "a.osm.gz").write_bytes(packed)
+    assert "over 5 MB when it is unpacked" in refusal(tmp_path / "a.osm.gz").message
+    (tmp_path / "b.osm.gz").write_bytes(gzip.compress(b"<osm>" + b" " * 2_000_000 + b"</osm>", mtime=0)[:-9])
+    assert "cannot be unpacked" in refusal(tmp_path / "b.osm.gz").message
+
+
+def test_pipes_devices_and_broken_links_are_named_so(tmp_path):
+    os.mkfifo(tmp_path / "pipe.osm")
+    (tmp_path / "link.osm").symlink_to("nowhere")
+    (tmp_path / "loop.osm").symlink_to("loop.osm")
+    for path in (tmp_path / "pipe.osm", tmp_path / "link.osm", tmp_path / "loop.osm"):
+        assert refusal(path).message == "is a device, a pipe or a broken link, not a map"
 
 
 def test_folder_and_missing_file_are_refused(tmp_path):

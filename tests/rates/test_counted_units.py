@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, strategies as st
@@ -33,7 +34,7 @@ def trial(number, *, crashed=False, valid=True, has_ended=True, origin="", steps
 def data(number, outcome="survived", **more):
     """A trial as a ledger has it."""
     driven = {"driven_s": 10.0, "driven_m": 100.0, "step_length_s": 0.1}
-    return {"spec": {"number": number}, "outcome": outcome, "steps": 100, **driven, **more}
+    return {"spec": {"number": number, "seed": number}, "outcome": outcome, "steps": 100, **driven, **more}
 
 
 def counted(trials, rule=RULE, per="trial"):
@@ -87,6 +88,32 @@ def test_units_of_a_hunt_with_few_traffics_are_traffics():
     whole = counted([one._replace(number=number) for number, one in enumerate(trials[:40])])
     assert found.certain.high - found.certain.low > whole.certain.high - whole.certain.low
     assert counted(trials[:39], rule).units == 4
+
+
+def test_trials_on_training_traffic_leave_both_sides_and_none_left_leaves_no_rate():
+    trials = [trial(number, crashed=number % 3 == 0)._replace(seed=number) for number in range(30)]
+    rule = replace(RULE, is_held_out=lambda seed: seed % 2 == 0)
+    found, plain = counted(trials, rule), counted([one._replace(number=n) for n, one in enumerate(trials[::2])])
+    assert (found.trials, found.crashes, found.excluded) == (15, 5, {"trained_on": 15})
+    assert (found.certain, found.estimate) == (plain.certain, plain.estimate)
+    nothing = counted(trials, replace(RULE, is_held_out=lambda _seed: False))
+    assert (nothing.certain, nothing.estimate, nothing.trials) == (None, None, 0)
+    assert nothing.why_not.startswith("an agent was trained on the traffic of all 30 trials; run another --seed")
+
+
+def test_hunt_with_a_bar_decides_on_held_out_traffic_only():
+    def seeded(number):
+        return data(number, "collision" if number % 2 else "survived")
+
+    watch = BarWatch(replace(RULE, is_held_out=lambda seed: seed % 2 == 0), 0.05, "trial", ("collision",))
+    for number in range(400):
+        watch.add(seeded(number))
+    assert watch.verdict == "below"
+    assert watch.running(now=True)["trained_on"] == watch.sequence.trained_on > 0
+    everything = BarWatch(RULE, 0.05, "trial", ("collision",))
+    for number in range(400):
+        everything.add(seeded(number))
+    assert everything.verdict == "above"
 
 
 def test_rate_per_hour_and_per_1000_km_scale_with_exposure():

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import re
 import shutil
 from contextlib import closing
 from dataclasses import replace
+from statistics import median
 
 import pytest
 from conftest import Shell
@@ -15,8 +17,11 @@ from hypothesis import given, strategies as st
 import crashhunt
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError, UsageError
+from crashhunt.estimation import GateReport, measure_rates
+from crashhunt.hunts import hunt_state
 from crashhunt.ledger import Ledger
-from crashhunt.report import describe_comparison
+from crashhunt.rates import CountingRule, RateCounter, TrialFacts, UnitSequence, make_rate
+from crashhunt.report import comparison_page, describe_comparison, describe_gate, describe_running, gate_summary
 from crashhunt.training import (
     CrashEnv,
     HeldOutTraffics,
@@ -184,23 +189,98 @@ def test_compare_counts_held_out_traffics_only(place):
     assert (plain.trials, plain.excluded) == (TRIALS, 0)
 
 
-def test_compare_refuses_traffic_of_which_nothing_is_held_out(place, tmp_path):
-    (carried,) = (place / "after").glob("snapshots/*/files/*-trained_on.json")
-    before = carried.read_text()
-    carried.write_text(json.dumps({**json.loads(before), "test": 0.0}))
-    try:
-        with pytest.raises(UsageError, match=f"an agent was trained on all {TRIALS} traffics"):
-            crashhunt.compare("before", "after")
-    finally:
-        carried.write_text(before)
+@pytest.mark.usefixtures("without_test_part")
+def test_compare_refuses_traffic_of_which_nothing_is_held_out():
+    with pytest.raises(UsageError, match=f"an agent was trained on all {TRIALS} traffics"):
+        crashhunt.compare("before", "after")
 
 
-def test_a_rate_in_traffic_that_was_trained_on_is_no_evidence(place):
+def test_rates_of_a_comparison_exclude_training_traffic_on_both_sides(place):
+    found = crashhunt.compare("before", "after")
+    held_out = sum(is_test_traffic(seed, 0.5) for seed in seeds_of(place / "before"))
+    left_out = {"trained_on": TRIALS - held_out}
+    crashed = [bundle for bundle in list_bundles(place / "before") if is_test_traffic(bundle.result.spec.seed, 0.5)]
+    assert [(hunt.trials, hunt.exclusions) for hunt in found.hunts] == [(held_out, left_out)] * 2
+    assert [hunt.crashes for hunt in found.hunts] == [len(crashed), 0]
+    assert found.hunts[0].median_steps_to_crash == median(bundle.result.steps for bundle in crashed)
+    said = describe_comparison(found)
+    assert said.count(f": {TRIALS - held_out} trials on training traffic are excluded\n") == 2
+    assert [hunt["left_out"] for hunt in found.to_json()["hunts"]] == [left_out] * 2
+    comparison_page(found, place / "page.html")
+    page = (place / "page.html").read_text()
+    assert page.count(f"{TRIALS - held_out} trials on training traffic are excluded") == 2
+    drawn = [int(count) for count in re.findall(r"of (\d+) trials</title>", page)]
+    assert sum(drawn) == 2 * held_out  # the plot of the only argument
+    # Hunts of other traffic do not exclude it.
+    (alone, elsewhere) = crashhunt.compare("before", "elsewhere").hunts
+    assert (alone.exclusions, elsewhere.exclusions) == ({}, {})
+
+
+def test_rate_excludes_training_traffic(place, shell):
+    shell.folder = place
+    held_out = sum(is_test_traffic(seed, 0.5) for seed in seeds_of(place / "before"))
+    found = shell.crashhunt("rate", "after", "before", "--json", "--html", "rates.html")
+    after, before = (next(one for one in found.json["rates"] if one["dir"] == name) for name in ("after", "before"))
+    assert (after["units"], after["left_out"]) == (held_out, {"trained_on": TRIALS - held_out})
+    assert (before["units"], before["left_out"]) == (TRIALS, {})
+    said = f"{TRIALS - held_out} trials on training traffic are excluded"
+    assert found.err.count(said) == 1
+    assert said in (place / "rates.html").read_text()
+    with_rate = hunt_state(place / "after").rate
+    assert (with_rate["trials"], with_rate["trained_on"]) == (held_out, TRIALS - held_out)
+    assert said in describe_running(with_rate)
+
+
+def test_unpaired_comparison_uses_rates_on_held_out_traffic(place):
+    (pair,) = crashhunt.compare("elsewhere", "after").pairs
+    held_out = sum(is_test_traffic(seed, 0.5) for seed in seeds_of(place / "after"))
+    assert (pair.test, pair.counts[1], pair.counts[3]) == ("intervals", TRIALS, held_out)
+
+
+@pytest.fixture
+def without_test_part(place):
+    """The record of the trained agent without a test part, next to its policy and in its hunt's snapshot."""
+    records = [*(place / "after").glob("snapshots/*/files/*-trained_on.json"), place / "trained" / "trained_on.json"]
+    before = [record.read_text() for record in records]
+    for record, text in zip(records, before, strict=True):
+        record.write_text(json.dumps({**json.loads(text), "test": 0.0}))
+    yield
+    for record, text in zip(records, before, strict=True):
+        record.write_text(text)
+
+
+@pytest.mark.usefixtures("without_test_part")
+def test_no_rate_without_held_out_traffic(place):
+    for rate in measure_rates("after"):
+        assert (rate.trials, rate.certain, rate.estimate) == (0, None, None)
+        assert rate.why_not.startswith(f"an agent was trained on the traffic of all {TRIALS} trials")
     (pair,) = crashhunt.compare("elsewhere", "after").pairs
     assert (pair.test, pair.answer, pair.difference) == ("", "", None)
-    assert "has no rate, because its agent was trained on this --seed" in pair.verdict
-    (pair,) = crashhunt.compare("before", "elsewhere").pairs
-    assert pair.test == "intervals"
+    assert f"after has no rate: an agent was trained on the traffic of all {TRIALS} trials" in pair.verdict
+
+
+@pytest.mark.usefixtures("without_test_part")
+def test_hunt_for_a_rate_on_training_traffic_is_refused(place, shell):
+    shell.folder = place
+    words = ("--scenario", "held.toml", "--seed", "4", "--arg", "path=trained/speed.txt")
+    done = shell.crashhunt("run", "bar", "1", "0", "60", *words, "--until-rate", "0.5/trial", "--most", "20", expect=2)
+    assert done.err.splitlines()[-1] == (
+        "crashhunt: --until-rate: an agent was trained on all traffics of --seed 4; give another --seed"
+    )
+
+
+def test_verdict_of_a_gate_reports_training_traffic():
+    rule = CountingRule(max_steps=60, is_held_out=lambda seed: seed % 2 == 0)
+    sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")
+    for number in range(24):
+        for unit in sequence.add(TrialFacts(number, True, True, False, 60, None, None, None, "", seed=number)):
+            counter.add(unit)
+    rate = make_rate("h", "trial", counter, sequence)
+    found = GateReport(verdict="undecided", base="a", head="b", pairs=12, trained_on=12, rates=(rate, rate))
+    for text in (describe_gate(found), gate_summary(found)):
+        assert "12 pairs do not count: an agent was trained on traffics of this part" in text
+        assert text.count("0 crashes in 12 trials (12 trials on training traffic are excluded), at most") == 2
+    assert found.to_json()["head"]["left_out"] == {"trained_on": 12}
 
 
 @pytest.mark.nightly  # by day, compare counts the same pairs
@@ -218,6 +298,7 @@ def test_gate_counts_held_out_traffics_only(place, shell):
     assert found.json["pairs"] <= held_out
     assert found.json["trained_on"] > 0
     assert "pairs do not count: an agent was trained on traffics of this part" in found.err
+    assert found.json["base"]["left_out"]["trained_on"] == found.json["head"]["left_out"]["trained_on"] > 0
     elsewhere = shell.crashhunt(*words, "--max-steps", "60", "--most", "2", "--seed", "5", expect=None).json
     assert (elsewhere["pairs"], elsewhere["trained_on"]) == (2, 0)
     record = place / "gate_after" / "trained_on.json"

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import json
+import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
+import threading
+import time
 import warnings
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -179,6 +187,71 @@ def test_a_process_of_its_own_gives_the_same_episodes(crashes):
     assert found[0] == found[1]
 
 
+@pytest.fixture
+def remote(crashes):
+    made = CrashEnv(crashes, before_s=BEFORE_S, share=1.0, process=True)
+    yield made
+    made.close()
+
+
+def interrupt(*_words):
+    raise KeyboardInterrupt
+
+
+def test_after_an_interrupt_the_next_request_gets_its_own_answer(remote, monkeypatch):
+    name = remote.crashes[0]
+    observation, info = remote.reset(options={"crash": name})
+    for _ in range(3):
+        with monkeypatch.context() as patch:
+            patch.setattr(remote._episodes, "_answers", SimpleNamespace(poll=interrupt))
+            with pytest.raises(KeyboardInterrupt):
+                remote.step(1)
+        again, info_again = remote.reset(options={"crash": name})
+        assert (again.tobytes(), info_again) == (observation.tobytes(), info)
+
+
+def test_an_interrupt_in_the_middle_of_a_message_ends_the_process(remote, monkeypatch):
+    remote.reset(seed=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(type(remote._episodes._pipe), "recv_bytes", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            remote.step(1)
+    for _ in range(2):
+        with pytest.raises(SimulatorError, match="interrupted in the middle of a message; make a new environment"):
+            remote.reset()
+    assert not os.path.exists(f"/proc/{remote._episodes.pid}")  # noqa: PTH110
+
+
+@pytest.mark.parametrize("crash", ["", None])
+def test_a_killed_process_is_reported_whatever_is_asked_next(remote, crash):
+    remote.reset(seed=1)
+    os.kill(remote._episodes.pid, signal.SIGKILL)
+    for _ in range(2):
+        with pytest.raises(SimulatorError, match="the process of the environment ended by signal 9; make a new"):
+            remote.reset(options={"crash": crash})
+    remote.close()
+    remote.close()
+
+
+def test_requests_of_several_threads_do_not_mix(remote):
+    failed = []
+
+    def ask(name, words, kind):
+        try:
+            for _ in range(60):
+                assert isinstance(remote._episodes._ask(name, *words), kind)
+        except Exception as error:
+            failed.append(error)
+
+    kinds = [("agent_name", (), str), ("reset_to_crash", (0,), tuple), ("agent_name", (), str)]
+    threads = [threading.Thread(target=ask, args=words) for words in kinds]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not failed
+
+
 def test_a_recording_that_differs_is_not_used(crashes):
     env = CrashEnv(crashes, before_s=BEFORE_S, share=1.0)
     first = env.crashes[0]
@@ -340,6 +413,65 @@ def test_vectors_of_processes_and_of_stable_baselines3(crashes, tmp_path):
     words = [sys.executable, "vectors.py", str(crashes)]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr
+
+
+ATTACKED = """
+import sys
+import gymnasium
+
+def make():
+    words = {"crashes": [sys.argv[1]], "before_s": 1.0, "process": True, "trained_on": "policy"}
+    return gymnasium.make("crashhunt:crashhunt/Crashes-v0", **words)
+
+if __name__ == "__main__":
+    vector = gymnasium.vector.AsyncVectorEnv([make, make])
+    vector.reset(seed=[1, 2])
+    print("ready", flush=True)
+    while True:
+        vector.step(vector.action_space.sample())
+"""
+
+
+def processes_with(mark):
+    """Return the processes that have a mark in their environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if mark.encode() in (folder / "environ").read_bytes():
+                found.append(int(folder.name))
+    return found
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("attack", ["ctrl-c", "killed program", "killed environment"])
+def test_no_process_outlives_a_training(crashes, tmp_path, attack):
+    (tmp_path / "attacked.py").write_text(ATTACKED)
+    mark = f"ATTACKED={tmp_path}"
+    words = [sys.executable, "attacked.py", str(crashes)]
+    with subprocess.Popen(
+        words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env={**os.environ, "ATTACKED": str(tmp_path)},
+    ) as program:  # fmt: skip
+        assert program.stdout.readline() == "ready\n"
+        alive = processes_with(mark)
+        assert len(alive) >= 5  # the program, two workers and their environments
+        if attack == "ctrl-c":
+            os.killpg(program.pid, signal.SIGINT)
+        else:
+            names = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in alive}
+            environments = [pid for pid, name in names.items() if "crashhunt.envs._process" in name]
+            assert len(environments) == 2
+            os.kill(program.pid if attack == "killed program" else environments[0], signal.SIGKILL)
+        said = program.communicate(timeout=100)[1]
+    if attack == "killed environment":
+        expected = "SimulatorError: the process of the environment ended by signal 9; make a new environment"
+        assert said.splitlines()[-1].endswith(expected)
+    deadline = time.monotonic() + 60
+    while processes_with(mark):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert json.loads((tmp_path / "policy" / "trained_on.json").read_text())["seeds"]
+    assert [file.name for file in (tmp_path / "policy").iterdir()] == ["trained_on.json"]
 
 
 # Which crash is drawn.

@@ -56,11 +56,11 @@ function showHunt() {
   const problems = [hunt.detail, ...hunt.problems].filter((part) => part);
   $("detail").hidden = !problems.length;
   setText($("detail"), problems.join("\n"));
-  $("progress").hidden = !hunt.trials_planned || hunt.state !== "running";
+  $("progress").hidden = !(hunt.trials_planned >= hunt.trials_run && hunt.trials_planned) || hunt.state !== "running";
   $("progress").value = hunt.trials_planned ? hunt.trials_run / hunt.trials_planned : 0;
   const rate = hunt.rate, newest = hunt.newest_kind_at;
   const tiles = [
-    ["trials", hunt.trials_planned ? `${count(hunt.trials_run)} of ${count(hunt.trials_planned)}` : count(hunt.trials_run)],
+    ["trials", hunt.trials_planned >= hunt.trials_run && hunt.trials_planned ? `${count(hunt.trials_run)} of ${count(hunt.trials_planned)}` : count(hunt.trials_run)],
     ["crashed trials", count(hunt.crashed_trials)],
     ...(hunt.kinds_count === null ? [] : [["crash types", count(hunt.kinds_count)]]),
     ...(newest ? [["since the last new type", seconds(Math.max(0, now() - newest))]] : []),

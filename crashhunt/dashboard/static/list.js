@@ -99,7 +99,7 @@ function fill(row) {
   node.state.className = `state ${row.state}`;
   setText(node.why, row.damaged || row.state === "error" || row.state === "killed" ? row.detail : "");
   setText(cells.scenario, row.scenario);
-  setText(cells.trials, row.trials_planned ? `${count(row.trials_run)} of ${count(row.trials_planned)}` : count(row.trials_run));
+  setText(cells.trials, row.trials_planned >= row.trials_run && row.trials_planned ? `${count(row.trials_run)} of ${count(row.trials_planned)}` : count(row.trials_run));
   setText(cells.speed, row.rate_per_s ? row.rate_per_s.toFixed(row.rate_per_s < 10 ? 1 : 0) : "-");
   setText(cells.left, seconds(row.seconds_left));
   setText(cells.crashes, count(row.crashed_trials));
