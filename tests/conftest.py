@@ -11,6 +11,7 @@ import importlib
 import importlib.util
 import json
 import os
+import secrets
 import shutil
 import signal
 import subprocess
@@ -95,6 +96,8 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("crashhunt")
 
 _TIMEOUT_S = 400.0
+_OF_ALL_WORKERS = "CRASHHUNT_TEST_COMMANDS"
+_SHARED = os.environ.pop(_OF_ALL_WORKERS, "")  # which commands of tests must not see
 collect_ignore = ["e2e/frozen"]  # in which a case of a corpus is a test to whoever has crashhunt's plugin
 _REPOSITORY = f"{Path(__file__).parents[1]}{os.sep}"
 FAULTY = Path(__file__).parent / "e2e" / "faulty.py"
@@ -183,18 +186,25 @@ def _usual_environment() -> dict[str, str]:
 
 @functools.cache
 def _commands() -> Commands:
-    return Commands(_usual_environment())
+    environment = _usual_environment()
+    return (_SHARED and Commands.connect(_SHARED, environment)) or Commands(environment)
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile all modules once, before several workers start: else each of them would compile all of them.
+    """Do once, before several workers of pytest-xdist start, what each of them would do: compile, start servers.
 
-    Compiling the tests of a fresh clone takes 7 s of a processor, most of it for what pytest adds to assertions.
+    Compiling the tests of a fresh clone takes 7 s of a processor, most of it for what pytest adds to assertions, and
+    the servers that commands are forked from take 3 s.
     """
-    chosen = config.args_source is pytest.Config.ArgsSource.TESTPATHS
-    if chosen and config.getoption("tx", None) and "PYTEST_XDIST_WORKER" not in os.environ:
+    if not config.getoption("tx", None) or "PYTEST_XDIST_WORKER" in os.environ:
+        return
+    if config.args_source is pytest.Config.ArgsSource.TESTPATHS:
         compile_once(config, Path(__file__).parent, max(1, os.cpu_count() or 1))
+    name = f"crashhunt-tests-{os.getpid()}-{secrets.token_hex(4)}"
+    servers = Commands(_usual_environment(), name)
+    os.environ[_OF_ALL_WORKERS] = name
+    config.add_cleanup(servers.close)
 
 
 def compile_once(config: pytest.Config, tests: Path, processes: int) -> None:
