@@ -415,7 +415,11 @@ def _with_simulator(simulator: str) -> socket.socket:
             os.closerange(3, theirs.fileno())
             os.closerange(theirs.fileno() + 1, _FREE)
             leave_after(
-                lambda: (_import(_OF_SIMULATORS[simulator]), _import_ours(simulator), _serve(Clients(theirs), simulator))
+                lambda: (
+                    _import(_OF_SIMULATORS[simulator]),
+                    _import_ours(simulator),
+                    _serve(Clients(theirs), simulator),
+                )
             )
     return ours
 
