@@ -21,7 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn
 
-from warm import OF_THE_GROUP, Process, Warm, ask, at_start, leave_after, path_of
+from warm import OF_THE_GROUP, Clients, Process, Warm, ask, at_start, connect, leave_after, path_of, pid_of
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
@@ -44,24 +44,46 @@ class Commands:
 
     Args:
         environment: in which it starts.
+        name: for other processes to connect to, where there are any.
     """
 
-    def __init__(self, environment: Mapping[str, str]) -> None:
+    def __init__(self, environment: Mapping[str, str], name: str = "") -> None:
         self._at_start = at_start(environment)
-        from crashhunt.executors import worker_environment
-
-        started = {**environment, **worker_environment()}
-        self.warm, self._kept = Warm.start(started)
+        started = self._environment_of_keepers(environment)
+        self.warm, kept = Warm.start(started, name and _name_of_keepers(name))
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MESSAGE)
         descriptors = [theirs.fileno(), self.warm.control.fileno()]
         with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, __file__, *map(str, descriptors), json.dumps(at_start(started))],
+            process = subprocess.Popen(
+                [sys.executable, __file__, *map(str, descriptors), json.dumps(at_start(started)), name],
                 pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,
                 env=environment,
             )
+        self._started = process, kept
+        self.pids = process.pid, kept.pid
+
+    @classmethod
+    def connect(cls, name: str, environment: Mapping[str, str]) -> Commands | None:
+        """Return the commands that another process has started, if they begin as those of this environment do."""
+        started = cls._environment_of_keepers(environment)
+        control, keepers = connect(name, environment), connect(_name_of_keepers(name), started)
+        if control is None or keepers is None:
+            for opened in (control, keepers):
+                if opened is not None:
+                    opened.close()
+            return None
+        self = cls.__new__(cls)
+        self._at_start, self._control, self.warm = at_start(environment), control, Warm(keepers, started)
+        self._started, self.pids = (), (pid_of(control), pid_of(keepers))
+        return self
+
+    @staticmethod
+    def _environment_of_keepers(environment: Mapping[str, str]) -> dict[str, str]:
+        from crashhunt.executors import worker_environment
+
+        return {**environment, **worker_environment()}
 
     def fits(self, environment: Mapping[str, str]) -> bool:
         """Whether a process that is started with these variables begins as the forks do."""
@@ -105,15 +127,19 @@ class Commands:
             raise
 
     def close(self) -> None:
-        """End it."""
+        """End it, where this process has started it; else it goes on for the others."""
         self._control.close()
-        self._process.wait(60)
         self.warm.control.close()
-        try:
-            self._kept.wait(10)
-        except subprocess.TimeoutExpired:  # a hunt that a test has left has a socket to it
-            self._kept.kill()
-            self._kept.wait()
+        for process in self._started:
+            try:
+                process.wait(60)
+            except subprocess.TimeoutExpired:  # a hunt that a test has left has a socket to it
+                process.kill()
+                process.wait()
+
+
+def _name_of_keepers(name: str) -> str:
+    return f"{name}-keepers"
 
 
 class Begun(Process):
@@ -155,42 +181,37 @@ def _text_of(file: IO[bytes]) -> str:
         return file.read().decode().replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _serve(control: socket.socket) -> None:
+def _serve(clients: Clients) -> None:
     """Fork for whoever asks, and tell how the forks end."""
     global AT_FIRST
     running: dict[int, tuple[int, socket.socket]] = {}  # what the kernel tells the end of a process by
-    while True:
-        ready, _, _ = select.select([control, *running], [], [])
+    while clients.has_any:
+        ready, _, _ = select.select([*clients.sockets, *running], [], [])
         for ended in running.keys() & set(ready):
             pid, reply = running.pop(ended)
             _, status = os.waitpid(pid, 0)
             os.close(ended)
             with reply, suppress(OSError):  # the process that asked has ended
                 reply.send(str(os.waitstatus_to_exitcode(status)).encode())
-        if control not in ready:
-            continue
-        data, descriptors, _, _ = socket.recv_fds(control, _MESSAGE, 4)
-        if not data:
-            return
-        request = json.loads(data)
-        for name in _FOR_COMMAND.get(next(iter(request["words"]), ""), ()):
-            importlib.import_module(name)
-            AT_FIRST |= sys.modules.keys()
-        asker, *streams = descriptors
-        pid = os.fork()
-        if pid == 0:
-            control.close()
-            os.close(asker)
-            for descriptor, (_, other) in running.items():
+        for data, (asker, *streams) in clients.receive(ready):
+            request = json.loads(data)
+            for name in _FOR_COMMAND.get(next(iter(request["words"]), ""), ()):
+                importlib.import_module(name)
+                AT_FIRST |= sys.modules.keys()
+            pid = os.fork()
+            if pid == 0:
+                clients.close()
+                os.close(asker)
+                for descriptor, (_, other) in running.items():
+                    os.close(descriptor)
+                    other.close()
+                _be_command(request, *streams)
+            for descriptor in streams:
                 os.close(descriptor)
-                other.close()
-            _be_command(request, *streams)
-        for descriptor in streams:
-            os.close(descriptor)
-        reply = socket.socket(fileno=asker)
-        with suppress(OSError):  # the process that asked has ended
-            reply.send(str(pid).encode())
-        running[os.pidfd_open(pid)] = pid, reply
+            reply = socket.socket(fileno=asker)
+            with suppress(OSError):  # the process that asked has ended
+                reply.send(str(pid).encode())
+            running[os.pidfd_open(pid)] = pid, reply
 
 
 def _be_command(request: dict, typed: int, out: int, err: int) -> NoReturn:
@@ -286,4 +307,4 @@ if __name__ == "__main__":
     crashhunt.base.plugins.registered("agents")
     gc.collect()
     gc.freeze()
-    _serve(socket.socket(fileno=int(sys.argv[1])))
+    _serve(Clients(socket.socket(fileno=int(sys.argv[1])), sys.argv[4]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import fcntl
 import functools
 import gc
@@ -10,6 +11,7 @@ import importlib
 import importlib.util
 import json
 import os
+import secrets
 import shutil
 import signal
 import subprocess
@@ -17,6 +19,7 @@ import sys
 import tempfile
 import threading
 from dataclasses import dataclass
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -93,6 +96,8 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("crashhunt")
 
 _TIMEOUT_S = 400.0
+_OF_ALL_WORKERS = "CRASHHUNT_TEST_COMMANDS"
+_SHARED = os.environ.pop(_OF_ALL_WORKERS, "")  # which commands of tests must not see
 collect_ignore = ["e2e/frozen"]  # in which a case of a corpus is a test to whoever has crashhunt's plugin
 _REPOSITORY = f"{Path(__file__).parents[1]}{os.sep}"
 FAULTY = Path(__file__).parent / "e2e" / "faulty.py"
@@ -181,7 +186,57 @@ def _usual_environment() -> dict[str, str]:
 
 @functools.cache
 def _commands() -> Commands:
-    return Commands(_usual_environment())
+    environment = _usual_environment()
+    return (_SHARED and Commands.connect(_SHARED, environment)) or Commands(environment)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Do once, before several workers of pytest-xdist start, what each of them would do: compile, start servers.
+
+    Compiling the tests of a fresh clone takes 7 s of a processor, most of it for what pytest adds to assertions, and
+    the servers that commands are forked from take 3 s.
+    """
+    if not config.getoption("tx", None) or "PYTEST_XDIST_WORKER" in os.environ:
+        return
+    if config.args_source is pytest.Config.ArgsSource.TESTPATHS:
+        compile_once(config, Path(__file__).parent, max(1, os.cpu_count() or 1))
+    name = f"crashhunt-tests-{os.getpid()}-{secrets.token_hex(4)}"
+    servers = Commands(_usual_environment(), name)
+    os.environ[_OF_ALL_WORKERS] = name
+    config.add_cleanup(servers.close)
+
+
+def compile_once(config: pytest.Config, tests: Path, processes: int) -> None:
+    """Compile the modules of crashhunt and of a folder of tests that are not compiled yet, in several processes."""
+    try:
+        from _pytest.assertion.rewrite import PYC_TAIL, _rewrite_test, _write_pyc, assertstate_key, get_cache_dir
+    except ImportError:  # of another version of pytest, where each worker compiles for itself
+        return
+
+    def compile_test(file: Path) -> None:
+        compiled = get_cache_dir(file) / f"{file.stem}{PYC_TAIL}"
+        if not compiled.exists():
+            compiled.parent.mkdir(parents=True, exist_ok=True)
+            source, code = _rewrite_test(file, config)
+            _write_pyc(config.stash[assertstate_key], code, source, compiled)
+
+    def compile_module(file: Path) -> None:
+        SourceFileLoader("", str(file)).get_code("")  # which keeps it
+
+    work = [(compile_test, file) for file in sorted(tests.rglob("test_*.py"))]
+    work += [(compile_module, file) for file in sorted(Path(_core.__file__).parents[1].rglob("*.py"))]
+    started = []
+    for number in range(processes):
+        pid = os.fork()
+        if pid == 0:
+            with contextlib.suppress(Exception):  # the worker that imports the module reports what is wrong with it
+                for compile_file, file in work[number::processes]:
+                    compile_file(file)
+            os._exit(0)
+        started.append(pid)
+    for pid in started:
+        os.waitpid(pid, 0)
 
 
 # Thousands of tests and their modules live to the end: the garbage collector need not walk them each time, neither

@@ -6,6 +6,8 @@ import os
 import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
 import warm
@@ -34,9 +36,9 @@ def test_servers_outlast_a_signal_to_the_group_of_the_session(toy):
     # `timeout 500 pytest` sends SIGTERM to the group. A hunt of the test ends as asked, and the next one of the same
     # test failed with "Broken pipe".
     toy.crashhunt("--version")
-    for server in (_commands()._process, _commands()._kept):
+    for server in _commands().pids:
         for number in warm.OF_THE_GROUP:
-            server.send_signal(number)
+            os.kill(server, number)
     run = ("run", "h", "1", "2", "20", "--scenario", "toy", "--arg", "speed=5", "--no-snapshot", "--json")
     assert toy.crashhunt(*run).json["outcomes"] == {"survived": 2}
     command = toy.begin("run", "h2", "1", "2", "20", "--scenario", "toy", "--set", "step_wall_s=5", "--no-snapshot")
@@ -47,11 +49,12 @@ def test_servers_outlast_a_signal_to_the_group_of_the_session(toy):
 
 def test_server_of_keepers_outlasts_a_killed_process_that_asked(start_keeper, monkeypatch):
     assert start_keeper().wait(60) == 0
-    server = _commands()._kept.pid
+    _, server = _commands().pids
     with monkeypatch.context() as patch:
         patch.setattr(warm.Process, "__init__", lambda self, words, reply: reply.close())  # as the kernel does
         os.kill(server, signal.SIGSTOP)
-        os.waitpid(server, os.WUNTRACED)
+        while Path(f"/proc/{server}/stat").read_text().rpartition(")")[2].split()[0] != "T":
+            time.sleep(0.01)
         try:
             start_keeper()
         finally:

@@ -22,9 +22,11 @@ import os
 import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
+import time
 import traceback
 import types
 from contextlib import suppress
@@ -34,13 +36,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 
 # What Python and its libraries look at when they start.
 _AT_START = ("PYTHON", "LC_", "LANG", "LD_", "COVERAGE", "OMP_", "OPENBLAS_")
 _SET_LATER = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX")
 _OF_SIMULATORS = {"gym": "gymnasium", "highway": "crashhunt.simulators.highway._lean", "sumo": "libsumo"}
 _MESSAGE = 1 << 20
+_START_S = 300.0  # a server imports for two seconds; on a loaded machine for longer
 _FREE = 500  # where a process has no files of its own
 # What interrupts a session, such as `timeout`, sends these to its whole group. A hunt that a test runs takes that as
 # a request to stop, and the test goes on: what serves it must not have ended by then.
@@ -95,6 +98,81 @@ def leave_after(call: Callable[[], object]) -> NoReturn:
         os._exit(code)
 
 
+class Clients:
+    """The sockets that a server is asked by: that of the process that started it, and those that connect to its name.
+
+    Args:
+        first: the socket of the process that started it.
+        name: of the server, as `connect` finds it; empty if no other process connects.
+    """
+
+    def __init__(self, first: socket.socket, name: str = "") -> None:
+        self._listening: socket.socket | None = None
+        self._controls = [first]
+        if name:
+            self._listening = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            self._listening.bind(f"\0{name}")
+            self._listening.listen()
+
+    @property
+    def has_any(self) -> bool:
+        """Whether any process can still ask."""
+        return bool(self._controls)
+
+    @property
+    def sockets(self) -> list[socket.socket]:
+        """What to wait for."""
+        return [*self._controls, *([self._listening] if self._listening else [])]
+
+    def receive(self, ready: Container[object]) -> Iterator[tuple[bytes, list[int]]]:
+        """Yield the requests that have come with their descriptors, and admit and dismiss clients."""
+        for control in [*self._controls]:
+            if control in ready:
+                data, descriptors, _, _ = socket.recv_fds(control, _MESSAGE, 16)
+                if data:
+                    yield data, descriptors
+                else:
+                    self._controls.remove(control)
+                    control.close()
+        if self._listening in ready:
+            assert self._listening is not None
+            control, _ = self._listening.accept()
+            with suppress(OSError):  # the process that connected has ended
+                control.send(json.dumps(at_start(os.environ)).encode())
+            self._controls.append(control)
+
+    def close(self) -> None:
+        """Close all, as a fork must do."""
+        for opened in self.sockets:
+            opened.close()
+
+
+def connect(name: str, environment: Mapping[str, str]) -> socket.socket | None:
+    """Return a socket to the server of a name, or None if there is none that started with these variables."""
+    control = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    control.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MESSAGE)
+    deadline = time.monotonic() + _START_S
+    while True:
+        try:
+            control.connect(f"\0{name}")
+            if json.loads(control.recv(_MESSAGE) or b"{}") == at_start(environment):
+                return control
+        except ConnectionRefusedError:  # it is still importing
+            if time.monotonic() < deadline:
+                time.sleep(0.05)
+                continue
+        except OSError:  # it has ended
+            pass
+        control.close()
+        return None
+
+
+def pid_of(control: socket.socket) -> int:
+    """Return the process that listens at the other end."""
+    pid: int = struct.unpack("3i", control.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[0]
+    return pid
+
+
 class Warm:
     """The process of which keepers are forks, and whoever asks for one.
 
@@ -108,13 +186,16 @@ class Warm:
         self._at_start = at_start(environment)
 
     @classmethod
-    def start(cls, environment: Mapping[str, str]) -> tuple[Warm, subprocess.Popen[bytes]]:
-        """Start it; it ends when nobody has a socket to it any more."""
+    def start(cls, environment: Mapping[str, str], name: str = "") -> tuple[Warm, subprocess.Popen[bytes]]:
+        """Start it, for other processes to connect to where it has a name.
+
+        It ends when no process has a socket to it any more.
+        """
         control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         control.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MESSAGE)
         with theirs:
             process = subprocess.Popen(
-                [sys.executable, "-P", __file__, str(theirs.fileno())], pass_fds=[theirs.fileno()],
+                [sys.executable, "-P", __file__, str(theirs.fileno()), name], pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment,
             )  # fmt: skip
         return cls(control, environment), process
@@ -296,38 +377,34 @@ def _is_ours(name: str) -> bool:
     return name.partition(".")[0] == "crashhunt"
 
 
-def _serve(control: socket.socket, simulator: str = "") -> None:
+def _serve(clients: Clients, simulator: str = "") -> None:
     """Fork for whoever asks, and tell how the forks end; one for each simulator does the same, with that imported."""
     running: dict[int, tuple[int, socket.socket]] = {}  # what the kernel tells the end of a process by
     others: dict[str, socket.socket] = {}
-    while True:
-        ready, _, _ = select.select([control, *running], [], [])
+    while clients.has_any:
+        ready, _, _ = select.select([*clients.sockets, *running], [], [])
         for ended in running.keys() & set(ready):
             pid, reply = running.pop(ended)
             _, status = os.waitpid(pid, 0)
             os.close(ended)
             with reply, suppress(OSError):
                 reply.send(str(os.waitstatus_to_exitcode(status)).encode())
-        if control not in ready:
-            continue
-        data, descriptors, _, _ = socket.recv_fds(control, _MESSAGE, 16)
-        if not data:
-            return
-        request = json.loads(data)
-        if request["simulator"] != simulator:
-            if request["simulator"] not in others:
-                others[request["simulator"]] = _with_simulator(request["simulator"])
-            socket.send_fds(others[request["simulator"]], [data], descriptors)
-        else:
-            pid = os.fork()
-            if pid == 0:
-                _be_keeper(request, descriptors[1:])
-            reply = socket.socket(fileno=os.dup(descriptors[0]))
-            with suppress(OSError):  # the process that asked was killed meanwhile; the keeper sees it too
-                reply.send(str(pid).encode())
-            running[os.pidfd_open(pid)] = pid, reply
-        for descriptor in descriptors:
-            os.close(descriptor)
+        for data, descriptors in clients.receive(ready):
+            request = json.loads(data)
+            if request["simulator"] != simulator:
+                if request["simulator"] not in others:
+                    others[request["simulator"]] = _with_simulator(request["simulator"])
+                socket.send_fds(others[request["simulator"]], [data], descriptors)
+            else:
+                pid = os.fork()
+                if pid == 0:
+                    _be_keeper(request, descriptors[1:])
+                reply = socket.socket(fileno=os.dup(descriptors[0]))
+                with suppress(OSError):  # the process that asked was killed meanwhile; the keeper sees it too
+                    reply.send(str(pid).encode())
+                running[os.pidfd_open(pid)] = pid, reply
+            for descriptor in descriptors:
+                os.close(descriptor)
 
 
 def _with_simulator(simulator: str) -> socket.socket:
@@ -338,7 +415,11 @@ def _with_simulator(simulator: str) -> socket.socket:
             os.closerange(3, theirs.fileno())
             os.closerange(theirs.fileno() + 1, _FREE)
             leave_after(
-                lambda: (_import(_OF_SIMULATORS[simulator]), _import_ours(simulator), _serve(theirs, simulator))
+                lambda: (
+                    _import(_OF_SIMULATORS[simulator]),
+                    _import_ours(simulator),
+                    _serve(Clients(theirs), simulator),
+                )
             )
     return ours
 
@@ -448,4 +529,4 @@ if __name__ == "__main__":
         "xml.etree.ElementTree",
         "xml.sax",
     )
-    _serve(socket.socket(fileno=int(sys.argv[1])))
+    _serve(Clients(socket.socket(fileno=int(sys.argv[1])), sys.argv[2]))

@@ -20,7 +20,7 @@ from mcap.writer import Writer
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
 from crashhunt.recording._blackbox import Record
-from crashhunt.recording._foxglove import MESSAGES, NAMESPACE, LogWriter, to_ns, write_views
+from crashhunt.recording._foxglove import MESSAGES, NAMESPACE, LogWriter, messages_of, to_ns, write_views
 from crashhunt.recording._reading import Prologue
 from crashhunt.recording._recording import Compact, Recording
 from crashhunt.recording.records import RECORD_TYPES
@@ -97,17 +97,12 @@ def read_log(path: Path) -> Recording:
                 raise refuse("this MCAP file was not written by crashhunt", "give a log.mcap of a crash bundle")
             if version != SCHEMA:
                 raise refuse(f"its schema is {version}, not {SCHEMA}", "use the version of crashhunt that wrote it")
-            messages = reader.iter_messages(log_time_order=False)
             evidence = [
                 _Message(
-                    sequence=message.sequence,
-                    topic=channel.topic,
-                    data=message.data,
-                    schema=schema.name,
-                    metadata=channel.metadata,
+                    sequence=sequence, topic=channel.topic, data=data, schema=schema.name, metadata=channel.metadata
                 )
-                for schema, channel, message in messages
-                if schema is not None and schema.name.startswith(NAMESPACE) and message.sequence
+                for schema, channel, sequence, data in messages_of(file, reader, validate_crcs=True)
+                if schema is not None and sequence and schema.name.startswith(NAMESPACE)
             ]
             evidence.sort(key=itemgetter(0))
             return Recording(_read_evidence(evidence), compact)

@@ -56,7 +56,7 @@ class Sources:
         excluded: The files that were not taken, each with the reason.
     """
 
-    files: dict[str, Path] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
     paths: list[str] = field(default_factory=lambda: [layout.CODE])
     trees: list[Path] = field(default_factory=list)
     excluded: list[str] = field(default_factory=list)
@@ -64,13 +64,16 @@ class Sources:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Sources:
         """Return the sources that `to_json` has described."""
-        files = {str(place): Path(path) for place, path in data["files"].items()}
-        return cls(files, list(data["paths"]), list(map(Path, data["trees"])), list(data["excluded"]))
+        return cls(dict(data["files"]), list(data["paths"]), list(map(Path, data["trees"])), list(data["excluded"]))
 
     def to_json(self) -> JsonObject:
         """Return a description that can be written as JSON."""
-        files = {place: str(path) for place, path in self.files.items()}
-        return {"files": files, "paths": self.paths, "trees": list(map(str, self.trees)), "excluded": self.excluded}
+        return {
+            "files": self.files,
+            "paths": self.paths,
+            "trees": list(map(str, self.trees)),
+            "excluded": self.excluded,
+        }
 
 
 def find_sources(
@@ -97,6 +100,7 @@ def find_sources(
         SnapshotError: A root does not exist.
     """
     found = Sources()
+    _real_folder.cache_clear()  # a link may lead elsewhere than at the snapshot before
     names = {locate("agents", locator).__module__.partition(".")[0] for locator in locators}
     for module in modules:
         import_module(module)
@@ -144,12 +148,12 @@ def _is_installed(place: Path | None) -> bool:
     """Whether a module is installed, so that its version identifies it."""
     if place is None or not {"site-packages", "dist-packages"}.isdisjoint(place.parts):
         return True
-    return any(map(place.is_relative_to, _installed_places()))
+    return f"{place}{os.sep}".startswith(_installed_places())
 
 
 @cache
-def _installed_places() -> tuple[Path, ...]:
-    return tuple({Path(path).resolve() for path in sysconfig.get_paths().values()})
+def _installed_places() -> tuple[str, ...]:
+    return tuple({f"{Path(path).resolve()}{os.sep}" for path in sysconfig.get_paths().values()})
 
 
 def _place_of(name: str) -> Path | None:
@@ -159,8 +163,15 @@ def _place_of(name: str) -> Path | None:
     if file is None:
         paths = list(getattr(module, "__path__", ()))  # a package without __init__.py
         return Path(paths[0]).resolve().parent if len(paths) == 1 else None
-    path = Path(file).resolve()
+    # Hundreds of modules lie in a few folders, so resolve each folder once.
+    folder, own_name = os.path.split(file)
+    path = Path(file).resolve() if os.path.islink(file) else _real_folder(folder) / own_name  # noqa: PTH114
     return path.parent.parent if path.stem == "__init__" else path.parent
+
+
+@cache
+def _real_folder(folder: str) -> Path:
+    return Path(folder).resolve()
 
 
 def _take_module(name: str, found: Sources) -> None:
@@ -169,10 +180,10 @@ def _take_module(name: str, found: Sources) -> None:
     file = getattr(module, "__file__", None)
     for folder in map(Path, getattr(module, "__path__", ())):
         for path in _walk(folder):
-            found.files[f"{layout.CODE}/{name}/{path}"] = folder / path
+            found.files[f"{layout.CODE}/{name}/{path}"] = f"{folder}/{path}"
         return
     if file is not None:
-        found.files[f"{layout.CODE}/{Path(file).name}"] = Path(file)
+        found.files[f"{layout.CODE}/{Path(file).name}"] = file
 
 
 def _is_page(place: str) -> bool:
@@ -234,7 +245,7 @@ def _take_tree(
         listed = [name for name in names if not name.startswith(tuple(hunts))]
         for name in listed:
             for place, path in _resolved(tree, name, listed, found):
-                found.files[f"{base}/{place}"] = path
+                found.files[f"{base}/{place}"] = str(path)
     entries = [*map(Path, imports), *(Path(entry or ".").resolve() for entry in sys.path)]
     for entry in entries:
         if entry.is_relative_to(tree):
@@ -273,7 +284,7 @@ def _resolved(tree: Path, name: str, listed: Sequence[str], found: Sources) -> I
 def _take_root(root: Path, found: Sources, without: Path | None) -> None:
     path = root.resolve()
     if path.is_file():
-        found.files[f"{layout.CODE}/@{path.parent.name}/{path.name}"] = path
+        found.files[f"{layout.CODE}/@{path.parent.name}/{path.name}"] = str(path)
         return
     if not path.is_dir():
         raise SnapshotError(f"--snapshot-root {str(root)!r} does not exist", fix="correct the path")
@@ -359,7 +370,7 @@ def take_snapshot(
     found = Sources.from_json(seen["sources"])
     argument_files = _argument_files(settings) if options.code else {}
     argument_files |= _training_records(seen["agents"], argument_files)
-    files = found.files | {argument_files[value]: Path(value) for value in argument_files}
+    files = found.files | {place: path for path, place in argument_files.items()}
     _check_size(files, options.limit_mb)
     try:
         snapshots.mkdir(exist_ok=True)
@@ -376,7 +387,7 @@ def take_snapshot(
 
 def _build(
     building: Path,
-    files: dict[str, Path],
+    files: dict[str, str],
     found: Sources,
     argument_files: dict[str, str],
     scenario: Scenario,
@@ -387,7 +398,7 @@ def _build(
     building.mkdir()
     for folder in {name.rpartition("/")[0] for name in files}:
         (building / folder).mkdir(parents=True, exist_ok=True)
-    entries = {name: _store(path, building / name) for name, path in files.items()}
+    entries = {name: _store(path, f"{building}/{name}") for name, path in files.items()}
     entries |= _store_scenario(scenario, building)
     stored = {name: entry for name, entry in entries.items() if entry is not None}
     manifest: Manifest = {
@@ -454,7 +465,7 @@ def _training_records(modules: Sequence[str], argument_files: dict[str, str]) ->
     return {record: f"{layout.FILES}/{place}-{layout.TRAINED_ON}" for place, record in enumerate(there, first)}
 
 
-def _check_size(files: dict[str, Path], limit_mb: float) -> None:
+def _check_size(files: dict[str, str], limit_mb: float) -> None:
     sizes = {path: _size(path) for path in files.values()}
     total = sum(sizes.values())
     if total > limit_mb * _MEGABYTE:
@@ -466,14 +477,14 @@ def _check_size(files: dict[str, Path], limit_mb: float) -> None:
         )
 
 
-def _size(path: Path) -> int:
+def _size(path: str) -> int:
     try:
-        return path.stat().st_size
+        return os.stat(path).st_size  # noqa: PTH116 - a Path takes several times as long
     except OSError:
         return 0
 
 
-def _store(path: Path, copy: Path) -> FileEntry | None:
+def _store(path: str, copy: str) -> FileEntry | None:
     """Copy a file with its permissions; return None if the file has been deleted meanwhile."""
     try:
         with open(path, "rb", buffering=0) as file:
@@ -481,7 +492,7 @@ def _store(path: Path, copy: Path) -> FileEntry | None:
             content = file.readall() if status.st_size < _SMALL else None
         if content is None:
             shutil.copy(path, copy)
-            return {"size": copy.stat().st_size, "blake2b": digest_of_file(copy)}
+            return {"size": _size(copy), "blake2b": digest_of_file(Path(copy))}
     except FileNotFoundError:
         return None
     # A hunt copies hundreds of modules, so write the content that was read, without shutil and Path.
@@ -500,7 +511,7 @@ def _store_scenario(scenario: Scenario, building: Path) -> dict[str, FileEntry |
     for name in scenario.files():
         place = f"{layout.SCENARIO_FILES}/{name}"
         (building / place).parent.mkdir(parents=True, exist_ok=True)
-        entries[place] = _store(scenario.folder / name, building / place)
+        entries[place] = _store(f"{scenario.folder}/{name}", f"{building}/{place}")
         moved = relocated(scenario.folder / name) if relocated is not None and name in texts else None
         if moved is not None:
             (building / place).write_bytes(moved)

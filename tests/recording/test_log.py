@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import json
 import resource
 import shutil
@@ -15,10 +16,13 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import HealthCheck, given, settings, strategies as st
-from mcap.reader import make_reader
+from mcap.reader import SeekingReader, make_reader
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.writer import Writer
 
 from crashhunt.errors import BundleError
-from crashhunt.recording import foxglove_layout, read_log, write_log
+from crashhunt.recording import _foxglove, _log, foxglove_layout, read_log, write_log
+from crashhunt.recording._foxglove import messages_of
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Lane
 
@@ -40,6 +44,43 @@ def test_a_log_gives_back_every_bit(tmp_path, episode):
     found = read_log(tmp_path / "log.mcap")
     assert found.records == recording.records
     assert found.digest == recording.digest
+
+
+@pytest.mark.parametrize("chunk_size", [1 << 20, 2000])
+def test_messages_are_those_of_the_reader_of_mcap(tmp_path, monkeypatch, chunk_size):
+    path = tmp_path / "log.mcap"
+    recording = record(Episode(["ego"], 40, 3), tmp_path / "box")
+    monkeypatch.setattr(_log, "Writer", functools.partial(Writer, chunk_size=chunk_size))
+    write_log(path, recording, lanes=LANES, crash=CRASH)
+    with path.open("rb") as file:
+        reader = SeekingReader(file)
+        theirs = [
+            (schema.name, channel.topic, message.sequence, message.data)
+            for schema, channel, message in reader.iter_messages(log_time_order=False)
+        ]
+        ours = [
+            (schema.name, channel.topic, sequence, data)
+            for schema, channel, sequence, data in messages_of(file, reader)
+        ]
+        assert (len(reader.get_summary().chunk_indexes) > 1) == (chunk_size == 2000)
+        assert ours == theirs
+        assert [one for *_, one in messages_of(file, reader, topic="/tf")] == [
+            data for _, topic, _, data in theirs if topic == "/tf"
+        ]
+
+
+@pytest.mark.parametrize("missing", [1, 12])
+def test_record_that_is_longer_than_its_chunk_is_refused(tmp_path, monkeypatch, missing):
+    path = tmp_path / "log.mcap"
+    write_log(path, record(Episode(["ego"], 12, 3), tmp_path / "box"), lanes=LANES)
+
+    def shortened(chunk, *, validate_crc):
+        stream, size = get_chunk_data_stream(chunk, validate_crc)
+        return stream, size - missing
+
+    monkeypatch.setattr(_foxglove, "get_chunk_data_stream", shortened)
+    with pytest.raises(BundleError, match="McapError: a record of"):
+        read_log(path)
 
 
 @given(st.data())

@@ -214,11 +214,20 @@ def test_which_it_takes_no_more_where_it_begins_later_is_excluded_of_a_few_as_we
     assert (search.best.script.names, search.best.max_steps) == (("g",), 60)
 
 
-@pytest.mark.parametrize(("escape", "begins"), [(None, [39, 29, 19, 9]), (25, [25, 19, 9]), (0, [])])
-def test_it_begins_while_the_agent_can_still_avoid_it(escape, begins):
+@pytest.mark.parametrize(
+    ("steps", "escape", "begins"),
+    [
+        (49, None, [39, 29, 19, 9]),
+        (49, 25, [25, 19, 9]),
+        (49, 0, []),
+        (450, None, [440, 430, 420, 410, 390, 370, 330, 250, 50]),
+    ],
+)
+def test_it_begins_while_the_agent_can_still_avoid_it(steps, escape, begins):
     ego = Actor("ego", "passenger", 5.0, 1.8)
     scenes = [
-        Scene(step / 10, Roster((ego,)), [(float(step), 0.0)], [0.0], [10.0], lanes=("road_0",)) for step in range(50)
+        Scene(step / 10, Roster((ego,)), [(float(step), 0.0)], [0.0], [10.0], lanes=("road_0",))
+        for step in range(steps + 1)
     ]
     rerun = SimpleNamespace(
         spec=TrialSpec(0, 1, {"ego": {}}, {}, 300),
@@ -226,7 +235,7 @@ def test_it_begins_while_the_agent_can_still_avoid_it(escape, begins):
             result=SimpleNamespace(escape=None if escape is None else Escape(escape, escape + 1, 8.0, ""))
         ),
         recorded=SimpleNamespace(
-            agents=("ego",), steps=49, prologue=SimpleNamespace(step_length_s=0.1), scenes=lambda: scenes
+            agents=("ego",), steps=steps, prologue=SimpleNamespace(step_length_s=0.1), scenes=lambda: scenes
         ),
     )
     assert _scripting.Scripting(rerun).begins(("ego",)) == begins
@@ -622,6 +631,8 @@ def test_a_script_may_take_a_second_longer_than_what_was_recorded():
     assert later.max_steps == 29
     assert later.disturbances == (replace(LATE, step=10),)
     assert scripting.spec(Part(("ego",), (), begin=40)).disturbances == ()
+    rerun.recorded.prologue = SimpleNamespace(step_length_s=2.5)
+    assert _scripting.Scripting(rerun).spec(Part(("ego",), ())).max_steps == 50  # a step at least
 
 
 def test_after_a_part_was_excluded_the_parts_stay_as_small():
@@ -699,6 +710,8 @@ def test_few_actors_with_which_the_crash_takes_longer_are_scripted_from_later_on
     search = Search(crash(arguments={"ego": {}}, scenario_arguments={}), Lasting(steps), "either")
     search._scripting = FromLaterOn()
     assert search.run(lambda: False)[0] == "done"
+    # A script may take as many steps as the crash that is known, and not as many as one in traffic.
+    assert {most for most, spec in search._runs.tried if spec.script is not None and spec.max_steps == 60} == {100}
     if scripted_steps == 40:
         assert (search.best.script.names, search._steps) == (("b",), 40)
     else:

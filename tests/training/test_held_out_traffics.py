@@ -56,7 +56,7 @@ class Driver:
     def act(self, observation):
         return self.speed, 0
 '''
-TRIALS = 16
+TRIALS = 10
 
 
 @pytest.fixture(scope="module")

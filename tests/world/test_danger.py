@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from crashhunt.world import Actor, DangerMeter, Frame, Roster, dangers, followers_danger, outlines_overlap
 
@@ -293,7 +293,8 @@ places = st.floats(-40, 40)
 others = st.tuples(places, places, st.floats(-3.1, 3.1), st.floats(2, 20), st.floats(-0.3, 0.3))
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=40, deadline=None)
+@example(bend=0.0, speed=5.0, ways=[(-3.0, 14.0, -1.6875, 11.0, 0.28125)])  # crosses where the way begins
 @given(bend=st.floats(-0.03, 0.03), speed=st.floats(4, 14), ways=st.lists(others, min_size=1, max_size=2))
 def test_it_is_what_a_search_over_time_shifts_finds(bend, speed, ways):
     """By brute force: the agent is moved along its own way in time until it overlaps the other one.
@@ -314,9 +315,11 @@ def test_it_is_what_a_search_over_time_shifts_finds(bend, speed, ways):
         return  # they touch in earnest, or all but
     measured, _ = level(ego, *theirs)
     whole = searched(ego, theirs, LENGTH, WIDTH, same_way=math.pi / 6 - 2 * abs(bend))
-    # Behind the agent, 30 m of its way are looked at, of which the last places are 4 m apart; and who goes its way is
-    # left out by the place where whole cars touch, within 12 m of where their inner parts do.
-    inner = searched(ego, theirs, 1.0, 0.8, behind=int(26 / (speed * 0.1)), same_way=math.pi / 6 + 12 * abs(bend))
+    # Behind the agent, 30 m of its way are examined at places 4 m apart, none of which may lie in the first 4 m of the
+    # way or the last 4 m of the 30 m. An actor that goes the agent's way is excluded by the place where whole cars
+    # touch, within 12 m of where their inner parts do.
+    behind, first = int(26 / (speed * 0.1)), math.ceil(4 / (speed * 0.1))
+    inner = searched(ego, theirs, 1.0, 0.8, behind=behind, first=first, same_way=math.pi / 6 + 12 * abs(bend))
     found = -1.2 * np.log(np.maximum(measured, 1e-9))
     sampled = np.arange(0, steps, 3)
     # The way ends; nobody knows what is beyond.
@@ -325,10 +328,11 @@ def test_it_is_what_a_search_over_time_shifts_finds(bend, speed, ways):
     assert np.all(found[sampled] < inner[sampled] + 0.15)
 
 
-def searched(ego, theirs, length, width, behind=None, *, same_way):
+def searched(ego, theirs, length, width, behind=None, first=0, *, same_way):
     """The least shift in time, in s, with which an overlap comes about at each step.
 
-    Back, it is looked for by so many steps at most, and not with whom goes the same way, up to some rad.
+    Back, the search covers at most ``behind`` steps, and none before the first. It skips actors that go the same way,
+    up to some rad.
     """
     steps = len(ego)
     nearest = np.full(steps, np.inf)
@@ -338,13 +342,15 @@ def searched(ego, theirs, length, width, behind=None, *, same_way):
         out = (LENGTH - length) / 2
         return x - out * math.cos(heading), y - out * math.sin(heading), heading, length, width
 
-    for step in range(0, steps, 3):
-        for other in theirs:
-            for at in range(max(0, step - (behind or step)), steps):
-                lag = 0.1 * abs(at - step)
-                if lag >= nearest[step] or math.dist(ego[at][:2], other[step][:2]) > 12:
-                    continue
+    for other in theirs:
+        apart = np.hypot(*(ego[:, None] - other[None])[..., :2].T).T
+        for step in range(0, steps, 3):
+            earliest = min(step, max(first, step - (behind or step)))
+            for at in sorted(range(earliest, steps), key=lambda at: abs(at - step)):
+                if 0.1 * abs(at - step) >= nearest[step]:
+                    break
                 follows = at < step and math.cos(ego[at][2] - other[step][2]) >= math.cos(same_way)
-                if not follows and outlines_overlap(outline(ego[at]), outline(other[step])):
-                    nearest[step] = lag
+                near = apart[at, step] <= 12 and not follows
+                if near and outlines_overlap(outline(ego[at]), outline(other[step])):
+                    nearest[step] = 0.1 * abs(at - step)
     return nearest
