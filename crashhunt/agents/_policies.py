@@ -72,11 +72,14 @@ class StableBaselines3:
         self._deterministic = deterministic
         trained = self._model.observation_space
         if observation_space is not None and _shape(trained) != _shape(observation_space):
-            raise ValueError(f"the model was trained on {trained}, but the vehicle observes {observation_space}")
+            raise ValueError(
+                f"{path!r} was trained on observations of shape {_shape(trained)}, but those of this scenario have "
+                f"shape {_shape(observation_space)}"
+            )
         decides = self._model.action_space
         if action_space is not None and _choices(decides) != _choices(action_space):
             raise ValueError(
-                f"the model was trained with actions in {decides}, but the vehicle's actions are in {action_space}"
+                f"{path!r} was trained with actions in {decides}, but those of this scenario are in {action_space}"
             )
 
     def reset(self, seed: int) -> None:
