@@ -147,7 +147,7 @@ class Pair:
     def _answer(self) -> str:
         if self.answer in ("first", "second"):
             return f"{self.first if self.answer == 'first' else self.second} crashes less"
-        return "undecided, no difference that chance does not explain"
+        return "undecided, because chance may explain the difference"
 
     @property
     def _difference(self) -> str:

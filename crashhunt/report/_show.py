@@ -276,10 +276,8 @@ class Story:
         also, until = about_changes(tried.changed), self._ago(tried.step)
         if tried.too_late is None:
             return [f"{braking} could have avoided it until {until}: a run from this step avoids it.{also}"]
-        return [
-            f"{braking} could have avoided it until {until}: a run from this step avoids it, and a run from one step "
-            f"later crashes.{also}"
-        ]
+        runs = "a run from this step avoids it, and a run from one step later crashes"
+        return [f"{braking} could have avoided it until {until}: {runs}.{also}"]
 
     def about_judgement(self) -> list[str]:
         """Return until when the crash could have been avoided, according to the runs of `judge`."""

@@ -32,7 +32,8 @@ def test_a_collision_is_reported_in_words_and_a_table(crash):
     assert f"ego at {speeds[0]}, {facts['other']} at {speeds[1]}" in again
     (marked,) = (line for line in text.splitlines() if "<- the last step" in line)
     assert int(marked.split()[0]) == facts["last_escape_step"]
-    assert f"after step {facts['last_escape_step']}: a run from this step avoids it, and a run from one step later crashes." in text
+    runs = "a run from this step avoids it, and a run from one step later crashes."
+    assert f"after step {facts['last_escape_step']}: {runs}" in text
     # The rows of the table are the moments.
     rows = [line.split() for line in text.splitlines() if re.match(r"\s*\d+  ", line)]
     by_step = {moment["step"]: moment for moment in facts["moments"]}
@@ -69,4 +70,5 @@ def test_software_faults_are_reported_too(shell, agent, says):
 
 def test_a_terminal_that_does_not_know_every_letter_is_shown_the_others(crash):
     crash.environment["PYTHONIOENCODING"] = "ascii"
-    assert "Braking at 8 m/s\\xb2, the maximum of its vehicle type, could have avoided it" in crash.crashhunt("show", "h").out
+    text = crash.crashhunt("show", "h").out
+    assert "Braking at 8 m/s\\xb2, the maximum of its vehicle type, could have avoided it" in text
