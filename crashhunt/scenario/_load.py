@@ -214,7 +214,7 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
 
     Args:
         name: name of a shipped scenario, or the path of a folder, a ``scenario.toml`` or a simulator's configuration.
-        ego: for such a configuration, which vehicle is controlled, as its `Configuration` understands it.
+        ego: for a simulator's configuration, the controlled vehicle in the syntax of `--ego`.
         kept: whether the scenario is that of a snapshot. A snapshot has run before, so its scenario is not refused now.
 
     Raises:
