@@ -29,12 +29,13 @@ class HuntCall(HuntOptions):
     """What `prepare` takes: the options of the list, and what only Python has.
 
     Args:
-        directory: where everything is kept; made where it does not exist. The same hunt there resumes.
+        directory: directory of the hunt, created if it does not exist. A hunt that exists there with the same settings
+            resumes.
         parallel: trials at a time; 0 for one per core.
-        trials: how many at most; 0 for no limit, where there is a ``duration``.
-        max_steps: the bound on each, in steps.
-        snapshot: the ``snapshot_…`` options in one, which is instead of them.
-        overwrite: begin again, and replace an existing hunt.
+        trials: maximum number of trials; 0 for no limit, which needs a ``duration``.
+        max_steps: maximum number of steps of a trial.
+        snapshot: options of the snapshot, in place of the ``snapshot_…`` arguments.
+        overwrite: whether a new hunt replaces an existing one.
         command: the command line, as a comment in ``hunt.toml``.
     """
 
@@ -53,13 +54,14 @@ class RunCall(HuntCall):
     """What `run` takes: everything that `prepare` takes, and the observers.
 
     Args:
-        directory: where everything is kept; made where it does not exist. The same hunt there resumes.
+        directory: directory of the hunt, created if it does not exist. A hunt that exists there with the same settings
+            resumes.
         parallel: trials at a time; 0 for one per core.
-        trials: how many at most; 0 for no limit, where there is a ``duration``.
-        max_steps: the bound on each, in steps.
+        trials: maximum number of trials; 0 for no limit, which needs a ``duration``.
+        max_steps: maximum number of steps of a trial.
         watch: called about ten times a second.
-        snapshot: the ``snapshot_…`` options in one, which is instead of them.
-        overwrite: begin again, and replace an existing hunt.
+        snapshot: options of the snapshot, in place of the ``snapshot_…`` arguments.
+        overwrite: whether a new hunt replaces an existing one.
         command: the command line, as a comment in ``hunt.toml``.
     """
 
@@ -126,26 +128,26 @@ def replay(
     accelerate: bool = True,
     trust: bool = False,
 ) -> ReplayReport:
-    """Run a saved crash again in a fresh process, as ``crashhunt replay`` does.
+    """Run a saved crash again in a new process, as ``crashhunt replay`` does.
 
     Args:
-        crash: the directory of a hunt or of one crash, or a crash of what `load` has returned.
-        crash_id: which of a hunt; the one with the fewest steps by default.
-        code: which code drives: that of the ``snapshot``, the ``current`` code, or the actions of the ``log``.
+        crash: directory of a hunt or of one crash, or a crash of the hunt that `load` returned.
+        crash_id: id of a crash of the hunt; by default the crash with the fewest steps.
+        code: code that drives: that of the ``snapshot``, the ``current`` code, or the actions of the ``log``.
         changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value.
-        times: how often.
-        force: replay even from a snapshot that is damaged.
+        times: number of replays.
+        force: whether to replay from a damaged snapshot.
         scenario: the name or path of another scenario in which the same agents drive, on another simulator too.
         accelerate: speed simulators up where that changes no bit.
         trust: run its code even if it is neither made here nor trusted. With the actions of the ``log``, its scenario
             may then do more than simulate.
 
     Returns:
-        The verdict, and everything behind it.
+        The verdict with its evidence.
 
     Raises:
-        UntrustedError: its code would run, and it is neither made here nor trusted.
-        CrashhuntError: it cannot be run.
+        UntrustedError: the code of the crash would run, but the crash is neither made on this machine nor trusted.
+        CrashhuntError: the crash cannot be run.
     """
     from crashhunt.crashes import Bundle, find_bundle
     from crashhunt.plans import spec_words
@@ -183,30 +185,30 @@ def what_if(
     """Run a saved crash again with changes and count the outcomes, as ``crashhunt whatif`` does.
 
     Args:
-        crash: the directory of a hunt or of one crash, or a crash of what `load` has returned.
-        crash_id: which of a hunt; the one with the fewest steps by default.
+        crash: directory of a hunt or of one crash, or a crash of the hunt that `load` returned.
+        crash_id: id of a crash of the hunt; by default the crash with the fewest steps.
         changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value; with a step, of the agent from then on.
-        from_step: how many steps stay as they were recorded.
-        before_s: the same, in s of simulation time before the crash.
+        from_step: number of steps that stay as recorded.
+        before_s: time before the crash at which the change begins, in s of simulation time; replaces ``from_step``.
         agent: ``module:Name`` of an agent that takes over after that step.
         arguments: arguments of that agent.
         futures: give the simulator's random generators another seed after that step, a different one in each run.
         overrule: ``brake``, ``left``, ``right``, ``keep_lane``, ``keep_speed``, ``reference_speed``,
             ``reference_lanes`` or ``reference``, after that step.
-        leave_out: ids of actors that do not take part.
-        interventions: further ones, of `crashhunt.whatif`.
+        leave_out: ids of actors to remove from the start.
+        interventions: further interventions, from `crashhunt.whatif`.
         code: which code drives: that of the ``snapshot``, or the ``current`` code, which is the default with ``agent``.
-        times: how many runs; 0 for 50 with ``futures``, else 1.
-        parallel: how many at a time; 0 for one per core.
-        time_s: the most wall time for all of them, in s.
+        times: number of runs; 0 for 50 with ``futures``, else 1.
+        parallel: runs at a time; 0 for one per core.
+        time_s: maximum wall time of all runs, in s.
         trust: run its code even if it is neither made here nor trusted.
 
     Returns:
         The counts, with each run.
 
     Raises:
-        UntrustedError: its code would run, and it is neither made here nor trusted.
-        CrashhuntError: it cannot be run, or the simulator cannot do that.
+        UntrustedError: the code of the crash would run, but the crash is neither made on this machine nor trusted.
+        CrashhuntError: the crash cannot be run, or the simulator does not support the change.
     """
     from crashhunt.crashes import Bundle, find_bundle
     from crashhunt.plans import spec_words

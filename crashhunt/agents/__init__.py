@@ -1,4 +1,4 @@
-"""Agents: who drives. The protocol, and the agents that come with crashhunt."""
+"""Agents: the protocol of a driver, and the agents that crashhunt includes."""
 
 import lazy_loader
 

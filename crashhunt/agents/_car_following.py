@@ -175,16 +175,16 @@ class CarFollowing:
     It is safe for most of its arguments. A long delay together with a short headway and weak brakes is not.
 
     Args:
-        delay_s: how old the observation is that it acts on, in s.
-        headway_s: the time gap that it keeps, in s.
-        max_brake: the hardest that it brakes, in m/s².
+        delay_s: age of the observation on which the agent acts, in s.
+        headway_s: time gap that the agent keeps, in s.
+        max_brake: maximum deceleration, in m/s².
         desired_speed: desired speed with a free road, in m/s.
         step_length_s: step length of the simulation, in s; turns the delay into steps.
         observation_space: observation space of the vehicle.
         action_space: action space of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
 
     Raises:
-        ValueError: an argument makes no sense, or the observation has other columns than the default ones.
+        ValueError: an argument is out of range, or the observation does not have the default columns.
     """
 
     def __init__(
@@ -217,7 +217,7 @@ class CarFollowing:
         self._curvature = PathCurvature(step_length_s)
 
     def reset(self, seed: int) -> None:
-        """Forget what was seen."""
+        """Forget all observations."""
         self._seen.clear()
         self._curvature.reset()
 

@@ -40,21 +40,21 @@ BRAKE = 4.0  # m/s²: deceleration that it accepts for the follower in the targe
 
 
 class LaneChanger:
-    """Overtakes slower traffic on either side, and looks over its shoulder everywhere but in a blind spot.
+    """Overtakes slower traffic on either side, and observes the next lane except for a blind spot.
 
     Without a blind spot it changes lanes only into a gap in which no vehicle has to brake hard. It detects a lane to
     its left by the layout of the observation, and a lane to its right once it or another vehicle has been there.
 
     Args:
-        blind_spot_m: how far back from its own centre a vehicle in the next lane goes unnoticed, in m.
-        patience_s: how long it follows before it overtakes, in s.
+        blind_spot_m: length of the blind spot in the next lane, backwards from the agent's centre, in m.
+        patience_s: time behind a slower vehicle before the agent overtakes, in s.
         desired_speed: desired speed in m/s.
         step_length_s: step length of the simulation, in s.
         observation_space: observation space of the vehicle.
         action_space: action space of the vehicle; (target speed, lane change), or discrete meta-actions.
 
     Raises:
-        ValueError: an argument makes no sense, or the observation has other columns than the default ones.
+        ValueError: an argument is out of range, or the observation does not have the default columns.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class LaneChanger:
         self.reset(0)
 
     def reset(self, seed: int) -> None:
-        """Be patient again."""
+        """Begin a new waiting time."""
         self._path.reset()
         self._waited_s = 0.0
         self._from_left = 0.0
@@ -162,15 +162,15 @@ class IntelligentDriver(LaneChanger):
     Args:
         desired_speed: desired speed in m/s.
         headway_s: time gap, in s.
-        politeness: how much the others' acceleration counts, against the own.
-        gain: the least advantage for which it changes lanes, in m/s².
-        patience_s: the time from one decision about lanes to the next, in s.
+        politeness: weight of the other vehicles' acceleration, relative to the agent's own.
+        gain: minimum advantage for a lane change, in m/s².
+        patience_s: time between two decisions about lanes, in s.
         step_length_s: step length of the simulation, in s.
         observation_space: observation space of the vehicle.
         action_space: action space of the vehicle.
 
     Raises:
-        ValueError: an argument makes no sense, or the observation has other columns than the default ones.
+        ValueError: an argument is out of range, or the observation does not have the default columns.
     """
 
     def __init__(

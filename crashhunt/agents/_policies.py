@@ -31,18 +31,19 @@ _ALGORITHMS = ("PPO", "DQN", "A2C", "SAC", "TD3", "DDPG")
 class StableBaselines3:
     """Drives by a model that Stable-Baselines3 has saved.
 
-    Such a file holds pickles: load your own only. The environment must show what the model was trained on.
+    Such a file contains pickles, so load only your own files. The environment must have the observations and actions on
+    which the model was trained.
 
     Args:
-        path: what ``model.save`` wrote, with its ``.zip``.
+        path: path of the file that ``model.save`` wrote, with ``.zip``.
         algorithm: the class of the model, or ``module:Class`` such as ``sb3_contrib:TQC``.
-        deterministic: take the most probable action; otherwise draw one.
+        deterministic: whether to take the most probable action; otherwise draw an action.
         observation_space: observation space of the vehicle.
         action_space: action space of the vehicle.
 
     Raises:
-        ValueError: there is no such file or algorithm, the file is no model of that algorithm, or the model was trained
-            on other observations or actions.
+        ValueError: the file or the algorithm does not exist, the file is not a model of this algorithm, or the model
+            was trained with other observations or actions.
     """
 
     libraries = ("stable_baselines3",)  # imported before any trial's time runs
@@ -72,11 +73,14 @@ class StableBaselines3:
         self._deterministic = deterministic
         trained = self._model.observation_space
         if observation_space is not None and _shape(trained) != _shape(observation_space):
-            raise ValueError(f"the model was trained on {trained}, but the vehicle observes {observation_space}")
+            raise ValueError(
+                f"{path!r} was trained on observations of shape {_shape(trained)}, but those of this scenario have "
+                f"shape {_shape(observation_space)}"
+            )
         decides = self._model.action_space
         if action_space is not None and _choices(decides) != _choices(action_space):
             raise ValueError(
-                f"the model was trained with actions in {decides}, but the vehicle's actions are in {action_space}"
+                f"{path!r} was trained with actions in {decides}, but those of this scenario are in {action_space}"
             )
 
     def reset(self, seed: int) -> None:
@@ -86,7 +90,7 @@ class StableBaselines3:
         self._first = True
 
     def act(self, observation: object) -> object:
-        """Return what the model predicts."""
+        """Return the action that the model predicts."""
         action, self._state = self._model.predict(
             observation, state=self._state, episode_start=np.array([self._first]), deterministic=self._deterministic
         )
@@ -163,12 +167,12 @@ class TorchPolicy(_Network):
 
     Args:
         path: path of the module.
-        flatten: whether it expects observations as one row of numbers.
+        flatten: whether the network expects an observation as one row of numbers.
         action_space: action space of the vehicle.
         observation_space: observation space of the vehicle.
 
     Raises:
-        ValueError: there is no such file, or it takes other observations or answers with another number of values.
+        ValueError: the file does not exist, or the network has another shape of input or output.
     """
 
     libraries = ("torch",)  # imported before any trial's time runs
@@ -200,12 +204,12 @@ class OnnxPolicy(_Network):
 
     Args:
         path: path of the model.
-        flatten: whether it expects observations as one row of numbers.
+        flatten: whether the network expects an observation as one row of numbers.
         action_space: action space of the vehicle.
         observation_space: observation space of the vehicle.
 
     Raises:
-        ValueError: there is no such file, or it takes other observations or answers with another number of values.
+        ValueError: the file does not exist, or the network has another shape of input or output.
     """
 
     libraries = ("onnxruntime",)  # imported before any trial's time runs
@@ -282,8 +286,8 @@ class NumpyPolicy:
     - ``weight_0``, ``bias_0``, ``weight_1``, …: the layers, with rectified linear units between them. The last layer
       has a value for each of highway-env's five meta-actions.
     - ``columns`` and ``scale``: the columns of the observation that the network sees, and their factors.
-    - ``rows``: the number of rows that it sees.
-    - ``period_s``: the time from one decision to the next, in s.
+    - ``rows``: the number of rows that the network receives.
+    - ``period_s``: the time between two decisions, in s.
     - ``target_speeds``: in m/s.
 
     The distance that the vehicle itself has driven is replaced by 0.
@@ -326,7 +330,7 @@ class NumpyPolicy:
         self.reset(0)
 
     def reset(self, seed: int) -> None:
-        """Be ready to decide."""
+        """Begin an episode without a pending decision."""
         self._left = 0
         self._target = -1.0
         self.values = np.zeros(len(_MEANINGS), np.float32)
@@ -347,7 +351,7 @@ class NumpyPolicy:
     def features(
         observation: NDArray[np.float32], rows: int, columns: NDArray[np.int64], scale: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Return what the network sees, float32, shape (rows * columns,), within -1 and 1."""
+        """Return the input of the network, float32, shape (rows * columns,), from -1 to 1."""
         seen = np.zeros((rows, len(columns)), np.float32)
         part = observation[:rows][:, columns]
         seen[: len(part)] = np.clip(part / scale, -1.0, 1.0)
@@ -364,7 +368,7 @@ class NumpyPolicy:
         return found
 
     def panels(self) -> object:
-        """Show the values."""
+        """Return a panel with the value of each action."""
         from crashhunt import panels
 
         names = [name.removeprefix("LANE_") for name in _MEANINGS]

@@ -29,13 +29,13 @@ class Agent(Protocol):
     """
 
     def reset(self, seed: int) -> None:
-        """Forget everything; from here on, draw random numbers from ``seed`` only."""
+        """Begin an episode: forget all state, and draw random numbers from ``seed`` only."""
 
     def act(self, observation: Any) -> Any:
         """Return an action inside the vehicle's action space.
 
         Args:
-            observation: inside its observation space. No other process writes to it again.
+            observation: the observation, inside the observation space. No other process writes to it again.
         """
 
 
@@ -50,18 +50,18 @@ class DrawsPanels(Protocol):
 
 
 class Closes(Protocol):
-    """An agent that has something to let go of."""
+    """An agent that holds resources."""
 
     def close(self) -> None:
-        """Let go of everything; called once, at the end of the trial, however it ended."""
+        """Release all resources. Called once, at the end of the trial, with any outcome."""
 
 
 class NeedsLibraries(Protocol):
-    """What makes agents (a class or function) that import libraries which take long to load."""
+    """A class or function that makes agents, with libraries that take long to import."""
 
     @property
     def libraries(self) -> Sequence[str]:
-        """Modules to import before any trial's time runs; one that is missing is left for the agent to tell."""
+        """Modules to import before the first trial. A missing module is reported by the agent."""
 
 
 # How agents that think in speeds and lanes say so in discrete meta-actions.

@@ -16,14 +16,14 @@ __all__ = ["KeepLaneWithSpeed", "RandomAgent", "Recorded"]
 
 
 class KeepLaneWithSpeed:
-    """Keeps its lane at a constant speed, whatever is in front of it.
+    """Keeps its lane at a constant speed, and ignores other vehicles.
 
     Args:
         speed: speed in m/s.
         action_space: action space of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
 
     Raises:
-        ValueError: it has other actions.
+        ValueError: the actions are neither (target speed, lane change) nor meta-actions.
     """
 
     def __init__(
@@ -88,11 +88,11 @@ class RandomAgent:
 
 
 class Recorded:
-    """Plays the recorded actions of one agent, one a step.
+    """Replays the recorded actions of one agent, one in each step.
 
     Args:
         log: the path of a ``log.mcap``.
-        agent: whose actions.
+        agent: id of the agent whose actions are replayed.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Recorded:
         """Return the next action.
 
         Raises:
-            IndexError: the log is exhausted; it never drives on silently.
+            IndexError: the log has no further action.
         """
         if self._next >= len(self._actions):
             raise IndexError(f"the log has {len(self._actions)} actions, but the episode needs one more")

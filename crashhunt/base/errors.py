@@ -187,7 +187,7 @@ class InternalError(CrashhuntError):
 
 
 class EpisodeError(CrashhuntError):
-    """Raised inside an episode; becomes the trial's outcome."""
+    """An error inside an episode, which becomes the outcome of the trial."""
 
 
 class InvalidEpisodeError(EpisodeError):

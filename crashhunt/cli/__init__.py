@@ -62,13 +62,13 @@ examples:
   crashhunt run out 4 1000 1500 --scenario my/town.sumocfg --agent my_pkg.agents:Planner --arg headway_s=0.3:2
       hunt your own agent on your own network
   crashhunt replay crash
-      run the crash again in a fresh process and prove that it is the same
+      run the crash again in a new process, and check that it is bit-identical
   crashhunt replay crash --code current --expect fixed
-      has today's code got rid of it?
+      check whether today's code fixes the crash
   crashhunt show crash
-      what happened, in words and numbers
+      describe the crash in words and numbers
 
-exit codes: 0 done, 1 the answer is no, 2 bad usage or input, 3 not one valid trial or undecided, 130 interrupted
+exit codes: 0 done, 1 negative result, 2 wrong usage or input, 3 no valid trial or undecided, 130 interrupted
 """
 
 

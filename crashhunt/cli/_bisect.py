@@ -23,7 +23,7 @@ def add_bisect(commands: Commands) -> None:
     """Add the command."""
     bisect = commands.add_parser(
         "bisect",
-        help="find the commit with which a crash came",
+        help="find the commit that introduced a crash",
         description="Find the commit of the agent's repository that introduced a crash: git bisect, with the crash "
         "as the test. Revisions are checked out in a separate work tree; your own work tree does not change. "
         "Revisions that "

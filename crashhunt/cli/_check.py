@@ -22,9 +22,9 @@ def add_check(commands: Commands) -> None:
     """Add the command."""
     check = commands.add_parser(
         "check",
-        help="see that everything on disk is what was written, and what can be saved",
-        description="Check that everything on disk is as it was written: every trial of the ledger, every crash with "
-        "its log, and every snapshot of code. Check that they belong together. The command changes nothing and "
+        help="check that the files on disk are complete and unchanged",
+        description="Check that the files on disk are complete, unchanged and consistent: every trial of the ledger, "
+        "every crash with its log, and every snapshot of code. The command changes nothing and "
         "runs no code. Exits with 1 if something is damaged, and reports what is lost and how to recover the rest.",
     )
     check.add_argument(

@@ -226,7 +226,7 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     """Add ``--trust``, the same for every command that runs code of a crash."""
     parser.add_argument(
         "--trust", action="store_true",
-        help="run the code although it was not made on this machine; crashhunt trust DIR does this permanently",
+        help="run code from another machine without a question; crashhunt trust DIR trusts it permanently",
     )  # fmt: skip
 
 
@@ -389,7 +389,7 @@ def add_options_of_machine(parser: argparse.ArgumentParser) -> None:
     """Add the options that say where all the hunts of a command run, whatever each of them says."""
     for option in hunt_options():
         if option.about.anywhere:
-            _add(parser, option, help_text=option.help_with("as each hunt says"))
+            _add(parser, option, help_text=option.help_with("as in each hunt"))
     parser.set_defaults(**{option.name: None for option in hunt_options() if option.about.anywhere})
 
 

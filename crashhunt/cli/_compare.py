@@ -22,7 +22,7 @@ def add_compare(commands: Commands) -> None:
     """Add the command."""
     compare = commands.add_parser(
         "compare",
-        help="say which of several hunts crashes less",
+        help="report which of several hunts crashes less",
         description="Compare the crash rates of hunts, with confidence intervals. For trials with the same seeds, "
         "report whether a hunt crashes less than the first one. Run two versions of an agent with the same "
         "--seed and --keep-going.",

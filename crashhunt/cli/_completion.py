@@ -33,7 +33,7 @@ def add_completion(commands: Commands) -> None:
     """Add the command."""
     completion = commands.add_parser(
         "completion",
-        help="print a script that has the tab key complete commands, options, names and crashes",
+        help="print a shell script that adds tab completion",
         description="Print a script for a shell, in which the tab key then completes commands, options, scenarios, "
         "agents, samplers, arguments, outcomes, directories and crashes.",
         epilog=_HOW,

@@ -37,7 +37,7 @@ def add_corpus(commands: Commands) -> None:
     """Add the command."""
     corpus = commands.add_parser(
         "corpus",
-        help="keep crashes in a repository, and see that they stay mended",
+        help="keep crashes in a repository, and check that they stay fixed",
         description="Keep crashes in your repository, each with the result that you expect from today's code.",
     )
     inner = corpus.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -70,12 +70,12 @@ def add_gate(commands: Commands) -> None:
     )  # fmt: skip
     how = gate.add_argument_group("how it is compared")
     how.add_argument(
-        "--most", metavar="N", type=integer, default=_MOST, help=f"the most pairs of trials to run; default: {_MOST}"
+        "--most", metavar="N", type=integer, default=_MOST, help=f"maximum number of pairs of trials; default: {_MOST}"
     )
     how.add_argument("--for", metavar="TIME", dest="duration", default="", help="stop after this time, such as 30m")
     how.add_argument(
         "--max-steps", metavar="N", type=integer, default=None,
-        help=f"the most steps of a trial; default: {_MAX_STEPS}, or as the suite says",
+        help=f"maximum number of steps of a trial; default: {_MAX_STEPS}, or as in the suite",
     )  # fmt: skip
     how.add_argument(
         "--margin", metavar="SHARE", default=str(_MARGIN),

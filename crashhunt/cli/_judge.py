@@ -36,11 +36,11 @@ def add_judge(commands: Commands) -> None:
     """Add the command."""
     judge = commands.add_parser(
         "judge",
-        help="find out until when a collision could have been avoided, and what a crash hangs on, by running it",
+        help="find the last avoidable step and the causes of a crash, by running it again",
         description="Find the last avoidable step and the causes of a crash. First run the collision many times, "
         "each time with the agent overruled from another step: full braking, or a lane change and braking. Other "
         "vehicles react. Report the last step from which such a maneuver avoids the collision. Then run the crash "
-        "with one thing removed at a time: a decision of the agent, a maneuver of another vehicle, the "
+        "with one element removed at a time: a decision of the agent, a maneuver of another vehicle, the "
         "value of an argument. Report the causes. Crashes other than collisions get the second analysis "
         "only. The result is written to crash.json, and crashhunt show prints it.",
     )
@@ -49,15 +49,15 @@ def add_judge(commands: Commands) -> None:
         "--all", action="store_true", help="analyse all crashes of the hunt that have not been analysed, except hangs"
     )
     judge.add_argument(
-        "--runs", metavar="N", type=integer, default=60, help="the most trials to run for one collision; default: 60"
+        "--runs", metavar="N", type=integer, default=60, help="maximum number of trials for one collision; default: 60"
     )
     judge.add_argument(
         "--why", metavar="N", type=integer, default=80,
-        help="the most trials to run for the causes of one crash; 0: none; default: 80",
+        help="maximum number of trials for the causes of one crash; 0: none; default: 80",
     )  # fmt: skip
     judge.add_argument(
         "--reference", metavar="N", type=integer, default=20,
-        help="the most trials to run with a reference driver, to find what the agent omitted; 0: none; default: 20",
+        help="maximum number of trials with a reference driver, to find omissions of the agent; 0: none; default: 20",
     )  # fmt: skip
     judge.add_argument(
         "--parallel", metavar="N", type=integer, default=0, help="trials at a time; default: one per core"

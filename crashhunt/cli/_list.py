@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import one_line, visible
@@ -22,12 +23,16 @@ __all__ = ["add_lists"]
 def add_lists(commands: Commands) -> None:
     """Add the commands."""
     for name, command, text in (
-        ("agents", _agents, "list the agents that come with crashhunt or are installed, with their arguments"),
-        ("disturbances", _disturbances, "list the disturbances that come with crashhunt or are installed"),
-        ("oracles", _oracles, "list the oracles that come with crashhunt or are installed, with their arguments"),
-        ("scenarios", _scenarios, "list the scenarios that come with crashhunt, with their arguments"),
+        ("agents", _agents, "list the agents that crashhunt includes or that are installed, with their arguments"),
+        ("disturbances", _disturbances, "list the disturbances that crashhunt includes or that are installed"),
+        ("oracles", _oracles, "list the oracles that crashhunt includes or that are installed, with their arguments"),
+        ("scenarios", _scenarios, "list the scenarios that crashhunt includes, with their arguments, or copy one"),
     ):
         listing = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        if name == "scenarios":
+            listing.add_argument(
+                "--copy", nargs=2, metavar=("NAME", "DIR"), help="copy a scenario into a new folder, to edit it"
+            )
         add_json(listing)
         listing.set_defaults(command=command)
 
@@ -53,6 +58,17 @@ def _oracles(options: argparse.Namespace, _words: list[str]) -> int:
 def _scenarios(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.report import list_scenarios
 
+    if options.copy is not None:
+        from crashhunt.scenario import copy_shipped_scenario
+
+        name, folder = options.copy
+        copy_shipped_scenario(name, Path(folder))
+        if options.json:
+            entries = [entry for entry in list_scenarios() if entry.get("name") == name]
+            return _print_listing("scenarios", entries, as_json=True)
+        hunt = f"crashhunt run OUT 0 100 1000 --scenario {folder}"
+        print(visible(f"{folder} has the files of {name}. Hunt in it: {hunt}"))
+        return 0
     return _print_listing("scenarios", list_scenarios(), as_json=options.json)
 
 

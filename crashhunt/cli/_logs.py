@@ -23,7 +23,7 @@ def add_logs(commands: Commands) -> None:
     """Add the command."""
     logs = commands.add_parser(
         "logs",
-        help="show what hunts and trials have printed, and their errors",
+        help="show the output and the errors of hunts and trials",
         description="Show the output of hunts and trials (run), why they failed (error), and when the state of a "
         "hunt changed (state). Only crashes and kept trials have logs.",
     )

@@ -225,8 +225,8 @@ def add_replay(commands: Commands) -> None:
     """Add the command."""
     replay = commands.add_parser(
         "replay",
-        help="run a saved crash again and say whether it is the same",
-        description="Run a saved crash again in a fresh process, from its bundle alone, and compare every observation, "
+        help="run a saved crash again, and report whether it is bit-identical",
+        description="Run a saved crash again in a new process, from its bundle alone, and compare every observation, "
         "action and scene with the log. Exits with 1 if the verdict is not the expected one.",
     )
     add_crash(replay)

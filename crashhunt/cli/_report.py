@@ -36,7 +36,7 @@ def add_report(commands: Commands) -> None:
         metavar="N",
         type=integer,
         default=20,
-        help="the most crashes to animate, and the most near misses; default: 20",
+        help="maximum number of crashes to animate, and of near misses; default: 20",
     )
     add_json(report)
     report.set_defaults(command=_report)

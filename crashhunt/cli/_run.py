@@ -97,8 +97,10 @@ def add_run(commands: Commands) -> None:
     run.add_argument("--help-all", action="help", help="show all options")
     run.add_argument("directory", metavar="DIR", type=Path, help="directory of the hunt; created if it does not exist")
     run.add_argument("parallel", metavar="PARALLEL", type=integer, help="trials at a time; 0: one per core")
-    run.add_argument("trials", metavar="TRIALS", type=integer, help="the most trials to run; 0: no limit (needs --for)")
-    run.add_argument("max_steps", metavar="MAX_STEPS", type=integer, help="the most steps of a trial")
+    run.add_argument(
+        "trials", metavar="TRIALS", type=integer, help="maximum number of trials; 0: no limit, needs --for"
+    )
+    run.add_argument("max_steps", metavar="MAX_STEPS", type=integer, help="maximum number of steps of a trial")
     groups = {name: run.add_argument_group(title) for name, title in _GROUPS.items()}
     add_options(groups)
     groups["kept"].add_argument(

@@ -36,7 +36,7 @@ def add_shrink(commands: Commands) -> None:
     """Add the command."""
     shrink = commands.add_parser(
         "shrink",
-        help="make a crash smaller while it stays the same kind of crash",
+        help="minimize a crash while its crash type stays the same",
         description="Minimize a crash while its crash type stays the same: remove other actors, drop disturbances, "
         "and set arguments to their defaults and to round numbers. If the crash needs many other actors, "
         "move them along their recorded paths, remove the unnecessary ones, and cut off the beginning. "
@@ -47,7 +47,7 @@ def add_shrink(commands: Commands) -> None:
     add_crash(shrink)
     shrink.add_argument(
         "--budget", metavar="TRIALS", type=integer, default=_BUDGET,
-        help=f"the most trials to run; default: {_BUDGET}",
+        help=f"maximum number of trials; default: {_BUDGET}",
     )  # fmt: skip
     shrink.add_argument(
         "--for", metavar="TIME", dest="time", default="",
@@ -80,8 +80,8 @@ def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
         raise UsageError(f"--for is {options.time!r}", fix="give a time above 0, such as 90s, 1m or 1h30m") from None
     if options.directory.is_file():
         raise UsageError(
-            "shrink writes its result next to the crash, so it cannot work on an exported file",
-            fix="unpack it (a zip file) into a new folder and give that folder; shrink asks before it runs the code",
+            "shrink writes its result next to the crash, and cannot write into an exported file",
+            fix="unpack this zip file into a new folder, and give that folder",
             where=str(options.directory),
         )
     with opened_crash(options.directory, options.crash) as (bundle, _), stop_requests() as asked:

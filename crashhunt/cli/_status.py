@@ -13,8 +13,7 @@ from crashhunt.cli._common import BAD_INPUT, DONE, add_json
 if TYPE_CHECKING:
     import argparse
 
-    from rich.console import Console
-    from rich.table import Table
+    from rich.console import Console, Group
 
     from crashhunt.cli._common import Commands
     from crashhunt.hunts import BranchSums, HuntState, ProbeSums
@@ -73,44 +72,51 @@ def states_console(*, stderr: bool = False) -> Console:
     return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_WIDTH)
 
 
-def states_table(states: list[HuntState]) -> Table:
-    """Return hunts as a table for a terminal."""
+def states_table(states: list[HuntState]) -> Group:
+    """Return hunts as a table for a terminal, and below it the other facts of each hunt, one line each."""
     from rich import box
+    from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
-    from crashhunt.report import describe_running, format_pace, format_seconds
+    from crashhunt.report import format_pace, format_seconds
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("hunt", no_wrap=True)
+    table.add_column("hunt", overflow="fold")
     table.add_column("state")
-    for name in ("trials", "rate", "left", "crashes", "errors"):
+    for name in ("trials", "pace", "left", "crashes", "errors"):
         table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("outcomes", overflow="fold")
+    table.add_column("outcomes", overflow="fold", min_width=13)
     for state in states:
         said = ", ".join(f"{name} {count}" for name, count in state.outcomes.items())
         table.add_row(
             Text(one_line(state.dir)),
-            Text(_state(state), style=_COLORS.get(state.state, ""), no_wrap=True),
+            Text(_state(state), style=_COLORS.get(state.state, ""), no_wrap=state.phase is None),
             out_of(state.trials_run, state.trials_planned, "/"),
             format_pace(state.rate_per_s) if state.rate_per_s else "-",
             format_seconds(state.seconds_left) if state.seconds_left is not None else "-",
-            _crashes(state),
+            str(state.crashes),
             str(state.errors),
             Text(said),
         )
-        for line in fork_lines(state):
-            table.add_row(*[""] * 7, Text(line))
-        if state.rate is not None:
-            table.add_row(*[""] * 7, Text(describe_running(state.rate)))
-        if state.core is not None:
-            table.add_row(Text(one_line(f"  compiled core {state.core}")))
         for node in (state.nodes or [])[:_NODES]:
             name = one_line(f"  {node['name']} ({node['parallel']} at a time)")
             table.add_row(Text(name), "", str(node["trials"]), format_pace(node["rate_per_s"]))
         if len(state.nodes or []) > _NODES:
             table.add_row(f"  and {len(state.nodes or []) - _NODES} more")
-    return table
+    lines = [Text(one_line(f"{state.dir}: {line}"), overflow="fold") for state in states for line in _facts(state)]
+    return Group(table, *lines)
+
+
+def _facts(state: HuntState) -> list[str]:
+    """Return the facts of a hunt that no column has, one line each."""
+    from crashhunt.report import describe_running
+
+    crashes = _crashes(state)
+    lines = [f"{state.crashes} {'crash' if state.crashes == 1 else 'crashes'}: {crashes}"] if crashes else []
+    lines += [describe_running(state.rate)] if state.rate is not None else []
+    lines += fork_lines(state)
+    return [*lines, *([f"compiled core {state.core}"] if state.core is not None else [])]
 
 
 def _state(state: HuntState) -> str:
@@ -149,7 +155,7 @@ def _confirmed(sums: ProbeSums | BranchSums) -> str:
 
 
 def _crashes(state: HuntState) -> str:
-    """Return the number of crashes and crash types and, if the hunt runs, the age of the last new type."""
+    """Return how many crashes are saved and disturbed, the number of types, and the age of the last new type."""
     from crashhunt.report import describe_types, format_seconds
 
     said = [] if state.crashes_saved is None else [f"{state.crashes_saved} saved"]
@@ -158,7 +164,7 @@ def _crashes(state: HuntState) -> str:
         said.append(describe_types(len(state.kinds), state.types_by_cause))
         if state.state == "running" and state.newest_kind_s is not None:
             said.append(f"last new {format_seconds(state.newest_kind_s)} ago")
-    return str(state.crashes) + (f" ({', '.join(said)})" if said else "")
+    return ", ".join(said)
 
 
 def show_states(states: list[HuntState], console: Console) -> None:

@@ -68,8 +68,8 @@ def add_rerun(commands: Commands) -> None:
     """Add the command."""
     rerun = commands.add_parser(
         "rerun",
-        help="run again what failed, or a hunt with other settings elsewhere",
-        description="Run again what failed: restart hunts that ended in an error, resume interrupted and killed "
+        help="run failed hunts again, or a hunt with other settings in another directory",
+        description="Run failed hunts again: restart hunts that ended in an error, resume interrupted and killed "
         "hunts, and repeat trials with a failed setup. The command keeps replaced files next to the new ones. "
         "With --to, "
         "run one hunt with other settings in another directory.",
@@ -78,11 +78,11 @@ def add_rerun(commands: Commands) -> None:
     rerun.add_argument("--run", metavar="ID", action="append", default=[],
                        help="in a suite: only this run, such as town/0, or all of town; may be repeated")  # fmt: skip
     which = rerun.add_mutually_exclusive_group()
-    which.add_argument("--failed", action="store_true", help="only what failed (the default)")
+    which.add_argument("--failed", action="store_true", help="run only failed hunts and trials again (the default)")
     which.add_argument("--all", action="store_true", help="run all hunts again from the start")
     rerun.add_argument("--set", metavar="NAME=SPEC", action="append", default=[], dest="sets",
-                       help="with --to or --all: another specification for an argument (ID.NAME for one of several "
-                       "agents), or for trials, max_steps or seed")  # fmt: skip
+                       help="with --to or --all: new values for an argument (ID.NAME for one of several agents), "
+                       "or a new number for trials, max_steps or seed")  # fmt: skip
     rerun.add_argument(
         "--to",
         metavar="DIR",

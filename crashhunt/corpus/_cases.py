@@ -10,6 +10,7 @@ import math
 import shutil
 import tomllib
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
@@ -26,11 +27,11 @@ from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Signature
     from crashhunt.recording import Recording
+    from crashhunt.trial import TrialSpec, Value
 
 
 __all__ = ["Added", "Case", "Expectation", "add_case", "find_cases", "known_kinds", "read_case"]
@@ -272,7 +273,8 @@ def _build(bundle: Bundle, case: Case, folder: Path) -> None:
     shutil.copyfile(bundle.hunt / layout.HUNT, folder / layout.HUNT)
     snapshot = without_code(Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot), folder / layout.SNAPSHOTS)
     case.write(folder)
-    kept = replace(bundle, path=crash, snapshot=snapshot.digest, files={}, authentication_code="")
+    result = replace(bundle.result, spec=_with_relative_paths(bundle.result.spec, folder))
+    kept = replace(bundle, path=crash, result=result, snapshot=snapshot.digest, files={}, authentication_code="")
     kept = replace(kept, authentication_code=authenticate_bundle(kept))
     kept.write(into=crash)
     write_log(crash / layout.LOG, recording, views=False)
@@ -280,6 +282,26 @@ def _build(bundle: Bundle, case: Case, folder: Path) -> None:
         write_log(crash / layout.LOG, _compact(bundle, recording), views=False)
     kept.write(into=crash)  # with the digest of the log
     sync_tree(folder)
+
+
+def _with_relative_paths(spec: TrialSpec, case: Path) -> TrialSpec:
+    """Return a specification with relative paths for files below the current folder, such as weights.
+
+    Paths from a scenario file are absolute, and another machine has the repository elsewhere. A case outside of the
+    current folder, such as that of `crashhunt bisect`, keeps absolute paths.
+    """
+    here = Path.cwd()
+    if not case.resolve().is_relative_to(here):
+        return spec
+
+    def relative(value: Value) -> Value:
+        inside = isinstance(value, str) and Path(value).is_absolute() and Path(value).is_relative_to(here)
+        return str(Path(str(value)).relative_to(here)) if inside else value
+
+    arguments = {
+        agent: {name: relative(value) for name, value in given.items()} for agent, given in spec.arguments.items()
+    }
+    return replace(spec, arguments=arguments)
 
 
 def _copy(bundle: Bundle, case: Case, folder: Path) -> None:

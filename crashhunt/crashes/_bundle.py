@@ -258,7 +258,7 @@ class Bundle:
         result: the crash.
         hunt_seed: seed of the hunt that found it.
         snapshot: the digest of the code that it ran.
-        confirmed: Whether a replay in a new process was bit-identical; None if no replay has run to its end.
+        confirmed: Whether a replay in a new process was bit-identical; None if no replay has finished.
         divergence: Where the replay deviated, if it did.
         files: Size and digest of the other files of the bundle; empty in bundles of earlier versions.
         added: Keys that a later version has added, which are written back.
@@ -279,7 +279,7 @@ class Bundle:
 
     @property
     def id(self) -> str:
-        """Its name within the hunt, such as ``000012-collision``."""
+        """The name of the crash within the hunt, such as ``000012-collision``."""
         return self.path.name
 
     @property
@@ -289,12 +289,12 @@ class Bundle:
 
     @property
     def is_near_miss(self) -> bool:
-        """Whether it is a trial without a crash, which was kept because it was dangerous."""
+        """Whether the trial has no crash, and was kept because of its high criticality."""
         return self.result.outcome.category == "no crash"
 
     @property
     def driver(self) -> str:
-        """The agent that it is about; of one that is about none, the first."""
+        """The agent of the crash; the first agent if the crash belongs to none."""
         result = self.result
         about = next((found.agent for found in (result.collision, result.event, result.failure) if found), "")
         return about or next(iter(self.result.spec.arguments), "")
@@ -303,7 +303,7 @@ class Bundle:
         """Read the log.
 
         Raises:
-            BundleError: it is missing, damaged, or that of another crash.
+            BundleError: the log is missing, damaged, or that of another crash.
         """
         from crashhunt.recording import read_log  # MCAP and protobuf take longer than a hunt that is refused
 

@@ -261,7 +261,7 @@ class DisturbanceSampler:
 
         Args:
             seed: seed of the trial.
-            max_steps: the bound on its length, in steps.
+            max_steps: maximum number of steps of the trial.
         """
         found: list[Disturbance] = []
         for number, agent in enumerate(self.agents):

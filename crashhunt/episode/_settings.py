@@ -45,7 +45,7 @@ class WorkerSettings(Serializable):
     """Everything that a worker needs to run the trials of one hunt. It crosses process boundaries.
 
     Args:
-        scenario: where the trials take place.
+        scenario: scenario of the trials.
         oracles: the oracles that detect crashes, each as in ``--oracle``.
         crash_on: the outcomes that end a trial as a crash.
         scratch: the folder in which workers keep black boxes and output while trials run.

@@ -1,4 +1,4 @@
-"""Estimation: what the trials of hunts say about agents, with its uncertainty."""
+"""Estimation: crash rates and comparisons of agents from the trials of hunts, with intervals."""
 
 import lazy_loader
 

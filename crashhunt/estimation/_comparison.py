@@ -49,10 +49,10 @@ class HuntFigures:
 
     Args:
         dir: its directory.
-        state: where it stands.
+        state: state of the hunt.
         agents: vehicle to its agent.
-        trials: that count and are valid: up to the first number that has not ended.
-        crashes: crashes of them.
+        trials: number of valid trials, up to the first one that has not ended.
+        crashes: number of crashes in these trials.
         crash_rate: crash rate of the trials, from 0 to 1; NaN if it would be biased, or there is no trial.
         interval: interval of the rate, of 95 % confidence, valid whenever you look; None if the trials do not allow
             one.
@@ -60,11 +60,11 @@ class HuntFigures:
         median_steps_to_crash: NaN if there was no crash.
         median_time_to_collision_s: median time to collision of the trials without a crash, the least of each; infinite
             if most never were on a collision course.
-        outcomes: how many trials ended how, invalid ones too; of all trials.
-        counted: the origin of the trials that all other figures are of, if the hunt guided the rest of its trials. Only
-            unguided trials show a crash rate. Empty if all trials count.
-        disturbed: how many of the crashes had disturbances; None if the hunt has none.
-        excluded: how many trials have ended, but not all of lower numbers; they do not count.
+        outcomes: outcome to its number of trials, over all trials, with invalid ones.
+        counted: origin of the trials that count, if the search guided all others. Only unguided trials show a crash
+            rate. Empty if all trials count.
+        disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
+        excluded: number of trials that do not count, because a trial with a lower number has not ended.
         exclusions: reason to number of trials that do not count. Reason ``trained_on``: an agent of this hunt, or of
             a compared hunt with the same seed, was trained on their traffic.
     """
@@ -151,7 +151,7 @@ class Pair:
     def _answer(self) -> str:
         if self.answer in ("first", "second"):
             return f"{self.first if self.answer == 'first' else self.second} crashes less"
-        return "undecided, no difference that chance does not explain"
+        return "undecided, because chance may explain the difference"
 
     @property
     def _difference(self) -> str:
@@ -176,7 +176,7 @@ class Comparison:
 
     Args:
         hunts: hunts in the order in which they were given.
-        pairs: the first against each other one.
+        pairs: comparisons of the first hunt with each of the others.
     """
 
     hunts: tuple[HuntFigures, ...]
@@ -219,11 +219,11 @@ def _plain(pair: Pair) -> dict[str, object]:
 
 @clear_calls()
 def compare(*directories: Path | str) -> Comparison:
-    """Compare hunts: how often each crashed, and over trials with the same seeds, whether one crashes less.
+    """Compare the crash rates of hunts and, for trials with the same seeds, report whether a hunt crashes less.
 
     Raises:
-        UsageError: fewer than two are given.
-        HuntDirectoryError: one is not the directory of a hunt, or its ledger is damaged.
+        UsageError: fewer than two directories are given.
+        HuntDirectoryError: a directory has no hunt, or its ledger is damaged.
     """
     if len(directories) < 2:
         raise UsageError("there is nothing to compare with", fix="give the directories of two hunts or more")

@@ -56,7 +56,7 @@ class _Running:
 
 
 class FreshProcessExecutor:
-    """Runs every trial in a fresh process, and with it the code that the settings name.
+    """Runs every trial, and the code that the settings name, in a new process.
 
     Args:
         settings: settings of the hunt.
@@ -78,7 +78,7 @@ class FreshProcessExecutor:
         self._start()
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
-        """Yield the trials that have ended, waiting so long for a first one."""
+        """Yield the trials that have ended; wait at most this long for the first one."""
         deadline = time.monotonic() + timeout_s
         while True:
             found = [result for number in list(self._running) if (result := self._look(number)) is not None]
@@ -95,7 +95,7 @@ class FreshProcessExecutor:
             self._running.pop(number).kept.end()
 
     def where(self) -> dict[int, BlackBoxHeader]:
-        """Return where each running trial is, for people who watch."""
+        """Return the progress of each running trial, for the status screen."""
         found = {number: where_it_is(self._settings.scratch, number) for number in self._running}
         return {number: header for number, header in found.items() if header is not None}
 
@@ -104,7 +104,7 @@ class FreshProcessExecutor:
         return self._notes.fresh()
 
     def close(self) -> None:
-        """Kill every process, and everything that it has started."""
+        """Kill every process, with all processes that it has started."""
         self.cancel()
 
     def _start(self) -> None:
@@ -284,7 +284,7 @@ def run_alone(
     """Run one trial in a new Python process; return the result, None if it was stopped.
 
     Raises:
-        CrashhuntError: it cannot be run.
+        CrashhuntError: the crash cannot be run.
     """
     with closing(FreshProcessExecutor(settings)) as executor:
         runs = run_trials(executor, [spec], stopped=stopped, check_every_s=_STOP_CHECK_INTERVAL_S)
@@ -314,7 +314,7 @@ class SharedExecutors:
             What came of it, and the folder in which it was recorded; None if it was stopped.
 
         Raises:
-            CrashhuntError: it cannot be run.
+            CrashhuntError: the crash cannot be run.
         """
         key = json.dumps(replace(settings, scratch=self._scratch).to_json(), sort_keys=True)
         with self._lock:

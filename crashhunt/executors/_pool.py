@@ -173,18 +173,18 @@ class _Worker:
 
 
 class PoolExecutor:
-    """Runs every trial in its own process, a fork of one that has imported the agents and run nothing.
+    """Runs every trial in its own process: a fork of a process that has imported the agents and has run no trial.
 
-    A thread hands trials out as soon as a slot is free, whatever the thread of the hunt is busy with.
+    A thread starts a trial as soon as a slot is free, independently of the thread of the hunt.
 
     Args:
         settings: settings of the hunt.
-        parallel: how many slots.
+        parallel: number of slots.
         recycle_after: not used; no process runs two trials.
         snapshot: whether crashhunt itself comes from the code of the settings, in new Python processes.
 
     Attributes:
-        held_back: how many slots get no further trial for now.
+        held_back: number of slots that receive no further trial for now.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ class PoolExecutor:
 
     @property
     def capacity(self) -> int:
-        """How many trials run at a time."""
+        """The number of trials that run at a time."""
         return self._parallel
 
     def submit(self, spec: TrialSpec) -> None:
@@ -222,10 +222,10 @@ class PoolExecutor:
         self._wake_up.send(b".")
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
-        """Yield the trials that have ended, waiting so long for a first one.
+        """Yield the trials that have ended; wait at most this long for the first one.
 
         Raises:
-            CrashhuntError: no trial can be run, for a reason that has nothing to do with it.
+            CrashhuntError: no trial can be run, for a reason outside of the trials.
         """
         with suppress(queue.Empty):
             found = self._done.get(timeout=timeout_s) if timeout_s > 0 else self._done.get_nowait()
@@ -255,7 +255,7 @@ class PoolExecutor:
                 self._done.put(found)
 
     def where(self) -> dict[int, BlackBoxHeader]:
-        """Return where each running trial is, for people who watch."""
+        """Return the progress of each running trial, for the status screen."""
         with self._lock:
             running = [worker.attempt.spec.number for worker in self._workers.values() if worker.attempt is not None]
         found = {number: where_it_is(self._settings.scratch, number) for number in running}
@@ -266,7 +266,7 @@ class PoolExecutor:
         return self._notes.fresh()
 
     def close(self) -> None:
-        """Kill every worker, and everything that it has started."""
+        """Kill every worker, with all processes that it has started."""
         with self._lock:
             self._closing = True
             self.cancel()

@@ -49,7 +49,7 @@ __all__ = [
 
 
 class Executor(Protocol):
-    """Runs trials somewhere else.
+    """Runs trials in other processes or on other machines.
 
     Contract: every submitted trial comes back from `completed` exactly once, unless it is cancelled first. A worker
     that dies or hangs costs exactly its own trial. Trials begin in the order in which they were submitted. A trial
@@ -63,19 +63,19 @@ class Executor(Protocol):
 
     @property
     def capacity(self) -> int:
-        """How many trials run at a time, now. The hunt hands over more than that, so that no worker waits for it.
+        """The number of trials that run at a time. The hunt submits more trials, so that no worker waits.
 
         It may change, and is at least 1: if no machine is available for a while, the hunt waits for submitted trials.
         """
 
     def submit(self, spec: TrialSpec) -> None:
-        """Queue a trial. No number may come twice, as a worker may still have the folder of the first."""
+        """Queue a trial. Submit each number once, because a worker may still use the folder of that number."""
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
-        """Yield the trials that have ended since the last call, waiting so long for a first one.
+        """Yield the trials that have ended since the last call; wait at most this long for the first one.
 
         Raises:
-            CrashhuntError: no trial can be run, for a reason that has nothing to do with it.
+            CrashhuntError: no trial can be run, for a reason outside of the trials.
         """
 
     def cancel(self, *, above: int = -1) -> None:
@@ -88,7 +88,7 @@ class Executor(Protocol):
         """Return new notices for the user on how trials were run."""
 
     def close(self) -> None:
-        """Stop every process, whatever it is doing. May be called twice."""
+        """Stop every process at once. A second call does nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,7 +295,7 @@ def run_trials(
         check_every_s: the longest time between two calls of ``stopped``, in s of wall time.
 
     Raises:
-        CrashhuntError: no trial can be run, for a reason that has nothing to do with it.
+        CrashhuntError: no trial can be run, for a reason outside of the trials.
     """
     places = {spec.number: place for place, spec in enumerate(specs)}
     try:

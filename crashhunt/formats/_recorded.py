@@ -33,7 +33,7 @@ class Pose(NamedTuple):
     Args:
         step: 0 is before the first.
         x: in m.
-        y: likewise.
+        y: y of the front bumper of the controlled vehicle, in m.
         z: likewise; 0 if the map is flat.
         heading: heading in rad, from -pi to pi, counter-clockwise from the x axis.
         speed: speed in m/s.

@@ -63,16 +63,16 @@ _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker wa
 class Hunt:
     """One hunt in one directory.
 
-    The same hunt on the same directory resumes. With settings that make other trials, it refuses.
+    A hunt with the same settings on the same directory resumes. Settings that make other trials are refused.
 
     Args:
-        directory: made where it does not exist.
-        scenario: where the trials take place.
-        settings: what was asked.
+        directory: directory of the hunt, created if it does not exist.
+        scenario: scenario of the trials.
+        settings: settings of the hunt.
         command: the command line, as a comment in ``hunt.toml``.
-        overwrite: begin again, and replace an existing hunt.
-        seed_given: whether the seed was asked for; if not, a resumed hunt keeps its own.
-        snapshot: what the snapshot of the code takes in.
+        overwrite: whether a new hunt replaces an existing one.
+        seed_given: whether the user chose the seed; if not, a resumed hunt keeps its own seed.
+        snapshot: options of the snapshot of the code.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Hunt:
 
         Raises:
             HuntDirectoryError: the directory is busy, foreign, unwritable or full.
-            CrashhuntError: the machinery failed; an `InternalError` where crashhunt itself is to blame.
+            CrashhuntError: a process or a file failed; an `InternalError` if crashhunt has a defect.
         """
         with self._place.locked(), stop_requests() as self._stops:
             self.settings = self._place.claim(

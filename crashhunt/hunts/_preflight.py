@@ -109,9 +109,14 @@ class Preflight:
         given = result.spec.arguments.get(failure.agent, {})
         names = ", ".join(f"--arg {name}={value}" for name, value in given.items() if isinstance(value, str))
         places = re.findall(r'^  File "([^"]+)", line (\d+)', trace, re.MULTILINE)
+        fix = f"correct {names or 'the agent'}"
+        if "pip install" in message:
+            fix = "install the package"
+        elif "of this scenario" in message:  # a policy that was trained elsewhere; see agents/_policies.py
+            fix = "choose a --scenario with the environment in which it was trained"
         return ArgumentError(
             f"{self._settings.agents[failure.agent].agent} does not start: {kind}{message}",
-            fix="install the package" if "pip install" in message else f"correct {names or 'the agent'}",
+            fix=fix,
             where=":".join(places[-1]) if kind and places else f"agent {failure.agent}",
         )
 

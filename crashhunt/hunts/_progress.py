@@ -168,7 +168,7 @@ class HuntStatus:
         newest_kind_trials: how many trials have ended since; None if it came in an earlier run of the hunt.
         types_by_cause: number of causes, each type on its own; None if types count.
         time_left_s: time until no more trials begin, in s of wall time; infinite without a limit.
-        disturbed: how many of the crashes had disturbances; None if the hunt has none.
+        disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
         stressed: the trial with the least stress margin; None if no copy was asked, or if no copy crashed.
         branched: how many branches have crashed.
         not_fully_asked: number of trials with a question to their copies that has no answer.

@@ -209,13 +209,13 @@ class UnfinishedWarning(UserWarning):
 
 
 class HuntResults:
-    """A hunt that has been run, or is running.
+    """A finished or running hunt.
 
     Args:
         directory: directory of the hunt.
 
     Raises:
-        HuntDirectoryError: it is not one.
+        HuntDirectoryError: the directory has no hunt.
     """
 
     def __init__(self, directory: Path | str) -> None:
@@ -251,7 +251,7 @@ class HuntResults:
 
     @cached_property
     def independent(self) -> bool:
-        """Whether every trial was drawn independently of the others, so that the rate of crashes means something."""
+        """Whether every trial was drawn independently, so that the share of crashes estimates the crash rate."""
         with closing(self._ledger()) as ledger:
             return draws_independently(ledger.facts(), self.settings)
 
@@ -263,7 +263,7 @@ class HuntResults:
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
-        """The columns of a table of its trials; ``parent`` and ``origin`` where its sampler says such a thing.
+        """The columns of a table of the trials, with ``parent`` and ``origin`` if the sampler reports them.
 
         Likewise ``disturbances`` and ``log_likelihood``, where it has any disturbances, those of `STRESS`, where
         it has probes, and those of `BRANCHES`, where it has branches.
@@ -277,16 +277,16 @@ class HuntResults:
 
     @property
     def crashes(self) -> list[Bundle]:
-        """What was found, in order of the trials; `Bundle.recording` has the arrays."""
+        """The saved crashes, in order of the trials; `Bundle.recording` has the arrays."""
         return list_bundles(self.directory)
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario as it ran, with the agents at the wheel."""
+        """The scenario with the agents that drove."""
         return with_settings(self._snapshot().scenario(), self.settings)
 
     def results(self, *, outcomes: Sequence[str] = ()) -> Iterator[TrialResult]:
-        """Yield the trials in order of their numbers, all or those that ended in one of some ways."""
+        """Yield the trials in order of their numbers: all, or those with the given outcomes."""
         with closing(self._ledger()) as ledger:
             yield from ledger.results(outcomes=tuple(outcomes))
 
@@ -298,7 +298,7 @@ class HuntResults:
                 yield TrialRow(data).cells(names)
 
     def trial_rows(self) -> Iterator[TrialRow]:
-        """Yield the trials as what tables tell of them, which takes a third of the time of `results`."""
+        """Yield the trials as rows of the ledger, which takes a third of the time of `results`."""
         with closing(self._ledger()) as ledger:
             yield from map(TrialRow, ledger.plain_results())
 
@@ -306,7 +306,7 @@ class HuntResults:
         """Return one trial.
 
         Raises:
-            UsageError: it has not ended.
+            UsageError: the trial has not ended.
         """
         with closing(self._ledger()) as ledger:
             found = ledger.result(number)
@@ -332,7 +332,7 @@ class HuntResults:
         return table
 
     def dataframe(self) -> DataFrame:
-        """Return the same as a `pandas.DataFrame`.
+        """Return the table of `trials` as a `pandas.DataFrame`.
 
         Raises:
             UsageError: pandas is not installed.
@@ -347,13 +347,13 @@ class HuntResults:
         """Return an agent made as in a trial, with today's code.
 
         Args:
-            trial: its number.
-            agent: the vehicle's id; may be empty if there is one.
+            trial: number of the trial.
+            agent: id of the vehicle; may be empty if the hunt has a single controlled vehicle.
             trust: import what the hunt names even if the hunt is neither made here nor trusted.
 
         Raises:
             UsageError: there is no such vehicle or trial.
-            UntrustedError: what the hunt names would run, and the hunt is neither made here nor trusted.
+            UntrustedError: code of the hunt would run, but the hunt is neither made on this machine nor trusted.
         """
         if not trust and not is_hunt_trusted(self.directory, self._snapshot()):
             runs = describe_code(self._snapshot(), self.settings)
@@ -396,7 +396,7 @@ class SuiteResults(dict[str, HuntResults]):
 
 @clear_calls()
 def load(directory: Path | str) -> HuntResults | SuiteResults:
-    """Load a hunt, or all hunts of a suite. What is not finished is loaded as far as it is, with a warning.
+    """Load a hunt, or all hunts of a suite. Of an unfinished hunt, load the trials that have ended, with a warning.
 
     Raises:
         HuntDirectoryError: there is no hunt.

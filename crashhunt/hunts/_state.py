@@ -204,7 +204,7 @@ class HuntState(Serializable):
         damaged: whether its ledger cannot be read, so that the counts say nothing.
         phase: what it does after its last trial: fields of `PhaseStatus` but the time; None before, and where it does
             not run.
-        disturbed: how many of the crashes had disturbances; None if the hunt has none.
+        disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
         probes: what came of them so far; None if it has none.
         branches: likewise.
         rate: the crash rate, as it was at its last heartbeat: fields of `RunningRate`; None if none is known.
@@ -509,10 +509,10 @@ class HuntDirectory:
         """Make the directory this hunt's, or see that it is already; return the settings that hold.
 
         Args:
-            settings: what was asked.
+            settings: settings of the hunt.
             command: the command line, as a comment in ``hunt.toml``.
-            overwrite: begin again, and replace an existing hunt.
-            seed_given: whether the seed was asked for; if not, a resumed hunt keeps its own.
+            overwrite: whether a new hunt replaces an existing one.
+            seed_given: whether the user chose the seed; if not, a resumed hunt keeps its own seed.
 
         Raises:
             HuntDirectoryError: the hunt that is there makes other trials, or the directory is unwritable.

@@ -475,7 +475,7 @@ class Audit:
 
     @property
     def parallel(self) -> int:
-        """How many trials run at a time."""
+        """The number of trials that run at a time."""
         return self._executor.capacity
 
     @parallel.setter

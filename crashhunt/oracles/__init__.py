@@ -1,4 +1,4 @@
-"""Oracles: whether a step is a crash, and how near to one it came."""
+"""Oracles: detectors of crashes and traffic events in the scene of a step."""
 
 import lazy_loader
 

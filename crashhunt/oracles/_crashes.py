@@ -22,7 +22,7 @@ HARDEST = 10.0
 
 
 class ReportedCollision:
-    """Believes the simulator's own list of collisions, where a controlled vehicle takes part.
+    """Detects the collisions of controlled vehicles that the simulator reports.
 
     The ways of both actors decide the collider, the speeds and the time. After a long step or a lane change the
     simulator may report the two vehicles in the wrong order, and a lane that is not the agent's.
@@ -93,7 +93,7 @@ class Overlap:
 
 
 class OffRoad:
-    """Believes the simulator when it says that a controlled vehicle left the road."""
+    """Detects controlled vehicles that left the road, according to the simulator."""
 
     name = "off_road"
 

@@ -50,7 +50,7 @@ class Finding:
 
 
 class Oracle(Protocol):
-    """Looks at scenes and says when one is a crash. It draws no random numbers and keeps no clock.
+    """Examines scenes and detects crashes. It uses no random numbers and no clock.
 
     Contract: a new oracle is made for every trial, with the arguments of ``--oracle NAME:key=value``. Its state
     therefore belongs to this trial only. `check` is called once a step, in order, also with the
@@ -67,10 +67,10 @@ class Oracle(Protocol):
 
 @runtime_checkable
 class SeesMap(Protocol):
-    """Offered by an oracle that wants to know the roads."""
+    """An oracle that receives the map of the trial."""
 
     def see_map(self, lanes: Sequence[Lane]) -> None:
-        """Take the map of the trial, before the first `Oracle.check`; empty if the simulator has none."""
+        """Receive the lanes of the map, before the first `Oracle.check`; empty if the simulator has no map."""
 
 
 @runtime_checkable

@@ -49,10 +49,10 @@ _scopes: ContextVar[tuple[str, ...]] = ContextVar("crashhunt_render_scopes", def
 
 @contextmanager
 def scope(name: str) -> Iterator[None]:
-    """Name the panels that are made inside; scopes nest.
+    """Prefix the names of the panels that are created in a ``with`` block; blocks can be nested.
 
     Args:
-        name: comes before the names of scopes and panels inside.
+        name: prefix of the names of the scopes and panels in the block.
     """
     token = _scopes.set((*_scopes.get(), name))
     try:
@@ -127,7 +127,7 @@ class Heatmap(Panel):
     Args:
         values: shape (rows, columns).
         low: the value of the darkest colour; the least value by default.
-        high: the value of the brightest; the greatest by default.
+        high: the value of the brightest colour; the greatest value by default.
         annotate: whether to write the values into the cells.
     """
 
@@ -145,7 +145,7 @@ class Contour(Panel):
         values: shape (rows, columns).
         low: value of the lowest level; the least value by default.
         high: value of the highest level; the greatest by default.
-        levels: how many.
+        levels: number of levels.
     """
 
     values: ArrayLike
@@ -160,10 +160,10 @@ class Curve(Panel):
 
     Args:
         series: name to values; or the values of the only one.
-        x: of all values; their number by default.
+        x: x of all values; by default their index.
         low: lower end of the vertical axis; the least value by default.
-        high: likewise.
-        cursor: where to draw a vertical line.
+        high: upper end of the axis; by default the greatest value.
+        cursor: x of a vertical line.
     """
 
     series: Mapping[str, ArrayLike] | ArrayLike
@@ -193,7 +193,7 @@ class Bar(Panel):
     Args:
         values: name to value, or values.
         low: lower end of the axis; 0 or the least value by default.
-        high: likewise.
+        high: upper end of the axis; by default the greatest value.
     """
 
     values: Mapping[str, float] | ArrayLike
@@ -206,7 +206,7 @@ class Text(Panel):
     """Some lines of text.
 
     Args:
-        text: what to write.
+        text: the text.
     """
 
     text: str
@@ -218,8 +218,8 @@ class Action(Panel):
 
     Args:
         value: value of a Box space, or the integer of a discrete one.
-        low: the bounds of each part; needed for bars.
-        high: likewise.
+        low: lower bound of each part; needed for bars.
+        high: upper bound of each part.
         names: names of the parts.
     """
 
@@ -231,12 +231,12 @@ class Action(Panel):
 
 @dataclass
 class ActionDistribution(Panel):
-    """How likely an agent is to act in which way.
+    """The probability of each action of an agent.
 
     Args:
         probabilities: probabilities of each discrete action.
         mean: mean of each part of a continuous action, with ``std``.
-        std: its standard deviation.
+        std: standard deviation of each part of a continuous action.
         names: names of the actions or parts.
     """
 

@@ -65,26 +65,26 @@ class Subject(_Options):
     """What is hunted."""
 
     scenario: Path | str = option(
-        "loop", "a shipped name, or a path",
+        "loop", "name of an included scenario, or a path",
         help="a shipped scenario (see crashhunt scenarios), a folder, a scenario.toml or a .sumocfg",
         brief="a shipped scenario, a folder, a scenario.toml or a .sumocfg",
         flag="--scenario", metavar="NAME|PATH", group="what",
     )  # fmt: skip
     ego: str = option(
-        "", "which vehicle of a bare ``.sumocfg``",
+        "", "controlled vehicle of a bare ``.sumocfg``",
         help="for a .sumocfg: the vehicle to control; route=ID or edges=FROM,TO adds a vehicle; any: a random "
             "vehicle in each trial",
         unset="any",
         flag="--ego", metavar="VEHICLE", group="what",
     )  # fmt: skip
     action: str = option(
-        "", "how agents act on SUMO, ``continuous`` or ``meta``",
+        "", "form of the actions on SUMO, ``continuous`` or ``meta``",
         help="on SUMO: continuous (a speed and a lane change) or meta (highway-env's five actions)",
-        unset="as the scenario says, and continuous for a .sumocfg",
+        unset="as in the scenario, and continuous for a .sumocfg",
         flag="--action", metavar="FORM", group="what",
     )  # fmt: skip
     agents: Mapping[str, Driver] | None = option(
-        {}, "vehicle to its agent, where there are several",
+        {}, "vehicle to its agent, for several controlled vehicles",
         help="the agent that drives: a class or function, or a name that crashhunt agents lists; ID= if the scenario "
             "has several controlled vehicles",
         brief="the class, function or listed name that drives",
@@ -97,13 +97,13 @@ class Subject(_Options):
         flag="--arg", metavar="NAME=SPEC", group="what",
     )  # fmt: skip
     scenario_arguments: Mapping[str, Spec] | None = option(
-        {}, "the same for arguments of the scenario: name to value or specification",
+        {}, "name of an argument of the scenario to a value or a specification",
         help="values to try for an argument of the scenario, such as its traffic demand",
         brief="the same for an argument of the scenario, such as its traffic",
         flag="--set", metavar="NAME=SPEC", group="what",
     )  # fmt: skip
     oracles: Sequence[str] = option(
-        (), "who looks for crashes besides the simulator's report, overlaps and the edge of the road",
+        (), "additional oracles, next to those for reported collisions, overlaps and the edge of the road",
         help="an additional oracle that detects crashes, with its arguments; crashhunt oracles lists all; none: "
             "without the default oracles; may be repeated",
         flag="--oracle", metavar="NAME[:KEY=VALUE,…]", group="what",
@@ -115,7 +115,7 @@ class TrialOptions(_Options):
     """What a trial is; `HuntSettings` has them too."""
 
     sampler: str = option(
-        "random", "its name",
+        "random", "name of the sampler",
         help="random, halton, sobol, grid or sweep; or one that learns from results: guided, cross-entropy, "
             "mutation, cma-es, optuna:NAME, as in optuna:tpe",
         brief="random, grid, guided and others: how arguments are chosen",
@@ -131,15 +131,15 @@ class TrialOptions(_Options):
         flag="--seed", group="search", metavar="N", check=at_least(0),
     )  # fmt: skip
     crash_on: Sequence[str] = option(
-        CRASHES, "the outcomes that count as a crash",
+        CRASHES, "outcomes that count as a crash",
         help="the outcomes that count as a crash: collision, off_road, agent_error, simulator_error, process_died, "
         "hang, which are the default; and traffic events: red_light, wrong_way, off_route, not_moving (for 60 s, or "
         "not_moving:S), others_collided, hard_braking (or hard_braking:M/S²), teleport",
         flag="--crash-on", group="what", metavar="KIND,…", separator=",",
     )  # fmt: skip
     disturb: Sequence[str] = option(
-        (), "how often others around the agent err, or it sees or acts late: ``NAME=RATE`` with a rate per second; or "
-        "what every trial has in one step, ``KIND@STEP=WHO:HOW_STRONG:HOW_LONG``",
+        (), "faults of the vehicles around the agent, or of its sensors and actuators: ``NAME=RATE`` with a rate per"
+            " second, or ``KIND@STEP=PLACE:STRENGTH:DURATION`` in every trial",
         help="inject faults of the vehicles around the agent, or of its sensors and actuators, with rates per "
             "second, as in brake=0.02,cut_in=0.01: brake, stop, dawdle, speed, cut_in, late_merge, step_out, "
             "ignore_priority, unseen, "
@@ -150,25 +150,26 @@ class TrialOptions(_Options):
         flag="--disturb", group="faults", metavar="NAME=RATE,…", separator=",",
     )  # fmt: skip
     probe: str = option(
-        "", "how often copies of a trial are asked for the mildest disturbance with which it crashes, such as ``4s``",
+        "", "interval at which copies of a trial search for the mildest disturbance that makes it crash, such as "
+            "``4s``",
         help="at this interval of simulation time, such as 4s, search copies of the trial for the mildest "
             "disturbance with which it crashes", unset="never", flag="--probe", group="faults", metavar="TIME",
         check=check_probe,
     )  # fmt: skip
     branch: bool = option(
-        False, "whether copies of a trial continue with other disturbances where another actor is near",
+        False, "whether copies of a trial continue with other disturbances when another actor is near",
         help="when another actor is near, continue copies of the trial with several disturbances, from this moment "
             "and from some seconds earlier; needs --disturb",
         flag="--branch", group="faults",
     )  # fmt: skip
     rare: bool = option(
-        False, "whether to estimate how often rare crashes happen, by copies of trials with forced disturbances",
+        False, "whether to estimate the rate of rare crashes from copies of trials with forced disturbances",
         help="estimate how often rare crashes happen: one of five trials runs undisturbed, and copies of it begin with "
         "a first disturbance, weighted by its probability; needs --disturb with rates and implies --keep-going",
         flag="--rare", group="faults",
     )  # fmt: skip
     seeds: int = option(
-        0, "how many traffics there are, each used for many arguments; 0: every trial has its own",
+        0, "number of traffics, each used for many arguments of the agents; 0: a new traffic in each trial",
         help="draw this many traffics (a seed and the scenario's arguments), and use each for many arguments of the "
             "agents after one warm-up; 0: a new traffic in each trial",
         unset="every trial has its own",
@@ -181,7 +182,7 @@ class RunOptions(_Options):
     """How trials are run; `RunSettings` has them too."""
 
     duration: str = option(
-        "", "time limit of the hunt: ``90s``, ``30m``, ``1h30m``; TRIALS may be 0 then",
+        "", "time limit of the hunt: ``90s``, ``30m``, ``1h30m``; TRIALS may then be 0",
         help="start no trial after this time, such as 90s, 30m or 1h30m; TRIALS may then be 0 (no limit)",
         unset="no time limit", brief="begin no trial after this time, such as 30m",
         flag="--for", group="search", metavar="TIME", check=check_duration,
@@ -192,44 +193,46 @@ class RunOptions(_Options):
         flag="--keep-going", group="search",
     )  # fmt: skip
     distinct: int = option(
-        0, "end after so many crash types, and collect all crashes until then; 0: never",
+        0, "number of crash types after which the hunt ends; it collects all crashes until then; 0: no limit",
         help="collect all crashes until N crash types have been found, as crashhunt crashes counts them; 0: no such "
             "limit",
         flag="--distinct", group="search", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
     until_rate: str = option(
-        "", "a rate, such as ``1e-3/trial``, ``2/hour`` or ``5/1000km``: end once the agent certainly crashes less, or "
-        "more, often",
+        "", "a rate, such as ``1e-3/trial``, ``2/hour`` or ``5/1000km``: the hunt ends when the crash rate is "
+            "certainly below or above it",
         help="stop when the crash rate is certainly below or above this rate, such as 1e-3/trial, 2/hour or "
             "5/1000km; collects all crashes, and TRIALS may be 0; exit code 0: below, 1: above, 3: undecided",
         unset="run all trials", flag="--until-rate", group="search", metavar="RATE", check=check_rate,
     )  # fmt: skip
     most: int = option(
-        0, "with ``until_rate``, how many trials it has at most; 0: as many as TRIALS says",
-        help="with --until-rate: the most trials to run; 0: as many as TRIALS",
+        0, "with ``until_rate``, maximum number of trials; 0: as many as TRIALS",
+        help="with --until-rate: maximum number of trials; 0: as many as TRIALS",
         flag="--most", group="search", metavar="N", check=at_least(0, zero="as many as TRIALS says"),
     )  # fmt: skip
     keep: int = option(
-        0, "number of bundles to keep of each crash type, those of the shortest crashes; 0: all",
+        0, "number of bundles to keep of each crash type, the shortest crashes first; 0: all",
         help="keep only the N shortest bundles of each crash type; the ledger keeps all crashes. Requires "
         "--keep-going or --distinct; 0: keep all",
         brief="keep only the N shortest crashes of each type",
         flag="--keep", group="kept", metavar="N", check=at_least(0, zero="keep all"),
     )  # fmt: skip
     by_cause: int = option(
-        0, "with ``distinct`` or ``keep``, how many crashes of each type to judge, so that each cause counts; 0: none",
+        0, "with ``distinct`` or ``keep``, number of crashes of each type to judge, so that each cause counts; 0: "
+           "none",
         help="with --distinct or --keep: count each cause of a crash type on its own. Runs up to N crashes of each "
         "type again, as crashhunt crashes --by-cause does; 0: count types",
         flag="--by-cause", group="search", metavar="N", check=at_least(0, zero="count types"),
     )  # fmt: skip
     only_at_fault: bool = option(
-        False, "stop only at crashes that are the agent's own fault; the others are kept, and the hunt continues",
+        False, "stop only at a crash that is the agent's fault; other crashes are saved, and the hunt continues",
         help="stop only at a crash that is the agent's fault according to the rules; crashes that are not its fault, "
             "or undecided, are saved and do not end the hunt",
         flag="--only-at-fault", group="search",
     )  # fmt: skip
     until_error: str = option(
-        "", "with ``rare``, end once half of the width of the interval is at most this share of the estimate: ``0.3``",
+        "", "with ``rare``, largest ratio of half the interval's width to the estimate, such as ``0.3``: the hunt "
+            "ends when it is reached",
         help="with --rare: stop when half the width of the interval is at most this share of the estimate, such as "
             "0.3", unset="all trials", flag="--until-error", group="faults", metavar="SHARE", check=check_share,
     )  # fmt: skip
@@ -245,12 +248,12 @@ class RunOptions(_Options):
         False, "keep the log of every trial, not only of crashes", flag="--keep-trials", group="kept",
     )  # fmt: skip
     accelerate: bool = option(
-        True, "speed simulators up where that changes no bit",
+        True, "whether to run simulators with their accelerator; results are bit-identical",
         help="run highway-env without the accelerator; trials stay bit-identical and take longer",
         flag="--no-accelerate", group="run",
     )  # fmt: skip
     native: bool = option(
-        True, "use the compiled core of simulators where it is there, which changes no bit",
+        True, "whether to use the compiled core of simulators, if it is installed; results are bit-identical",
         help="run SUMO without the compiled core; trials stay bit-identical and take longer",
         flag="--no-native", group="run",
     )  # fmt: skip
@@ -265,19 +268,20 @@ class RunOptions(_Options):
         flag="--warm-copies", group="run", metavar="N", check=at_least(0, zero="none"),
     )  # fmt: skip
     audit: float = option(
-        0.0, "the share of trials without a crash that are run again in a fresh process, to see that they are the same",
+        0.0, "share of the trials without a crash that run again in a new process, to check that they are bit-"
+             "identical",
         help="replay this share of the trials without a crash, each in a new process, and report every difference; "
             "0.02 is one trial in fifty",
         flag="--audit", group="run", metavar="SHARE", check=within(0, 1, "give a share of the trials, from 0 to 1"),
     )  # fmt: skip
     near_misses: int = option(
-        0, "how many of the most dangerous trials without a crash are kept as bundles of their own",
+        0, "number of trials without a crash to save as bundles, those with the highest criticality first",
         help="save the N most critical trials without a crash as bundles, for replay and show; each is run once more "
             "at the end",
         flag="--near-misses", group="kept", metavar="N", check=at_least(0, zero="none"),
     )  # fmt: skip
     executor: str = option(
-        "pool", "where trials run: its name, and perhaps ``:ARG``",
+        "pool", "executor that runs the trials, by its name; ``:ARG`` appends an argument",
         help="where trials run: pool (warm processes on this machine), fresh (a new process for each), "
         "ray[:HOST:PORT] (all machines of a Ray cluster) or module:attribute; append :ARG to pass an argument to the "
         "executor",
@@ -312,17 +316,17 @@ class SnapshotChoices(_Options):
     """What the snapshot of the code takes in."""
 
     snapshot_roots: Sequence[str | Path] = option(
-        (), "files and folders that the snapshot takes in besides the agents' own projects",
+        (), "files and folders to add to the snapshot, in addition to the agents' projects",
         help="a file or folder to add to the snapshot, in addition to the agent's project; may be repeated",
         flag="--snapshot-root", group="kept", metavar="PATH",
     )  # fmt: skip
     snapshot_limit_mb: float = option(
-        500.0, "the greatest size of a snapshot, in MB", help="the greatest size of a snapshot, in MB",
+        500.0, "maximum size of a snapshot, in MB", help="the greatest size of a snapshot, in MB",
         flag="--snapshot-limit", group="kept", metavar="MB",
         check=above_zero("give MB above 0, or --no-snapshot", finite=False),
     )  # fmt: skip
     snapshot_code: bool = option(
-        True, "whether the snapshot has code at all; without, a replay runs what is current",
+        True, "whether the snapshot contains code; without it, a replay runs the current code",
         help="save no code; a replay then runs today's code", flag="--no-snapshot", group="kept",
     )  # fmt: skip
 
@@ -331,7 +335,7 @@ class SnapshotChoices(_Options):
 class HuntOptions(SnapshotChoices, RunOptions, TrialOptions, Subject):
     """All of them, in the order of the help: what `crashhunt.prepare` takes, and a hunt of a ``suite.toml``."""
 
-    agent: Driver | None = option(None, "who drives, where the scenario has one controlled vehicle")
+    agent: Driver | None = option(None, "agent that drives, if the scenario has one controlled vehicle")
 
 
 def hunt_options(kind: type = HuntOptions) -> tuple[HuntOption, ...]:

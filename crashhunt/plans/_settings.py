@@ -111,7 +111,7 @@ class HuntSettings(TrialOptions):
         scenario: the name or path that was given.
         scenario_digest: digest of the scenario's files and settings.
         trials: how many to run; 0 if only the time is limited.
-        max_steps: the bound on each, in steps.
+        max_steps: maximum number of steps of a trial.
         seed: seed of the hunt; with a trial's number it determines the trial.
         crash_on: the outcomes that count as a crash.
         oracles: the oracles that detect crashes, each as in ``--oracle``.
@@ -348,8 +348,8 @@ class Request(TrialOptions, Subject):
     """The request of a user for a hunt. `plan` decides everything else. Options are those of the list.
 
     Args:
-        trials: how many.
-        max_steps: the bound on each, in steps.
+        trials: number of trials.
+        max_steps: maximum number of steps of a trial.
         agents: agent id to locator; the id may be empty if the scenario has one controlled vehicle.
         arguments: ``NAME`` or ``AGENT.NAME`` to specification.
         scenario_arguments: name to specification.
@@ -392,7 +392,7 @@ def request_of(asked: HuntOptions, *, trials: int, max_steps: int, parallel: int
     """Return the request for options as they are given in Python or in a ``suite.toml``.
 
     Raises:
-        UsageError: who drives is not in a module that workers can import.
+        UsageError: the agent is not in a module that workers can import.
     """
     drivers = {} if asked.agent in (None, "") else {"": asked.agent}
     given: Given = {

@@ -149,11 +149,11 @@ class Divergence:
     """The first difference between a recording and its replay.
 
     Args:
-        step: at which step; the observation and the action of step n lead to the scene of step n.
-        agent: the agent or actor that it is about; empty if it is about the whole episode.
-        field: such as ``observation[1, x]``, ``action[target_speed]``, ``scene.x`` or ``length``.
+        step: step of the difference; the observation and the action of step n lead to the scene of step n.
+        agent: agent or actor whose value differs; empty for a value of the whole episode.
+        field: name of the value, such as ``observation[1, x]``, ``action[target_speed]``, ``scene.x`` or ``length``.
         recorded: the value in the recording; None if there is none.
-        replayed: likewise in the replay.
+        replayed: the value in the replay; None if there is none.
         place: place of the value within the step: the name of the type of record, and the index in what it holds.
     """
 

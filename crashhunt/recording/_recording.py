@@ -57,11 +57,11 @@ class Recording:
     """Everything that was recorded of one episode.
 
     Args:
-        records: as they were written, from a black box or a log.
-        compact: what is missing; None for a whole recording.
+        records: records of a black box or of a log, in the order in which they were written.
+        compact: description of the missing parts; None for a complete recording.
 
     Raises:
-        BundleError: the records make no sense.
+        BundleError: the records contradict each other.
     """
 
     def __init__(self, records: Iterable[Record], compact: Compact | None = None) -> None:
@@ -84,14 +84,14 @@ class Recording:
 
     @property
     def digest(self) -> str:
-        """The trace digest, in hexadecimal; of a compact recording that of the whole one."""
+        """The digest of the trace, in hexadecimal; for a compact recording, the digest of the complete one."""
         if self.compact is not None and self.compact.digest:
             return self.compact.digest
         return digest_of(b"".join(record.encode() for record in self.records if is_evidence(record.tag)))
 
     @property
     def steps(self) -> int:
-        """How many steps were completed."""
+        """The number of completed steps."""
         return max((step.step for step in self.all_steps if step.whole), default=0)
 
     def compacted(self, always: Collection[str], radius_m: float, *, observations: bool = True) -> Recording:
@@ -100,7 +100,7 @@ class Recording:
         Args:
             always: identifiers of the actors that are kept in each step.
             radius_m: greatest distance between an agent and another actor, in m.
-            observations: whether it has what the agents observed.
+            observations: whether it contains the observations of the agents.
         """
         compact = Compact(
             digest=self.digest,
@@ -125,7 +125,7 @@ class Recording:
         return Recording(self.records[:records], compact)
 
     def observations(self, agent: str) -> NDArray[np.generic]:
-        """What an agent was shown, shape (steps it saw, *observation shape).
+        """The observations of an agent, shape (steps with an observation, *observation shape).
 
         Values of any length (`is_opaque`) are an array of arrays, shape (steps it saw,); `decode_value` reads each.
         """
@@ -134,7 +134,7 @@ class Recording:
         return _stacked(found, channel.observation_dtype, channel.observation_shape)
 
     def actions(self, agent: str) -> NDArray[np.generic]:
-        """What an agent answered, shape (steps it acted, *action shape); of any length as for `observations`."""
+        """The actions of an agent, shape (steps with an action, *action shape), as in `observations`."""
         channel = self._channel(agent)
         found = [step.actions[agent] for step in self.all_steps if agent in step.actions]
         return _stacked(found, channel.action_dtype, channel.action_shape)
@@ -156,7 +156,7 @@ class Recording:
 
     @property
     def disturbances(self) -> tuple[Disturbance, ...]:
-        """Those that began, as they took place; without a target, the vehicle is empty."""
+        """The disturbances that took place; without a target vehicle, its id is empty."""
         return tuple(one for step in self.all_steps for one in step.more.get("disturbance", ()))
 
     def _channel(self, agent: str) -> AgentChannel:

@@ -69,8 +69,8 @@ class ReplayOptions:
     Args:
         code: which code drives: that of the snapshot, today's, or the recorded actions.
         changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value.
-        force: replay even from a snapshot that is damaged.
-        times: how often.
+        force: whether to replay from a damaged snapshot.
+        times: number of replays.
         scenario: the name or path of another scenario to drive in; empty for that of the crash.
         accelerate: whether simulators are sped up where that changes no bit.
         trusted: whether its code may run; None to find out. Without trust only recorded actions are replayed, and
@@ -132,7 +132,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     Raises:
         BundleError: the bundle is damaged.
         UsageError: an edit cannot be meant.
-        UntrustedError: its code would run, and it is neither made here nor trusted.
+        UntrustedError: the code of the crash would run, but the crash is neither made on this machine nor trusted.
     """
     recorded = bundle.recording()
     snapshot = Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot)

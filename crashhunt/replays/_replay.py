@@ -41,17 +41,17 @@ Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"
 
 @dataclass(frozen=True, slots=True)
 class ReplayReport:
-    """What came of a replay.
+    """The result of a replay.
 
     Args:
-        rerun: what was run.
-        verdict: whether it is the same; of several times, the first that was not.
+        rerun: description of the run.
+        verdict: the verdict; of several replays, that of the first one that deviates.
         replayed: the trial that was run now.
         recording: recording of it.
         divergence: the first difference.
         around: step, recorded and replayed value of the field that differs, in the steps around.
         reason: why the two cannot be compared.
-        verdicts: verdicts of all runs, and how many had each.
+        verdicts: verdict to the number of runs that had it.
     """
 
     rerun: Rerun
@@ -70,7 +70,7 @@ class ReplayReport:
 
     @property
     def steps_replayed(self) -> int:
-        """How many steps it completed."""
+        """The number of completed steps."""
         return self.recording.steps
 
     def to_json(self) -> JsonObject:
@@ -101,7 +101,7 @@ def judged(
     """Compare two recordings of a crash.
 
     Args:
-        rerun: what was run.
+        rerun: description of the run.
         recorded: the recording, or its beginning.
         replayed: number of steps that were replayed.
         result: what came of the replay.

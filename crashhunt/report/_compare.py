@@ -70,7 +70,7 @@ def describe_comparison(found: Comparison) -> str:
     ]
     lines = aligned([header, *rows], left=1)
     lines += [
-        f"{hunt.dir}: counted are the trials of origin {hunt.counted}, for the hunt guided all others"
+        f"{hunt.dir}: only trials of origin {hunt.counted} count, because the search guided all others"
         for hunt in found.hunts
         if hunt.counted
     ]
@@ -131,7 +131,7 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
             said += f", {count_training_trials(trained_on)}"
         bar = f'<span style="left:0;width:{rate * scale:.2f}%;background:{colors[hunt.dir]}"></span>'
         if hunt.counted:
-            said += f", of origin {html.escape(hunt.counted)} only, as the hunt guided all others"
+            said += f", only trials of origin {html.escape(hunt.counted)} count, because the search guided all others"
         if hunt.interval:
             low, high = hunt.interval
             said += f", 95 % interval {low:.2%} to {high:.2%}"

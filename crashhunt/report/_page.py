@@ -410,7 +410,7 @@ def _rate(rate: RunningRate | None) -> dict[str, object] | None:
     if rate["method"] == "rare":
         words += " The estimate omits failures that no copy has met; the certain bounds include them."
     return {
-        "answer": describe_running(rate).removeprefix("rate: "),
+        "answer": describe_running(rate).removeprefix("crash rate: "),
         "words": words,
         "certain": rate["certain"],
         "estimated": rate["estimated"],

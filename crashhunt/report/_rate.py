@@ -81,22 +81,22 @@ def describe_running(rate: RunningRate) -> str:
         return _describe_rare(rate)
     bar = f"; bar {format_rate(rate['bar'])} {_PER[rate['per']]}: {rate['verdict']}" if rate["bar"] is not None else ""
     if rate["certain"] is None:
-        return f"rate: not known yet ({rate['why_not']}){bar}"
-    trials = f"{_count(rate['crashes'], 'crash', 'crashes')} in {_count(rate['trials'], 'trial', 'trials')}"
-    trials += " drawn at random" if rate["origin"] else ""
+        return f"crash rate: not known yet ({rate['why_not']}){bar}"
+    kind = "random trial" if rate["origin"] else "trial"
+    trials = f"{_count(rate['crashes'], 'crash', 'crashes')} in {_count(rate['trials'], kind, f'{kind}s')}"
     if trained_on := rate.get("trained_on"):
         bar += f"; {count_training_trials(trained_on)}"
-    return f"rate: {_certain(rate['certain'])} {_PER[rate['per']]} ({trials}, {rate['confidence']:g} %){bar}"
+    return f"crash rate: {_certain(rate['certain'])} {_PER[rate['per']]} ({trials}, {rate['confidence']:g} %){bar}"
 
 
 def _describe_rare(rate: RunningRate) -> str:
     roots = _count(rate["units"], "root", "roots")
     certain = f"; certain: {_certain(rate['certain'])} ({rate['confidence']:g} %)" if rate["certain"] else ""
     if rate["estimate"] is None:
-        return f"rate: not known yet ({rate['why_not']}){certain}"
+        return f"crash rate: not known yet ({rate['why_not']}){certain}"
     if not rate["estimate"]:
-        return f"rate: no crash yet in {roots} and their copies{certain}"
-    found = f"rate: {format_rate(rate['estimate'])} per trial"
+        return f"crash rate: no crash yet in {roots} and their copies{certain}"
+    found = f"crash rate: {format_rate(rate['estimate'])} per trial"
     if (one := rate["estimated"]) is not None and one["high"] is not None:
         found += f" ({format_rate(one['low'])} to {format_rate(one['high'])}, estimated from {roots})"
     else:
@@ -168,7 +168,7 @@ def _part_lines(rate: CrashRate) -> list[str]:
     if not rate.parts:
         return []
     parts = len(rate.parts)
-    together = f"all {parts} together {rate.confidence:g} %" if parts > 1 else f"{rate.confidence:g} %"
+    together = f"{rate.confidence:g} % for all {parts} intervals together" if parts > 1 else f"{rate.confidence:g} %"
     return [
         f"  {_PER[rate.per]}, by {rate.parts[0].by} ({together}):",
         *(f"    {part.name}: {part.crashes} of {part.trials:,} trials, {_answer(part)}" for part in rate.parts),

@@ -177,8 +177,8 @@ class Story:
         drives_into = hit is not None and hit.role == "collider"  # the agent had the other in front of it
         header = ["step", "time s", f"{self.agent} m/s", *names]
         if self.encounter is not None:
-            header += [f"{self.other} m/s", "gap to it m", "closing m/s", "TTC to it s"]
-            header += ["needs m/s²"] if drives_into else []
+            header += [f"{self.other} m/s", "gap m", "closing m/s", "TTC s"]
+            header += ["braking needed m/s²"] if drives_into else []
         header += COLUMNS if self.danger is not None else ()
         moments = {moment.step: moment for moment in self.encounter.moments} if self.encounter else {}
         rows = []
@@ -272,11 +272,12 @@ class Story:
         braking = f"Braking {tried.how}"
         if tried.step is None:
             assert tried.too_late is not None
-            return [f"{braking} would not have avoided it even {self._ago(tried.too_late)}; that was run."]
+            return [f"{braking} would not have avoided it even {self._ago(tried.too_late)}: that run crashes."]
         also, until = about_changes(tried.changed), self._ago(tried.step)
         if tried.too_late is None:
-            return [f"{braking} would have avoided it until {until}; that was run.{also}"]
-        return [f"{braking} would have avoided it until {until}; one step later it was too late. Both were run.{also}"]
+            return [f"{braking} could have avoided it until {until}: a run from this step avoids it.{also}"]
+        runs = "a run from this step avoids it, and a run from one step later crashes"
+        return [f"{braking} could have avoided it until {until}: {runs}.{also}"]
 
     def about_judgement(self) -> list[str]:
         """Return until when the crash could have been avoided, according to the runs of `judge`."""
@@ -293,10 +294,10 @@ class Story:
         tried = self.bundle.result.escape
         can = ""
         if tried is not None and tried.braking is not None and braking > 1.01 * tried.braking:
-            can = f" ({tried.braking:.1f} is all that it did when that was run)"
+            can = f" (in the run, it braked with at most {tried.braking:.1f})"
         return (
-            f"Braking at {braking:g} m/s²{can} would have avoided it until {self._ago(self.escape)}, had "
-            f"{self.other} moved as it did; that is calculated, not run."
+            f"Braking at {braking:g} m/s²{can} could have avoided it until {self._ago(self.escape)}, if "
+            f"{self.other} had moved as recorded. This is a calculation, not a run."
         )
 
     def before_contact_s(self, step: int) -> float:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["Watcher", "describe_phase", "format_arguments", "format_inputs", "format_pace", "format_seconds"]
 
 _LINE_EVERY_S = 5.0  # where lines cannot be overwritten, such as in a CI log
+_LOW_SCREEN = 16  # lines; on a lower screen, workers need the space
 _LEAST_BAR = 8  # columns; a shorter bar is unreadable, and the words need the space
 _STYLES = {
     "traffic crash": "bold red",
@@ -95,17 +96,19 @@ class Watcher:
         if status.disturbed is not None and status.crashes:
             outcomes += Text(f"   {_disturbed(status)}")
         rows.append(outcomes or Text("no trial has finished", style="dim"))
-        if status.rate is not None:
-            rows.append(Text(describe_running(status.rate), no_wrap=True, overflow="ellipsis"))
+        if status.rate is not None and status.done:
+            rows.append(self._folded(Text(describe_running(status.rate))))
         if status.kinds:
-            kinds = Text(f"{describe_kinds(status)}: ", no_wrap=True, overflow="ellipsis")
-            each = "; ".join(f"{kind.count} {kind.signature}" for kind in status.kinds)
-            rows.append(kinds + Text(one_line(each), "dim"))
+            each = "; ".join(f"{kind.signature} ({kind.count})" for kind in status.kinds)
+            rows.append(self._folded(Text(f"{describe_kinds(status)}: ") + Text(one_line(each), "dim")))
         # A terminal shows nothing below its last line, and the cursor needs that line.
         left = height - 1 - len(self._console.render_lines(Group(*rows)))
         if status.search.strategies and len(status.workers) < left:
-            rows.append(Text(one_line(_strategies(status.search)), no_wrap=True, overflow="ellipsis"))
-            left -= 1
+            tried = self._folded(Text(one_line(_strategies(status.search))))
+            if len(self._console.render_lines(tried)) + len(status.workers) > left:
+                tried = Text(tried.plain, no_wrap=True, overflow="ellipsis")
+            left -= len(self._console.render_lines(tried))
+            rows.append(tried)
         if status.nearest is not None:
             near = Text(one_line(f"nearest miss{_grown(status.search)}: {_near(status.nearest)}"), overflow="fold")
             if len(self._console.render_lines(near)) + len(status.workers) > left:
@@ -126,8 +129,14 @@ class Watcher:
         nodes = _nodes(status, max(1, left // 2))
         return Group(*rows, *nodes, _workers(status, width, max(1, left - len(nodes))))
 
+    def _folded(self, text: Text) -> Text:
+        """Return a text of at most two lines; a longer one, or one on a low screen, is cut to one line."""
+        folds = self._console.height > _LOW_SCREEN and len(self._console.render_lines(text)) <= 2
+        return text if folds else Text(text.plain, no_wrap=True, overflow="ellipsis")
+
     def _head(self, status: HuntStatus, width: int) -> Text:
-        phase = "confirming" if status.progress is not None else status.phase
+        phase = "running" if status.phase == "hunting" else status.phase
+        phase = "confirming" if status.progress is not None else phase
         now = f"   {phase}   {format_seconds(status.elapsed_s)}"
         title = Text(self._title, "bold")
         title.truncate(max(1, width - len(now)), overflow="ellipsis")
@@ -284,7 +293,7 @@ def describe_kinds(status: HuntStatus) -> str:
 
 
 def _disturbed(status: HuntStatus) -> str:
-    return f"of {status.crashes} {'crash' if status.crashes == 1 else 'crashes'}, {status.disturbed} with disturbances"
+    return f"{status.disturbed} of {status.crashes} {'crash' if status.crashes == 1 else 'crashes'} with disturbances"
 
 
 def _line(status: HuntStatus) -> str:
@@ -323,10 +332,10 @@ def _strategies(search: SearchStatus) -> str:
     """Return the strategies of the search, with the mean criticality of their trials."""
     parts = []
     for one in search.strategies:
-        came = [] if one.danger is None else [f"danger {one.danger:.2f}"]
+        came = [] if one.danger is None else [f"mean danger {one.danger:.2f}"]
         came += [f"{one.crashes} {'crash' if one.crashes == 1 else 'crashes'}"] if one.crashes else []
-        parts.append(f"{one.name} {one.share:.0%}" + (f" ({', '.join(came)})" if came else ""))
-    return f"tried: {', '.join(parts)}"
+        parts.append(f"{one.name} {one.share:.0%} of trials" + (f" ({', '.join(came)})" if came else ""))
+    return f"search: {', '.join(parts)}"
 
 
 def _grown(search: SearchStatus) -> str:
@@ -334,13 +343,13 @@ def _grown(search: SearchStatus) -> str:
     if search.grown_trials is None or search.grown_s is None:
         return ""
     count = search.grown_trials
-    return f", {count} {'trial' if count == 1 else 'trials'} ago ({format_seconds(search.grown_s)})"
+    return f" ({count} {'trial' if count == 1 else 'trials'} / {format_seconds(search.grown_s)} ago)"
 
 
 def _near(result: TrialResult) -> str:
     closest = result.closest
     if math.isfinite(closest.time_to_collision_s):
-        how = f"{closest.time_to_collision_s:.2f} s from a collision"
+        how = f"least TTC {closest.time_to_collision_s:.2f} s"
     else:
         how = "never on a collision course"
     danger = "" if result.danger is None else f"danger {result.danger:.2f}"

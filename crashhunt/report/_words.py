@@ -129,22 +129,16 @@ def about_danger(course: DangerCourse, *, touched: bool = False) -> str:
         A sentence; empty if it would say nothing.
     """
     parts = []
-    for whose, moment, total, relation, absent in (
-        (f"{course.agent}'s own", course.greatest, course.own_total, "towards", _no_danger(course)),
-        (
-            "that by those behind it",
-            course.greatest_behind,
-            course.behind_total,
-            "by",
-            "no vehicle closed in from behind",
-        ),
+    for heading, moment, total, relation, absent in (
+        (f"Danger of {course.agent}", course.greatest, course.own_total, "towards", _no_danger(course)),
+        ("From behind", course.greatest_behind, course.behind_total, "by", "no vehicle closed in"),
     ):
-        if moment.danger <= 0:
-            parts += [] if touched else [absent]
-            continue
-        most = f"at most {moment.danger:.2f}, after step {moment.step}, {relation} {moment.other}"
-        parts.append(f"{whose} was {most} ({total:.2f} over the trial)")
-    return f"Danger: {'; '.join(parts)}." if parts else ""
+        if moment.danger > 0:
+            most = f"at most {moment.danger:.2f}, after step {moment.step}, {relation} {moment.other}"
+            parts.append(f"{heading}: {most} ({total:.2f} over the trial).")
+        elif not touched:
+            parts.append(f"{heading}: {absent}.")
+    return " ".join(parts)
 
 
 def _no_danger(course: DangerCourse) -> str:
@@ -224,7 +218,7 @@ def about_disturbances(recording: Recording, result: TrialResult, first_step: in
         for one in recent
     ]
     if earlier:
-        sentences.insert(0, f"{earlier} {'disturbance was' if earlier == 1 else 'disturbances were'} over before that.")
+        sentences.insert(0, f"{earlier} {'disturbance was' if earlier == 1 else 'disturbances were'} over earlier.")
     return sentences
 
 
@@ -382,7 +376,7 @@ def about_reference(reference: Reference, ago: Callable[[int], str], agent: str)
     sentences = [f"Cause: {_omitted(omission, agent, ago)}."]
     count = "the run ends" if len(runs) == 1 else f"all {len(runs)} runs end"
     changed = sorted({each for run in runs for each in run.changed} if omission.faculty == "longitudinal" else ())
-    more = f" In these runs {' and '.join(changed)}, too." if changed else ""
+    more = f" In addition, {' and '.join(changed)} in these runs." if changed else ""
     sentences.append(
         f"With a reference driver that {_FACULTIES[omission.faculty]} from {ago(omission.step)}, on, {count} without a "
         f"crash.{more}"
@@ -423,7 +417,7 @@ def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
 
 def about_changes(changed: Sequence[str]) -> str:
     """Return what else the agent does otherwise in a run, as a sentence with a leading space; empty for nothing."""
-    return f" In that run {' and '.join(changed)}, too." if changed else ""
+    return f" In addition, {' and '.join(changed)} in that run." if changed else ""
 
 
 def _until(attempt: Attempt, ago: Callable[[int], str]) -> str:
@@ -434,10 +428,10 @@ def _until(attempt: Attempt, ago: Callable[[int], str]) -> str:
     )
     more = about_changes(attempt.changed)
     if attempt.all_later_run and attempt.last_step < attempt.end - 1:
-        return f"{words}; that was run, and after each later step it was too late.{more}"
+        return f"{words}: a run from this step avoids it, and runs from all later steps crash.{more}"
     if attempt.too_late_step is not None:
-        return f"{words}; that was run, and one step later it was too late.{more}"
-    return f"{words}; that was run.{more}"
+        return f"{words}: a run from this step avoids it, and a run from one step later crashes.{more}"
+    return f"{words}: a run from this step avoids it.{more}"
 
 
 # The causes of a crash, in words. Every sentence reports runs, not calculations.
@@ -509,16 +503,16 @@ def _outcome(factor: Factor) -> str:
         words = f"{factor.crashed} of {of} runs crash ({100 * low:.0f} to {100 * high:.0f} %)"
         if factor.crashed == factor.same:
             return words
-        return f"{words}, {factor.same or 'none'} of them with the same one"
+        return f"{words}, {factor.same or 'none'} of them the same crash"
     counts = (("no crash", of - factor.crashed), ("another crash", factor.crashed - factor.same))
-    several = [*counts, ("the same", factor.same)]
+    several = [*counts, ("the same crash", factor.same)]
     parts = [f"{words} in {number} of {of} runs" if of > 1 else words for words, number in several if number]
     into = sorted({run.into for run in factor.runs if run.into})
     more = f", though {factor.name} then drives into {' or '.join(into)} itself" if into else ""
     changed = sorted({each for run in factor.runs for each in run.changed})
     of_changed = sum(bool(run.changed) for run in factor.runs)
     if changed:
-        more += f" (in {of_changed} of {of} runs {' or '.join(changed)}, too)"
+        more += f" (in {of_changed} of {of} runs in addition {' or '.join(changed)})"
     return f"{' and '.join(parts)}{more}"
 
 

@@ -1,4 +1,4 @@
-"""Scenarios: what a trial takes place in, read from ``scenario.toml`` or from a configuration of SUMO."""
+"""Scenarios: network, traffic, controlled vehicles and arguments, from ``scenario.toml`` or a SUMO configuration."""
 
 import lazy_loader
 

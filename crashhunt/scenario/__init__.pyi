@@ -1,4 +1,5 @@
 from ._load import (
+    copy_shipped_scenario as copy_shipped_scenario,
     endings as endings,
     load_scenario as load_scenario,
     scenario_from_dict as scenario_from_dict,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tomllib
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
 from crashhunt.base.codec import known_part
-from crashhunt.base.errors import ArgumentError, ScenarioError
+from crashhunt.base.errors import ArgumentError, HuntDirectoryError, ScenarioError
+from crashhunt.base.files import cannot_write
 from crashhunt.base.layout import PACKAGE, SCENARIO
 from crashhunt.base.plugins import registered
 from crashhunt.base.text import did_you_mean, listed, near_path, one_of
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 __all__ = [
     "check",
     "check_arguments",
+    "copy_shipped_scenario",
     "endings",
     "load_scenario",
     "refuse",
@@ -172,6 +175,37 @@ def shipped_scenarios() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in shipped_folder().glob(f"*/{SCENARIO}")))
 
 
+def copy_shipped_scenario(name: str, to: Path) -> None:
+    """Copy the files of a scenario that comes with crashhunt into a new folder.
+
+    Args:
+        name: Name of the scenario.
+        to: The folder to make; it may exist if it is empty.
+
+    Raises:
+        ScenarioError: There is no such scenario.
+        HuntDirectoryError: The folder is not empty or cannot be written.
+    """
+    if name not in shipped_scenarios():
+        fix = f"{did_you_mean(name, shipped_scenarios())} give one of {listed(shipped_scenarios())}"
+        raise ScenarioError(f"no scenario {name!r} comes with crashhunt", fix=fix.strip())
+    if to.exists() and (not to.is_dir() or any(to.iterdir())):
+        raise HuntDirectoryError("the folder is not empty", fix="give a new folder", where=str(to))
+    source = shipped_folder() / name
+    text = (source / SCENARIO).read_text(encoding="utf-8")
+    files = [file for file in source.iterdir() if file.is_file() and file.name != SCENARIO]
+    for shared in re.findall(r'"(\.\./[^"]+)"', text):  # a file of another scenario, such as weights
+        files.append(source / shared)
+        text = text.replace(f'"{shared}"', f'"{Path(shared).name}"')
+    try:
+        to.mkdir(parents=True, exist_ok=True)
+        for file in files:
+            (to / file.name).write_bytes(file.read_bytes())
+        (to / SCENARIO).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise cannot_write(to, error) from error
+
+
 _INTERNAL = ("folder", "file", "notes", "added")  # of a Scenario, and not of a file
 
 
@@ -180,7 +214,7 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
 
     Args:
         name: name of a shipped scenario, or the path of a folder, a ``scenario.toml`` or a simulator's configuration.
-        ego: for such a configuration, which vehicle is controlled, as its `Configuration` understands it.
+        ego: for a simulator's configuration, the controlled vehicle in the syntax of `--ego`.
         kept: whether the scenario is that of a snapshot. A snapshot has run before, so its scenario is not refused now.
 
     Raises:

@@ -148,7 +148,7 @@ class AgentSetup:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationSetup:
-    """``[observation]``: what an agent is shown; the layout is highway-env's Kinematics.
+    """``[observation]``: the observation of an agent, in the layout of highway-env's Kinematics.
 
     Args:
         vehicles: rows: the controlled vehicle and its nearest actors.
@@ -176,7 +176,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """What a trial takes place in.
+    """The setting of a trial: network, traffic, controlled vehicles and their arguments.
 
     Args:
         title: one line, for people.
@@ -184,17 +184,17 @@ class Scenario:
         step_length_s: the control step, in s; that of some simulators follows from their own configuration.
         warmup_s: simulation time before the controlled vehicles enter, in s.
         insertion_timeout_s: how much later they may enter before the episode is invalid, in s.
-        observation: what agents are shown; None for what the simulator shows of itself, or the default.
+        observation: layout of the observations; None for the simulator's own layout, or the default.
         arguments: the arguments that shape the traffic.
         agents: agent id to controlled vehicle.
         tables: the tables of plugin simulators by name; in the file, they are on the same level as
             these keys. Each is of the dataclass that the simulator's `Backend` says.
         events: limits of traffic events, such as ``not_moving`` in s, where they are not the default.
-        disturbances: how often others err, or an agent sees or acts late: name to a rate per second. Hunts heed it, and
-            nothing else.
+        disturbances: faults of other vehicles and of the agent's sensors: name to a rate per second. Only hunts use
+            them.
         schema: schema of the file format.
-        name: what people call it; the folder's name by default.
-        folder: where its files are; not part of the file.
+        name: name for users; by default the name of the folder.
+        folder: folder of its files; not part of the file.
         file: what was read, relative to the folder; not part of it, and not of what crosses to a worker.
         notes: decisions of crashhunt, as texts for the user; not part of the file.
         added: what a later version has written into the file, for a worker of that version; nothing here reads it.
@@ -220,7 +220,7 @@ class Scenario:
 
     @property
     def origin(self) -> str:
-        """Where errors about it point."""
+        """The place that errors about the scenario name."""
         return str(self.folder / self.file)
 
     @property
@@ -285,7 +285,7 @@ class Scenario:
         return {name: setup.argument(name, f"{self.origin}: arguments") for name, setup in self.arguments.items()}
 
     def agent_arguments(self, agent: str) -> dict[str, Argument]:
-        """What the scenario knows about the arguments of an agent."""
+        """Return the scenario's settings of the arguments of an agent."""
         where = f"{self.origin}: agents.{agent}.arguments"
         return {name: setup.argument(name, where) for name, setup in self.agents[agent].arguments.items()}
 
@@ -459,7 +459,7 @@ class Backend:
     Functions are called with the scenario, whose table is ``scenario.table(KIND)``; paths are relative to its folder.
 
     Args:
-        title: how people call it.
+        title: name for users.
         table: the dataclass of its table in ``scenario.toml``; its types must be there at run time, and may be numbers,
             text, lists, tuples and tables of those, and further dataclasses.
         example: the required keys of the table, for the message about a missing table.

@@ -126,7 +126,7 @@ def shrink(
         time_s: time limit, in s of wall-clock time; two runs that confirm the result are additional.
         form: ``traffic``: the other actors drive. ``scripted``: they follow recorded paths. ``either``: the form
             depends on the number of remaining actors.
-        parallel: how many at a time; 0 for one per core.
+        parallel: runs at a time; 0 for one per core.
         watch: called with how many have been run, and how many may be.
         stopped: Returns whether to stop; called repeatedly.
         trusted: whether its code may run; None to find out.

@@ -135,7 +135,7 @@ class ToySimulator:
         """Return the action with which a vehicle brakes as hard as it can."""
         if self._setups[agent].action == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
-        return FullBraking((0.0, 0), "all that it can do", _BRAKING)
+        return FullBraking((0.0, 0), "the maximum of the vehicle", _BRAKING)
 
     disturbing_kinds = ("brake", "stop", "unseen")
 

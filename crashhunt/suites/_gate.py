@@ -133,13 +133,13 @@ class Gate:
         head: the version with it.
         hunts: name to what a hunt of either version is; its ``trials`` do not count.
         folder: folder from which the user imports agents.
-        most: how many pairs of trials, of all hunts together.
+        most: maximum number of pairs of trials, of all hunts together.
         duration_s: the most wall time, in s; infinite for no limit.
         margin: the greatest difference in crashes per trial that counts as none; 0 for no such verdict.
         confidence: confidence of the verdict, in percent.
         corpus: corpus of HEAD, as a path from the folder; where it is None, ``crashes``, if HEAD is a commit that has
             it.
-        parallel: trials at a time, of both together; 0 for one per core.
+        parallel: trials at a time, of both versions together; 0 for one per core.
         is_suite: whether there may be several hunts; then only *worse* ends the gate before the last of them.
         trusted: whether hunts that are there already, and the corpus, may run in any case.
         machine: options such as ``executor`` that hold for all hunts.

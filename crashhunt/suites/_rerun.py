@@ -62,7 +62,7 @@ def rerun(
         to: run one hunt in this directory instead; its own directory does not change.
         parallel: trials at a time, of all hunts together; 0 for one per core.
         watch: called about once a second.
-        machine: options such as ``executor`` that hold for all of them, whatever each says.
+        machine: options such as ``executor`` that apply to all hunts, in place of their own.
         trusted: whether what the hunts name may run; otherwise each has to be trusted, before the first one runs.
 
     Raises:

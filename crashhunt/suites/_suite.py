@@ -74,10 +74,10 @@ class Suite:
 
     Args:
         entries: the hunts.
-        folder: folder from which scenarios that are paths are looked for, and agents imported.
+        folder: folder from which relative paths of scenarios start, and from which agents are imported.
 
     Raises:
-        UsageError: an id is missing, taken or no name for a folder.
+        UsageError: an id is missing, is used twice, or is not a valid folder name.
     """
 
     def __init__(self, entries: Sequence[SuiteEntry], *, folder: Path | None = None) -> None:
@@ -132,10 +132,10 @@ class Suite:
             raise UsageError(error.message, fix=error.fix, where=str(file)) from None
 
     def plan(self, directory: Path | str) -> list[Path]:
-        """Create a folder for every run, with its request. Done twice, nothing changes.
+        """Create a folder for every run, with its request. A second call changes nothing.
 
         Raises:
-            HuntDirectoryError: the directory has another suite in it, or cannot be written.
+            HuntDirectoryError: the directory contains another suite, or cannot be written.
         """
         place = Path(directory)
         if is_hunt(place):
@@ -176,13 +176,13 @@ class Suite:
             directory: directory of the suite; created if it does not exist. Finished hunts in it stay unchanged.
             parallel: trials at a time, of all hunts together; 0 for one per core.
             watch: called about once a second.
-            machine: options such as ``executor`` that hold for all of them, whatever each says.
+            machine: options such as ``executor`` that apply to all hunts, in place of their own.
             trusted: whether what hunts name that are there already may run; otherwise each has to be trusted, before
                 the first one runs.
 
         Raises:
             UntrustedError: an existing hunt was not made on this machine and is not trusted.
-            HuntDirectoryError: the directory has another suite in it, or cannot be written.
+            HuntDirectoryError: the directory contains another suite, or cannot be written.
             PluginError: there is no such executor.
         """
         check_machine(parallel, machine)
@@ -199,14 +199,14 @@ class Suite:
         return [hunt_state(folder) for folder in folders]
 
     def request(self, entry: SuiteEntry, number: int) -> RunRequest:
-        """Return what a run of an entry will be, with its own seed.
+        """Return the request of a run of an entry, with its own seed.
 
         Args:
             entry: entry of this suite.
             number: number of the run, from 0.
 
         Raises:
-            UsageError: who drives is not in a module that workers can import.
+            UsageError: the agent is not in a module that workers can import.
         """
         roots = tuple(str((self.folder / root).resolve()) for root in entry.snapshot_roots)
         snapshot = SnapshotChoices(**{name: getattr(entry, name) for name in fields_of(SnapshotChoices)})

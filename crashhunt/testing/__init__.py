@@ -1,4 +1,4 @@
-"""For tests: `assert_survives`, and contract suites, which say what every simulator, sampler and so on must do.
+"""For tests: `assert_survives`, and suites that check the contracts of agents, simulators, samplers and other plugins.
 
 Subclass a suite in a test module, give it its fixture, and let pytest collect it::
 

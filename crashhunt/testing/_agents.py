@@ -31,23 +31,23 @@ class AgentContract:
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return what makes an agent."""
+        """Return a function that makes an agent."""
         raise NotImplementedError("give the suite a fixture named make")
 
     @pytest.fixture
     def form(self) -> ActionForm:
-        """Return the form of its actions."""
+        """Return the form of the agent's actions."""
         raise NotImplementedError("give the suite a fixture named form")
 
     @pytest.fixture
     def observations(self) -> list[NDArray[np.generic]]:
-        """Return what the agent is shown."""
+        """Return the observations of the agent, in order."""
         raise NotImplementedError("give the suite a fixture named observations")
 
     def test_it_acts_inside_its_space_and_by_its_seed_alone(
         self, make: Make, form: ActionForm, observations: list[NDArray[np.generic]]
     ) -> None:
-        """After a reset it does the same again, as does another instance."""
+        """After a reset, and in another instance, the agent has the same actions again."""
 
         def drive(agent: Agent, seed: int) -> list[bytes]:
             agent.reset(seed)

@@ -59,7 +59,7 @@ class BackendContract:
         return found
 
     def test_it_belongs_to_a_registered_simulator(self, name: str, scenario: Path) -> None:
-        """And a scenario that names the simulator asks this descriptor."""
+        """A scenario that names the simulator uses this descriptor."""
         assert name in registered("simulators")
         loaded = load_scenario(scenario)
         assert loaded.simulator == name
@@ -113,7 +113,7 @@ class BackendContract:
             assert relocated is None or isinstance(relocated(loaded.folder / file), bytes | None)
 
     def test_the_digest_is_that_of_every_file(self, scenario: Path, tmp_path: Path) -> None:
-        """Another content is another scenario."""
+        """Other content gives another digest."""
         loaded = load_scenario(shutil.copytree(scenario, tmp_path / "copied" / scenario.name))
         before = scenario_digest(loaded)
         assert scenario_digest(load_scenario(scenario)) == before
@@ -155,7 +155,7 @@ class BackendContract:
                 assert with_action(loaded, agent, form).agents[agent].action == form
 
     def test_without_its_accelerator_it_is_the_same_scenario(self, name: str, scenario: Path) -> None:
-        """Switching it off twice is switching it off, and there is nothing to tell then."""
+        """Disabling the accelerator twice is the same as once, and gives no note."""
         accelerator, loaded = self._backend(name).accelerator, load_scenario(scenario)
         if accelerator is not None:
             plain = accelerator.switched_off(loaded)

@@ -29,7 +29,7 @@ class DisturbanceContract:
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return what makes a model."""
+        """Return a function that makes a disturbance model."""
         raise NotImplementedError("give the suite a fixture named make")
 
     def test_what_is_drawn_is_a_disturbance(self, make: Make) -> None:
@@ -43,7 +43,7 @@ class DisturbanceContract:
             assert 0 < drawn.how_long < math.inf
 
     def test_the_generator_alone_decides(self, make: Make) -> None:
-        """It draws from no other one, and keeps nothing."""
+        """The model uses no other generator, and has no memory."""
         model = make()
         found = []
         for seed in (1, 2):
@@ -53,7 +53,7 @@ class DisturbanceContract:
         assert found[0] == found[1] == _draws(make(), seed=3)
 
     def test_the_likelihood_is_that_of_the_draws(self, make: Make) -> None:
-        """A probability for everything that is drawn, as often as it says, and no more than 1 in all."""
+        """Each draw has a probability, draws occur as often as it states, and all probabilities add up to at most 1."""
         model = make()
         counts = Counter(_draws(model, seed=5))
         total = 0.0

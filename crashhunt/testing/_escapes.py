@@ -29,11 +29,11 @@ class EscapeCheck:
     """The result of checking the last avoidable step of a crash.
 
     Args:
-        crash: its id.
-        step: the last step after which braking helps, as the crash says it.
-        too_late: a step after which braking does not help, found in the same way.
-        avoided: whether braking after ``step`` avoided the collision; None if nothing is said.
-        avoided_later: whether braking after ``too_late`` did.
+        crash: id of the crash.
+        step: the last avoidable step according to the crash.
+        too_late: a step after which braking does not help, according to the crash.
+        avoided: whether braking after ``step`` avoided the collision; None if the crash has no such step.
+        avoided_later: whether braking after ``too_late`` avoided the collision.
     """
 
     crash: str
@@ -44,7 +44,7 @@ class EscapeCheck:
 
     @property
     def verdict(self) -> Literal["right", "silent", "wrong"]:
-        """What to think of it."""
+        """The verdict of the check."""
         if self.step is None and self.too_late is None:
             return "silent"
         return "wrong" if self.avoided is False or self.avoided_later else "right"
@@ -55,7 +55,7 @@ class RecordedThenBrakes:
 
     Args:
         log: the path of a ``log.mcap``.
-        agent: whose actions.
+        agent: id of the agent whose actions are replayed.
         after: the step; an agent that is not overruled repeats its last action when the log is exhausted.
         action_space: action space of the vehicle.
     """
@@ -78,9 +78,9 @@ class RecordedThenBrakes:
 
 
 def check_escape(bundle: Bundle) -> EscapeCheck:
-    """Try what a crash says about braking, each step in a fresh process.
+    """Check the last avoidable step of a crash by runs, each in a new process.
 
-    This is another way than the one by which a hunt finds it out: no code of the agents is run.
+    The check is independent of the hunt's own search: it runs no code of the agents.
     """
     said = bundle.result.escape
     if said is None:

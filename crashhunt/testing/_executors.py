@@ -37,7 +37,7 @@ class ExecutorContract:
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return what makes an executor."""
+        """Return a function that makes an executor."""
         raise NotImplementedError("give the suite a fixture named make")
 
     @pytest.fixture
@@ -92,7 +92,7 @@ class ExecutorContract:
             self._see_nodes(executor, executor, len(specs))
 
     def test_a_failure_costs_its_own_trial_only(self, executor: Executor) -> None:
-        """Good trials between an exception, an exit, a segmentation fault and a hang are what they would be alone."""
+        """Trials between an exception, an exit, a segmentation fault and a hang have the same results as alone."""
         # The hang comes first: the other worker does the rest while it is waited for.
         failures = {1: "hang_at_step", 3: "fail_at_step", 5: "exit_at_step", 7: "segfault_at_step"}
         for number in range(9):
@@ -133,7 +133,7 @@ class ExecutorContract:
         assert dict(executor.where()) == {}
 
     def test_what_is_reported_is_reported_once(self, executor: Executor) -> None:
-        """Notes are lines for people."""
+        """Notes are lines for the user."""
         executor.submit(self._spec(0))
         self._collect(executor, 1)
         notes = executor.notes()

@@ -29,7 +29,7 @@ class OracleContract:
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return what makes an oracle."""
+        """Return a function that makes an oracle."""
         raise NotImplementedError("give the suite a fixture named make")
 
     def test_it_has_a_name_and_states_which_outcomes_it_brings(self, make: Make) -> None:
@@ -57,7 +57,7 @@ class OracleContract:
         assert list(_watch(make(), seed=1)) == list(_watch(make(), seed=2))
 
     def test_it_leaves_scenes_as_they_are(self, make: Make) -> None:
-        """They are recorded, and shown to others."""
+        """Scenes are recorded, and other oracles receive them."""
         oracle = make()
         _show_map(oracle)
         for scene in drive():
@@ -76,7 +76,7 @@ class OracleContract:
 
 
 def drive() -> Iterator[Scene]:
-    """Yield the scenes of an episode in which much goes wrong, each with the one before.
+    """Yield the scenes of an episode with many traffic events, each with its previous scene.
 
     ``ego`` drives into ``other``, passes ``near`` closely, runs a red light and leaves the road; ``second`` stands.
     """

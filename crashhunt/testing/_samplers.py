@@ -33,7 +33,7 @@ class SamplerContract:
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return what makes a sampler."""
+        """Return a function that makes a sampler."""
         raise NotImplementedError("give the suite a fixture named make")
 
     @pytest.fixture

@@ -54,7 +54,7 @@ class SimulatorContract:
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return what makes a simulator."""
+        """Return a function that makes a simulator."""
         raise NotImplementedError("give the suite a fixture named make")
 
     def _drive(self, simulator: Simulator, seed: int, reseeded: tuple[int, int] | None = None) -> list[_Shown]:
@@ -109,7 +109,7 @@ class SimulatorContract:
         return found
 
     def test_an_episode_depends_on_its_seed_alone(self, make: Make) -> None:
-        """Equal seeds give equal episodes, whatever ran before, and another seed another one."""
+        """Equal seeds give equal episodes after any other episodes, and another seed gives another episode."""
         simulator = make()
         first = self._drive(simulator, 1)
         other = self._drive(simulator, 2)
@@ -179,7 +179,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_it_offers_faculties_as_a_whole(self, make: Make) -> None:
-        """Who has one part of a faculty has all of it: half a window would be taken for none."""
+        """A simulator with one method of an optional protocol has all of them; else the protocol is ignored."""
         simulator = make()
         simulator.reset(seed=1)
         for faculty in FACULTIES:
@@ -335,7 +335,7 @@ class SimulatorContract:
         fresh.close()
 
     def test_closing_twice_is_fine(self, make: Make) -> None:
-        """Closing lets go of everything, once."""
+        """Closing releases all resources, and a second call does nothing."""
         simulator = make()
         simulator.reset(seed=1)
         simulator.close()

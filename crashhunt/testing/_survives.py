@@ -30,13 +30,13 @@ __all__ = ["Example", "assert_survives"]
 
 
 class Example(TypedDict, total=False):
-    """One trial, as a failure of `assert_survives` prints it.
+    """One trial, in the form in which a failure of `assert_survives` prints it.
 
     Args:
         seed: seed of the trial.
         arguments: arguments of the agents, by their ids.
         scenario_arguments: arguments of the scenario.
-        only: which of the others take part; all where it is missing.
+        only: ids of the other actors that take part; all if the key is missing.
         disturbances: as in `crash.json`; none where it is missing.
     """
 
@@ -61,28 +61,28 @@ def assert_survives(
     parallel: int = 0,
     directory: Path | str | None = None,
 ) -> None:
-    """Fail where an agent crashes in one of some trials, with the smallest such crash that was found.
+    """Fail if the agent crashes in one of the trials, and print the minimized crash.
 
-    The same seed makes the same trials. What is printed can be pasted: with ``example`` that one trial is run, and no
-    other.
+    The same seed runs the same trials. The printed call can be pasted into a test: with ``example``, it runs this
+    single trial.
 
     Args:
-        agent: a class or function of a module, or ``module:attribute``.
-        scenario: a shipped name, or a path.
-        trials: how many.
-        max_steps: the bound on each, in steps.
-        seed: seed of all of them.
-        arguments: arguments of the agent, as `crashhunt.run` takes them: values or what to try.
-        scenario_arguments: the same of the scenario.
-        example: the one trial to run; what it says of arguments goes before ``arguments``.
-        budget: how many further trials may be run to make a crash smaller; 0 for none.
+        agent: class or function of a module, or ``module:attribute``.
+        scenario: name of an included scenario, or a path.
+        trials: number of trials.
+        max_steps: maximum number of steps of a trial.
+        seed: seed of the hunt.
+        arguments: arguments of the agent: values or specifications, as in `crashhunt.run`.
+        scenario_arguments: arguments of the scenario: values or specifications.
+        example: the single trial to run. Its arguments replace those in ``arguments``.
+        budget: maximum number of trials to minimize a crash; 0 to skip the minimization.
         parallel: trials at a time; 0 for one per core.
-        directory: where to keep the hunt, such as pytest's ``tmp_path``; without, it is removed.
+        directory: directory that keeps the hunt, such as pytest's ``tmp_path``; None to remove the hunt.
 
     Raises:
-        AssertionError: it crashes.
-        UsageError: the example has something that no example has.
-        CrashhuntError: nothing could be run.
+        AssertionError: the agent crashes.
+        UsageError: the example has an unknown key.
+        CrashhuntError: no trial could be run.
     """
     __tracebackhide__ = True  # of pytest
     options = HuntOptions(

@@ -69,7 +69,7 @@ class Escape(Serializable):
         braking: The greatest deceleration of these runs, in m/s²; None if the vehicle never slowed down.
         how: A description of the braking, as in `FullBraking`.
         why_not: Why there is no such step, and no step after which braking does not help; empty if there is one.
-        changed: What else the agent does otherwise in the run that avoids it, such as ``ego does not change lanes``.
+        changed: Further differences of the run that avoids the collision, such as ``ego does not change lanes``.
     """
 
     step: int | None = None
@@ -90,7 +90,7 @@ class Failure(Serializable):
         traceback: The traceback of the exception, or the stack of the stuck thread.
         agent: The agent whose code failed; empty if it was no agent's code.
         party: Whose code failed: ``agent``, ``environment``, ``simulator`` or ``oracle``; empty if it is not known.
-        place: What that code was called for, such as ``act``, ``step`` or ``space conversion``; empty if not known.
+        place: Task of that code, such as ``act``, ``step`` or ``space conversion``; empty if unknown.
         exit_code: The exit code of a process that died; negative for a signal, as in `subprocess`.
         last_output: The last output of the process.
     """

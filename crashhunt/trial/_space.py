@@ -95,14 +95,14 @@ class Choice:
         return self.options
 
     def quantile(self, share: float) -> Value:
-        """Return the option below which such a share of them lies, from 0 to 1."""
+        """Return the option below which this share of the options lies, from 0 to 1."""
         return self.options[min(int(share * len(self.options)), len(self.options) - 1)]
 
     def share_of(self, value: Value) -> float:
         """Return the middle of the shares whose quantile is this option.
 
         Raises:
-            ValueError: it is none of them.
+            ValueError: the value is not an option.
         """
         return (self.options.index(value) + 0.5) / len(self.options)
 
@@ -121,7 +121,7 @@ class Range:
     Args:
         low: the lower end.
         high: the upper end.
-        step: only ``low``, ``low + step``, … where given.
+        step: distance of the values ``low``, ``low + step``, …; None for a continuous range.
         log: uniform in the logarithm; needs ``low > 0``.
         integer: whole numbers only.
     """
@@ -155,7 +155,7 @@ class Range:
 
     @property
     def steps(self) -> int:
-        """How many values a stepped or whole-number range has."""
+        """The number of values of a range with a step or with whole numbers."""
         return math.floor(self._steps) + 1
 
     @property
@@ -186,7 +186,7 @@ class Range:
         return round(value) if self.integer else value
 
     def quantile(self, share: float) -> Value:
-        """Return the value below which such a share of all draws lies, from 0 to 1."""
+        """Return the value below which this share of all draws lies, from 0 to 1."""
         if self.log:
             low, high = self._logarithms
             return self._exp(low + (high - low) * share)
@@ -198,7 +198,7 @@ class Range:
         """Return a share whose quantile is this value: 0 to 1, in the middle of those of a stepped range.
 
         Raises:
-            ValueError: it is no number.
+            ValueError: the value is not a number.
         """
         value = float(value)
         if self.low == self.high:
@@ -237,11 +237,11 @@ Distribution = Constant | Choice | Range
 
 @dataclass(frozen=True, slots=True)
 class Argument:
-    """An argument that an agent or a scenario takes, and what is known about it.
+    """An argument of an agent or a scenario, with its type, default, distribution and unit.
 
     Args:
-        name: its name, as in ``--arg NAME=SPEC``.
-        kind: the type of its values, where it is known.
+        name: name, as in ``--arg NAME=SPEC``.
+        kind: type of the values; None if it is unknown.
         default: The default value; None if there is none.
         distribution: The distribution from which a hunt draws by default; None if the argument keeps its default.
         unit: The unit, such as ``m/s``.
@@ -279,11 +279,11 @@ def parse_spec(text: str, kind: Kind | None = None, *, where: str = "") -> Distr
 
     Args:
         text: the specification.
-        kind: the type of the argument; guessed from the text where it is None.
-        where: what an error should point to, such as ``--arg speed``.
+        kind: the type of the argument; None to derive it from the text.
+        where: option or key that an error names, such as ``--arg speed``.
 
     Raises:
-        ArgumentError: the text says nothing that can be sampled.
+        ArgumentError: the text is not a specification.
     """
     try:
         return _parse(text, kind)
@@ -387,12 +387,13 @@ _KINDS: dict[object, Kind] = {float: "float", int: "int", bool: "bool", str: "st
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """What a factory takes.
+    """The arguments that a factory accepts.
 
     Args:
         arguments: arguments by name, in order.
-        open: whether it takes any other keyword as well (``**kwargs``).
-        given: which of ``observation_space``, ``action_space`` and ``step_length_s`` it asks for.
+        open: whether the factory accepts any other keyword (``**kwargs``).
+        given: those of ``observation_space``, ``action_space`` and ``step_length_s`` that the factory has as
+            parameters.
         required: names of the arguments that have no default of any type.
     """
 
@@ -431,10 +432,10 @@ class Signature:
         return {"arguments": arguments, "open": self.open, "given": self.given, "required": self.required}
 
     def check(self, names: Iterable[str], *, where: str) -> None:
-        """Refuse arguments that it does not take.
+        """Refuse arguments that the factory does not accept.
 
         Raises:
-            ArgumentError: with the accepted ones.
+            ArgumentError: an argument is not accepted; the fix names those that are.
         """
         for name in names:
             if name not in self.arguments and not self.open:
@@ -443,7 +444,7 @@ class Signature:
 
 
 def signature_of(factory: Callable[..., object]) -> Signature:
-    """Read the arguments of a factory off its signature.
+    """Return the arguments of a factory, read from its signature.
 
     A parameter may be annotated ``Annotated[float, Argument(...)]`` to say what a hunt should try. Parameters named
     ``observation_space`` and ``action_space`` are not arguments: they receive the spaces of the vehicle. Nor is

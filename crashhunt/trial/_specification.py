@@ -104,11 +104,11 @@ class TrialSpec(Serializable):
     """Everything that determines one trial.
 
     Args:
-        number: its place in the hunt, from 0.
+        number: number of the trial in the hunt, from 0.
         seed: seed for the simulator, the agents and the global generators; 0 to 2**31 - 1.
-        arguments: agent id to argument name to value.
-        scenario_arguments: name to value.
-        max_steps: the bound on its length, in steps.
+        arguments: agent id to a mapping from argument name to value.
+        scenario_arguments: argument name to value.
+        max_steps: maximum number of steps of the trial.
         overruled: The override of an agent's actions; None if all agents act to the end.
         parent: The trial from which the sampler derived this trial, or None. It does not affect the trial.
         origin: The sampler's label, such as the name of a strategy. It does not affect the trial.
@@ -148,7 +148,7 @@ class TrialSpec(Serializable):
         """Return the specification from the data of `to_json` of any version; unknown keys are ignored.
 
         Raises:
-            CrashhuntError: it needs what this version does not know.
+            CrashhuntError: the trial needs a feature that this version does not have.
         """
         unknown = not_understood(data.get("requires") or (), cls, Overruled, Handover, Reseeding)
         if unknown:

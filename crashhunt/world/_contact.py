@@ -66,7 +66,7 @@ class Touch:
         share: share of the step, from 0 to 1; 1 is the present scene.
         drives_into: whether the first actor drives into the second; otherwise the second drives into the first.
         x: of the first actor's front bumper, in m.
-        y: likewise.
+        y: y of the front bumper of the controlled vehicle, in m.
         speed: speed of the first actor, in m/s.
         other_speed: speed of the second actor, in m/s.
         face: the side of the first actor that is touched.
@@ -472,7 +472,7 @@ def _drives_into(first: _Party, second: _Party, x: float, y: float, *, jumps: bo
         first: one actor.
         second: another.
         x: of the unit vector from the first to the second.
-        y: likewise.
+        y: y of the front bumper of the controlled vehicle, in m.
         jumps: whether an instantaneous lane change makes the contact.
     """
     if jumps:  # the actor that moves into the other's lane

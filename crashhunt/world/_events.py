@@ -37,12 +37,12 @@ class Event(Serializable):
     Args:
         kind: one of `EVENT_WORDS`.
         agent: the controlled vehicle that did it, or to which it was nearest.
-        what: in words, a clause such as ``ego ran the red light 'c'``.
+        what: description, a clause such as ``ego ran the red light 'c'``.
         others: the other vehicles that took part.
-        lane: where the controlled vehicle was.
-        x: of its front bumper, in m.
-        y: likewise.
-        speed: its own, in m/s.
+        lane: lane of the controlled vehicle.
+        x: x of the front bumper of the controlled vehicle, in m.
+        y: y of the front bumper of the controlled vehicle, in m.
+        speed: speed of the controlled vehicle, in m/s.
     """
 
     kind: str
@@ -114,7 +114,7 @@ class RightOfWay:
         Args:
             lanes: lanes on which it was, in this order; the same lane may come again.
             x: where it is, in m.
-            y: likewise.
+            y: y of the front bumper of the controlled vehicle, in m.
         """
         for back in range(len(lanes) - 1, -1, -1):
             lane, later = lanes[back], lanes[back + 1 :]

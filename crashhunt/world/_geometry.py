@@ -40,7 +40,7 @@ def outlines_overlap(one: Rectangle, two: Rectangle, *, margin: float = 0.0) -> 
     Args:
         one: an outline.
         two: another.
-        margin: answer True for all that are nearer than this as well, and some that are a little further apart, in m.
+        margin: distance in m below which two outlines count as overlapping; some pairs slightly beyond it count, too.
     """
     x1, y1, h1, l1, w1 = one
     x2, y2, h2, l2, w2 = two

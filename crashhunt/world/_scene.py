@@ -65,8 +65,8 @@ class Contact:
     Args:
         collider: the actor that drove into the other.
         victim: the actor that was hit.
-        kind: the simulator's word for it.
-        lane: where.
+        kind: the simulator's name of the type.
+        lane: lane of the collision.
         collider_speed: speed of the collider, in m/s.
         victim_speed: speed of the other actor, in m/s.
     """
@@ -131,12 +131,12 @@ class Roster:
 
     @cached_property
     def reaches(self) -> list[float]:
-        """How far the far corner of each outline is from the centre of its front bumper, in m."""
+        """The distance from the centre of each front bumper to the farthest corner of the outline, in m."""
         return [math.hypot(actor.length, actor.width / 2) for actor in self.actors]
 
     @cached_property
     def touch_distance(self) -> float:
-        """No two outlines touch whose front bumpers are further apart than this, in m."""
+        """The distance of front bumpers beyond which no two outlines touch, in m."""
         return 2 * max(self.reaches, default=0.0)
 
     def __len__(self) -> int:
@@ -155,7 +155,7 @@ class Frame(NamedTuple):
         columns: float64, shape (scenes, 4 n): x and y alternating, then all headings, then all speeds.
         heights: float64, shape (scenes, 2 n): all heights, then all grades; None if the map is flat.
         spines: spines of each scene; None if no long vehicle is in a bend.
-        core: what computes with it faster, where there is such a thing; the results are the same.
+        core: compiled core that computes with the scene, if there is one; results are bit-identical.
     """
 
     roster: Roster
@@ -228,18 +228,18 @@ class Scene:
         speeds: speeds in m/s.
         contacts: the collisions that the simulator reports for this step.
         off_road: the controlled vehicles that left the road in this step.
-        lanes: the lane of each actor, or empty if this step did not look.
+        lanes: the lane of each actor; empty if the step did not read them.
         heights: z of each front bumper, in m; empty if the map is flat.
-        grades: how far the road rises a metre where each of them is, ahead of it; empty if the map is flat.
-        spines: row to centre line, of the long vehicles that are bent.
+        grades: slope of the road at each actor, in m per m, positive if it rises ahead; empty if the map is flat.
+        spines: row to centre line, for long vehicles in a bend.
         swept: whether all actors have driven here from the previous scene along the way that the headings describe.
             Contacts between the two scenes can then be found. A lane change of SUMO, a jump sideways, is at the end.
-        core: what computes with it faster, where there is such a thing; the results are the same.
+        core: compiled core that computes with the scene, if there is one; results are bit-identical.
         columns: points, headings and speeds as arrays of the core; they replace the three arguments.
 
     Attributes:
-        events: what else happened in this step.
-        agent_lanes: the lane of each controlled vehicle, where the simulator says; not recorded.
+        events: traffic events of this step.
+        agent_lanes: the lane of each controlled vehicle, if the simulator reports it; not recorded.
         previous: the scene one step before; None at the start. It has no previous one itself, so that nothing piles up.
     """
 
@@ -328,7 +328,7 @@ class Scene:
         return self.speeds[row] if self.columns is None else self.columns.speed(row)
 
     def follow(self, previous: Scene | None) -> None:
-        """Say which scene was one step before."""
+        """Set the scene one step before."""
         if previous is self:
             return  # a simulator that hands out the same object again
         if previous is not None:

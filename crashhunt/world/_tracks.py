@@ -65,7 +65,7 @@ class Track(NamedTuple):
     Args:
         time: time in s since the first scene.
         x: of the centre of its outline, in m.
-        y: likewise.
+        y: y of the front bumper of the controlled vehicle, in m.
         heading: heading in rad, without jumps by whole turns.
         z: of its front, in m.
         half_length: half length in m.
@@ -362,7 +362,7 @@ class State(NamedTuple):
 
     Args:
         x: of the centre of the front bumper, in m.
-        y: likewise.
+        y: y of the front bumper of the controlled vehicle, in m.
         heading: heading in rad, counter-clockwise from the x axis.
         speed: speed in m/s.
         z: of the front bumper, in m; 0 if the map is flat.

@@ -9,6 +9,7 @@ import sys
 import time
 import tomllib
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -103,6 +104,17 @@ def test_what_is_there_already_gets_another_expectation_only(kept):
     assert (again.case.expect, again.case.note) == ("fixed", "too fast")
     assert read_case(again.case.path) == again.case
     assert sorted(corpus.iterdir()) == before
+
+
+@pytest.mark.parametrize(("corpus", "expected"), [("weights", "w/model.zip"), ("../outside", "{here}/w/model.zip")])
+def test_case_inside_repository_names_its_files_by_relative_paths(kept, corpus, expected):
+    bundle = find_bundle(kept.folder / "h", "0")
+    arguments = {"ego": {**bundle.result.spec.arguments["ego"], "path": str(kept.folder / "w" / "model.zip")}}
+    spec = replace(bundle.result.spec, arguments=arguments)
+    case = add_case(replace(bundle, result=replace(bundle.result, spec=spec)), kept.folder / corpus).case
+    (found,) = case.bundle().result.spec.arguments.values()
+    assert found["path"] == expected.format(here=kept.folder)
+    assert found["speed"] == bundle.result.spec.arguments["ego"]["speed"]
 
 
 def test_todays_code_is_judged(kept):

@@ -33,7 +33,7 @@ def test_crashes_with_disturbances_from_the_hunt_to_the_report(toy):
     assert f"Likeliest crash with disturbances: {likeliest['id']} (log-likelihood " in done.err
     state = toy.crashhunt("status", "h", "--json").json["hunts"][0]
     assert (state["crashes"], state["disturbed"]) == (len(crashes), len(disturbed))
-    assert f"{len(crashes)} ({len(disturbed)} disturbed, " in toy.crashhunt("status", "h").out
+    assert f"{len(crashes)} crashes: {len(disturbed)} disturbed, " in toy.crashhunt("status", "h").out
     assert toy.crashhunt("check", "h").code == 0
     compared = toy.crashhunt("compare", "h", "h", "--json").json["hunts"][0]
     assert (compared["crashes"], compared["disturbed"]) == (len(crashes), len(disturbed))

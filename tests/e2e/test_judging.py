@@ -31,7 +31,7 @@ def test_what_is_found_is_kept_and_reported(toy):
     assert judged["runs"] <= 9
     assert brake["manoeuvre"] == "brake"
     assert brake["deceleration"] == pytest.approx(8.0)
-    assert "by braking (at up to 8.0 m/s²); that was run" in found.err
+    assert "by braking (at up to 8.0 m/s²): a run from this step avoids it" in found.err
     why = {(factor["kind"], factor["name"], factor["what"]): factor for factor in judged["why"]["factors"]}
     assert (judged["why"]["runs"], judged["why"]["why_not"]) == (12, "")
     sped_up = why["agent", "ego", "sped up"]
@@ -46,7 +46,7 @@ def test_what_is_found_is_kept_and_reported(toy):
     assert {name: value for name, value in after.items() if name not in ("judged", "integrity")} == {
         name: value for name, value in before.items() if name != "integrity"
     }
-    assert "by braking (at up to 8.0 m/s²); that was run" in toy.crashhunt("show", "h").out
+    assert "by braking (at up to 8.0 m/s²): a run from this step avoids it" in toy.crashhunt("show", "h").out
     assert "At fault: ego, by the rule 'rear end': ego drove into the back of leader" in toy.crashhunt("show", "h").out
     assert toy.crashhunt("show", "h", "--json").json["judged"] == {
         name: value for name, value in judged.items() if name != "crash"

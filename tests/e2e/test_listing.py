@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.scenario import shipped_scenarios
+from crashhunt.scenario import copy_shipped_scenario, load_scenario, shipped_folder, shipped_scenarios
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,6 +32,23 @@ def test_every_listed_scenario_states_what_it_is(shell):
     for entry in scenarios:
         assert entry["title"]
         assert entry["arguments"]
+
+
+@pytest.mark.parametrize("name", shipped_scenarios())
+def test_copied_scenario_needs_no_file_of_the_package(name, tmp_path):
+    copy_shipped_scenario(name, tmp_path / "mine")
+    mine = load_scenario(str(tmp_path / "mine"))
+    assert mine.title == load_scenario(name).title
+    named = [value for setup in mine.agents.values() for value in setup.arguments.values()]
+    assert str(shipped_folder()) not in str([mine, named])
+
+
+def test_copy_of_a_scenario_is_refused_with_the_fix(shell):
+    assert "mine has the files of loop" in shell.crashhunt("scenarios", "--copy", "loop", "mine").out
+    assert shell.crashhunt("scenarios", "--copy", "loop", "more", "--json").json["scenarios"][0]["name"] == "loop"
+    assert "not empty; give a new folder" in shell.crashhunt("scenarios", "--copy", "loop", "mine", expect=2).err
+    assert "did you mean 'loop'?" in shell.crashhunt("scenarios", "--copy", "lop", "new", expect=2).err
+    assert not (shell.folder / "new").exists()
 
 
 def test_listed_agents_can_be_hunted_by_name(shell):

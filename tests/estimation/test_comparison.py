@@ -169,7 +169,7 @@ def test_of_a_hunt_that_guided_its_trials_only_those_count_that_it_did_not(tmp_p
     assert (second.trials, second.counted) == (40, "")
     (pair,) = found.pairs  # the same trials, as the same number and seed is the same draw
     assert (pair.trials, pair.only_first, pair.only_second, pair.both) == (8, 1, 0, 3)
-    assert "guided: counted are the trials of origin random" in describe_comparison(found)
+    assert "guided: only trials of origin random count" in describe_comparison(found)
 
 
 def test_a_hunt_that_stopped_at_a_guided_crash_has_no_crash_rate_either(tmp_path):

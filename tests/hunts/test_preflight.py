@@ -43,6 +43,12 @@ def test_files_are_named_as_they_were_given():
         preflight.filter_setup_failures(result(0, "'/s/files/0-w.onnx' has nine outputs"))
 
 
+def test_policy_trained_in_another_environment_names_the_scenario_as_the_fix():
+    message = "'m.zip' was trained on observations of shape (5, 5), but those of this scenario have shape (8, 7)"
+    with pytest.raises(ArgumentError, match="choose a --scenario with the environment in which it was trained"):
+        Preflight(settings_of(speed="15"), 1).filter_setup_failures(result(0, message))
+
+
 @pytest.mark.parametrize(
     "other",
     [result(9, outcome=Outcome.SURVIVED), result(9, "another reason"), result(9, agent=""), result(9, kind="KeyError")],

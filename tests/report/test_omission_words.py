@@ -67,5 +67,5 @@ def test_the_first_sentence_is_the_cause(more, cause):
 def test_only_clear_runs_count_and_other_changes_are_reported():
     (_, runs) = said(endings=("none", "unclear", "none"), changed=("ego does not change lanes",))
     assert "on, all 2 runs end without a crash." in runs
-    assert runs.endswith("In these runs ego does not change lanes, too.")
+    assert runs.endswith("In addition, ego does not change lanes in these runs.")
     assert about_reference(Reference(), str, "ego") == []

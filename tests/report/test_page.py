@@ -62,7 +62,7 @@ def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
     assert text(browser, "tiles").split("\n")[:4] == ["3 of 3", "trials", str(len(bundles)), "crashes"]
     assert "collision" in text(browser, "outcomes")
     rate = hunt_state(hunt.folder / "<b>bold&").rate
-    assert text(browser, "crash-rate") == describe_running(rate).removeprefix("rate: ")
+    assert text(browser, "crash-rate") == describe_running(rate).removeprefix("crash rate: ")
     assert browser.find_element(By.CSS_SELECTOR, "#crash-rate-scale .certain").size["width"] > 2
     listed = browser.find_elements(By.CSS_SELECTOR, "#list button")
     assert sorted(button.text.split("\n")[0] for button in listed) == [bundle.id for bundle in bundles]

@@ -46,7 +46,7 @@ def test_every_worker_is_on_the_screen(width, height, workers):
     lines = screen(width, height, workers)
     assert len(lines) < height
     assert max(map(len, lines)) <= width
-    assert "hunting   1:05" in lines[0]
+    assert "running   1:05" in lines[0]
     assert "123/1000" in lines[1]
     for number in range(120, 120 + workers):
         shown = "setting up" if number == 120 else f"step {number - 20}"
@@ -60,8 +60,10 @@ def test_what_the_search_tries_and_when_danger_last_grew_is_shown_where_there_is
         console = Console(width=120, height=height, force_terminal=True, color_system=None)
         with console.capture() as seen:
             console.print(Watcher(console, TITLE)._screen(found))
-        assert ("tried: mutation 60% (danger 0.31, 1 crash), random 40%" in seen.get()) is shown
-        assert "nearest miss, 1 trial ago (1:05): trial 123" in seen.get()
+        assert (
+            "search: mutation 60% of trials (mean danger 0.31, 1 crash), random 40% of trials" in seen.get()
+        ) is shown
+        assert "nearest miss (1 trial / 1:05 ago): trial 123" in seen.get()
 
 
 def test_the_least_stress_margin_is_shown_where_there_is_room():
@@ -106,15 +108,28 @@ def test_kinds_of_crashes_and_when_the_last_new_one_came():
         lines = [line.rstrip() for line in shown.get().splitlines()]
         assert len(lines) < 12
         assert any(line.startswith("2 crash types (last new type: 1 trial") for line in lines)
-    assert any("(last new type: 1 trial / 3:12 ago): 2 rear end, the" in line for line in lines)
+    assert any("(last new type: 1 trial / 3:12 ago): rear end, the" in line for line in lines)
     assert describe_kinds(replace(found, newest_kind_trials=None)).endswith("(last new type: 3:12 ago)")
     by_cause = replace(found, newest_kind_s=None, types_by_cause=5)  # --by-cause 8
     assert describe_kinds(by_cause) == "2 crash types, 5 by cause"
 
 
+def test_long_lines_fold_on_a_screen_of_80_columns():
+    kind = SimpleNamespace(signature="rear end, the agent into the other, while the agent changes lanes", count=2)
+    rate = PLAIN | {"crashes": 1, "origin": "random", "certain": {"low": 1e-4, "high": 0.02}}
+    found = replace(status(2), rate=rate, kinds=(kind,), newest_kind_s=192.0, newest_kind_trials=1)
+    console = Console(width=80, height=40, force_terminal=True, color_system=None)
+    with console.capture() as shown:
+        console.print(Watcher(console, TITLE)._screen(found))
+    text = " ".join(shown.get().split())
+    assert describe_running(rate) in text
+    assert "while the agent changes lanes (2)" in text
+    assert "…" not in text.partition("crash rate")[2]
+
+
 @pytest.mark.parametrize(
     ("crashes", "disturbed", "said"),
-    [(2, 1, "of 2 crashes, 1 with disturbances"), (1, 0, "of 1 crash, 0 with disturbances"), (0, 0, ""), (2, None, "")],
+    [(2, 1, "1 of 2 crashes with disturbances"), (1, 0, "0 of 1 crash with disturbances"), (0, 0, ""), (2, None, "")],
 )
 def test_how_many_crashes_had_disturbances(crashes, disturbed, said):
     found = replace(status(2), crashes=crashes, disturbed=disturbed)
@@ -131,7 +146,7 @@ def test_where_not_all_fit_it_states_how_many_more():
     lines = screen(40, 12, 64)
     assert len(lines) < 12
     assert "and 53 more" in lines[-1]
-    assert lines[4].startswith("nearest miss: trial 123, 0.42 s")
+    assert lines[4].startswith("nearest miss: trial 123, least TTC 0.42")
 
 
 def test_nodes_are_on_the_screen_and_in_the_line():
@@ -223,28 +238,34 @@ RARE = PLAIN | {
 @pytest.mark.parametrize(
     ("rate", "words"),
     [
-        (PLAIN, "rate: at most 6.7e-3 per trial (0 crashes in 500 trials, 95 %)"),
+        (PLAIN, "crash rate: at most 6.7e-3 per trial (0 crashes in 500 trials, 95 %)"),
         (
             PLAIN | {"crashes": 1, "origin": "random", "certain": {"low": 1e-4, "high": 0.02}},
-            "rate: at least 1.0e-4, at most 0.020 per trial (1 crash in 500 trials drawn at random, 95 %)",
+            "crash rate: at least 1.0e-4, at most 0.020 per trial (1 crash in 500 random trials, 95 %)",
         ),
-        (PLAIN | {"certain": None, "why_not": "no trial counts yet"}, "rate: not known yet (no trial counts yet)"),
+        (
+            PLAIN | {"certain": None, "why_not": "no trial counts yet"},
+            "crash rate: not known yet (no trial counts yet)",
+        ),
         (
             PLAIN | {"per": "hour", "certain": {"low": 2.0, "high": None}, "bar": 1.0, "verdict": "above"},
-            "rate: at least 2.0, at most any number per hour (0 crashes in 500 trials, 95 %); bar 1.0 per hour: above",
+            (
+                "crash rate: at least 2.0, at most any number per hour (0 crashes in 500 trials, 95 %); "
+                "bar 1.0 per hour: above"
+            ),
         ),
         (
             RARE,
             (
-                "rate: 2.0e-5 per trial (1.3e-5 to 2.7e-5, estimated from 400 roots); "
+                "crash rate: 2.0e-5 per trial (1.3e-5 to 2.7e-5, estimated from 400 roots); "
                 "certain: at least 1.1e-5, at most 1.9e-3 (95 %)"
             ),
         ),
         (
             RARE | {"estimated": None, "units": 1, "certain": None},
-            "rate: 2.0e-5 per trial (no interval from 1 root yet)",
+            "crash rate: 2.0e-5 per trial (no interval from 1 root yet)",
         ),
-        (RARE | {"estimate": None, "why_not": "none", "certain": None}, "rate: not known yet (none)"),
+        (RARE | {"estimate": None, "why_not": "none", "certain": None}, "crash rate: not known yet (none)"),
     ],
 )
 def test_running_rate_is_on_the_screen_and_in_the_line(rate, words):

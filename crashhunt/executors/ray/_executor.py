@@ -99,7 +99,7 @@ class RayExecutor:
         self._send({"submit": [(ticket, spec.to_json())]})
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
-        """Yield the trials that have ended, waiting so long for a first one.
+        """Yield the trials that have ended; wait at most this long for the first one.
 
         Raises:
             CrashhuntError: no node can run any.

@@ -93,7 +93,7 @@ def array_difference(
     """Return the first difference between two arrays of an agent, either of which may be missing.
 
     Args:
-        step: at which step.
+        step: number of the step.
         agent: the agent.
         kind: ``observation`` or ``action``.
         columns: the names of the columns, if they are known.

@@ -250,7 +250,7 @@ class SumoSimulator:
         if setup.action == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
         if setup.speed_mode & _KEEPS_DECELERATION:
-            return FullBraking((0.0, 0), "all that its type can do", float(libsumo.vehicle.getDecel(agent)))
+            return FullBraking((0.0, 0), "the maximum of its vehicle type", float(libsumo.vehicle.getDecel(agent)))
         return FullBraking((0.0, 0), f"as hard as its speed mode {setup.speed_mode} allows")
 
     def surroundings(self, agent: str) -> Surroundings:
