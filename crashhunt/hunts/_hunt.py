@@ -395,10 +395,7 @@ class Hunt:
                 watch(self._status(progress, "saving"))
                 self._save(crash, ledger, snapshot, progress)
             executor.close()
-            audit.parallel = self._parallel_here
-            while audit.waiting and not bool(self._stops):
-                watch(self._status(progress, "auditing"))
-                self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
+            self._finish_audit(runs_again.phases, executor, audit, ledger, progress)
             if progress.last_wanted is not None:
                 return progress.why_stopped(keep_going=run.keep_going)
         except CrashhuntError as error:  # name the file that the user can correct
@@ -455,6 +452,19 @@ class Hunt:
             ledger.remark(f"audit: {difference}")
         if self.settings.run.audit > 0:
             self._audits_left.note(audit, progress)
+
+    def _finish_audit(
+        self, phases: PhaseClock, executor: Executor, audit: Audit, ledger: Ledger, progress: Progress
+    ) -> None:
+        """Run the trials again that still wait for it after the last trial."""
+        audit.parallel = self._parallel_here
+        if (total := audit.waiting) and not self._stops:
+            phases.begin("auditing", total)
+        while (waiting := audit.waiting) and not bool(self._stops):
+            self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
+            for _ in range(waiting - audit.waiting):
+                phases.advance()
+            phases.tick()
 
     def _restore_ledger(self, ledger: Ledger, progress: Progress) -> None:
         """Write the ledger again if its file was removed while the hunt ran.

@@ -41,3 +41,33 @@ def test_closed_output_is_no_error():
     command = ["/bin/sh", "-c", 'exec "$0" -c "$1" >&-', sys.executable, script]
     done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+SHOWS = """
+import os, subprocess, sys
+from crashhunt import cli
+
+def show(_):
+    with open(sys.argv[1], "w") as file:
+        subprocess.run(["/bin/sh", "-c", "echo from a child; echo from a child >&2"], check=True)
+        print("to people", file=sys.stderr)
+        for descriptor in range(3):
+            print(os.path.exists(f"/proc/self/fd/{descriptor}") and os.readlink(f"/proc/self/fd/{descriptor}"), file=file)
+    return 0
+
+cli._run = show
+cli.main([])
+"""
+
+
+@pytest.mark.parametrize("closed", ["2>&-", "<&- >&-", "<&- >&- 2>&-"])
+def test_no_file_takes_the_descriptor_of_a_closed_standard_stream(tmp_path, closed):
+    file = tmp_path / "file"
+    command = ["/bin/sh", "-c", f'exec "$0" -c "$1" "$2" {closed}', sys.executable, SHOWS, file]
+    done = subprocess.run(command, stdin=subprocess.PIPE, capture_output=True, text=True, check=False)
+    names = [name for name in ("<&-", ">&-", "2>&-") if name in closed.split()]
+    shown = file.read_text().splitlines()
+    assert done.returncode == 0
+    assert [shown[("<&-", ">&-", "2>&-").index(name)] for name in names] == ["/dev/null"] * len(names)
+    assert len(shown) == 3  # nothing else has been written into the file
+    assert done.stdout == ("" if ">&-" in names else "from a child\n")
