@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from peers import PEERS
 from problems import PROBLEMS, REAL
+from search_faults import FAULTS, faults_table, write_faults
 from search_kinds import kinds_table, write_kinds
 from search_plot import GIVE_UP, table, write_plot
 from search_pool import trials_on
@@ -315,6 +316,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--plot", type=Path, help="an SVG to write, of all hunts")
     parser.add_argument("--store", type=Path, help="a file of JSON to which hunts are added; the table is of all in it")
     parser.add_argument("--kinds", type=int, help="instead, hunts of so many trials that go on, for kinds of crashes")
+    parser.add_argument("--faults", type=int, help="instead, so many hunts for planted faults; needs --store")
     parser.add_argument("--wall", action="store_true", help="instead, hunts of the product, for time by the clock")
     parser.add_argument("--again", action="store_true", help="hunts that are stored already, too")
     parser.add_argument("--lag", default=LAG, type=a_lag, help=f"of results, in trials, or {GROWING!r}")
@@ -324,6 +326,13 @@ def main(words: Sequence[str] | None = None) -> int:
         options.samplers, options.problems, options.repetitions = "random,halton,guided", "easy,blind,motorway", 2
     seeds = range(options.first_seed, options.first_seed + options.repetitions)
     samplers, names = options.samplers.split(","), options.problems.split(",")
+    if options.faults:
+        if options.store is None:
+            parser.error("--faults needs --store FILE")
+        faults = range(options.first_seed, options.first_seed + options.faults)
+        write_faults(options.store, [*FAULTS], faults, options.parallel)
+        print(faults_table(options.store))
+        return 0
     if options.kinds:
         write_kinds(options.store, names, samplers, seeds, options.kinds, options.parallel)
         print(kinds_table(options.store))
