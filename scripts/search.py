@@ -31,10 +31,12 @@ from search_wall import wall_table
 
 from crashhunt.hunts import GREATEST_LAG, growing_lag, spec_of
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, plan, sampler_of
+from crashhunt.samplers import _guided, _model, _strategies
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
+    from types import ModuleType
 
     from problems import Problem, Real
     from search_pool import Trials
@@ -165,6 +167,16 @@ def a_lag(word: str) -> str:
     if word != GROWING and not (word.isdecimal() and int(word) > 0):
         raise argparse.ArgumentTypeError(f"{word!r} is no lag; give trials above 0, or {GROWING!r}")
     return word
+
+
+def a_constant(word: str) -> tuple[ModuleType, str, float]:
+    """Return the module, the name and the value of a constant of the samplers, for argparse."""
+    path, _, value = word.partition("=")
+    place, _, name = path.rpartition(".")
+    known = {module.__name__.rpartition(".")[2]: module for module in (_guided, _model, _strategies)}
+    if place not in known or not isinstance(getattr(known[place], name, None), int | float):
+        raise argparse.ArgumentTypeError(f"{path!r} is no constant of {', '.join(known)}; give MODULE.NAME=VALUE")
+    return known[place], name, type(getattr(known[place], name))(value)
 
 
 def lag_of(number: int, lag: str) -> int:
@@ -321,9 +333,15 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--again", action="store_true", help="hunts that are stored already, too")
     parser.add_argument("--lag", default=LAG, type=a_lag, help=f"of results, in trials, or {GROWING!r}")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
+    parser.add_argument(
+        "--set", action="append", default=[], type=a_constant, metavar="MODULE.NAME=VALUE",
+        help="a constant of a sampler, such as _guided._FORGET=0.9, for this run",
+    )  # fmt: skip
     options = parser.parse_args(words)
     if options.quick:
         options.samplers, options.problems, options.repetitions = "random,halton,guided", "easy,blind,motorway", 2
+    for module, name, value in options.set:
+        setattr(module, name, value)
     seeds = range(options.first_seed, options.first_seed + options.repetitions)
     samplers, names = options.samplers.split(","), options.problems.split(",")
     if options.faults:

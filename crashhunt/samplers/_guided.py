@@ -116,7 +116,7 @@ class Niches:
         rank = np.searchsorted(np.sort(scores), scores) / len(scores)
         known = np.isfinite(reach)  # all but the most critical one
         least = _FAR_FOOT * float(reach[known].mean()) if known.any() else 0.0
-        worth = np.where(known & (reach > least), np.where(known, reach, 0.0) * rank, 0.0)
+        worth = np.where(known & (reach > least), reach, 0.0) * rank
         for place in np.argsort(-worth, kind="stable"):
             tried = (float(np.linalg.norm(points[place] - foot.point)) for foot in self._tried)
             if worth[place] > 0.0 and all(one > 0.5 * reach[place] for one in tried):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from spaces import ask, spec_of
 
-from crashhunt.samplers import Cube, GuidedSampler, HuntFacts
+from crashhunt.samplers import Cube, GuidedSampler, HuntFacts, NamedSampler
 from crashhunt.samplers._guided import Niches, Portfolio
 from crashhunt.samplers._model import Model
 from crashhunt.samplers._strategy import ScoredTrial
@@ -47,6 +47,28 @@ def test_as_long_as_nothing_came_near_strategies_have_a_third_at_most():
     far, near = (portfolio_told(*trials, *[("model", score)] * 6)._shares() for score in (0.45, 0.55))
     assert 0.3 < sum(far.values()) < 0.37 < 0.6 < sum(near.values()) < 0.73
     assert far["model"] > 2 * far["mutation"]
+
+
+def test_strategies_far_more_critical_than_most_unguided_trials_are_stuck_without_progress():
+    trials = [("random", 0.015 * number) for number in range(60)]
+    assert portfolio_told(*trials, *[("model", 0.88)] * 20)._is_stuck  # above 59 of 60, a payoff of 3.7
+    assert not portfolio_told(*trials, *[("model", 0.74)] * 20)._is_stuck  # above 50 of 60, a payoff of 1.8
+
+
+def test_next_peak_is_searched_after_12_trials_and_then_32_trials_after_each_failure():
+    niches = Niches(Cube(SPACE), Model(Cube(SPACE)))
+    searched = []
+    for number in range(80):
+        niches.tell(ScoredTrial(number, PLACES[number], number, 0.0))  # equal everywhere, so there is no peak
+        before = niches._not_before
+        niches.begin()
+        if niches._not_before != before:
+            searched.append(number + 1)
+    assert searched == [12, 44, 76]
+
+
+def test_a_hunt_that_another_version_began_is_told_apart():
+    assert NamedSampler("guided", SPACE, points=4).version == 2
 
 
 def test_another_peak_is_abandoned_where_danger_stays_as_far_from_a_crash():

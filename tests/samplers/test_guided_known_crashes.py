@@ -98,6 +98,42 @@ def test_basin_of_a_crash_is_excluded_only_when_its_neighbourhood_yields_known_t
     assert not known.cover(at(0.67))
 
 
+def test_basins_depend_on_the_order_of_criticality_alone():
+    covered = []
+    for scaled in (lambda score: score, lambda score: 0.45 * score, lambda score: score**2):
+        known = KnownCrashes(4)
+        for number in range(41):
+            x = 0.5 + number / 80
+            score = 0.95 - 3 * abs(x - 0.5) if x < 0.7 else 0.7 - 2 * abs(x - 0.9)
+            known.see(ScoredTrial(number, at(x), number, scaled(score)))
+        known.add(crash(0.5, seed=100))
+        covered.append([known.cover(at(x)) for x in np.linspace(0.5, 1.0, 200)])
+    assert 40 < sum(covered[0]) < 160
+    assert covered[0] == covered[1] == covered[2]
+
+
+def test_basins_are_made_again_after_16_trials_without_a_crash():
+    known = KnownCrashes(4)
+    known.see(ScoredTrial(0, at(0.5), 0, 0.9))
+    known.add(crash(0.45, seed=100))
+    made = []
+    for number in range(1, 36):
+        before = known._ground
+        known.see(ScoredTrial(number, at(0.5), number, 0.5))
+        made.append(known._ground is not before)
+    assert [number for number, again in enumerate(made, start=1) if again] == [16, 32]
+
+
+def test_types_of_the_last_256_crashes_are_known():
+    known = KnownCrashes(4)
+    for number in range(256):
+        known.add(crash(0.5, f"type {number}"))
+    assert not known.is_new(crash(0.5, "type 0"))
+    known.add(crash(0.5, "type 256"))
+    assert known.is_new(crash(0.5, "type 0"))
+    assert not known.is_new(crash(0.5, "type 1"))
+
+
 def test_trials_in_a_basin_are_learned_from_when_they_turn_out_to_be_at_another_peak():
     known = KnownCrashes(4)
     for number in range(20):
