@@ -113,7 +113,7 @@ class Niches:
         trials = [trial[number] for number in sorted(trial)]
         points, scores = np.array([trial.point for trial in trials]), np.array([trial.score for trial in trials])
         reach, _ = nearest_better(points, scores)
-        rank = np.searchsorted(np.sort(scores), scores) / len(scores)
+        rank = np.searchsorted(np.sort(scores), scores)
         known = np.isfinite(reach)  # all but the most critical one
         least = _FAR_FOOT * float(reach[known].mean()) if known.any() else 0.0
         worth = np.where(known & (reach > least), reach, 0.0) * rank

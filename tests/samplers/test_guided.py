@@ -55,6 +55,12 @@ def test_strategies_far_more_critical_than_most_unguided_trials_are_stuck_withou
     assert not portfolio_told(*trials, *[("model", 0.74)] * 20)._is_stuck  # above 50 of 60, a payoff of 1.8
 
 
+def test_strategies_are_ahead_only_of_unguided_trials_that_are_less_critical():
+    trials = [("random", 0.6)] * 12
+    assert portfolio_told(*trials, *[("model", 0.6)] * 10)._ahead == 0.0
+    assert portfolio_told(*trials, *[("model", 0.61)] * 10)._ahead == pytest.approx(1.0 - 0.9**10)
+
+
 def test_next_peak_is_searched_after_12_trials_and_then_32_trials_after_each_failure():
     niches = Niches(Cube(SPACE), Model(Cube(SPACE)))
     searched = []
