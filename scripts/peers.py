@@ -2,12 +2,14 @@
 
 Optuna as its own documentation drives it; ``--sampler optuna:NAME`` gives it a random trial in five besides. VerifAI is
 installed by whoever measures: ``pip install verifai``, best into an environment of its own, as it brings Scenic, and an
-attrs of 2022.
+attrs of 2022. So is SMAC: ``pip install smac``.
 """
 
 from __future__ import annotations
 
+import tempfile
 from bisect import insort
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
     from crashhunt.samplers import Key, Space
     from crashhunt.trial import TrialResult, Value
 
-__all__ = ["PEERS", "OptunaCmaEs", "OptunaTpe", "PlainMutation", "VerifaiBandit", "VerifaiCrossEntropy"]
+__all__ = ["PEERS", "OptunaCmaEs", "OptunaTpe", "PlainMutation", "Smac", "VerifaiBandit", "VerifaiCrossEntropy"]
 
 PEERS = {
     "optuna-tpe": "peers:OptunaTpe",
@@ -27,6 +29,7 @@ PEERS = {
     "plain-mutation": "peers:PlainMutation",
     "verifai-ce": "peers:VerifaiCrossEntropy",
     "verifai-mab": "peers:VerifaiBandit",
+    "smac": "peers:Smac",
 }
 """Name in tables to what stands for it."""
 
@@ -132,6 +135,49 @@ class VerifaiBandit(_Verifai):
     """Its multi-armed bandit."""
 
     make = "multiArmedBanditSamplerFor"
+
+
+class Smac:
+    """SMAC3 (Lindauer et al. 2022) with its facade for hyperparameters, a random forest, asked and told in turns."""
+
+    learns = True
+    wants_hunt = True
+
+    def __init__(self, space: Space, *, points: int = 10, hunt: HuntFacts = HuntFacts()) -> None:  # noqa: B008
+        import smac
+        from ConfigSpace import Categorical, ConfigurationSpace, Float
+
+        self._space = {f"x{place}": (key, known) for place, (key, known) in enumerate(sorted(space.items()))}
+        seed = hunt.seed % 2**31
+        configurations = ConfigurationSpace(seed=seed)
+        configurations.add([
+            Categorical(name, known.options) if isinstance(known, Choice) else Float(name, (0.0, 1.0))
+            for name, (_, known) in self._space.items()
+        ])  # fmt: skip
+        scenario = smac.Scenario(
+            configurations, deterministic=True, n_trials=100_000, seed=seed, output_directory=Path(tempfile.mkdtemp())
+        )
+        facade = smac.HyperparameterOptimizationFacade
+        # The number of initial draws depends on the trials that are planned: as for 500 of them.
+        initial = facade.get_initial_design(scenario, n_configs=min(10 * len(space), 50))
+        self._smac = facade(scenario, lambda *_: 0.0, initial_design=initial, logging_level=False)
+        self._asked: dict[int, Any] = {}
+
+    def ask(self, number: int, rng: np.random.Generator) -> Proposal:
+        """Return its next configuration."""
+        self._asked[number] = asked = self._smac.ask()
+        return Proposal({
+            key: asked.config[name] if isinstance(known, Choice) else known.quantile(float(asked.config[name]))
+            for name, (key, known) in self._space.items()
+        }, origin="smac")  # fmt: skip
+
+    def tell(self, result: TrialResult) -> None:
+        """Tell it how far from a crash the trial was."""
+        from smac.runhistory import TrialValue
+
+        crashed = result.outcome.category != "no crash"
+        cost = 0.0 if crashed else 1.0 - (result.danger or 0.0)
+        self._smac.tell(self._asked.pop(result.spec.number), TrialValue(cost=cost), save=False)
 
 
 class PlainMutation:

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from peers import PEERS
 from problems import PROBLEMS, REAL
+from search_faults import FAULTS, faults_table, write_faults
 from search_kinds import kinds_table, write_kinds
 from search_plot import GIVE_UP, table, write_plot
 from search_pool import trials_on
@@ -30,10 +31,12 @@ from search_wall import wall_table
 
 from crashhunt.hunts import GREATEST_LAG, growing_lag, spec_of
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, plan, sampler_of
+from crashhunt.samplers import _guided, _model, _strategies
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
+    from types import ModuleType
 
     from problems import Problem, Real
     from search_pool import Trials
@@ -164,6 +167,16 @@ def a_lag(word: str) -> str:
     if word != GROWING and not (word.isdecimal() and int(word) > 0):
         raise argparse.ArgumentTypeError(f"{word!r} is no lag; give trials above 0, or {GROWING!r}")
     return word
+
+
+def a_constant(word: str) -> tuple[ModuleType, str, float]:
+    """Return the module, the name and the value of a constant of the samplers, for argparse."""
+    path, _, value = word.partition("=")
+    place, _, name = path.rpartition(".")
+    known = {module.__name__.rpartition(".")[2]: module for module in (_guided, _model, _strategies)}
+    if place not in known or not isinstance(getattr(known[place], name, None), int | float):
+        raise argparse.ArgumentTypeError(f"{path!r} is no constant of {', '.join(known)}; give MODULE.NAME=VALUE")
+    return known[place], name, type(getattr(known[place], name))(value)
 
 
 def lag_of(number: int, lag: str) -> int:
@@ -315,15 +328,29 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--plot", type=Path, help="an SVG to write, of all hunts")
     parser.add_argument("--store", type=Path, help="a file of JSON to which hunts are added; the table is of all in it")
     parser.add_argument("--kinds", type=int, help="instead, hunts of so many trials that go on, for kinds of crashes")
+    parser.add_argument("--faults", type=int, help="instead, so many hunts for planted faults; needs --store")
     parser.add_argument("--wall", action="store_true", help="instead, hunts of the product, for time by the clock")
     parser.add_argument("--again", action="store_true", help="hunts that are stored already, too")
     parser.add_argument("--lag", default=LAG, type=a_lag, help=f"of results, in trials, or {GROWING!r}")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
+    parser.add_argument(
+        "--set", action="append", default=[], type=a_constant, metavar="MODULE.NAME=VALUE",
+        help="a constant of a sampler, such as _guided._FORGET=0.9, for this run",
+    )  # fmt: skip
     options = parser.parse_args(words)
     if options.quick:
         options.samplers, options.problems, options.repetitions = "random,halton,guided", "easy,blind,motorway", 2
+    for module, name, value in options.set:
+        setattr(module, name, value)
     seeds = range(options.first_seed, options.first_seed + options.repetitions)
     samplers, names = options.samplers.split(","), options.problems.split(",")
+    if options.faults:
+        if options.store is None:
+            parser.error("--faults needs --store FILE")
+        faults = range(options.first_seed, options.first_seed + options.faults)
+        write_faults(options.store, [*FAULTS], faults, options.parallel)
+        print(faults_table(options.store))
+        return 0
     if options.kinds:
         write_kinds(options.store, names, samplers, seeds, options.kinds, options.parallel)
         print(kinds_table(options.store))

@@ -11,11 +11,12 @@ Why not the best strategy alone: rising criticality does not imply a crash, whic
 signs show that it misleads: strategies are far ahead of the unguided trials and make no progress, or they never
 exceed a criticality of 0.5. In both cases their share is capped, and a part of it explores other peaks (`Niches`).
 
-After the first crash, new crash types count: the share falls with the ratio of the rate of new types that strategies
-find to the rate of the unguided trials.
+After the first crash, new crash types count: before each proposal, a draw of the rate of new types that strategies find
+is compared with one of the rate of unguided trials (Thompson 1933). Strategies do not search in basins of crashes that
+yield known types only.
 
-Sources: nearest-better distance (Preuss 2010), Halton's sequence (1960); payoffs and shares are our own, measured with
-`scripts/search`. Cost: below a millisecond per trial in addition to the model.
+Sources: nearest-better distance (Preuss 2010), Thompson sampling (1933), Halton's sequence (1960); payoffs and shares
+are our own, measured with `scripts/search`. Cost: below a millisecond per trial in addition to the model.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from crashhunt.base.draws import one_of
 from crashhunt.samplers._model import Model
 from crashhunt.samplers._space_filling import HaltonSampler
 from crashhunt.samplers._strategies import Mutation
-from crashhunt.samplers._strategy import Draft, Elites, reflected
+from crashhunt.samplers._strategy import CRASHED, Draft, Elites, reflected
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -111,14 +112,11 @@ class Niches:
         trial = {one.number: one for one in self._last} | {one.number: one for one in self._best}
         trials = [trial[number] for number in sorted(trial)]
         points, scores = np.array([trial.point for trial in trials]), np.array([trial.score for trial in trials])
-        away = (points**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * points @ points.T
-        away = np.sqrt(np.maximum(away, 0.0))
-        away[scores <= scores[:, None]] = np.inf
-        reach = away.min(axis=1)
-        rank = np.searchsorted(np.sort(scores), scores) / len(scores)
+        reach, _ = nearest_better(points, scores)
+        rank = np.searchsorted(np.sort(scores), scores)
         known = np.isfinite(reach)  # all but the most critical one
         least = _FAR_FOOT * float(reach[known].mean()) if known.any() else 0.0
-        worth = np.where(known & (reach > least), np.where(known, reach, 0.0) * rank, 0.0)
+        worth = np.where(known & (reach > least), reach, 0.0) * rank
         for place in np.argsort(-worth, kind="stable"):
             tried = (float(np.linalg.norm(points[place] - foot.point)) for foot in self._tried)
             if worth[place] > 0.0 and all(one > 0.5 * reach[place] for one in tried):
@@ -144,7 +142,11 @@ class Niches:
         self._model.remember(trial for trial in trials if float(np.linalg.norm(trial.point - foot.point)) < reach)
 
 
-# Known crashes: a resumed hunt searches for other crashes, not for these again.
+# Known crashes: search for other crashes, not for these again.
+#
+# Criticality leads to a known crash from all of its basin, so its neighbourhood alone is not enough: just outside of it
+# are the most critical trials of all. A trial belongs to the basin of the nearest more critical one, unless that is far
+# away (nearest-better clustering; Preuss 2010). A basin is excluded if its crash yields known types only.
 
 _MOST = 32  # crashes whose neighbourhood is excluded
 _MAX_KINDS = 256  # crash types in memory
@@ -152,15 +154,17 @@ _SEEDS = 1024  # seeds of crashes in memory
 _AROUND = 0.1  # radius of an excluded neighbourhood, times the square root of the dimensions
 _JUST_THERE = 0.02  # the same, while the next crash there may be of another type
 _REPEATS = 3  # consecutive crashes of known types in a neighbourhood: the next is new in at most one of five cases
-_WIDER, _WIDEST = 1.5, 0.45  # growth of a radius if the best trials are just outside, and its upper bound
+_SEEN = 256  # last trials of which basins are made
+_BASINS_EVERY = 16  # trials without a crash, after which basins are made again
 
 
 class KnownCrashes:
     """The places in the space of arguments that are not worth another trial.
 
-    A crash excludes a neighbourhood that depends on its type. If the result has no type, a wide neighbourhood is
-    excluded at once. If it has one, almost nothing is excluded at first, because the same arguments may lead to other
-    types. After three consecutive crashes of known types, the wide neighbourhood is excluded.
+    A crash excludes a neighbourhood that depends on its type. If the result has no type, a wide neighbourhood and the
+    basin of the crash are excluded at once. If it has one, almost nothing is excluded at first, because the same
+    arguments may lead to other types. After three consecutive crashes of known types, the wide neighbourhood and the
+    basin are excluded.
 
     The same traffic leads to the same crash even with other arguments, so no proposal reuses the seed of a crash.
 
@@ -175,27 +179,53 @@ class KnownCrashes:
         self._kinds: dict[str, None] = {}
         self._seeds: dict[int, None] = {}
         self._again: list[NDArray[np.float64]] = []  # last crashes of known types that no new type has followed nearby
+        self._seen: deque[ScoredTrial] = deque(maxlen=_SEEN)
+        self._covered_trials: deque[ScoredTrial] = deque(maxlen=_SEEN)
+        self._since_basins = 0
+        self._ground = np.empty((0, dimensions))  # points of trials, and of excluded crashes
+        self._in_basin = np.empty(0, dtype=bool)  # of these, which are in an excluded basin
 
     def __bool__(self) -> bool:
         return bool(len(self._radii))
 
     def cover(self, point: NDArray[np.float64], seed: int | None = None) -> bool:
-        """Return whether a point is near a known crash, or a seed is that of one."""
-        return seed in self._seeds or bool((self._away(point) < self._radii).any())
+        """Return whether a point is near a known crash or in its basin, or a seed is that of one."""
+        return seed in self._seeds or bool(self._covered(point[None])[0])
 
     def is_new(self, trial: ScoredTrial) -> bool:
         """Return whether a crash has an unknown type; without a type, whether no known crash is near it."""
         return trial.kind not in self._kinds if trial.kind else not self.cover(trial.point)
 
     def outside(self, trials: Sequence[ScoredTrial]) -> list[ScoredTrial]:
-        """Return the trials that are neither near a known crash nor have the seed of one."""
+        """Return the trials that are neither near a known crash or in its basin, nor have the seed of one."""
         if not trials:
             return []
-        points = np.array([trial.point for trial in trials])
-        covered = np.any(self._away(points[:, None]) < self._radii, axis=1).tolist()
+        covered = self._covered(np.array([trial.point for trial in trials])).tolist()
         return [
             trial for trial, near in zip(trials, covered, strict=True) if not near and trial.seed not in self._seeds
         ]
+
+    def see(self, trial: ScoredTrial) -> list[ScoredTrial]:
+        """Add a trial without a crash; return all trials that are worth learning from since it is known.
+
+        Usually, that is the trial itself, or nothing if it is covered. Covered trials follow when they turn out to be
+        at another peak than the known crashes.
+        """
+        self._seen.append(trial)
+        self._since_basins += 1
+        if self._since_basins < _BASINS_EVERY or not self._in_basin.any():
+            return self.sift([trial])
+        self._make_basins()
+        again = [*self._covered_trials, trial]
+        self._covered_trials.clear()
+        return self.sift(again)
+
+    def sift(self, trials: Sequence[ScoredTrial]) -> list[ScoredTrial]:
+        """Return the trials that are `outside`, and remember the others, because basins may change."""
+        kept = self.outside(trials)
+        numbers = {trial.number for trial in kept}
+        self._covered_trials.extend(trial for trial in trials if trial.number not in numbers)
+        return kept
 
     def add(self, trial: ScoredTrial) -> bool:
         """Add a crash; return whether the excluded region has changed."""
@@ -206,17 +236,42 @@ class KnownCrashes:
         self._seeds[trial.seed] = None
         if len(self._seeds) > _SEEDS:
             del self._seeds[next(iter(self._seeds))]
-        away = self._away(trial.point)
+        away = self._away(trial.point[None])[0]
         around = away < self._radii
-        if new:  # the region contains more types than assumed, so shrink what is excluded
-            self._radii = np.where(around, np.minimum(self._radii / _WIDER, away), self._radii)
+        if new:  # the region contains more types than assumed, so it is open again
+            self._radii = np.where(around, np.minimum(_JUST_THERE * self._unit, away), self._radii)
         elif around.any():
             return False
         kept = self._radii > 0.0  # a radius of 0 is the very same point, as with choices and whole numbers
-        radius = (_JUST_THERE if trial.kind and not self._is_worked_out(trial.point, new) else _AROUND) * self._unit
+        worked_out = not trial.kind or self._is_worked_out(trial.point, new)
+        radius = (_AROUND if worked_out else _JUST_THERE) * self._unit
         self._points = np.vstack((self._points[kept], trial.point))[-_MOST:]
         self._radii = np.append(self._radii[kept], radius)[-_MOST:]
+        self._make_basins()
         return True
+
+    def _make_basins(self) -> None:
+        """Compute which trials are in the basin of a crash whose wide neighbourhood is excluded."""
+        self._since_basins = 0
+        worked_out = self._points[self._radii > _JUST_THERE * self._unit]
+        if not len(worked_out) or not self._seen:
+            self._in_basin = np.zeros(len(self._ground), dtype=bool)
+            return
+        points = np.vstack((worked_out, [trial.point for trial in self._seen]))
+        scores = np.append(np.full(len(worked_out), CRASHED), [trial.score for trial in self._seen])
+        away, better = nearest_better(points, scores)
+        reached = np.isfinite(away)
+        far = _FAR_FOOT * float(away[reached].mean()) if reached.any() else 0.0
+        self._ground, self._in_basin = points, np.arange(len(points)) < len(worked_out)
+        for place in np.argsort(-scores, kind="stable")[len(worked_out) :]:
+            self._in_basin[place] = away[place] <= far and self._in_basin[better[place]]
+
+    def _covered(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        covered: NDArray[np.bool_] = np.any(self._away(points) < self._radii, axis=1)
+        if self._in_basin.any():
+            nearest = np.argmin(((points[:, None] - self._ground) ** 2).sum(axis=2), axis=1)
+            covered |= self._in_basin[nearest]
+        return covered
 
     def _is_worked_out(self, point: NDArray[np.float64], new: bool) -> bool:
         """Count a crash, and return whether its neighbourhood yields known types only."""
@@ -227,19 +282,19 @@ class KnownCrashes:
         self._again = [*self._again, point][-_MOST:]
         return sum(near) + 1 >= _REPEATS
 
-    def widen(self, top: NDArray[np.float64]) -> bool:
-        """Enlarge the nearest excluded neighbourhood if the top trial is just outside; return whether it was."""
-        away = self._away(top)
-        nearest = int(np.argmin(away / self._radii))
-        if away[nearest] >= _WIDER * self._radii[nearest]:
-            return False
-        wider = max(self._radii[nearest] * _WIDER, _AROUND * self._unit)
-        self._radii[nearest] = wider if wider < _WIDEST * self._unit else _AROUND * self._unit
-        return True
-
-    def _away(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
-        away: NDArray[np.float64] = np.sqrt(((self._points - point) ** 2).sum(axis=-1))
+    def _away(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        away: NDArray[np.float64] = np.sqrt(((points[:, None] - self._points) ** 2).sum(axis=2))
         return away
+
+
+def nearest_better(
+    points: NDArray[np.float64], scores: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Return the distance from each point to the nearest one with a greater score, and its index; infinity if none."""
+    away = (points**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * points @ points.T
+    away = np.sqrt(np.maximum(away, 0.0))
+    away[scores <= scores[:, None]] = np.inf
+    return away.min(axis=1), away.argmin(axis=1)
 
 
 _EVEN, _MODEL, _MUTATION, _NICHE = "halton", "model", "mutation", "niche"
@@ -256,7 +311,7 @@ _LATELY = 0.1  # weight of the last trial in that recent share
 _CREDIT = 3.0  # initial trials of each strategy, with a payoff of 2, so that each one is tried
 _FORGET = 0.96  # decay of a strategy's payoff per trial
 _INHERITED = 0.3  # weight of a trial whose criticality may come from the seed of its parent
-_KINDS, _TRIALS = 0.5, 25.0  # prior of the rate of new crash types: so many types in so many trials
+_KINDS = 0.5  # Jeffreys' prior of the number of new crash types
 _REMEMBERED = 200  # trials from which strategies restart after a crash
 
 
@@ -277,20 +332,19 @@ class Portfolio:
         self._best = Elites(_REMEMBERED)
         self._known = KnownCrashes(cube.dimensions)
         self._earned = dict.fromkeys((_MODEL, _MUTATION), (2.0 * _CREDIT, _CREDIT))  # decaying sum and count of payoffs
-        self._kinds = {True: (_KINDS, _TRIALS), False: (_KINDS, _TRIALS)}  # new types and trials: guided, unguided
+        self._kinds = {True: (_KINDS, 1.0), False: (_KINDS, 1.0)}  # new types and trials: guided, unguided
         self._model = Model(cube)
         self._begin()
 
     def _begin(self) -> None:
         """Restart the strategies from the trials that are not near a known crash."""
         best, self._best = sorted(self._best, key=lambda trial: trial.number), Elites(_REMEMBERED)
-        kept = self._known.outside(best)
+        kept = self._known.sift(best)
         self._model, mutation = Model(self._cube, like=self._model), Mutation(self._cube)
         self._model.remember(kept)
         self._strategies: dict[str, Strategy] = {_MODEL: self._model, _MUTATION: mutation}
         self._niches = Niches(self._cube, self._model)
         self._record, self._without_record = -1.0, 0  # greatest criticality, and trials since then
-        self._top = np.zeros(self._cube.dimensions)  # its point
         self._rival = 0.0  # greatest criticality of an unguided trial
         self._ahead = 0.0  # recent share of strategy trials above all unguided ones
         for trial in kept:
@@ -313,17 +367,14 @@ class Portfolio:
             if self._known.add(trial):
                 self._begin()
             return
-        if self._known.cover(trial.point, trial.seed):
-            return
-        self._best.add(trial)
-        for strategy in self._strategies.values():
-            strategy.tell(trial)
-        self._measure(trial)
-        self._niches.tell(trial)
+        for known in self._known.see(trial):
+            self._best.add(known)
+            for strategy in self._strategies.values():
+                strategy.tell(known)
+            self._measure(known)
+            self._niches.tell(known)
         if self._is_stuck:
             self._niches.begin()
-        if self._known and self._without_record >= self._patience and self._known.widen(self._top):
-            self._begin()
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft:
         """Return a proposal of one of the strategies, or the next point of the even search."""
@@ -343,14 +394,21 @@ class Portfolio:
         if self._is_stuck and rng.random() < elsewhere / _OF_OURS:
             names.append(_NICHE)
         shares = self._shares()
+        if self._known and not self._finds_more(rng):
+            shares = dict.fromkeys(shares, _PROBING)
         if rng.random() < sum(shares.values()) / _OF_OURS:
             names.append(one_of(shares, rng))
         return names
 
+    def _finds_more(self, rng: np.random.Generator) -> bool:
+        """Draw whether strategies find more new types per trial than unguided trials (Thompson 1933)."""
+        guided, unguided = (rng.standard_gamma(kinds) / trials for kinds, trials in self._kinds.values())
+        return bool(guided >= unguided)
+
     def _measure(self, trial: ScoredTrial) -> None:
         """Update the greatest criticality and the progress of strategies."""
         if 1.0 - trial.score < _NEARER * (1.0 - self._record):
-            self._record, self._top, self._without_record = trial.score, trial.point, 0
+            self._record, self._without_record = trial.score, 0
         elif trial.origin in self._strategies:
             self._without_record += 1
         if trial.origin in self._strategies:
@@ -373,9 +431,6 @@ class Portfolio:
         gains = {name: max(total / count - 1.0, 0.05) ** 2 for name, (total, count) in self._earned.items()}
         most = _STUCK if self._is_stuck else _CLIMBING if self._record > _NEAR else _FAR
         whole = most * min(1.0, max(gains.values()))
-        if self._known:
-            (ours, of), (theirs, among) = self._kinds[True], self._kinds[False]
-            whole *= min(1.0, ours * among / (theirs * of)) ** 2
         return {name: max(whole * gain / sum(gains.values()), _PROBING) for name, gain in gains.items()}
 
     @property

@@ -98,6 +98,7 @@ class GuidedSampler(Learning):
     """Gives each strategy a share of the trials by its success (`Portfolio`)."""
 
     origin = "guided"
+    version = 2  # 1 excluded neighbourhoods of known crashes, 2 excludes their basins
 
     def _make(self, space: Space) -> Strategy:
         return Portfolio(self._cube, space, self._hunt)

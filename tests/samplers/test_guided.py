@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from spaces import ask, spec_of
 
-from crashhunt.samplers import Cube, GuidedSampler, HuntFacts
+from crashhunt.samplers import Cube, GuidedSampler, HuntFacts, NamedSampler
 from crashhunt.samplers._guided import Niches, Portfolio
 from crashhunt.samplers._model import Model
 from crashhunt.samplers._strategy import ScoredTrial
@@ -49,6 +49,34 @@ def test_as_long_as_nothing_came_near_strategies_have_a_third_at_most():
     assert far["model"] > 2 * far["mutation"]
 
 
+def test_strategies_far_more_critical_than_most_unguided_trials_are_stuck_without_progress():
+    trials = [("random", 0.015 * number) for number in range(60)]
+    assert portfolio_told(*trials, *[("model", 0.88)] * 20)._is_stuck  # above 59 of 60, a payoff of 3.7
+    assert not portfolio_told(*trials, *[("model", 0.74)] * 20)._is_stuck  # above 50 of 60, a payoff of 1.8
+
+
+def test_strategies_are_ahead_only_of_unguided_trials_that_are_less_critical():
+    trials = [("random", 0.6)] * 12
+    assert portfolio_told(*trials, *[("model", 0.6)] * 10)._ahead == 0.0
+    assert portfolio_told(*trials, *[("model", 0.61)] * 10)._ahead == pytest.approx(1.0 - 0.9**10)
+
+
+def test_next_peak_is_searched_after_12_trials_and_then_32_trials_after_each_failure():
+    niches = Niches(Cube(SPACE), Model(Cube(SPACE)))
+    searched = []
+    for number in range(80):
+        niches.tell(ScoredTrial(number, PLACES[number], number, 0.0))  # equal everywhere, so there is no peak
+        before = niches._not_before
+        niches.begin()
+        if niches._not_before != before:
+            searched.append(number + 1)
+    assert searched == [12, 44, 76]
+
+
+def test_a_hunt_that_another_version_began_is_told_apart():
+    assert NamedSampler("guided", SPACE, points=4).version == 2
+
+
 def test_another_peak_is_abandoned_where_danger_stays_as_far_from_a_crash():
     cube = Cube(SPACE)
 
@@ -69,15 +97,18 @@ def test_another_peak_is_abandoned_where_danger_stays_as_far_from_a_crash():
     assert not is_climbed(0.84, 8)
 
 
-def test_after_a_crash_strategies_begin_again_with_what_is_not_near_to_it():
+def test_after_a_crash_strategies_begin_again_with_what_is_not_in_its_basin():
     made = portfolio_told(*[("random", 0.02 * number) for number in range(40)])
     model, mutation = made._strategies.values()
     middle = PLACES[7]
     made.tell(ScoredTrial(40, middle, 40, 1.0, "model"))
     assert not {model, mutation} & {*made._strategies.values()}
     assert made._model._parameters is model._parameters  # what was fitted stays
-    outside = [number for number in range(40) if np.linalg.norm(PLACES[number] - middle) >= 0.1 * 2**0.5]
-    assert 20 < len(outside) < 40
+    near = {number for number in range(40) if np.linalg.norm(PLACES[number] - middle) < 0.1 * 2**0.5}
+    outside = [number for number in range(40) if not made._known.cover(PLACES[number])]
+    assert near
+    assert near.isdisjoint(outside)
+    assert 10 < len(outside) < 40
     for strategy in (made._strategies["mutation"]._corpus, made._strategies["model"]._best):
         assert sorted(told.number for told in strategy) == outside
     again = [*made._strategies.values()]
@@ -88,38 +119,43 @@ def test_after_a_crash_strategies_begin_again_with_what_is_not_near_to_it():
 
 
 def test_no_strategy_goes_where_a_crash_is_known_and_the_even_search_does():
-    trials = [("random", 1.0 - float(np.linalg.norm(PLACES[number] - PLACES[7]))) for number in range(60)]
-    made = portfolio_told(*trials)
-    assert trials[7][1] == 1.0  # it is one
-    drafts = [made.propose(number, np.random.default_rng(number)) for number in range(60, 120)]
+    def score(place):
+        away, other = (float(np.linalg.norm(place - PLACES[number])) for number in (7, 17))
+        return max(1.0 - 2.0 * away, 0.8 - 2.0 * other, 0.0)
+
+    assert np.linalg.norm(PLACES[7] - PLACES[17]) > 0.5
+    made = portfolio_told(*[("random", score(PLACES[number])) for number in range(60)])
+    drafts = [made.propose(number, np.random.default_rng(number)) for number in range(60, 160)]
     even = [made._known.cover(draft.point) for draft in drafts if draft.origin == "halton"]
-    others = [made._known.cover(draft.point) for draft in drafts if draft.origin != "halton"]
+    others = [draft.point for draft in drafts if draft.origin != "halton"]
     assert any(even)
-    assert others
-    assert not any(others)
+    assert len(others) > 10
+    assert not any(made._known.cover(point) for point in others)
+    assert np.median([np.linalg.norm(point - PLACES[17]) for point in others]) < 0.25  # they climb the other peak
 
 
-def test_after_a_crash_strategies_have_the_less_the_fewer_new_kinds_they_find_than_chance():
-    made = portfolio_told(*[("random", 0.01 * number) for number in range(10)], *[("model", 0.45)] * 12)
-    made._earned["mutation"] = (0.0, 1.0)  # it has probes
-    assert made._shares() == pytest.approx({"model": 0.35, "mutation": 0.02}, rel=0.01)
-    made.tell(ScoredTrial(22, PLACES[22], 22, 1.0, "random", kind="rear end"))
-    made.tell(ScoredTrial(23, PLACES[23], 23, 1.0, "model", kind="rear end"))  # nothing new
-    few = (0.5 / 38) / (1.5 / 36)  # with half a kind in 25 trials, with which everybody begins
-    assert made._shares() == pytest.approx({"model": 0.35 * few**2, "mutation": 0.02}, rel=0.01)
-    made.tell(ScoredTrial(24, PLACES[24], 24, 1.0, "niche", kind="side swipe"))
-    made.tell(ScoredTrial(25, PLACES[25], 25, 1.0, "niche", kind="head-on"))
-    assert made._shares() == pytest.approx({"model": 0.35, "mutation": 0.02}, rel=0.01)  # no more than without
-    for number in range(26, 41):
-        made.tell(ScoredTrial(number, PLACES[number], number, 1.0, "halton", kind=f"{number}"))
-    assert made._shares() == {"model": 0.02, "mutation": 0.02}
+def test_after_a_crash_strategies_are_drawn_the_less_the_fewer_new_types_they_find_than_chance():
+    def drawn(*crashes):
+        made = portfolio_told(*[("random", 0.01 * number) for number in range(10)], *[("model", 0.45)] * 12)
+        for number, (origin, kind) in enumerate(crashes, start=22):
+            made.tell(ScoredTrial(number, PLACES[number], number, 1.0, origin, kind=kind))
+        return sum(bool(made._drawn(np.random.default_rng(place))) for place in range(400)) / 400
+
+    before = drawn()
+    assert 0.3 < before < 0.5
+    one = ("random", "rear end")
+    assert 0.1 * before < drawn(one) < 0.6 * before
+    assert drawn(one, ("model", "side swipe"), ("niche", "head-on"), ("model", "off road")) > 0.6 * before
+    luck = [("halton", f"{number}") for number in range(8)]
+    assert drawn(*luck) < 0.25 * before
+    assert drawn(*luck, *[("model", "0")] * 30) == pytest.approx(2 * 0.02 / 0.8, abs=0.04)  # probes alone
 
 
 def test_without_manner_and_place_a_crash_is_new_where_none_is_known_near_to_it():
     made = portfolio_told(*[("random", 0.01 * number) for number in range(60)])
     for number, place in enumerate((PLACES[7], PLACES[7] + 0.01, np.array([0.99, 0.99]) - PLACES[7]), start=60):
         made.tell(ScoredTrial(number, place, number, 1.0, "model"))
-    assert made._kinds == {True: (2.5, 28.0), False: (0.5, 85.0)}
+    assert made._kinds == {True: (2.5, 4.0), False: (0.5, 61.0)}
 
 
 def test_nothing_keeps_the_traffic_of_a_crash_that_is_known():

@@ -74,6 +74,16 @@ def test_noise_and_arguments_are_distinguished():
     assert clear._parameters.noise < 3 < blurred._parameters.noise
 
 
+def test_fit_moves_parameters_by_one_step_at_a_time():
+    model, steps = Model(PLANE), set()
+    for told in trials(lambda point, _: float(1 - abs(point - 0.6).sum() / 2), 60):
+        before = model._parameters
+        model.tell(told)
+        after = model._parameters
+        steps |= {after.noise - before.noise, after.seeded - before.seeded, *(after.lengths - before.lengths).tolist()}
+    assert steps == {-1, 0, 1}
+
+
 def test_a_model_proposes_what_leads_uphill():
     model = Model(PLANE)
     for told in trials(lambda point, _: float(1 - np.linalg.norm(point - 0.8)), 25):

@@ -62,19 +62,89 @@ def test_where_another_kind_comes_there_is_more_to_find():
     assert known.add(crash(0.5))
     assert known.add(crash(0.55, "side swipe"))
     assert not known.cover(at(0.58))
-    assert known.cover(at(0.52))
+    assert not known.cover(at(0.53))
+    assert known.cover(at(0.51))
 
 
-def test_what_is_most_dangerous_just_next_to_a_crash_is_that_crash_still():
+def two_peaks(known):
+    """Tell trials along a diagonal: criticality falls from 0.5 to 0.7, and rises again to 0.9."""
+    for number in range(41):
+        x = 0.5 + number / 80
+        known.see(ScoredTrial(number, at(x), number, 0.95 - 3 * abs(x - 0.5) if x < 0.7 else 0.7 - 2 * abs(x - 0.9)))
+
+
+def test_basin_of_a_crash_without_news_is_excluded_and_another_peak_is_not():
     known = KnownCrashes(4)
-    known.add(crash(0.5))
-    assert not known.widen(at(0.8))
-    assert known.widen(at(0.62))
-    assert known.cover(at(0.64))
-    assert not known.cover(at(0.66))
-    for _ in range(20):
-        known.widen(at(0.62))
-        assert not known.cover(at(1.0))
+    two_peaks(known)
+    assert not known.cover(at(0.65))
+    known.add(crash(0.5, seed=100))
+    assert known.cover(at(0.65))
+    assert known.cover(at(0.66), 7)
+    assert not known.cover(at(0.75))
+    assert not known.cover(at(0.95))
+    trials = [crash(x, seed=101) for x in (0.65, 0.8)]
+    assert known.outside(trials) == trials[1:]
+
+
+def test_basin_of_a_crash_is_excluded_only_when_its_neighbourhood_yields_known_types():
+    known = KnownCrashes(4)
+    two_peaks(known)
+    for x in (0.5, 0.54, 0.58):
+        known.add(crash(x, "rear end", 100))
+        assert not known.cover(at(0.67))
+    known.add(crash(0.62, "rear end", 100))
+    assert known.cover(at(0.67))
+    known.add(crash(0.6, "side swipe", 100))  # it is open again
+    assert not known.cover(at(0.67))
+
+
+def test_basins_depend_on_the_order_of_criticality_alone():
+    covered = []
+    for scaled in (lambda score: score, lambda score: 0.45 * score, lambda score: score**2):
+        known = KnownCrashes(4)
+        for number in range(41):
+            x = 0.5 + number / 80
+            score = 0.95 - 3 * abs(x - 0.5) if x < 0.7 else 0.7 - 2 * abs(x - 0.9)
+            known.see(ScoredTrial(number, at(x), number, scaled(score)))
+        known.add(crash(0.5, seed=100))
+        covered.append([known.cover(at(x)) for x in np.linspace(0.5, 1.0, 200)])
+    assert 40 < sum(covered[0]) < 160
+    assert covered[0] == covered[1] == covered[2]
+
+
+def test_basins_are_made_again_after_16_trials_without_a_crash():
+    known = KnownCrashes(4)
+    known.see(ScoredTrial(0, at(0.5), 0, 0.9))
+    known.add(crash(0.45, seed=100))
+    made = []
+    for number in range(1, 36):
+        before = known._ground
+        known.see(ScoredTrial(number, at(0.5), number, 0.5))
+        made.append(known._ground is not before)
+    assert [number for number, again in enumerate(made, start=1) if again] == [16, 32]
+
+
+def test_types_of_the_last_256_crashes_are_known():
+    known = KnownCrashes(4)
+    for number in range(256):
+        known.add(crash(0.5, f"type {number}"))
+    assert not known.is_new(crash(0.5, "type 0"))
+    known.add(crash(0.5, "type 256"))
+    assert known.is_new(crash(0.5, "type 0"))
+    assert not known.is_new(crash(0.5, "type 1"))
+
+
+def test_trials_in_a_basin_are_learned_from_when_they_turn_out_to_be_at_another_peak():
+    known = KnownCrashes(4)
+    for number in range(20):
+        assert [one.number for one in known.see(ScoredTrial(number, at(0.5 + number / 100), number, 0.9))] == [number]
+    known.see(ScoredTrial(20, at(0.72), 20, 0.1))
+    known.add(crash(0.5, seed=100))
+    assert known.cover(at(0.55))
+    found = [known.see(ScoredTrial(number, at(0.3 + number / 80), number, number / 80)) for number in range(21, 53)]
+    late = [len(trials) for trials in found if len(trials) > 1]
+    assert late
+    assert len({one.number for trials in found for one in trials}) == sum(map(len, found))  # none of them twice
 
 
 def test_several_kinds_at_the_very_same_arguments_keep_nothing_away_by_the_first_of_them():
@@ -83,9 +153,7 @@ def test_several_kinds_at_the_very_same_arguments_keep_nothing_away_by_the_first
     for kind in ("rear end", "side swipe", "off road"):
         assert known.add(crash(0.5, kind))
         assert known.cover(at(0.5))
-    assert known.widen(at(0.5))
-    assert not known.widen(at(0.9))
-    assert known.cover(at(0.59))
+        assert not known.cover(at(0.53))
 
 
 def test_the_oldest_of_many_crashes_is_forgotten():
