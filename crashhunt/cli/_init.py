@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import NoValidTrialError, UsageError
 from crashhunt.cli._common import DONE, add_json, say
@@ -133,12 +133,13 @@ def _check_agent(name: str) -> None:
     from crashhunt.base.plugins import is_foreign, locate
     from crashhunt.trial import signature_of
 
-    def needed() -> list[str]:
-        return list(signature_of(locate("agents", name)).required)
+    def needed() -> dict[str, object]:
+        return {"arguments": list(signature_of(locate("agents", name)).required)}
 
     # A module of the user may end or stop the process that imports it.
     task = f"{name!r} cannot be imported"
-    required = work_apart(needed, task=task, timeout_s=_IMPORT_S) if is_foreign("agents", name) else needed()
+    found = work_apart(needed, task=task, timeout_s=_IMPORT_S) if is_foreign("agents", name) else needed()
+    required: Any = found["arguments"]
     if required:
         fix = "give it a default: the new scenario has no value for it"
         raise UsageError(f"--agent {name}: it needs the argument {required[0]!r}", fix=fix)
