@@ -381,6 +381,9 @@ class Story:
         return ["-"] * len(self._names()) if action is None else [f"{value:.4g}" for value in action]
 
 
+_GAP_M = 0.05  # shown as 0.1; a smaller one needs any deceleration, up to millions of m/s²
+
+
 def _cells(moment: Moment) -> list[str]:
     time_s = moment.time_to_collision_s
     return [
@@ -388,7 +391,7 @@ def _cells(moment: Moment) -> list[str]:
         f"{moment.gap_m:.1f}",
         f"{moment.closing_speed:+.1f}",
         f"{time_s:.1f}" if math.isfinite(time_s) else "-",
-        f"{moment.required_deceleration:.1f}" if moment.gap_m > 0 else "-",
+        f"{moment.required_deceleration:.1f}" if moment.gap_m >= _GAP_M else "-",
     ]
 
 

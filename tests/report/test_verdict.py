@@ -11,6 +11,7 @@ import pytest
 
 from crashhunt.crashes import Attempt, Judgement, LaneMap, Omission, Reference, ReferenceRun
 from crashhunt.crashes._contact import record_in
+from crashhunt.report._show import _cells
 from crashhunt.report._verdict import describe_contact, verdict_of
 from crashhunt.trial import Collision, Escape
 from crashhunt.world import Actor, Roster, Scene
@@ -204,3 +205,11 @@ def test_road_departure_names_the_missing_lane():
         "ego left the road at step 13; ego changed to the left, where it has no lane; with a reference driver there is "
         "no crash."
     )
+
+
+@pytest.mark.parametrize(("gap_m", "shown"), [(0.0, "-"), (1e-9, "-"), (0.06, "52.1")])
+def test_needed_braking_is_shown_while_a_gap_is(gap_m, shown):
+    moment = SimpleNamespace(
+        other_speed=3.0, gap_m=gap_m, closing_speed=2.5, time_to_collision_s=0.0, required_deceleration=52.1
+    )
+    assert _cells(moment)[-1] == shown
