@@ -164,6 +164,7 @@ def test_random_configuration_has_the_bits_of_highway_env(name):
 
 
 @pytest.mark.nightly
+@pytest.mark.timeout(3600)  # minutes, and many more on a loaded machine
 @pytest.mark.parametrize("name", IDS)
 def test_many_random_configurations_have_the_bits_of_highway_env(name):
     ran = [compare(name, number, STEPS) for number in range(PER_ENVIRONMENT)]
