@@ -6,11 +6,14 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from crashhunt.base.processes import is_alive, kill
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 SCRIPT = """
 import os, subprocess, sys, time
