@@ -487,7 +487,7 @@ class PhaseStatus(Serializable):
     """Progress of a phase.
 
     Args:
-        name: of the phase.
+        name: name of the phase.
         done: number of runs that have ended.
         total: number of runs.
         seconds_left: until the phase ends; None where that is unknown.
@@ -518,7 +518,7 @@ class PhaseClock:
         """Begin a phase.
 
         Args:
-            name: of the phase.
+            name: name of the phase.
             total: number of runs.
             done: number of these that earlier runs of the hunt have finished.
         """

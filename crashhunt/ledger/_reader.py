@@ -75,7 +75,7 @@ class RunningRate(TypedDict):
         confidence: confidence of all intervals, in percent.
         units: independent units that count: trials, traffics or roots.
         trials: plain trials that count.
-        crashes: crashes of them.
+        crashes: number of crashes among them.
         origin: the origin of the trials that count; empty if all do.
         certain: interval that is valid whenever you look; None if there is none.
         estimate: crash probability per trial by the copies; None if there is none.
