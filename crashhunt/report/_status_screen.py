@@ -127,7 +127,8 @@ class Watcher:
         return Group(*rows, *nodes, _workers(status, width, max(1, left - len(nodes))))
 
     def _head(self, status: HuntStatus, width: int) -> Text:
-        phase = "confirming" if status.progress is not None else status.phase
+        said = _PHASES.get(status.phase, status.phase)  # such as "confirming near misses", as the next line says
+        phase = "confirming" if said.startswith("confirming") else said
         now = f"   {phase}   {format_seconds(status.elapsed_s)}"
         title = Text(self._title, "bold")
         title.truncate(max(1, width - len(now)), overflow="ellipsis")

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from crashhunt.executors import NodeFigures
-from crashhunt.hunts import HuntStatus, SearchStatus, StrategyStatus
+from crashhunt.hunts import HuntStatus, PhaseStatus, SearchStatus, StrategyStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher, describe_running
 from crashhunt.report._status_screen import _line, describe_kinds
@@ -102,6 +102,18 @@ def test_kinds_of_crashes_and_when_the_last_new_one_came():
     assert describe_kinds(replace(found, newest_kind_trials=None)).endswith("(last new type: 3:12 ago)")
     by_cause = replace(found, newest_kind_s=None, types_by_cause=5)  # --by-cause 8
     assert describe_kinds(by_cause) == "2 crash types, 5 by cause"
+
+
+@pytest.mark.parametrize(
+    ("phase", "head"),
+    [("auditing", "auditing"), ("causes", "finding causes"), ("near misses", "confirming"), ("saving", "saving")],
+)
+def test_first_line_has_the_phase(phase, head):
+    progress = PhaseStatus(name=phase, done=1, total=4, seconds_left=None) if phase != "saving" else None
+    console = Console(width=100, height=12, force_terminal=True, color_system=None)
+    with console.capture() as shown:
+        console.print(Watcher(console, "a hunt")._screen(replace(status(2), phase=phase, progress=progress)))
+    assert shown.get().splitlines()[0].rstrip() == f"a hunt   {head}   1:05"
 
 
 @pytest.mark.parametrize(
