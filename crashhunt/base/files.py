@@ -52,9 +52,14 @@ def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Itera
 
 def _refuse_device(path: Path) -> None:
     """Raise an error where a file would replace a device or a pipe, or a link to one: root could replace /dev/null."""
-    is_special = path.exists() and not (path.is_file() or path.is_dir())
-    if is_special or path.absolute().parent == Path("/dev"):
+    try:
+        is_special = path.exists() and not (path.is_file() or path.is_dir())
+    except OSError as error:  # such as a name that is too long
+        raise cannot_write(path, error) from error
+    if is_special:
         raise HuntDirectoryError("is a device or a pipe, and cannot be replaced", fix="give a file", where=str(path))
+    if path.absolute().parent == Path("/dev"):  # such as /dev/stdout, a link to what is a file now
+        raise HuntDirectoryError("is in the folder of devices", fix="give a file in another folder", where=str(path))
 
 
 def put_in_place(made: Path, final: Path) -> None:

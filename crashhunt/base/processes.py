@@ -37,12 +37,16 @@ def adopt_orphans() -> None:
     _prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
-def die_with(parent: int) -> None:
-    """Have the kernel kill this process when its parent ends; exit at once if the parent has ended already.
+def die_with(parent: int, number: int = signal.SIGKILL) -> None:
+    """Have the kernel end this process when its parent ends; exit at once if the parent has ended already.
 
     The kernel watches the *thread* that started this process, so that thread must stay alive.
+
+    Args:
+        parent: process id of the parent.
+        number: signal that the kernel sends.
     """
-    _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    _prctl(_PR_SET_PDEATHSIG, number)
     if os.getppid() != parent:  # it died before the prctl call
         os._exit(1)
 

@@ -53,7 +53,7 @@ class Way:
     """How an actor moved before the contact, a row for each of the times of a `ContactRecord`.
 
     Args:
-        id: of the actor.
+        id: identifier of the actor.
         points: x and y of its front bumper, shape (n, 2), in m.
         headings: shape (n,), in rad.
         speeds: shape (n,), in m/s.

@@ -58,7 +58,7 @@ class Moment:
     """How the other actor stands to the agent after one step.
 
     Args:
-        step: of the episode.
+        step: step of the episode.
         time_s: simulation time.
         speed: speed of the agent, in m/s.
         other_speed: speed of the other actor, in m/s.

@@ -337,23 +337,37 @@ class _Shared:
 
     A cancelled trial may still run when the same trial is submitted again. Therefore each run has its own number,
     which is the name of its folder.
+
+    An executor reports once that it can run no trial. The error is kept for all threads, which would wait forever.
     """
 
     def __init__(self, executor: Executor, scratch: Path) -> None:
         self.executor, self._scratch = executor, scratch
         self._lock = threading.Lock()
         self._ended: dict[int, TrialResult] = {}
+        self._error: Exception | None = None
         self._numbers = itertools.count()
 
     def run(self, spec: TrialSpec, stopped: Callable[[], bool]) -> tuple[TrialResult, Path] | None:
         with self._lock:
             number = next(self._numbers)
-            self.executor.submit(replace(spec, number=number))
+            if self._error is None:
+                self.executor.submit(replace(spec, number=number))
         while number not in self._ended:
             if stopped():
                 return None
             with self._lock:
                 if number not in self._ended:
-                    for result in self.executor.completed(_STOP_CHECK_INTERVAL_S):
-                        self._ended[result.spec.number] = result
+                    self._receive()
         return replace(self._ended.pop(number), spec=spec), scratch_of(self._scratch, number)
+
+    def _receive(self) -> None:
+        """Take in the trials that have ended."""
+        if self._error is not None:
+            raise self._error
+        try:
+            for result in self.executor.completed(_STOP_CHECK_INTERVAL_S):
+                self._ended[result.spec.number] = result
+        except Exception as error:
+            self._error = error
+            raise

@@ -127,7 +127,7 @@ def await_imports(reports: socket.socket, pid: int, timeout_s: float) -> None:
 
     Args:
         reports: connection from the child: a message before each import, an empty one at the end.
-        pid: pid of the child.
+        pid: process id of the child.
         timeout_s: as of `ImportWatch`.
 
     Raises:

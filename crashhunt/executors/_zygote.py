@@ -182,7 +182,7 @@ class _Suspended:
     """A suspended process, as its zygote knows it.
 
     Args:
-        pid: pid of the process.
+        pid: process id.
         asks: the end of a pipe to it.
         says: the end of one from it.
         used: number of the trial that used it last.

@@ -454,7 +454,7 @@ def prune_bundles(
     """Remove the bundles of crashes of which there are enough that are shorter; return the crashes that stay.
 
     Args:
-        ledger: of the hunt.
+        ledger: ledger of the hunt.
         kinds: The crash types of the hunt, which forget the removed crashes; None where the first crash ends the hunt.
         crashes: The crashes with a bundle.
         keep: Number of bundles that stay of each crash type; 0 for all.

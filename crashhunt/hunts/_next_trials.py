@@ -369,6 +369,8 @@ class Unanswered:
         if result.was_killed_from_outside:
             return False  # the ledger has an answer that is as good, or better
         progress.outcomes -= Counter([str(before.outcome)])
+        if not before.was_killed_from_outside:  # otherwise its outcome was unknown
+            progress.counted_before.add(result.spec.number)
         if before.digest and before.digest != result.digest:
             again = f"trial {result.spec.number} was run again for the answers of its copies"
             note = f"{again}, and is another one: it is not determined by its specification"

@@ -251,6 +251,7 @@ class Progress:
     searching: Searching = field(default_factory=Searching)
     rate: BarWatch | None = None
     counted: RateWatch | None = None  # the same where there is a bar
+    counted_before: set[int] = field(default_factory=set)  # trials that run again, and that the rate has already
     rare: RareWatch | None = None
 
     def resume(self, crashes: list[Bundle], run: RunSettings, before: Facts) -> None:
@@ -282,7 +283,7 @@ class Progress:
         self.outcomes[str(result.outcome)] += 1
         self.searching.take(result, crashed=crashed)
         self.remaining.ended(time.monotonic(), max(0, planned - sum(self.outcomes.values())), self.parallel)
-        if self.counted is not None:
+        if self.counted is not None and result.spec.number not in self.counted_before:
             self.counted.add(result)
         if result.outcome is Outcome.INVALID and not crashed:
             self.last_invalid = result
@@ -487,7 +488,7 @@ class PhaseStatus(Serializable):
     """Progress of a phase.
 
     Args:
-        name: of the phase.
+        name: name of the phase.
         done: number of runs that have ended.
         total: number of runs.
         seconds_left: until the phase ends; None where that is unknown.
@@ -518,7 +519,7 @@ class PhaseClock:
         """Begin a phase.
 
         Args:
-            name: of the phase.
+            name: name of the phase.
             total: number of runs.
             done: number of these that earlier runs of the hunt have finished.
         """

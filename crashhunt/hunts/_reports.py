@@ -280,7 +280,7 @@ class HuntReport:
         types_by_cause: number of causes, counted for each crash type on its own; None without ``--by-cause``.
         near_misses: the near misses that were kept, the most critical first.
         probes: the result of the probes; None without ``--probe``.
-        at_fault: numbers of the trials whose crash is the agent's fault; None without ``--at-fault``.
+        at_fault: numbers of the trials whose crash is the agent's fault; None without ``--only-at-fault``.
         branches: the result of the branches; None without ``--branch``.
         copied: the crash of a copy that ended the hunt. It was confirmed by a run from the start.
         rare: the result of rare mode; None without ``--rare``.

@@ -56,8 +56,8 @@ class About:
         meaning: meaning of its value, in words.
         help: the same on the command line, where it has to be said otherwise.
         unset: what holds where it is not given, in words; empty if that is the default itself.
-        flag: flag on the command line; empty if it is not there.
-        metavar: metavar of its value, on the command line.
+        flag: option on the command line; empty if it is not there.
+        metavar: placeholder of its value in the help.
         group: group of the help of ``crashhunt run``: what is tested, search, faults and probes, what is kept, how it
             runs, output.
         brief: the same in one line, for the short help of ``crashhunt run``; empty for options that it only names.

@@ -135,8 +135,8 @@ class Watcher:
         return text if folds else Text(text.plain, no_wrap=True, overflow="ellipsis")
 
     def _head(self, status: HuntStatus, width: int) -> Text:
-        phase = "running" if status.phase == "hunting" else status.phase
-        phase = "confirming" if status.progress is not None else phase
+        phase = _PHASES.get(status.phase, status.phase)  # such as "confirming near misses", as the next line says
+        phase = "confirming" if phase.startswith("confirming") else phase
         now = f"   {phase}   {format_seconds(status.elapsed_s)}"
         title = Text(self._title, "bold")
         title.truncate(max(1, width - len(now)), overflow="ellipsis")

@@ -51,8 +51,8 @@ def show(_):
     with open(sys.argv[1], "w") as file:
         subprocess.run(["/bin/sh", "-c", "echo from a child; echo from a child >&2"], check=True)
         print("to people", file=sys.stderr)
-        for descriptor in range(3):
-            print(os.path.exists(f"/proc/self/fd/{descriptor}") and os.readlink(f"/proc/self/fd/{descriptor}"), file=file)
+        for place in map("/proc/self/fd/{}".format, range(3)):
+            print(os.path.exists(place) and os.readlink(place), file=file)
     return 0
 
 cli._run = show

@@ -23,7 +23,8 @@ from crashhunt.hunts._next_trials import Unanswered, find_unanswered
 from crashhunt.hunts._progress import Progress
 from crashhunt.hunts._state import draws_independently, ledger_owner
 from crashhunt.ledger import Ledger
-from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.rates import CountingRule, RateWatch
+from crashhunt.trial import KILLED, Branches, Failure, Outcome, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
@@ -283,6 +284,26 @@ def test_trials_that_were_killed_are_run_again_and_counted_once(tmp_path):
         assert len(unanswered) == 1  # in the next run of the hunt
         assert unanswered.account(result(9), progress)
         assert len(unanswered) == 1
+
+
+def test_trials_that_run_again_count_once_for_the_rate(tmp_path):
+    """Of two traffics with three trials each, trial 0 was not fully asked, and trial 1 was killed."""
+    asked_again = Branches(unanswered=1, may_be_asked_again=True)
+    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(copies=["branches"])
+        ledger.record(result(0, branches=asked_again), snapshot="")
+        ledger.record(result(1, Outcome.INVALID, failure=KILLED_TRIAL), snapshot="")
+        unanswered, progress = Unanswered(ledger), Progress()
+        progress.counted = RateWatch(CountingRule(max_steps=9, traffics=2, planned=6), "trial", ("collision",))
+        progress.counted.add(result(0))  # as a resumed hunt reads it
+        for number in (0, 1, 2, 3):
+            assert unanswered.account(result(number), progress)
+            progress.count(result(number), crashed=False, planned=6)
+        assert progress.running_rate(now=True)["units"] == 0  # trials 4 and 5 are left, of one traffic each
+        progress.count(result(4), crashed=False, planned=6)
+        assert (progress.running_rate(now=True)["units"], progress.counted.sequence.valid) == (1, 3)
+        progress.count(result(5), crashed=False, planned=6)
+        assert (progress.running_rate(now=True)["units"], progress.counted.sequence.valid) == (2, 6)
 
 
 def test_what_is_whole_is_saved_into_another_directory(hunt, tmp_path):

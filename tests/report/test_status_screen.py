@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from crashhunt.executors import NodeFigures
-from crashhunt.hunts import HuntStatus, SearchStatus, StrategyStatus
+from crashhunt.hunts import HuntStatus, PhaseStatus, SearchStatus, StrategyStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher, describe_running
 from crashhunt.report._status_screen import _line, _near, describe_kinds, format_inputs
@@ -125,6 +125,18 @@ def test_long_lines_fold_on_a_screen_of_80_columns():
     assert describe_running(rate) in text
     assert "while the agent changes lanes (2)" in text
     assert "…" not in text.partition("crash rate")[2]
+
+
+@pytest.mark.parametrize(
+    ("phase", "head"),
+    [("auditing", "auditing"), ("causes", "finding causes"), ("near misses", "confirming"), ("saving", "saving")],
+)
+def test_first_line_has_the_phase(phase, head):
+    progress = PhaseStatus(name=phase, done=1, total=4, seconds_left=None) if phase != "saving" else None
+    console = Console(width=100, height=12, force_terminal=True, color_system=None)
+    with console.capture() as shown:
+        console.print(Watcher(console, "a hunt")._screen(replace(status(2), phase=phase, progress=progress)))
+    assert shown.get().splitlines()[0].rstrip() == f"a hunt   {head}   1:05"
 
 
 @pytest.mark.parametrize(

@@ -229,7 +229,7 @@ class Found:
     Args:
         id: Ray's.
         name: name for people.
-        cpus: cpus for work.
+        cpus: number of CPUs for work.
         free: those that are not in use.
     """
 
@@ -244,7 +244,7 @@ class Cluster:
 
     Args:
         address: address of the cluster; empty for one of our own, which ends with this process.
-        cpus: cpus of one of our own.
+        cpus: number of CPUs of a cluster of our own.
         temporary: the folder for files of one of our own.
 
     Raises:
@@ -383,7 +383,7 @@ class Cluster:
         Args:
             actors: all that were started.
             ready: those that run trials.
-            wait_s: wait for the ready ones to end their work, in s.
+            wait_s: time for the ready nodes to end their work, in s.
         """
         with suppress(Exception):
             closed = [self.order(actor, "close") for actor in ready]

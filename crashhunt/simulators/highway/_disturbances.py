@@ -81,9 +81,9 @@ def lanes_ahead(
     At such a fork, `RoadNetwork.next_lane` would draw a lane at random and change the simulation.
 
     Args:
-        network: of the road.
-        vehicle: with its route, where it has one.
-        index: of the first lane; None for that of the vehicle.
+        network: network of roads.
+        vehicle: the vehicle, with its planned route if it has one.
+        index: index of the first lane; None for the lane of the vehicle.
     """
     start, end, number = index or vehicle.lane_index
     # Only a ControlledVehicle has a planned route.

@@ -31,8 +31,8 @@ def surroundings_of(
     """Return the surroundings of a vehicle with meta-actions. Reads positions only, and draws no random number.
 
     Args:
-        network: of the road.
-        vehicle: the agent's.
+        network: network of roads.
+        vehicle: vehicle of the agent.
         others: all other vehicles and obstacles.
         name_of: returns the identifier of an actor.
     """
