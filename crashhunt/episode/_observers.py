@@ -261,7 +261,7 @@ class Nearness(Observer):
 
 
 class Recorder(Observer):
-    """Turns what happens into records; adds the digest to the result, and how often which event happened.
+    """Writes the records of an episode; adds the digest and the number of traffic events to the result.
 
     It comes first of all observers: a step is complete when it is recorded.
 

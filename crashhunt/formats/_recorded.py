@@ -111,7 +111,7 @@ class Recorded:
         title: what it is, in one line.
         number: number of its trial.
         step_length_s: step length in s.
-        steps: how many were recorded.
+        steps: number of recorded steps.
         agents: the ways of the controlled vehicles.
         others: those of everybody else.
         roads: the lanes that an agent came near.

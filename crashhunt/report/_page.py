@@ -191,7 +191,7 @@ def write_report(
         found: all crashes of the hunt; by default those of the directory.
         near_misses: number of near misses of the hunt, of which `bundles` has some.
         name: name of the hunt, for the title; its directory's by default.
-        watch: called after each crash with how many are done, and how many there are.
+        watch: called after each crash with the number of finished crashes, and the number of all crashes.
 
     Returns:
         Its size in bytes.
