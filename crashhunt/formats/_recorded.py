@@ -137,7 +137,7 @@ def recorded_of(bundle: Bundle) -> Recorded:
     lanes = read_lanes(bundle.path / layout.LOG)
     if not paths.agents:
         raise BundleError(
-            f"{bundle.id} has no scene with its agent, so there is nothing to hand on",
+            f"{bundle.id} has no scene with its agent, so there is nothing to export",
             fix="export it without --as: a Gymnasium environment records no vehicles",
         )
     if not lanes:
