@@ -54,7 +54,7 @@ _PANEL = (240, 160)
 _PAPER = 255
 _AROUND_S = 10.0  # of a near miss, half of it before and half after
 _SHOWN_S = 10.0  # of the built-in curves
-_BUILTIN = ("time to collision with the other s", "gap to the other m", "speed m/s", "action")
+_BUILTIN = ("time to collision s", "gap m", "speed m/s", "action")
 _NEAREST = ("least time to collision s", "nearest gap m")  # of a crash that has no other one
 _WITHOUT_SCENE = ("reward", "action")
 
