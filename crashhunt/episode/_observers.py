@@ -266,7 +266,7 @@ class Recorder(Observer):
     It comes first of all observers: a step is complete when it is recorded.
 
     Args:
-        box: what to write into; `BlackBox.begin` has been called.
+        box: the black box, after a call of `BlackBox.begin`.
         simulator: simulator of the episode.
     """
 
