@@ -58,7 +58,7 @@ class StableBaselines3:
     ) -> None:
         module, _, name = algorithm.rpartition(":")
         if not module and name not in _ALGORITHMS:
-            raise ValueError(f"algorithm {algorithm!r} is none of {', '.join(_ALGORITHMS)}, and not module:Class")
+            raise ValueError(f"algorithm {algorithm!r} is unknown (allowed: {', '.join(_ALGORITHMS)}, module:Class)")
         kind = getattr(_library(module or "stable_baselines3", "sb3"), name, None)
         if kind is None:
             raise ValueError(f"algorithm {algorithm!r}: {module} has no class {name!r}")

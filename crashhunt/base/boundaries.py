@@ -52,7 +52,7 @@ class Boundary:
 
     Args:
         party: The party whose code is called.
-        place: What it is called for, such as ``step``.
+        place: Task of the call, such as ``step``.
     """
 
     __slots__ = ("_party", "_place")

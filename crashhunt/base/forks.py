@@ -424,7 +424,8 @@ def _replacements(known: Held, keeps: Collection[int]) -> list[tuple[int, int, i
     own = {str(threading.get_native_id())}
     others = len(threads() - watchdog.threads - known.threads - own)
     if others > 0:
-        raise CannotForkError(f"a fork copies no threads, and {others} run{'s' * (others == 1)} besides the first")
+        count = f"{others} further thread{' runs' if others == 1 else 's run'}"
+        raise CannotForkError(f"a fork copies no threads, and {count}")
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():
         raise CannotForkError("a fork copies no state of a graphics card, and PyTorch uses one")

@@ -63,9 +63,9 @@ def _check(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _describe(found: Checked) -> str:
-    parts = [f"{len(found.trials)} trials"] if found.kind == "hunt" else []
+    parts = [f"{len(found.trials)} trial{'' if len(found.trials) == 1 else 's'}"] if found.kind == "hunt" else []
     parts.append(f"{len(found.crashes)} crash{'' if len(found.crashes) == 1 else 'es'}")
-    lines = [f"{found.dir}: {' and '.join(parts)} {'are' if found.kind == 'hunt' else 'is'} as written"]
+    lines = [f"{found.dir}: {' and '.join(parts)} {'are' if found.kind == 'hunt' else 'is'} intact"]
     if not found.fine:
         bad = [
             f"{len(numbers)} {name}"

@@ -63,7 +63,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
     Args:
         bundle: the crash.
         target: the file; an existing one is replaced.
-        watch: called after each file with how many are done, and how many there are.
+        watch: called after each file with the number of finished files, and the number of all files.
 
     Returns:
         Its size in bytes.

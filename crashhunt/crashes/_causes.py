@@ -163,7 +163,7 @@ class Division:
     distance, Theoretical Computer Science 38, 1985). Crashes may be added in between.
 
     Args:
-        most: how many crashes to judge at most.
+        most: maximum number of crashes to judge.
     """
 
     def __init__(self, most: int) -> None:

@@ -114,7 +114,7 @@ class Why(Serializable):
     Args:
         factors: factors in the order in which they were looked at.
         steps: number of steps after which a run ended that did not crash; of those with other arguments or seeds.
-        left: how many runs more there would have been.
+        left: number of further runs that the limit prevented.
         why_not: why there is no answer, or not a whole one; empty if there is.
     """
 
@@ -168,7 +168,7 @@ def wilson(found: int, of: int) -> tuple[float, float]:
 
     Args:
         found: how many.
-        of: of how many; at least 1.
+        of: number of all runs; at least 1.
     """
     share, spread = found / of, _Z * _Z / of
     center, half = share + spread / 2, math.sqrt(spread * share * (1 - share) + spread * spread / 4)

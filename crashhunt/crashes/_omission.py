@@ -21,7 +21,7 @@ class ReferenceRun(Serializable):
         faculty: ``longitudinal``, ``lateral`` or ``both``.
         step: the step after which the reference driver takes over.
         ending: what became of the crash: ``none``, ``same``, ``other`` or ``unclear``.
-        changed: what else differs from the recorded crash, such as ``ego does not change lanes``.
+        changed: further differences from the recorded crash, such as ``ego does not change lanes``.
     """
 
     faculty: str

@@ -105,7 +105,7 @@ def group_crashes(
 
     Args:
         bundles: bundles of one hunt or several; the log of each is read.
-        dropped: for each crash type, in words, how many more there were.
+        dropped: description of each crash type to the number of its crashes without a bundle.
         faults: whether to find the vehicle at fault for each crash.
     """
     signed, unsigned = [], []
@@ -148,7 +148,7 @@ def groups_of(
 
     Args:
         signed: the crashes.
-        dropped: for each crash type, in words, how many more there were.
+        dropped: description of each crash type to the number of its crashes without a bundle.
     """
     found: dict[Signature, list[Bundle]] = {}
     for signature, bundle in signed:

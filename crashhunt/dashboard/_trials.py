@@ -49,11 +49,11 @@ class Prefix(NamedTuple):
     """The first trials of a hunt, up to the first that has not ended.
 
     Args:
-        valid: how many of them count.
-        invalid: how many do not.
+        valid: number of trials that count.
+        invalid: number of trials that do not count.
         crashes: crashes of the valid ones.
         steps: steps of the valid ones.
-        excluded: how many trials have ended after them.
+        excluded: number of trials that have ended after them.
     """
 
     valid: int
@@ -246,7 +246,7 @@ class TrialCounts:
         return [found[round(place * (len(found) - 1) / (most - 1))] for place in range(most)]
 
     def parts(self) -> list[dict[str, object]]:
-        """Return the parts: the first and last number, and how many of its trials ended how."""
+        """Return the parts: the first and the last number, and the number of trials with each outcome."""
         return [
             {
                 "first": number * self._width,

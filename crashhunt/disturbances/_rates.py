@@ -159,7 +159,7 @@ def disturber_of(
     """Return the sampler of the disturbances of trials.
 
     Args:
-        rates: name of a model to how often it happens a second, around each agent.
+        rates: name of a model to its rate per second around each agent.
         agents: the controlled vehicles.
         step_length_s: step length in s.
         known: the kinds that the simulator supports; None if that is unknown.

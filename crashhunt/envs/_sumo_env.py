@@ -128,7 +128,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         bit-identical observations. Copies may be branched again, and outlive this environment. Close each of them.
 
         Args:
-            n: how many, at least 1.
+            n: number of copies, at least 1.
             seed: seed from which each copy gets another seed for SUMO's random generators, so that drivers behave
                 differently; when vehicles depart stays as planned. None to keep the state of the generators.
 

@@ -129,11 +129,11 @@ class Episode(Forkable, Ending):
         names: all actors, in the order of their numbers; empty before the start.
         agents: agents by name; one that is replaced between two steps is asked from the next one on.
         acting: the numbers of those that act in the next step.
-        steps: how many are complete.
+        steps: number of completed steps.
         result: The result; None while the episode runs.
         error: the exception that ended it, where one did; until it is closed.
         setup_s: wall time that `start` took, in s.
-        setup_steps: how many steps were simulated before the first one; None if the simulator does not say.
+        setup_steps: number of steps before the first one; None if the simulator does not report it.
     """
 
     def __init__(

@@ -261,12 +261,12 @@ class Nearness(Observer):
 
 
 class Recorder(Observer):
-    """Turns what happens into records; adds the digest to the result, and how often which event happened.
+    """Writes the records of an episode; adds the digest and the number of traffic events to the result.
 
     It comes first of all observers: a step is complete when it is recorded.
 
     Args:
-        box: what to write into; `BlackBox.begin` has been called.
+        box: the black box, after a call of `BlackBox.begin`.
         simulator: simulator of the episode.
     """
 

@@ -80,7 +80,7 @@ class Probed:
         """Return one.
 
         Args:
-            share: how much of it, from 0 to 1.
+            share: share of the plausible maximum, from 0 to 1.
             who: the chosen place.
             agent: The agent at the centre of the grid.
             step: in which it begins.
@@ -121,7 +121,7 @@ class Prober:
     """Asks copies of one episode after another.
 
     Args:
-        every_s: how often, in s of simulation time.
+        every_s: time between two probes, in s of simulation time.
         crash_on: what counts as a crash.
         delay: called with the wall time that copies have taken, in s.
         budget: steps that copies may take for each step of their trial.

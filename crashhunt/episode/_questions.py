@@ -41,7 +41,7 @@ class Questions:
 
     Attributes:
         why_not: why this process asks no copies any more, in words; empty if it does.
-        unanswered: how many questions of this trial have no answer.
+        unanswered: number of questions of this trial without an answer.
         why_unanswered: the reason for the first of them, in words; empty if all have an answer.
         may_be_answered: whether a cause was outside, so that the same trial, run again, may have all answers.
         has_answer: whether the last question has an answer.

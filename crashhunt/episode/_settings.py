@@ -60,8 +60,7 @@ class WorkerSettings(Serializable):
         audit: the share of trials without a crash whose scratch folder is kept, because they are run again.
         hunt_seed: what decides which.
         warm_copies: number of traffics for which a worker of a pool keeps a warmed-up copy of itself; 0 for none.
-        probe_s: how often copies of a trial are asked how little it would take for a crash, in s of simulation time; 0
-            for never.
+        probe_s: time between two probes of a trial, in s of simulation time; 0 for no probes.
         branch: The rates of disturbances in branches, ``NAME=RATE`` each; empty for no branches.
         force: The rates of disturbances of forks with a forced first onset, ``NAME=RATE`` each; empty for none.
     """

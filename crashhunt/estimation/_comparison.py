@@ -93,7 +93,7 @@ class Pair:
     Args:
         first: directory.
         second: directory.
-        trials: how many pairs of valid trials.
+        trials: number of pairs of valid trials.
         only_first: pairs in which only the first crashed; with ``--seeds``, traffics in which it crashed more often.
         only_second: likewise for the second.
         both: in which both did, equally often.

@@ -108,7 +108,7 @@ class GateReport:
         why: why the verdict is not that of the pairs, or why there is none; empty if nothing has to be said.
         is_interrupted: whether a request to stop came before the end.
         dir: where the hunts are; empty if they are not kept.
-        trained_on: how many pairs do not count, because an agent was trained on this part of the traffics.
+        trained_on: number of pairs that do not count, because an agent was trained on this part of the traffics.
     """
 
     verdict: PairVerdict
@@ -177,10 +177,10 @@ class PairedHunts:
         name: name of the hunt.
         base: directory of BASE's hunt.
         head: directory of HEAD's.
-        pairs: how many trials each has at most.
+        pairs: maximum number of trials of each hunt.
 
     Attributes:
-        trained_on: how many pairs do not count, because an agent was trained on this part of the traffics.
+        trained_on: number of pairs that do not count, because an agent was trained on this part of the traffics.
     """
 
     def __init__(self, name: str, base: Path, head: Path, pairs: int) -> None:

@@ -130,11 +130,11 @@ def rate_of_counts(
         directory: directory of the hunt.
         settings: settings of the hunt.
         facts: facts of its ledger.
-        valid: how many of the first trials, up to the first that has not ended, were valid.
-        invalid: how many of them were not.
+        valid: number of valid trials before the first unfinished one.
+        invalid: number of invalid trials among them.
         crashes: crashes of the valid ones.
         steps: that the valid ones took.
-        excluded: how many trials have ended after the first that has not.
+        excluded: number of trials that have ended after the first unfinished one.
         confidence: confidence of the certain interval, in percent.
     """
     rule = counting_rule(settings, facts)

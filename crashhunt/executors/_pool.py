@@ -51,7 +51,7 @@ class ForkServerLink:
     Args:
         settings: settings of the hunt.
         late: whether each trial imports its agents itself, because what has imported them cannot be forked.
-        deaths: how often it was killed before.
+        deaths: number of earlier kills of the process.
         snapshot: whether crashhunt itself comes from the code of the settings.
     """
 
@@ -343,7 +343,7 @@ class PoolExecutor:
         worker.socket.setblocking(False)
 
     def _hear(self, worker: _Worker) -> None:
-        """Take what a worker says, as far as it has come."""
+        """Read the messages that a worker has sent completely."""
         over = False
         try:
             data = worker.socket.recv(_RECEIVED)

@@ -146,7 +146,7 @@ def killed_from_outside(spec: TrialSpec, why: str, exit_code: int) -> TrialResul
 
     Args:
         spec: the trial.
-        why: how often it was killed, and where.
+        why: number and places of the kills.
         exit_code: exit code of its last process; negative for a signal.
     """
     return TrialResult(spec, Outcome.INVALID, failure=Failure(KILLED, why, exit_code=exit_code))

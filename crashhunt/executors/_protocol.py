@@ -97,8 +97,8 @@ class NodeFigures:
 
     Args:
         name: name of it.
-        parallel: how many trials run there at a time.
-        trials: how many have ended there in this run of the hunt.
+        parallel: number of trials that run on the node at a time.
+        trials: number of trials that have ended on the node in this run of the hunt.
         rate_per_s: trials a second since it takes part.
     """
 

@@ -113,7 +113,7 @@ def import_died(importing: str, exit_code: int, *, times: int = 1) -> CrashhuntE
     Args:
         importing: as of `ImportWatch`.
         exit_code: exit code of the process, negative for a signal.
-        times: how often it was tried.
+        times: number of attempts.
     """
     again = f", {times} times" if times > 1 else ""
     return CrashhuntError(

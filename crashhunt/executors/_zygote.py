@@ -283,7 +283,7 @@ _LOOK_EVERY_S = 0.005  # where the kernel does not report when a process ends
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What the processes of trials need not do again, as it was done before they were forked.
+    """The preparation of the processes of trials, done once before they are forked.
 
     Args:
         parts: what has been imported; None if each trial imports its agents itself.

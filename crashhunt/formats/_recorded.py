@@ -111,7 +111,7 @@ class Recorded:
         title: what it is, in one line.
         number: number of its trial.
         step_length_s: step length in s.
-        steps: how many were recorded.
+        steps: number of recorded steps.
         agents: the ways of the controlled vehicles.
         others: those of everybody else.
         roads: the lanes that an agent came near.
@@ -137,7 +137,7 @@ def recorded_of(bundle: Bundle) -> Recorded:
     lanes = read_lanes(bundle.path / layout.LOG)
     if not paths.agents:
         raise BundleError(
-            f"{bundle.id} has no scene with its agent, so there is nothing to hand on",
+            f"{bundle.id} has no scene with its agent, so there is nothing to export",
             fix="export it without --as: a Gymnasium environment records no vehicles",
         )
     if not lanes:

@@ -42,7 +42,7 @@ class Bounds(TypedDict):
 
 
 class EventCount(TypedDict):
-    """How often a traffic event occurred, and in how many trials."""
+    """The number of occurrences of a traffic event, and of trials with one."""
 
     count: int
     trials: int

@@ -234,13 +234,13 @@ class Kinds:
     """The kinds of the crashes that a hunt has saved.
 
     Args:
-        wanted: how many kinds are enough; 0 for never.
+        wanted: number of crash types that ends the hunt; 0 for no limit.
         crashes: that were saved before.
         newest: when the last new kind came, in s since the epoch; None if that is unknown.
         only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
         dropped: for each crash type, in words, the trials whose bundles were given up before.
         dropped_at_fault: of these trials, the ones whose crashes are the agent's own fault.
-        by_cause: how many crashes of each type to judge, so that each cause of a type counts; 0: types count.
+        by_cause: number of crashes of each type to judge, so that each cause of a type counts; 0: types count.
     """
 
     def __init__(
@@ -280,7 +280,7 @@ class Kinds:
 
         Args:
             bundle: the crash.
-            ended: how many trials have ended by now.
+            ended: number of trials that have ended.
         """
         if self._sign(bundle):
             self.newest, self.newest_trial = time.time(), ended
@@ -308,7 +308,7 @@ class Kinds:
         They still count, but are no members any more. A type whose crashes are still being judged keeps all of them.
 
         Args:
-            keep: how many stay.
+            keep: number of bundles to keep of each crash type.
             final: whether no more crashes are judged.
         """
         found = []
@@ -353,7 +353,7 @@ class Kinds:
         return None
 
     def count_to_judge(self) -> int:
-        """Return how many crashes are to be judged."""
+        """Return the number of crashes to judge."""
         return sum(division.left for division in self._divisions.values())
 
     def settle(self, judged: Judged) -> None:

@@ -298,7 +298,7 @@ def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport
 
     Args:
         copies: runs them.
-        differences: how many trials of the audit were not the same again.
+        differences: number of trials of the audit that were not bit-identical.
 
     Returns:
         None if the hunt is not in rare mode.

@@ -78,7 +78,7 @@ class Trials:
         unanswered: those of them that run again, in order of their numbers: something outside of them kept answers from
             it. The sampler receives the result in the ledger, and not that of the second run, so that a resumed hunt
             proposes the same trials.
-        lag: how many trials the hunt has under way at once; where it is deterministic, how many it may.
+        lag: number of trials that run at a time; in a deterministic hunt, the maximum number.
         lag_grows: whether the first trials of a deterministic hunt have a smaller lag (`growing_lag`).
         disturber: what draws their disturbances; None if they have none.
         forcings: the forcing of each root, in rare mode; None in any other hunt.

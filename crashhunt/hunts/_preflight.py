@@ -44,14 +44,14 @@ _ENOUGH = 4
 
 
 class Preflight:
-    """Holds back the first results of a hunt for as long as each says that the same agent failed to start, and how.
+    """Holds back the first results of a hunt while all of them are the same failure of an agent to start.
 
     It costs no time: these are the hunt's own first trials. Where an argument of the agent varies, another value of it
     may well do, and nothing is held back.
 
     Args:
         settings: settings of the hunt.
-        planned: how many trials there are to be.
+        planned: number of planned trials.
         files: files of arguments that name files, to where the snapshot has them.
         code: folders of the snapshot from which agents are imported.
         listen: called before the first result is accounted for, as it may be refused why there are none.
@@ -132,7 +132,7 @@ class Heard:
 
     Args:
         settings: settings of the hunt.
-        outcomes: outcomes of the trials that have ended, with how many.
+        outcomes: outcome to the number of ended trials with this outcome.
     """
 
     def __init__(self, settings: HuntSettings, outcomes: Mapping[str, int]) -> None:
@@ -180,7 +180,7 @@ def is_hopeless(settings: HuntSettings, outcomes: Mapping[str, int]) -> bool:
 
     Args:
         settings: settings of the hunt.
-        outcomes: outcomes of its trials, with how many.
+        outcomes: outcome to the number of its trials.
     """
     enough = min(settings.most_trials, max(_INVALID_BEFORE_GIVING_UP, 2 * settings.run.parallel))
     invalid = outcomes.get(str(Outcome.INVALID), 0)

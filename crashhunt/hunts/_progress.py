@@ -77,7 +77,7 @@ class SearchStatus:
 
     Args:
         strategies: those that have had trials, the most frequent first; empty if a sampler names none.
-        grown_trials: how many trials have ended since the greatest danger grew; None if it has not in this run.
+        grown_trials: number of trials since the last rise of the greatest danger; None without a rise in this run.
         grown_s: how long ago that was, in s of wall time; None likewise.
     """
 
@@ -165,12 +165,12 @@ class HuntStatus:
         nodes: the machines that take part now; None if there is this one only.
         kinds: kinds of crashes, the most frequent first; None if the first crash ends the hunt.
         newest_kind_s: how long ago the last new one came, in s; None if that is unknown.
-        newest_kind_trials: how many trials have ended since; None if it came in an earlier run of the hunt.
+        newest_kind_trials: number of trials since the last new crash type; None if an earlier run of the hunt found it.
         types_by_cause: number of causes, each type on its own; None if types count.
         time_left_s: time until no more trials begin, in s of wall time; infinite without a limit.
         disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
         stressed: the trial with the least stress margin; None if no copy was asked, or if no copy crashed.
-        branched: how many branches have crashed.
+        branched: number of branches that have crashed.
         not_fully_asked: number of trials with a question to their copies that has no answer.
         search: which strategies have had trials, and when the greatest danger grew in this run.
         rate: the crash rate so far; None if the trials bound none.

@@ -179,8 +179,8 @@ class RareReport:
 
     Args:
         estimate: estimate of the crash probability per trial.
-        verified: how many of the weightiest crashes of copies were run from the start.
-        not_finished: how many of these could not be run to their end.
+        verified: number of the weightiest crashes of copies that were run from the start.
+        not_finished: number of these runs that did not finish.
         crashes: those of them that crashed in the same way at the same step, and once more bit-identically.
     """
 

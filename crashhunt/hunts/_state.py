@@ -69,12 +69,12 @@ class ProbeSums(TypedDict):
         not_fully_asked: number of further trials with a question that has no answer.
         least: the least stress margin of the former; None if there is none.
         trial: the number of the trial that has it.
-        probes: how many copies were asked.
-        steps: how many steps they took.
-        left_out: how many questions were skipped, because copies had taken enough steps.
-        crashed_trials: how many trials a probe made crash that did not crash by themselves.
-        run_again: how many of the mildest were run from the start; None before that.
-        confirmed: how many of these crashed there as well.
+        probes: number of probes.
+        steps: number of steps of the copies.
+        left_out: number of skipped questions, because copies had used their share of steps.
+        crashed_trials: number of trials without a crash of their own that a probe made crash.
+        run_again: number of the mildest disturbances that were run from the start; None before these runs.
+        confirmed: number of these runs that crashed.
     """
 
     trials: int
@@ -96,13 +96,13 @@ class BranchSums(TypedDict):
         trials: number of trials that may have had some.
         moments: number of moments from which copies continued.
         branches: number of branches.
-        steps: how many steps they took.
-        left_out: how many were skipped, because branches had taken enough steps.
-        crashed: how many crashed.
+        steps: number of steps of the copies.
+        left_out: number of skipped branches, because branches had used their share of steps.
+        crashed: number of branches that crashed.
         crashed_trials: number of trials whose copies crashed.
         not_fully_asked: number of trials with a branch that has no answer.
-        run_again: how many of the likeliest were run from the start; None before that.
-        confirmed: how many of these crashed there as well.
+        run_again: number of the likeliest crashes that were run from the start; None before these runs.
+        confirmed: number of these runs that crashed.
     """
 
     trials: int
@@ -191,12 +191,12 @@ class HuntState(Serializable):
         state: ``queued``, ``running``, ``finished`` (no crash), ``crashed`` (found one), ``error``, ``interrupted``
             or ``killed`` (its process is gone and did not say why).
         detail: why, where it is an error.
-        trials_planned: how many were asked for; 0 if only the time is limited.
-        trials_run: how many have ended.
+        trials_planned: number of planned trials; 0 if only the time is limited.
+        trials_run: number of ended trials.
         outcomes: how.
-        crashes: how many were found, with or without a bundle.
-        crashes_saved: how many have a bundle, where these are fewer (``--keep``); else None.
-        errors: how many trials could not be set up, or ended in a software fault.
+        crashes: number of crashes, with or without a bundle.
+        crashes_saved: number of crashes with a bundle, if there are fewer (``--keep``); else None.
+        errors: number of trials that could not be set up, or ended in a software fault.
         rate_per_s: trials a second, in its last run.
         seconds_left: expected time to the last trial, to the time limit, or to the end of the phase, in s; None if
             unknown.
@@ -315,7 +315,7 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
     Args:
         directory: directory of the hunt.
         facts: facts of its ledger.
-        outcomes: how many trials ended how.
+        outcomes: outcome to its number of trials.
         last: when the last trial ended, in s since the epoch; None if none has.
     """
     said = facts.get("state", "queued")

@@ -110,8 +110,8 @@ class Noted(TypedDict, total=False):
         owner: the process that runs it, while it runs.
         began: when it was begun or resumed, in s since the epoch.
         heartbeat: when it was there last, likewise.
-        done_before: how many trials had ended when it began.
-        planned: how many trials it has; 0 if only the time is limited.
+        done_before: number of trials that had ended at the start of this run.
+        planned: number of planned trials; 0 if only the time is limited.
         until: when its time is up, in s since the epoch; None if it has all the time.
         hunt_seed: what its trials are drawn from.
         independent: whether they were drawn independently of each other.
@@ -123,7 +123,7 @@ class Noted(TypedDict, total=False):
             version 1.
         origins: whether its sampler says where trials come from.
         core: whether the simulator's compiled core is used; None if it has none.
-        disturb: how often what disturbs its trials; None if nothing does.
+        disturb: disturbances of the trials with their rates; None without disturbances.
         copies: which copies of its trials there are to be, some of ``probes`` and ``branches``; None if there are
             none.
         confirmed: of the trials whose copies crashed, how many were run from the start of what they found, and how many
@@ -141,7 +141,7 @@ class Noted(TypedDict, total=False):
         audits_left: the trials that were to be run again for the audit, and have not been; None if there is none.
         phase: what the hunt does after its last trial: fields of `PhaseStatus`; None before and at its end.
         ends_at: when its last trial is expected to end, in s since the epoch; None if that is unknown.
-        failed_steps: how many steps were simulated to confirm something that was not confirmed.
+        failed_steps: number of steps of confirmations that failed.
         until_rate: ``bar``, as it was given, ``decided_at``, the number of the trial that decided, and ``verdict``;
             None if the hunt has no bar.
         running_rate: the crash rate so far: None if no rate is known.
@@ -307,7 +307,7 @@ class LedgerReader:
         return {number for (number,) in self._select("SELECT number FROM trials")}
 
     def outcomes(self) -> dict[str, int]:
-        """Return how many trials ended how."""
+        """Return the number of trials with each outcome."""
         seal = self._seal()
         found = self._outcomes()
         self._compare_seal(seal, "outcomes", found)
@@ -369,14 +369,14 @@ class LedgerReader:
         return [(name, count, measured, danger, int(crashes)) for name, count, measured, danger, crashes in rows]
 
     def trial_steps(self) -> int:
-        """Return how many steps trials have taken."""
+        """Return the number of steps of the trials."""
         seal = self._seal()
         found = self._steps()
         self._compare_seal(seal, "steps", found)
         return found
 
     def steps_total(self) -> int:
-        """Return how many steps were simulated in all.
+        """Return the number of simulated steps.
 
         They include the steps of trials, of their warm-up and of their copies, and those of confirmations that ended
         differently. Steps that an older ledger does not record are missing.
@@ -542,7 +542,7 @@ class LedgerReader:
         return int(next(self._select("SELECT coalesce(max(number), -1) FROM trials"))[0])
 
     def replaced_count(self) -> int:
-        """Return how many trials have been moved out of the way to run again."""
+        """Return the number of trials that were moved away to run again."""
         return self._count("replaced")
 
     def steps_by_outcome(self) -> dict[str, tuple[int, int, int]]:

@@ -48,7 +48,7 @@ class Route:
     Args:
         id: such as ``r7``.
         edges: ids of its edges.
-        weight: how many of the drawn trips take it.
+        weight: number of drawn trips on this route.
         length_m: length in m.
         free_s: its time on free roads, in s.
     """

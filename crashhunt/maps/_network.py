@@ -79,7 +79,7 @@ class Network:
 
     Args:
         edges: edges by id, in the order of the file.
-        junctions: type of junction to how many there are; ends of roads are not counted.
+        junctions: type of junction to its number; ends of roads are not counted.
         crossings: number of pedestrian crossings.
         left_hand: whether traffic keeps to the left.
         areas: the outlines of junctions, in m.

@@ -107,7 +107,7 @@ def above_zero(fix: str, *, finite: bool = True) -> Check:
 
 @dataclass(frozen=True, slots=True)
 class HuntOption:
-    """One option of the list.
+    """An option of `HuntOptions`, with its texts for Python and the command line.
 
     Args:
         name: name in Python and in files.

@@ -110,7 +110,7 @@ class HuntSettings(TrialOptions):
     Args:
         scenario: the name or path that was given.
         scenario_digest: digest of the scenario's files and settings.
-        trials: how many to run; 0 if only the time is limited.
+        trials: maximum number of trials; 0 if only the time is limited.
         max_steps: maximum number of steps of a trial.
         seed: seed of the hunt; with a trial's number it determines the trial.
         crash_on: the outcomes that count as a crash.

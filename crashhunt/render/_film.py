@@ -54,7 +54,7 @@ _PANEL = (240, 160)
 _PAPER = 255
 _AROUND_S = 10.0  # of a near miss, half of it before and half after
 _SHOWN_S = 10.0  # of the built-in curves
-_BUILTIN = ("time to collision with the other s", "gap to the other m", "speed m/s", "action")
+_BUILTIN = ("time to collision s", "gap m", "speed m/s", "action")
 _NEAREST = ("least time to collision s", "nearest gap m")  # of a crash that has no other one
 _WITHOUT_SCENE = ("reward", "action")
 
@@ -68,7 +68,7 @@ class FilmOptions:
         size: size of the scene, in pixels.
         last_s: length of the film, in s: the end of a crash, or the time around the nearest moment of a near miss. 0
             shows all of a crash and 10 s of a near miss.
-        last_step_repeats: how often the last picture is shown again.
+        last_step_repeats: number of repeats of the last picture.
         blank_frames: blank frames between two crashes.
         panels: whether to show panels at all.
         scale: pixels a metre.
@@ -230,7 +230,7 @@ def _count(shots: Sequence[Shot], options: FilmOptions) -> int:
 
 
 def _frame_rate(shots: Sequence[Shot], options: FilmOptions) -> float:
-    """Return how many pictures a second the film has."""
+    """Return the number of pictures per second."""
     return options.fps or 1.0 / min(shot.recording.prologue.step_length_s for shot in shots)
 
 

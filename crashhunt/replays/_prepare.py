@@ -47,7 +47,7 @@ class Look:
     """What to look at in a replay.
 
     Args:
-        until: how many steps to run.
+        until: number of steps to run.
         stop_at: the step in which to drop into the ``act`` of the agent that crashed; 0 for none.
         to_stderr: whether what is printed goes there.
         panels: the step from which on to draw the agents' panels, and the folder for them.
@@ -127,7 +127,7 @@ class Rerun:
 
 
 def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
-    """Check a bundle, and gather what its crash needs to be run again.
+    """Check a bundle, and return everything that a new run of its crash needs.
 
     Raises:
         BundleError: the bundle is damaged.

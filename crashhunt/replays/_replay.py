@@ -242,7 +242,7 @@ def confirm(
     Args:
         bundle: the crash.
         stopped: Returns whether to stop; called repeatedly. A replay that fails afterwards does not count.
-        failed: gets what came of the replay, where that is not the crash.
+        failed: receives the result of the replay, if it is not the crash.
         executors: which run it; a new Python process where there are none.
         trusted: whether its code may run; None to find out.
 

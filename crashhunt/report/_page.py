@@ -191,7 +191,7 @@ def write_report(
         found: all crashes of the hunt; by default those of the directory.
         near_misses: number of near misses of the hunt, of which `bundles` has some.
         name: name of the hunt, for the title; its directory's by default.
-        watch: called after each crash with how many are done, and how many there are.
+        watch: called after each crash with the number of finished crashes, and the number of all crashes.
 
     Returns:
         Its size in bytes.
@@ -406,9 +406,9 @@ def _rate(rate: RunningRate | None) -> dict[str, object] | None:
     """Return the crash rate as the hunt has left it; None if it has none, as those of earlier versions."""
     if rate is None:
         return None
-    words = f"At least and at most are certain: {rate['confidence']:g} % confidence, valid whenever you look."
+    words = f"The bounds have {rate['confidence']:g} % confidence, valid whenever you look."
     if rate["method"] == "rare":
-        words += " The estimate omits failures that no copy has met; the certain bounds include them."
+        words += " The estimate omits failures that no copy has met. The bounds include these failures."
     return {
         "answer": describe_running(rate).removeprefix("crash rate: "),
         "words": words,

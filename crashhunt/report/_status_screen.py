@@ -267,7 +267,7 @@ def format_seconds(seconds: float) -> str:
 
 
 def describe_types(count: int, by_cause: int | None, noun: str = "type") -> str:
-    """Return how many crash types there are, and how many causes if the hunt counts these.
+    """Return the number of crash types, and of causes if the hunt counts these, in words.
 
     >>> describe_types(4, 6)
     '4 types, 6 by cause'

@@ -122,7 +122,7 @@ def aligned(rows: Sequence[Sequence[str]], *, left: int = 0) -> list[str]:
 
     Args:
         rows: the heading first; what a row has beyond it follows as it is.
-        left: how many columns are aligned to the left; the others are to the right.
+        left: number of columns that are aligned to the left; the others are aligned to the right.
     """
     count = len(rows[0])
     widths = [max(len(row[column]) for row in rows) for column in range(count)]

@@ -183,7 +183,7 @@ class Scenario:
         simulator: the name of a registered simulator, or ``module:attribute``.
         step_length_s: the control step, in s; that of some simulators follows from their own configuration.
         warmup_s: simulation time before the controlled vehicles enter, in s.
-        insertion_timeout_s: how much later they may enter before the episode is invalid, in s.
+        insertion_timeout_s: maximum delay of their entry, in s; after it, the episode is invalid.
         observation: layout of the observations; None for the simulator's own layout, or the default.
         arguments: the arguments that shape the traffic.
         agents: agent id to controlled vehicle.

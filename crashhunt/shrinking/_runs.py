@@ -56,13 +56,13 @@ class Runs:
         scratch: a folder for the workers.
         memory: A file with the results of candidates, for a search that resumes after an interruption.
         parallel: trials at a time.
-        budget: how many may be run.
+        budget: maximum number of runs.
         time_s: time limit for all of them, in s of wall-clock time; None without a limit.
         stopped: Returns whether to stop; called repeatedly.
-        watch: called with how many have been run, and how many may be.
+        watch: called with the number of runs so far, and the maximum.
 
     Attributes:
-        count: how many have been run, or are known from the last time.
+        count: number of runs, with those known from an interrupted call.
         steps: number of steps of these, altogether.
         most_steps: what takes longer to crash does not count as the same.
         found_steps: how many steps the last candidate that crashed in the same manner has begun.

@@ -45,11 +45,11 @@ class Shrunk:
         small: the minimized crash; None if nothing was removed.
         why: reason for the end, in words.
         actors: how many were seen before and after, the agents with them.
-        trials: how many were run.
+        trials: number of runs.
         steps: number of steps of these, altogether.
         removed: the removed actors and disturbances.
         changed: arguments with a new value: name to old and new value.
-        steps_cut: how many steps of the beginning were cut off.
+        steps_cut: number of steps that were removed from the beginning.
         notes: what may make a difference, in words.
     """
 
@@ -122,12 +122,12 @@ def shrink(
 
     Args:
         bundle: the crash.
-        budget: how many trials may be run.
+        budget: maximum number of trials.
         time_s: time limit, in s of wall-clock time; two runs that confirm the result are additional.
         form: ``traffic``: the other actors drive. ``scripted``: they follow recorded paths. ``either``: the form
             depends on the number of remaining actors.
         parallel: runs at a time; 0 for one per core.
-        watch: called with how many have been run, and how many may be.
+        watch: called with the number of runs so far, and the maximum.
         stopped: Returns whether to stop; called repeatedly.
         trusted: whether its code may run; None to find out.
 

@@ -117,7 +117,7 @@ def write_request(folder: Path, request: RunRequest) -> None:
 
 
 def slots_of(parallel: int) -> int:
-    """Return how many trials run at a time; 0 means one per core.
+    """Return the number of trials that run at a time; 0 means one per core.
 
     Raises:
         UsageError: it is negative.

@@ -47,7 +47,7 @@ class SuiteEntry(HuntOptions):
         id: names its folder; unique in the suite.
         agent: the agent that drives, if the scenario has one controlled vehicle.
         agents: vehicle to its agent, if there are several.
-        runs: how often, each with its own seed.
+        runs: number of runs, each with its own seed.
         trials: trials of each run, at most.
         max_steps: the bound on each trial, in steps.
     """

@@ -114,7 +114,7 @@ class Forced(Serializable):
         survival: probability that no first onset begins before the root ends.
         masses: masses by cell, the probability that the first onset is of this cell and begins before the root ends.
         copies: copies in the order of their onsets; after each copy its own copies, with a second onset.
-        steps: how many steps they took.
+        steps: number of steps of the copies.
         unanswered: how many further copies there were to be, of which nothing is known.
         why_unanswered: the reason for the first of them; empty if there is none.
         may_be_asked_again: whether a reason lies outside of the trial, so that another run may get all answers.

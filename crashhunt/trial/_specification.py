@@ -59,7 +59,7 @@ class Handover(Serializable):
 
     Args:
         agent: the id of the vehicle.
-        after: how many recorded actions are played; the agent makes its first decision in the next step.
+        after: number of recorded actions to play; the agent makes its first decision in the next step.
         log: the path of the ``log.mcap`` with the recorded actions.
     """
 

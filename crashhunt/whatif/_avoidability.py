@@ -97,7 +97,7 @@ class Search:
         start: where to begin.
         run: runs a manoeuvre after each of some steps, and yields the result; raises `CannotError`.
         runs: the most runs.
-        parallel: how many to ask for at a time.
+        parallel: number of runs at a time.
     """
 
     def __init__(
@@ -231,8 +231,8 @@ def judge(
         runs: the most trials to run to avoid it.
         why: the most trials to run for the causes; 0 for none.
         reference: the most trials to run with a reference driver, for what the agent omitted; 0 leaves that out.
-        parallel: how many at a time.
-        watch: called with how many have been run, and the most.
+        parallel: number of runs at a time.
+        watch: called with the number of runs so far, and the maximum.
         stopped: Returns whether to stop; called repeatedly. The results until then are returned.
 
     Raises:

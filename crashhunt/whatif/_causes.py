@@ -72,7 +72,7 @@ def relevant_actors(recording: Recording, agent: str, other: str, most: int) -> 
         recording: recording of the collision.
         agent: the controlled vehicle.
         other: The collision partner; empty if there was none.
-        most: how many at most.
+        most: maximum number of actors.
     """
     scenes = recording.scenes()
     since = scenes[-1].time_s - _NEAR_S if scenes else 0.0
@@ -193,7 +193,7 @@ def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], Non
         rerun: the crash.
         runs: which runs its trials.
         most: number of trials to run, without the unchanged one.
-        tell: called with how many have been run.
+        tell: called with the number of runs so far.
 
     Raises:
         CrashhuntError: no trial can be run.

@@ -320,7 +320,7 @@ class Run(Serializable):
     Args:
         number: its place among those that were asked for, from 0.
         outcome: how it ended.
-        steps: how many steps it completed.
+        steps: number of completed steps.
         digest: digest of its recording; equal digests are equal runs.
         crashed: whether the hunt counts its outcome as a crash.
         excluded: why it does not count; empty if it counts.
@@ -346,7 +346,7 @@ class Counts(Serializable):
         code: the code that drove, ``snapshot`` or ``current``.
         recorded_outcome: the outcome of the recorded trial.
         recorded_steps: its length, in steps.
-        asked: how many runs were asked for.
+        asked: number of requested runs.
         each: the runs, by number.
         interrupted: why there are fewer than that; empty if there are not. Then `each` ends before the first run
             that had not finished: short runs finish first, so counting all finished runs would favour early crashes.

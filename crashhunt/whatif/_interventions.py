@@ -180,7 +180,7 @@ class HandOver:
     seed of the trial. The first observation that it is shown is that after the step: it has seen nothing before.
 
     Args:
-        from_step: how many recorded actions are played.
+        from_step: number of recorded actions to play.
         driver: ``module:Name`` of the new agent; empty for the recorded one.
         arguments: arguments of the new agent. Of the recorded agent, all others keep their recorded values.
         agent: the id of the vehicle; empty for the only one.

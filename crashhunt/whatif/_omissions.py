@@ -72,9 +72,9 @@ def find_omission(
         rerun: the crash.
         scratch: a folder for the workers.
         most: largest number of runs.
-        parallel: how many at a time.
-        stopped: returns whether to stop.
-        tell: called with how many have been run.
+        parallel: number of runs at a time.
+        stopped: returns True when the search should stop.
+        tell: called with the number of runs so far.
 
     Raises:
         CrashhuntError: no trial can be run.

@@ -50,7 +50,7 @@ def find_cause(
         bundle: the crash.
         options: options of the replays.
         parallel: runs at a time.
-        stopped: returns whether to stop.
+        stopped: returns True when the search should stop.
 
     Raises:
         CrashhuntError: no trial can be run.

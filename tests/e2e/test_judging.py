@@ -69,7 +69,7 @@ def test_what_is_found_is_kept_and_reported(toy):
         with_judgement(bundle, broken).write()
         words = ("judge", "h", "--all", "--runs", "1", "--why", "1", "--json")
         assert [one["crash"] for one in toy.crashhunt(*words).json["judged"]] == [bundle.id]
-    assert toy.crashhunt("check", "h").out.endswith("are as written\n")
+    assert toy.crashhunt("check", "h").out.endswith("are intact\n")
 
 
 @pytest.mark.parametrize(

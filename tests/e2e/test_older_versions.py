@@ -46,7 +46,7 @@ def test_a_hunt_is_listed_read_and_checked(shell, place):
     assert [json.loads(line)["outcome"] for line in told] == ["collision", "survived", "collision", "survived"]
     (state,) = shell.crashhunt("status", "hunt", "--json").json["hunts"]
     assert (state["trials_run"], state["crashes"]) == (4, 2)
-    assert "4 trials and 2 crashes are as written" in shell.crashhunt("check", "hunt").out
+    assert "4 trials and 2 crashes are intact" in shell.crashhunt("check", "hunt").out
     assert "drove into leader" in shell.crashhunt("show", "hunt", "--crash", "0").out
     shell.crashhunt("report", "hunt", "--output", "page.html")
     assert "leader" in (shell.folder / "page.html").read_text()

@@ -110,7 +110,7 @@ def test_how_many_run_here_is_known_of_each_executor(folder, monkeypatch):
 def test_an_option_states_what_it_means_and_whether_it_may_be_excluded():
     options = {option.name: option for option in hunt_options()}
     assert options["snapshot_code"].default is True
-    assert options["snapshot_code"].about.meaning.startswith("whether the snapshot has code")
+    assert options["snapshot_code"].about.meaning.startswith("whether the snapshot contains code")
     assert options["snapshot_limit_mb"].default == 500.0
     assert options["timeout_s"].help.endswith("; default: 60")
     assert options["sampler"].help.endswith("; default: random")

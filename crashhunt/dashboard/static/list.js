@@ -13,7 +13,7 @@ const COLUMNS = [
   { key: "rate", label: "Crash rate per trial", number: true, value: (row) => row.rate?.certain?.high ?? -1 },
   { key: "newest", label: "Last new type", number: true, value: (row) => -(newestAge(row) ?? Infinity) },
   { key: "curve", label: "Discovery" },
-  { key: "active", label: "Active", number: true, value: (row) => row.active_at },
+  { key: "active", label: "Last active", number: true, value: (row) => row.active_at },
 ];
 const rows = new Map(), nodes = new Map(), selected = new Set();
 let revision = "";

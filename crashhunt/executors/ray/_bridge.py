@@ -63,7 +63,7 @@ class Trial:
     Args:
         ticket: the order in which it was.
         spec: as JSON.
-        losses: how often the node was lost on which it ran.
+        losses: number of times that the node of the trial was lost.
     """
 
     ticket: int
@@ -208,8 +208,8 @@ def shares(free: Mapping[str, int], wanted: int | None) -> dict[str, int]:
     """Divide trials at a time among nodes: evenly, each at most what it has free.
 
     Args:
-        free: node to how many it could run.
-        wanted: how many are wanted in all; None for all there are.
+        free: node to the number of trials that it could run.
+        wanted: number of slots that the hunt wants; None for all free ones.
     """
     left = {node: count for node, count in free.items() if count > 0}
     if wanted is None:

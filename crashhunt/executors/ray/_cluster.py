@@ -397,7 +397,7 @@ def _greet(address: str) -> None:
     """See that a cluster answers, which Ray itself takes very long to doubt.
 
     Raises:
-        UnreachableError: it does not.
+        UnreachableError: the cluster does not answer.
     """
     from ray._raylet import GcsClient  # type: ignore[attr-defined]  # of which there is no public form
 

@@ -237,7 +237,7 @@ class Store:
 
     Args:
         folder: folder of the store; one below the folder for temporary files by default.
-        kept_bytes: how much of parcels is kept; the ones that were used last.
+        kept_bytes: size of the parcels to keep, those that were used last.
     """
 
     def __init__(self, folder: Path | None = None, *, kept_bytes: int = _KEPT_BYTES) -> None:
