@@ -22,7 +22,7 @@ def study():
     del sys.modules[spec.name]
 
 
-def test_guided_hunts_go_on_from_a_common_fault_to_rare_ones(study):
+def test_guided_hunts_find_rare_faults_after_a_common_one(study):
     hunts = [study.faults_found("rare", "guided", "name", seed) for seed in (3001, 3002)]
     assert all(hunt.count("0") > 1 for hunt in hunts)
     assert all(len({*hunt}) > 1 for hunt in hunts)
