@@ -15,11 +15,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from gymnasium.spaces import Box
 
 from crashhunt.hunts import spec_of
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, sampler_of
-from crashhunt.simulators._crash_cells import coarse_cell
 from crashhunt.trial import Collision, Outcome, TrialResult
 
 if TYPE_CHECKING:
@@ -32,7 +30,7 @@ __all__ = ["EVIDENCE", "FAULTS", "FaultProblem", "faults_found", "faults_table",
 
 _LAG = 4
 _ROOM = 0.1  # distance between two regions, at least
-_STATES = Box(0.0, 1.0, (4,), np.float32)
+_LEVELS = 3  # of each of four numbers of a state
 EVIDENCE = ("type", "cell", "name")
 """What a crash tells the sampler of its fault: nothing, a coarse cell of the state, or its name."""
 
@@ -114,7 +112,7 @@ class _Planted:
         state = 0.7 * self._ends[fault] + 0.3 * luck.random(4)
         hit = Collision(
             "ego", "collider", "ego", "", kind=f"fault {fault}" if evidence == "name" else "terminated",
-            cell=coarse_cell(state.astype(np.float32), _STATES, {}) if evidence == "cell" else "",
+            cell="".join(str(int(_LEVELS * share)) for share in state) if evidence == "cell" else "",
         )  # fmt: skip
         return TrialResult(spec, Outcome.COLLISION, steps=1, danger=1.0, collision=hit), f"{fault}"
 
