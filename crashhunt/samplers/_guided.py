@@ -11,9 +11,9 @@ Why not the best strategy alone: rising criticality does not imply a crash, whic
 signs show that it misleads: strategies are far ahead of the unguided trials and make no progress, or they never
 exceed a criticality of 0.5. In both cases their share is capped, and a part of it explores other peaks (`Niches`).
 
-After the first crash, new crash types count: before each proposal, a draw of the rate of new types that strategies find
-is compared with one of the rate of unguided trials (Thompson 1933). Strategies do not search in basins of crashes that
-yield known types only.
+After the first crash, new crash types count. Before each proposal, the rate of new types that strategies find is drawn
+from its posterior, and so is that of unguided trials (Thompson 1933). Strategies do not search in basins of crashes
+that yield known types only.
 
 Sources: nearest-better distance (Preuss 2010), Thompson sampling (1933), Halton's sequence (1960); payoffs and shares
 are our own, measured with `scripts/search`. Cost: below a millisecond per trial in addition to the model.

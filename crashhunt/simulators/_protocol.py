@@ -239,7 +239,7 @@ class NamesDanger(Protocol):
 
 
 class NamesCrashCell(Protocol):
-    """A simulator that describes the state after a crash coarsely, because its scenes have no actors."""
+    """A simulator that describes the state after a crash in words, because its scenes have no actors."""
 
     @property
     def crash_cell(self) -> str:

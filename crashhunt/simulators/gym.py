@@ -17,7 +17,7 @@ from crashhunt.base.plugins import load_object
 from crashhunt.base.text import encodable, one_of
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.gym import GymSetup
-from crashhunt.simulators._crash_cells import coarse_cell
+from crashhunt.simulators._crash_cells import crash_cell
 from crashhunt.simulators._gymnasium import ObservationForm, action_form, as_tables, merge, native, reseed_in_place
 from crashhunt.simulators._parallel import OneLearner, is_parallel, takes_turns
 from crashhunt.world import Contact, Roster, Scene
@@ -116,9 +116,7 @@ class GymSimulator:
         with _INFO:  # the crash rule may be a function of the user's
             what = self._rule(observation, reward, terminated, truncated, info)
             if what and not self._crashed:
-                self.crash_cell = (
-                    "" if self._rule.has_named else coarse_cell(self._form.encode(observation), self._form.space, info)
-                )
+                self.crash_cell = "" if self._rule.has_named else crash_cell(info)
             reported = info[self._key] if self._key and self._key in info else None
         self._look(what)
         if reported is not None:

@@ -33,8 +33,9 @@ class Collision(Serializable):
         collider_speed: Speed of the collider at the first contact, in m/s.
         victim_speed: Speed of the victim at the first contact, in m/s.
         time_s: Simulation time of the first contact, which lies within the step, in s; NaN if it is unknown.
-        cell: Of a simulator without scenes, a coarse description of the state after the collision. Samplers search for
-            crashes with other cells. It is no part of the crash type, because one fault may end in several cells.
+        cell: Of a simulator without scenes, the flags and short texts that describe the state after the collision.
+            Samplers search for crashes with other cells. It is no part of the crash type, because one fault may end in
+            several cells.
     """
 
     agent: str

@@ -73,7 +73,7 @@ def test_next_peak_is_searched_after_12_trials_and_then_32_trials_after_each_fai
     assert searched == [12, 44, 76]
 
 
-def test_a_hunt_that_another_version_began_is_told_apart():
+def test_hunts_of_another_version_are_recognized():
     assert NamedSampler("guided", SPACE, points=4).version == 2
 
 
