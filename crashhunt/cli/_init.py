@@ -14,6 +14,7 @@ from crashhunt.cli._common import DONE, add_json, say
 if TYPE_CHECKING:
     import argparse
 
+    from crashhunt.base.json_types import Plain
     from crashhunt.cli._common import Commands
     from crashhunt.maps import MapSource, PlainTrial
 
@@ -131,14 +132,15 @@ def _check_agent(name: str) -> None:
     """
     from crashhunt.base.apart import work_apart
     from crashhunt.base.plugins import is_foreign, locate
-    from crashhunt.trial import signature_of
+    from crashhunt.trial import Signature, signature_of
 
-    def needed() -> list[str]:
-        return list(signature_of(locate("agents", name)).required)
+    def described() -> Plain:
+        return signature_of(locate("agents", name)).to_json()
 
     # A module of the user may end or stop the process that imports it.
     task = f"{name!r} cannot be imported"
-    required = work_apart(needed, task=task, timeout_s=_IMPORT_S) if is_foreign("agents", name) else needed()
+    data = work_apart(described, task=task, timeout_s=_IMPORT_S) if is_foreign("agents", name) else described()
+    required = Signature.from_json(data).required
     if required:
         fix = "give it a default: the new scenario has no value for it"
         raise UsageError(f"--agent {name}: it needs the argument {required[0]!r}", fix=fix)
