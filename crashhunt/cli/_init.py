@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
 from crashhunt.cli._common import DONE, add_json, say
 
@@ -75,6 +76,11 @@ def _init(options: argparse.Namespace, _words: list[str]) -> int:
 
     try:
         made = make_scenario(_source(options), asked, options.directory, try_out=_try_out, tell=tell)
+    except KeyboardInterrupt:
+        tell("")
+        if not (options.directory / layout.SCENARIO).exists():
+            print(f"crashhunt: interrupted; {options.directory} was not made", file=sys.stderr)
+        raise
     finally:
         tell("")
     lines = [f"made {options.directory}", "", *describe_place(made), "", "Next:"]
