@@ -81,7 +81,7 @@ def near_path(path: Path, *endings: str) -> str:
     wanted = [
         str(path.parent / found.name)
         for found in siblings
-        if not found.name.startswith(".") and (found.is_dir() or found.name.endswith(endings))
+        if not found.name.startswith(".") and found != path and (found.is_dir() or found.name.endswith(endings))
     ]
     hint = did_you_mean(str(path), wanted)
     return f"{hint} " if hint else ""

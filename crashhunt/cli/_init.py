@@ -6,14 +6,16 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
 from crashhunt.cli._common import DONE, add_json, say
 
 if TYPE_CHECKING:
     import argparse
 
+    from crashhunt.base.json_types import Plain
     from crashhunt.cli._common import Commands
     from crashhunt.maps import MapSource, PlainTrial
 
@@ -74,6 +76,11 @@ def _init(options: argparse.Namespace, _words: list[str]) -> int:
 
     try:
         made = make_scenario(_source(options), asked, options.directory, try_out=_try_out, tell=tell)
+    except KeyboardInterrupt:
+        tell("")
+        if not (options.directory / layout.SCENARIO).exists():
+            print(f"crashhunt: interrupted; {options.directory} was not made", file=sys.stderr)
+        raise
     finally:
         tell("")
     lines = [f"made {options.directory}", "", *describe_place(made), "", "Next:"]
@@ -131,15 +138,15 @@ def _check_agent(name: str) -> None:
     """
     from crashhunt.base.apart import work_apart
     from crashhunt.base.plugins import is_foreign, locate
-    from crashhunt.trial import signature_of
+    from crashhunt.trial import Signature, signature_of
 
-    def needed() -> dict[str, object]:
-        return {"arguments": list(signature_of(locate("agents", name)).required)}
+    def described() -> Plain:
+        return signature_of(locate("agents", name)).to_json()
 
     # A module of the user may end or stop the process that imports it.
     task = f"{name!r} cannot be imported"
-    found = work_apart(needed, task=task, timeout_s=_IMPORT_S) if is_foreign("agents", name) else needed()
-    required: Any = found["arguments"]
+    data = work_apart(described, task=task, timeout_s=_IMPORT_S) if is_foreign("agents", name) else described()
+    required = Signature.from_json(data).required
     if required:
         fix = "give it a default: the new scenario has no value for it"
         raise UsageError(f"--agent {name}: it needs the argument {required[0]!r}", fix=fix)

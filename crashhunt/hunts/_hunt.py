@@ -206,6 +206,7 @@ class Hunt:
             phase=None,
             ends_at=None,
         )
+        self._place.has_begun = True
         progress.counted = progress.rate or rate_watch(settings, ledger, held_out)
         if progress.rare is not None:
             progress.rare.read(trials.upcoming)

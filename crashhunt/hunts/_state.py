@@ -9,7 +9,7 @@ import os
 import shutil
 import socket
 import time
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
@@ -461,10 +461,14 @@ class HuntDirectory:
 
     Args:
         path: path of it; it is made where it does not exist, its parents are not.
+
+    Attributes:
+        has_begun: whether the hunt runs. Until then, an error removes a directory that was made for it.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.has_begun = False
 
     @property
     def scratch(self) -> Path:
@@ -482,7 +486,7 @@ class HuntDirectory:
             HuntDirectoryError: the directory is busy, foreign or unwritable.
         """
         try:
-            self.path.mkdir(exist_ok=True)
+            is_new = self._make()
             if not (self.path / ".lock").exists():  # leave no file in a foreign folder
                 self._refuse_foreign()
             lock = (self.path / ".lock").open("a+")
@@ -502,8 +506,31 @@ class HuntDirectory:
             lock.truncate(0)
             lock.write(str(os.getpid()))
             lock.flush()
-            with temporary_beside(self.path / layout.LEDGER, name=self.scratch.name):
-                yield
+            try:
+                with temporary_beside(self.path / layout.LEDGER, name=self.scratch.name):
+                    yield
+            except BaseException:
+                if is_new and not self.has_begun:
+                    self._remove_own(".lock")
+                    with suppress(OSError):
+                        self.path.rmdir()
+                raise
+
+    def _make(self) -> bool:
+        """Make the directory; return whether it is new."""
+        try:
+            self.path.mkdir()
+        except FileExistsError:
+            self.path.mkdir(exist_ok=True)  # raises for a file
+            return False
+        return True
+
+    def _remove_own(self, *more: str) -> None:
+        for name in (*_OWN, *more):
+            if (self.path / name).is_dir():
+                shutil.rmtree(self.path / name, ignore_errors=True)
+            else:
+                (self.path / name).unlink(missing_ok=True)
 
     def claim(self, settings: HuntSettings, command: list[str], *, overwrite: bool, seed_given: bool) -> HuntSettings:
         """Make the directory this hunt's, or see that it is already; return the settings that hold.
@@ -518,11 +545,7 @@ class HuntDirectory:
             HuntDirectoryError: the hunt that is there makes other trials, or the directory is unwritable.
         """
         if overwrite:
-            for name in _OWN:
-                if (self.path / name).is_dir():
-                    shutil.rmtree(self.path / name, ignore_errors=True)
-                else:
-                    (self.path / name).unlink(missing_ok=True)
+            self._remove_own()
         file = self.path / layout.HUNT
         if file.exists():
             before = read_settings(file)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.base.processes import die_with
+from crashhunt.base.signals import blocked_signals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -72,18 +74,23 @@ class Tools:
         log = folder / f"{program}.log"
         try:
             with log.open("wb") as file:
-                child = subprocess.Popen(
-                    command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=file, stderr=file,
-                    preexec_fn=partial(die_with, os.getpid()),
-                )  # fmt: skip
+                child: subprocess.Popen[bytes] | None = None
                 try:
+                    # Python drops a KeyboardInterrupt that comes in its own hooks around a fork.
+                    begin = partial(_begin, os.getpid(), signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+                    with blocked_signals():
+                        child = subprocess.Popen(
+                            command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=file, stderr=file,
+                            preexec_fn=begin,
+                        )  # fmt: skip
                     code = child.wait(_TIME_LIMIT_S)
                 except subprocess.TimeoutExpired:
                     fix = "choose a smaller map, or a part of it with --bbox W,S,E,N"
                     raise ScenarioError(f"{program} takes over {_TIME_LIMIT_S / 60:g} minutes", fix=fix) from None
                 finally:
-                    child.kill()
-                    child.wait()
+                    if child is not None:
+                        child.kill()
+                        child.wait()
         except OSError as error:
             fix = "install it again: pip install --force-reinstall 'crashhunt[maps]'"
             raise ScenarioError(f"{program} cannot be started: {error.strerror}", fix=fix) from None
@@ -94,6 +101,15 @@ class Tools:
             fix = "free memory and disk space, or choose a smaller map"
             raise ScenarioError(f"{program} was ended by signal {-code}", fix=fix)
         return Outcome(code, log.read_text(encoding="utf-8", errors="replace"))
+
+
+def _begin(parent: int, mask: set[signal.Signals | int]) -> None:
+    """Prepare a program in its process: signals end it as they do by default, and the end of its parent does."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    die_with(parent)
 
 
 @cache

@@ -84,6 +84,7 @@ def test_init_that_is_interrupted_leaves_no_half_folder(shell, shape, sign):
     begun.send_signal(signal.SIGINT)
     _, err = begun.communicate(timeout=60)
     assert begun.returncode == 130, err
+    assert err == "crashhunt: interrupted; place was not made\n"
     assert not [path for path in shell.folder.iterdir() if "place" in path.name]
     assert not [*(shell.folder / "tmp").iterdir()]
 

@@ -73,3 +73,30 @@ def test_what_a_hunt_left_that_could_not_begin_is_in_nobodys_way(tmp_path):
     (tmp_path / ".scratch").mkdir()
     with HuntDirectory(tmp_path).locked():
         pass
+
+
+def _fail(place, *, begins=False, file=""):
+    with place.locked():
+        place.claim(SETTINGS, ["crashhunt"], overwrite=False, seed_given=True)
+        (place.path / "snapshots").mkdir()
+        if file:
+            (place.path / file).touch()
+        place.has_begun = begins
+        raise ValueError("no snapshot")
+
+
+def test_directory_of_a_hunt_that_cannot_begin_is_removed_if_it_was_made_for_it(tmp_path):
+    for name in ("new", "begun", "own"):
+        place = HuntDirectory(tmp_path / name)
+        if name == "own":
+            place.path.mkdir()
+        with pytest.raises(ValueError, match="no snapshot"):
+            _fail(place, begins=name == "begun")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["begun", "own"]
+    assert (tmp_path / "begun" / "hunt.toml").exists()
+
+
+def test_file_of_the_user_in_a_directory_that_is_removed_stays(tmp_path):
+    with pytest.raises(ValueError, match="no snapshot"):
+        _fail(HuntDirectory(tmp_path / "new"), file="thesis.tex")
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["thesis.tex"]

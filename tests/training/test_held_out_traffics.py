@@ -267,6 +267,7 @@ def test_hunt_for_a_rate_on_training_traffic_is_refused(place, shell):
     assert done.err.splitlines()[-1] == (
         "crashhunt: --until-rate: an agent was trained on all traffics of --seed 4; give another --seed"
     )
+    assert not (place / "bar").exists()
 
 
 def test_verdict_of_a_gate_reports_training_traffic():
