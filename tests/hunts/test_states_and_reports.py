@@ -17,12 +17,15 @@ import pytest
 
 import crashhunt
 from crashhunt.base import layout
+from crashhunt.episode import WorkerSettings
 from crashhunt.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.hunts import HuntStatus, _hunt as hunt_module, check, find_hunts, hunt_state, is_hunt, load, salvage
 from crashhunt.hunts._next_trials import Unanswered, find_unanswered
 from crashhunt.hunts._progress import Progress
 from crashhunt.hunts._state import draws_independently, ledger_owner
+from crashhunt.hunts._verification import Audit
 from crashhunt.ledger import Ledger
+from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -294,6 +297,35 @@ def test_what_is_whole_is_saved_into_another_directory(hunt, tmp_path):
     assert (found.state, found.trials_run, found.trials_planned, found.crashes) == ("interrupted", 3, 4, 1)
     assert [trial.spec.number for trial in load_quietly(tmp_path / "s").results()] == [1, 2, 3]
     assert load_quietly(tmp_path / "s").settings == load(hunt).settings
+
+
+def test_salvage_refuses_a_directory_that_has_something_and_names_what_cannot_be_copied(hunt, tmp_path, monkeypatch):
+    (hunt / "crashes" / "000000-collision" / "log.mcap").write_bytes(b"")
+    (checked,) = check(hunt)
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    (taken / "notes.txt").touch()
+    with pytest.raises(HuntDirectoryError, match="the directory exists already"):
+        salvage(checked, taken)
+    assert [path.name for path in taken.iterdir()] == ["notes.txt"]
+
+    def fail(*_):
+        raise shutil.Error([("source", "copy", "[Errno 5] Input/output error")])
+
+    monkeypatch.setattr("crashhunt.hunts._check.shutil.copytree", fail)
+    with pytest.raises(HuntDirectoryError, match=r"cannot be written: \[Errno 5\] Input/output error"):
+        salvage(checked, tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+
+
+def test_audit_that_is_closed_leaves_no_process(tmp_path, monkeypatch):
+    closed = []
+    executor = SimpleNamespace(close=lambda: closed.append(True))
+    monkeypatch.setattr("crashhunt.hunts._verification.FreshProcessExecutor", lambda settings: executor)
+    toy = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
+    settings = WorkerSettings(scenario=toy, oracles=(), crash_on=(), scratch=tmp_path, timeout_s=9.0)
+    Audit(settings, []).close()
+    assert closed == [True]
 
 
 def load_quietly(path):
