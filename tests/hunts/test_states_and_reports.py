@@ -187,6 +187,8 @@ def status(**figures):
         ({}, 3.0, 0.4),
         ({"time_left_s": 1.0}, 1.0, 2 / 3),
         ({"time_left_s": 8.0}, 3.0, 0.4),
+        ({"trials_left_s": 5.0}, 5.0, 0.4),
+        ({"trials_left_s": 5.0, "time_left_s": 4.0}, 4.0, 0.4),
         ({"planned": 0}, math.inf, 0.0),
         ({"planned": 0, "time_left_s": 6.0}, 6.0, 0.25),
         ({"rate_per_s": 0.0}, math.inf, 0.4),
