@@ -26,7 +26,7 @@ from crashhunt.hunts._state import draws_independently, ledger_owner
 from crashhunt.hunts._verification import Audit
 from crashhunt.ledger import Ledger
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import KILLED, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
@@ -219,6 +219,21 @@ def test_the_trial_that_came_nearest_is_kept():
     assert progress.time_left_s == math.inf
     assert Progress(until=time.monotonic() + 9).time_left_s == pytest.approx(9, abs=3)
     assert Progress(until=time.monotonic() - 9).time_left_s == 0
+
+
+def test_the_trial_with_the_least_margin_is_kept_and_open_ones_are_counted():
+    progress, brake = Progress(), Disturbance(20, "ahead", "brake", 4.0, 2.0, "ego")
+    for number, margin, disturbance in (
+        (0, 0.8, brake),
+        (1, 0.3, brake),
+        (2, 0.5, brake),
+        (3, 1.0, None),
+        (4, None, None),
+    ):
+        stress = Stress(margin=margin, probes=2, steps=9, disturbance=disturbance)
+        progress.count(result(number, stress=stress), crashed=False, planned=9)
+    assert progress.stressed.spec.number == 1
+    assert progress.not_fully_asked == 1
 
 
 def saved(number):
