@@ -25,6 +25,7 @@ from crashhunt.hunts._progress import Progress
 from crashhunt.hunts._state import draws_independently, ledger_owner
 from crashhunt.hunts._verification import Audit
 from crashhunt.ledger import Ledger
+from crashhunt.plans import RunSettings
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import KILLED, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
@@ -258,6 +259,24 @@ def test_a_hunt_ends_with_the_crash_of_the_least_number():
     assert progress.unsaved is None
     progress.replace([])
     assert progress.crashes == []
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"), [({"only_at_fault": True}, 1), ({"keep_going": True, "distinct": 3}, 3)]
+)
+def test_hunt_that_does_not_keep_going_ends_with_its_first_crash_at_fault(options, wanted):
+    progress = Progress()
+    progress.resume([], RunSettings(**options), {})
+    assert progress.kinds._wanted == wanted
+
+
+def test_new_type_is_of_the_trial_that_is_counted_after_its_row(monkeypatch):
+    progress, added = Progress(), []
+    progress.resume([], RunSettings(keep_going=True), {})
+    monkeypatch.setattr(progress.kinds, "add", lambda bundle, ended: added.append(ended))
+    progress.count(result(0), crashed=False, planned=9)
+    progress.save(saved(1))
+    assert added == [2]
 
 
 def test_what_the_ledger_is_to_know_now_is_noted():
