@@ -237,6 +237,7 @@ def format_pace(rate_per_s: float) -> str:
 
 
 _PHASES = {
+    "hunting": "running",
     "confirming": "confirming",
     "auditing": "auditing",
     "causes": "finding causes",

@@ -43,6 +43,9 @@ def test_the_moments_before_a_rear_end_collision():
     assert moments[0].time_to_collision_s == pytest.approx(3.9)
     assert moments[0].required_deceleration == pytest.approx(100 / 78)
     assert moments[-1].gap_m == 0
+    last = moments[-2]
+    assert 0 < last.time_to_collision_s < 0.2
+    assert last.required_deceleration == pytest.approx(10 / (2 * last.time_to_collision_s))
     assert [moment.step for moment in moments] == list(range(len(moments)))
 
 

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.crashes import refuse_side_effects
+from crashhunt.crashes import _trust, refuse_side_effects
+from crashhunt.crashes._trust import TrustedOrigin, remove_trusted
 from crashhunt.errors import UsageError
 from crashhunt.scenario import load_scenario
 
@@ -55,6 +56,24 @@ def sumo(tmp_path):
 def plain(tmp_path, text):
     (tmp_path / "scenario.toml").write_text('title = "x"\nschema = 1\n' + text + '[agents.ego]\nagent = "random"\n')
     return load_scenario(tmp_path / "scenario.toml", kept=True)
+
+
+def test_an_origin_is_removed_by_what_names_it_alone(tmp_path, monkeypatch):
+    known = [
+        TrustedOrigin(fingerprint=fingerprint, path=path, runs="", trusted_at="")
+        for fingerprint, path in (("abcdef1", "/a"), ("abcdef2", "/b"), ("0123456", "/c"))
+    ]
+    for origin in known:
+        (tmp_path / f"{origin.fingerprint}.json").touch()
+    monkeypatch.setattr(_trust, "list_trusted", lambda: known)
+    monkeypatch.setattr(_trust, "_folders", lambda: [tmp_path])
+    with pytest.raises(UsageError, match="--remove 'abcdef' matches 2 origins"):
+        remove_trusted(["0123456", "abcdef"])
+    with pytest.raises(UsageError, match="--remove '01234': no such origin is trusted"):
+        remove_trusted(["01234"])  # too short
+    assert len(list(tmp_path.iterdir())) == 3
+    assert remove_trusted(["ABCDEF2", "/c"]) == known[1:]
+    assert [path.stem for path in tmp_path.iterdir()] == ["abcdef1"]
 
 
 def refused(scenario, asked=None, values=None):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 
+from crashhunt.executors import _time_limits
 from crashhunt.executors._fresh import _has_words
-from crashhunt.executors._time_limits import START_UP_S, has_hung
+from crashhunt.executors._time_limits import START_UP_S, ImportWatch, has_hung
 from crashhunt.recording import BlackBoxHeader, Phase
 
 LIMIT_S = 5.0
@@ -27,11 +29,12 @@ LIMIT_S = 5.0
         ("File", 0.5, True),
     ],
 )
-def test_it_has_a_moment_and_a_while_where_the_machine_is_busy(tmp_path, stack, over_s, ended):
+def test_it_has_a_moment_and_a_while_where_the_machine_is_busy(tmp_path, monkeypatch, stack, over_s, ended):
     path = tmp_path / "stack"
     if stack is not None:
         path.write_text(stack)
     now = time.monotonic()
+    monkeypatch.setattr(_time_limits, "time", SimpleNamespace(monotonic=lambda: now))  # however long this test waits
     has_words = partial(_has_words, path)
 
     def hangs(header, *, begun, given_s):
@@ -45,3 +48,9 @@ def test_it_has_a_moment_and_a_while_where_the_machine_is_busy(tmp_path, stack, 
     # A start in the future, or before the trial was given, is forged.
     for forged in (now + 1e6, 0.0):
         assert hangs(replace(header, started=forged), begun=True, given_s=LIMIT_S) is ended
+
+
+def test_of_what_is_imported_so_much_is_kept_as_a_message_may_have():
+    watch = ImportWatch(1.0)
+    watch.begin("x" * 500)  # foreign code may write its own messages
+    assert watch.importing == "x" * 200

@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from climber import Climber
@@ -15,12 +16,15 @@ from conftest import examples
 from hypothesis import given, settings as how, strategies as st
 
 from crashhunt.base.integrity import digest_of_row
+from crashhunt.disturbances import FIRST_STEP
 from crashhunt.errors import HuntDirectoryError, PluginError
 from crashhunt.hunts import Trials, spec_of
+from crashhunt.hunts._next_trials import settings_again, settings_of_workers
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
 from crashhunt.samplers import NamedSampler, RandomSampler, Sampler
-from crashhunt.trial import Outcome, TrialResult
+from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.trial import Forcing, Outcome, TrialResult
 from crashhunt.world import ClosestApproach
 
 TRIALS = 60
@@ -322,6 +326,33 @@ def test_trials_take_turns_in_so_many_traffics():
     assert [one.arguments for one in shared] == [one.arguments for one in alone]
     more = replace(chosen, seeds=3, trials=1000)
     assert shared == [spec_of(number, more, sampler) for number in range(9)]
+
+
+def test_root_draws_disturbances_of_the_steps_before_its_first_forced_onset():
+    chosen = replace(settings("random"), max_steps=500)
+    sampler, asked = NamedSampler("random", chosen.space, points=10), []
+    disturber = SimpleNamespace(draw=lambda seed, steps: asked.append(steps) or ())
+    for steps, forcing in ((500, None), (500, Forcing(0.01)), (FIRST_STEP - 2, Forcing(0.01))):
+        spec_of(0, replace(chosen, max_steps=steps), sampler, disturber, forcing)
+    assert asked == [500, FIRST_STEP - 1, FIRST_STEP - 2]
+
+
+def test_workers_do_only_what_the_hunt_asks_for(tmp_path):
+    toy = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
+    snapshot = SimpleNamespace(scenario=lambda: toy, code=("code",), argument_files={})
+    plain = settings("random")
+    plain = replace(plain, run=replace(plain.run, warm_copies=3, timeout_s=7.0), disturb={"brake": 0.1})
+
+    def of_workers(**more):
+        return settings_of_workers(replace(plain, **more), snapshot, tmp_path)
+
+    found = of_workers()
+    assert (found.warm_copies, found.branch, found.force, found.timeout_s) == (0, (), (), 7.0)
+    assert of_workers(seeds=2).warm_copies == 3  # only trials in the same traffic have a warm-up in common
+    assert of_workers(branch=2).branch == ("brake",)
+    assert of_workers(rare=True).force == ("brake",)
+    again = settings_again(replace(plain, seeds=2), snapshot, tmp_path)
+    assert (again.warm_copies, again.keep_trials, again.timeout_s) == (0, True, 7.0)
 
 
 def test_what_another_sampler_proposes_for_the_scenario_stays():

@@ -17,14 +17,18 @@ import pytest
 
 import crashhunt
 from crashhunt.base import layout
+from crashhunt.episode import WorkerSettings
 from crashhunt.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.hunts import HuntStatus, _hunt as hunt_module, check, find_hunts, hunt_state, is_hunt, load, salvage
 from crashhunt.hunts._next_trials import Unanswered, find_unanswered
 from crashhunt.hunts._progress import Progress
 from crashhunt.hunts._state import draws_independently, ledger_owner
+from crashhunt.hunts._verification import Audit
 from crashhunt.ledger import Ledger
+from crashhunt.plans import RunSettings
 from crashhunt.rates import CountingRule, RateWatch
-from crashhunt.trial import KILLED, Branches, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.trial import KILLED, Branches, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
@@ -185,6 +189,8 @@ def status(**figures):
         ({}, 3.0, 0.4),
         ({"time_left_s": 1.0}, 1.0, 2 / 3),
         ({"time_left_s": 8.0}, 3.0, 0.4),
+        ({"trials_left_s": 5.0}, 5.0, 0.4),
+        ({"trials_left_s": 5.0, "time_left_s": 4.0}, 4.0, 0.4),
         ({"planned": 0}, math.inf, 0.0),
         ({"planned": 0, "time_left_s": 6.0}, 6.0, 0.25),
         ({"rate_per_s": 0.0}, math.inf, 0.4),
@@ -217,6 +223,21 @@ def test_the_trial_that_came_nearest_is_kept():
     assert Progress(until=time.monotonic() - 9).time_left_s == 0
 
 
+def test_the_trial_with_the_least_margin_is_kept_and_open_ones_are_counted():
+    progress, brake = Progress(), Disturbance(20, "ahead", "brake", 4.0, 2.0, "ego")
+    for number, margin, disturbance in (
+        (0, 0.8, brake),
+        (1, 0.3, brake),
+        (2, 0.5, brake),
+        (3, 1.0, None),
+        (4, None, None),
+    ):
+        stress = Stress(margin=margin, probes=2, steps=9, disturbance=disturbance)
+        progress.count(result(number, stress=stress), crashed=False, planned=9)
+    assert progress.stressed.spec.number == 1
+    assert progress.not_fully_asked == 1
+
+
 def saved(number):
     return SimpleNamespace(result=result(number, Outcome.COLLISION), id=str(number))
 
@@ -239,6 +260,24 @@ def test_a_hunt_ends_with_the_crash_of_the_least_number():
     assert progress.unsaved is None
     progress.replace([])
     assert progress.crashes == []
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"), [({"only_at_fault": True}, 1), ({"keep_going": True, "distinct": 3}, 3)]
+)
+def test_hunt_that_does_not_keep_going_ends_with_its_first_crash_at_fault(options, wanted):
+    progress = Progress()
+    progress.resume([], RunSettings(**options), {})
+    assert progress.kinds._wanted == wanted
+
+
+def test_new_type_is_of_the_trial_that_is_counted_after_its_row(monkeypatch):
+    progress, added = Progress(), []
+    progress.resume([], RunSettings(keep_going=True), {})
+    monkeypatch.setattr(progress.kinds, "add", lambda bundle, ended: added.append(ended))
+    progress.count(result(0), crashed=False, planned=9)
+    progress.save(saved(1))
+    assert added == [2]
 
 
 def test_what_the_ledger_is_to_know_now_is_noted():
@@ -315,6 +354,35 @@ def test_what_is_whole_is_saved_into_another_directory(hunt, tmp_path):
     assert (found.state, found.trials_run, found.trials_planned, found.crashes) == ("interrupted", 3, 4, 1)
     assert [trial.spec.number for trial in load_quietly(tmp_path / "s").results()] == [1, 2, 3]
     assert load_quietly(tmp_path / "s").settings == load(hunt).settings
+
+
+def test_salvage_refuses_a_directory_that_has_something_and_names_what_cannot_be_copied(hunt, tmp_path, monkeypatch):
+    (hunt / "crashes" / "000000-collision" / "log.mcap").write_bytes(b"")
+    (checked,) = check(hunt)
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    (taken / "notes.txt").touch()
+    with pytest.raises(HuntDirectoryError, match="the directory exists already"):
+        salvage(checked, taken)
+    assert [path.name for path in taken.iterdir()] == ["notes.txt"]
+
+    def fail(*_):
+        raise shutil.Error([("source", "copy", "[Errno 5] Input/output error")])
+
+    monkeypatch.setattr("crashhunt.hunts._check.shutil.copytree", fail)
+    with pytest.raises(HuntDirectoryError, match=r"cannot be written: \[Errno 5\] Input/output error"):
+        salvage(checked, tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+
+
+def test_audit_that_is_closed_leaves_no_process(tmp_path, monkeypatch):
+    closed = []
+    executor = SimpleNamespace(close=lambda: closed.append(True))
+    monkeypatch.setattr("crashhunt.hunts._verification.FreshProcessExecutor", lambda settings: executor)
+    toy = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
+    settings = WorkerSettings(scenario=toy, oracles=(), crash_on=(), scratch=tmp_path, timeout_s=9.0)
+    Audit(settings, []).close()
+    assert closed == [True]
 
 
 def load_quietly(path):
