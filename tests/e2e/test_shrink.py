@@ -188,7 +188,7 @@ def test_ctrl_c_leaves_the_best(hunt):
 def test_what_is_asked_for_must_make_sense(hunt):
     assert "--budget is 0" in hunt.crashhunt("shrink", "h", "--budget", "0", expect=2).err
     hunt.crashhunt("export", "h", "crash.zip")
-    assert "unpack it (a zip file) into a new folder" in hunt.crashhunt("shrink", "crash.zip", expect=2).err
+    assert "unpack this zip file into a new folder" in hunt.crashhunt("shrink", "crash.zip", expect=2).err
 
 
 @pytest.mark.nightly

@@ -124,7 +124,7 @@ def test_hanging_trial_in_shared_traffic_is_killed_alone(pool):
 def test_trial_runs_again_when_its_warmed_up_copy_was_killed(pool):
     with pool(2) as sharing:
         first = run(sharing, spec(0, 1))
-        os.kill(deepest_process_below(os.getpid()), signal.SIGKILL)
+        os.kill(deepest_process_below(sharing._link._kept.process.pid), signal.SIGKILL)
         found = run(sharing, spec(1, 1), spec(2, 1))
         notes = sharing.notes()
     assert [one.outcome for one in (*first, *found)] == [Outcome.SURVIVED] * 3

@@ -97,7 +97,7 @@ def test_every_count_of_crashes_is_that_of_the_ledger(hunts, name):
 
     (state,) = hunts.crashhunt("status", name, "--json").json["hunts"]
     assert (state["crashes"], state.get("crashes_saved")) == (count, saved if saved < count else None)
-    assert f"{count} (" in hunts.crashhunt("status", name).out
+    assert f"{name}: {count} crashes: " in hunts.crashhunt("status", name).out
     groups = hunts.crashhunt("crashes", name, "--json").json["groups"]
     assert {group["words"].partition(" ")[0]: group["count"] for group in groups} == truth
     assert sum(group["saved"] for group in groups) == saved
