@@ -124,7 +124,7 @@ def test_every_shipped_scenario_has_golden_trials():
 
 # --- ledgers and bundles of older versions
 
-LEDGERS = sorted((TESTS / "hunts" / "ledgers").glob("version-*.sqlite"))
+LEDGERS = sorted((TESTS / "ledger" / "versions").glob("version-*.sqlite"))
 BUNDLES = [
     *sorted((TESTS / "e2e" / "bundles").glob("*.zip")),
     *sorted((TESTS / "e2e" / "frozen").glob("*/*.zip")),
@@ -132,7 +132,7 @@ BUNDLES = [
 ]
 
 
-# Each value of these ledgers is compared in tests/hunts/test_ledger_versions.py; here it is what the commands print.
+# Each value of these ledgers is compared in tests/ledger/test_ledger_versions.py; here it is what the commands print.
 @pytest.mark.parametrize(
     "ledger",
     [

@@ -19,7 +19,7 @@ from crashhunt.trial import Branches, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
 # Every version of the tables leaves one here, written by the crashhunt of then: `write` is what was called.
-FROZEN = sorted((Path(__file__).parent / "ledgers").glob("version-*.sqlite"))
+FROZEN = sorted((Path(__file__).parent / "versions").glob("version-*.sqlite"))
 ORIGIN = {"parent": 1, "origin": "climb"}
 OUTCOMES = (Outcome.SURVIVED, Outcome.COLLISION, Outcome.FINISHED, Outcome.INVALID)
 EVENTS = {2: {"running_a_red_light": 2, "emergency_braking": 1}, 6: {"running_a_red_light": 6, "emergency_braking": 1}}
@@ -191,7 +191,7 @@ def test_a_proposal_that_is_gone_is_missed(tmp_path):
 
 def test_a_row_that_was_changed_before_a_migration_is_still_known_to_be(tmp_path):
     path = tmp_path / "ledger.sqlite"
-    shutil.copy(Path(__file__).parent / "ledgers" / "version-3.sqlite", path)
+    shutil.copy(Path(__file__).parent / "versions" / "version-3.sqlite", path)
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("UPDATE trials SET result = replace(result, '2.0', '2.5') WHERE number = 4")
     Ledger(path, writable=True).close()
@@ -203,7 +203,7 @@ def test_a_row_that_was_changed_before_a_migration_is_still_known_to_be(tmp_path
 
 def test_of_a_ledger_of_before_the_steps_of_copies_are_counted(tmp_path):
     path = tmp_path / "ledger.sqlite"
-    shutil.copy(Path(__file__).parent / "ledgers" / "version-4.sqlite", path)
+    shutil.copy(Path(__file__).parent / "versions" / "version-4.sqlite", path)
     columns = f"{', '.join(FIRST['trials'])}, danger"
     with closing(sqlite3.connect(path)) as database, database:  # as trials with probes and branches were
         database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values))
