@@ -53,7 +53,8 @@ def in_help(parser: argparse.ArgumentParser) -> Iterator[Sentence]:
                 yield from in_help(command)
         elif action.help and action.dest != "help":
             name = action.option_strings[-1] if action.option_strings else action.metavar
-            yield f"{parser.prog} {name}", action.help
+            shown = parser._get_formatter()._expand_help(action)
+            yield f"{parser.prog} {name}", shown
 
 
 def in_errors() -> Iterator[Sentence]:
@@ -62,10 +63,11 @@ def in_errors() -> Iterator[Sentence]:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if not (isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args):
                 continue
-            fix = next((item.value for item in node.exc.keywords if item.arg == "fix"), None)
-            message, remedy = literal(node.exc.args[0]), literal(fix)
+            keywords = {item.arg: item.value for item in node.exc.keywords}
+            message = literal(node.exc.args[0])
             if len(message.split()) >= MIN_WORDS:
-                shown = f"{message}; {remedy}" if remedy else message
+                where = f"{shown_value(keywords['where'])}: " if "where" in keywords else ""
+                shown = where + message + (f"; {shown_value(keywords['fix'])}" if "fix" in keywords else "")
                 yield f"{file.relative_to(ROOT).as_posix()}:{node.lineno}", shown
 
 
@@ -79,6 +81,11 @@ def literal(node: ast.expr | None) -> str:
             for part in node.values
         )
     return ""
+
+
+def shown_value(node: ast.expr) -> str:
+    """Return a string as the source has it, and any other expression in braces."""
+    return literal(node) or f"{{{ast.unparse(node)}}}"
 
 
 def in_docstrings() -> Iterator[Sentence]:
