@@ -57,7 +57,8 @@ def check_layout(space: Space[object] | None) -> None:
     columns = None if space is None else (space.shape or (0,))[-1]
     if columns not in (None, SIN_H + 1):
         raise ValueError(
-            f"needs the observation's default features (presence, x, y, vx, vy, cos_h, sin_h), not {columns} columns"
+            "the agent needs the default features (presence, x, y, vx, vy, cos_h, sin_h), but the observation has "
+            f"{columns} columns"
         )
 
 

@@ -93,7 +93,7 @@ def meta_actions(space: Space[object] | None) -> Mapping[str, int] | None:
         meanings = space.meanings if supports(space, HasMeanings) else _ALL if space.n == len(_ALL) else ()
     numbers = {name: number for number, name in enumerate(meanings)}
     if "IDLE" not in numbers:
-        raise ValueError(f"needs actions (target speed, lane change) or meta-actions, not {space}")
+        raise ValueError(f"the agent needs actions (target speed, lane change) or meta-actions, not the space {space}")
     return {name: numbers.get(name, numbers["IDLE"]) for name in _ALL}
 
 

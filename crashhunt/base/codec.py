@@ -119,7 +119,7 @@ def to_plain(value: Serializable) -> JsonObject:
 def from_plain(kind: type[_T], data: Mapping[str, Any]) -> _T:
     """Return the dataclass of a JSON object, as its annotations say; `Serializable.from_json` says the rest."""
     if not isinstance(data, dict):
-        raise TypeError(f"{str(data)[:60]!r} is no JSON object")
+        raise TypeError(f"{str(data)[:60]!r} is not a JSON object")
     values: JsonObject = {}
     for key, convert, needed in _readers(cast(Any, kind)):
         if key in data:

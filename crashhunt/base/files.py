@@ -59,7 +59,9 @@ def _refuse_device(path: Path) -> None:
     if is_special:
         raise HuntDirectoryError("is a device or a pipe, and cannot be replaced", fix="give a file", where=str(path))
     if path.absolute().parent == Path("/dev"):  # such as /dev/stdout, a link to what is a file now
-        raise HuntDirectoryError("is in the folder of devices", fix="give a file in another folder", where=str(path))
+        raise HuntDirectoryError(
+            "is in the folder of device files", fix="give a file in another folder", where=str(path)
+        )
 
 
 def put_in_place(made: Path, final: Path) -> None:

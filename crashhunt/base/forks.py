@@ -425,14 +425,14 @@ def _replacements(known: Held, keeps: Collection[int]) -> list[tuple[int, int, i
     others = len(threads() - watchdog.threads - known.threads - own)
     if others > 0:
         count = f"{others} further thread{' runs' if others == 1 else 's run'}"
-        raise CannotForkError(f"a fork copies no threads, and {count}")
+        raise CannotForkError(f"a process with several threads cannot be forked: {count}")
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():
-        raise CannotForkError("a fork copies no state of a graphics card, and PyTorch uses one")
+        raise CannotForkError("a process in which PyTorch uses a graphics card cannot be forked")
     if children_now() - known.children - _alive:
-        raise CannotForkError("a fork copies no child processes")
+        raise CannotForkError("a process with child processes cannot be forked")
     for name in shared_memory() - known.shared if known.shared is not None else ():
-        raise CannotForkError(f"a fork copies no memory that is shared with other processes: {name}")
+        raise CannotForkError(f"a process that shares memory with other processes cannot be forked: {name}")
     return [
         (descriptor, *_replacement(descriptor, what, known))
         for descriptor, what in _open().items()

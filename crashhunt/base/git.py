@@ -177,7 +177,9 @@ def git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str
         raise CrashhuntError(f"git cannot be run: {error.strerror}", fix="install git") from None
     if done.returncode and not skipped:
         if what:
-            raise UsageError(f"{what!r} is no commit of {folder}", fix="give a revision that git knows")
+            raise UsageError(
+                f"{what!r} is not a commit of the repository {folder}", fix="give a branch, a tag or a commit of it"
+            )
         said = " ".join(done.stderr.split()) or f"git {words[0]} failed"
         raise CrashhuntError(said, fix="run it in the repository of the agent", where=str(folder))
     return done.stdout.strip()

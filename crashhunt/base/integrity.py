@@ -144,7 +144,7 @@ def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the ty
     try:
         found = json.loads(text)
     except RecursionError:
-        raise ValueError("the data are nested too deeply") from None
+        raise ValueError("the JSON data are nested too deeply") from None
     if not isinstance(found, dict):
         raise ValueError(f"the file holds {type(found).__name__}, not an object")
     return cast(T, found)

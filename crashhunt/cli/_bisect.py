@@ -30,8 +30,10 @@ def add_bisect(commands: Commands) -> None:
         "cannot run, or crash in another way, are skipped. Exits with 1 if the skipped revisions prevent an answer.",
     )
     add_crash(bisect)
-    bisect.add_argument("--good", metavar="REV", required=True, help="a revision in which it does not crash")
-    bisect.add_argument("--bad", metavar="REV", default="HEAD", help="a revision in which it crashes; default: HEAD")
+    bisect.add_argument("--good", metavar="REV", required=True, help="a revision in which the crash does not occur")
+    bisect.add_argument(
+        "--bad", metavar="REV", default="HEAD", help="a revision in which the crash occurs; default: HEAD"
+    )
     bisect.add_argument(
         "--from", metavar="FOLDER", type=Path, dest="folder",
         help="folder of the repository from which the agent is imported; default: the current folder",

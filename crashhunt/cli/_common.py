@@ -201,7 +201,7 @@ def pairs(words: list[str], option: str, *, named: bool = True) -> dict[str, str
         elif not equals or not name:
             raise UsageError(f"{option} {word!r} has no name", fix=f"write {option} NAME=VALUE")
         if name in found:
-            raise UsageError(f"{option} {word!r}: {name or 'it'!r} was given already", fix="give it once")
+            raise UsageError(f"{option} {word!r}: {name or 'it'!r} is given twice", fix="give it once")
         found[name] = value
     return found
 

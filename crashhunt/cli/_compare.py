@@ -31,7 +31,7 @@ def add_compare(commands: Commands) -> None:
         "directories", metavar="DIR", type=Path, nargs="+", help="directories of at least two hunts, or of suites"
     )
     compare.add_argument("--csv", action="store_true", help="print a line per hunt as CSV")
-    compare.add_argument("--html", metavar="FILE", type=Path, help="write a page with plots")
+    compare.add_argument("--html", metavar="FILE", type=Path, help="write an HTML page with plots")
     add_json(compare)
     compare.set_defaults(command=_compare)
 

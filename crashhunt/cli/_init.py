@@ -50,7 +50,7 @@ def add_init(commands: Commands) -> None:
     how.add_argument("--bicycles", action="store_true", help="add cyclists, and lanes for bicycles")
     how.add_argument("--lefthand", action="store_true", help="traffic keeps to the left")
     how.add_argument("--agent", metavar="NAME", help="the agent that drives (default: car-following)")
-    how.add_argument("--workflow", choices=["github"], default="", help="add a workflow for this CI")
+    how.add_argument("--workflow", choices=["github"], default="", help="add a workflow file for this CI service")
     add_json(how)
     init.set_defaults(command=_init)
 

@@ -106,7 +106,7 @@ def _unjudged(options: argparse.Namespace) -> list[Bundle]:
     from crashhunt.trial import Outcome
 
     if options.directory.is_file():
-        raise UsageError("--all needs the directory of a hunt", fix="omit it", where=str(options.directory))
+        raise UsageError("--all needs the directory of a hunt", fix="omit --all", where=str(options.directory))
     bundles = [bundle for hunt in find_hunts(options.directory) for bundle in list_bundles(hunt)]
     return [
         bundle

@@ -30,7 +30,7 @@ def add_logs(commands: Commands) -> None:
     logs.add_argument("directory", metavar="DIR", type=Path, help="directory of a hunt or a suite")
     logs.add_argument("--run", metavar="ID", default="", help="of a suite: only this run, such as town/0")
     logs.add_argument("--trial", metavar="N", type=integer, help="only this trial")
-    logs.add_argument("--type", choices=("run", "error", "state"), help="default: all")
+    logs.add_argument("--type", choices=("run", "error", "state"), help="show only this kind of output; default: all")
     logs.add_argument("--errors-only", action="store_true", help="the same as --type error")
     logs.add_argument("--follow", action="store_true", help="keep printing while the hunt is running")
     logs.set_defaults(command=_logs)

@@ -32,7 +32,10 @@ def add_rate(commands: Commands) -> None:
     )
     rate.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="directories of hunts or suites")
     rate.add_argument(
-        "--per", metavar="UNIT", choices=RATE_PERS, help="trial, hour or 1000km; default: all three, or that of --bar"
+        "--per",
+        metavar="UNIT",
+        choices=RATE_PERS,
+        help="unit: trial, hour or 1000km; default: all three, or as in --bar",
     )
     rate.add_argument(
         "--confidence",
@@ -51,7 +54,7 @@ def add_rate(commands: Commands) -> None:
         "1 if it is certainly above, 3 if it is undecided",
     )  # fmt: skip
     rate.add_argument("--csv", action="store_true", help="print a line per rate as CSV")
-    rate.add_argument("--html", metavar="FILE", type=Path, help="write a page")
+    rate.add_argument("--html", metavar="FILE", type=Path, help="write an HTML page with the rates")
     add_json(rate)
     rate.set_defaults(command=_rate)
 

@@ -90,7 +90,7 @@ def add_film_options(parser: argparse.ArgumentParser) -> None:
         default=10,
         help="number of blank pictures between two crashes; default: 10",
     )
-    film.add_argument("--no-panels", action="store_true", help="show the scene alone")
+    film.add_argument("--no-panels", action="store_true", help="do not show the panels of the agent")
 
 
 def film_options(options: argparse.Namespace) -> FilmOptions | None:
@@ -353,7 +353,7 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
         for name in [
             name for name, given in {**look, "--print": options.fields, "a film": film is not None}.items() if given
         ]:
-            raise UsageError(f"--scenario: {name} applies to the scenario of the crash only", fix="omit one of the two")
+            raise UsageError(f"--scenario: {name} needs the scenario of the crash", fix="omit one of the two")
     if film is not None and options.from_log:
         look |= {"--print": options.fields, "--set": options.sets, "--times": options.times != 1}
         for name in [name for name, given in look.items() if given]:
@@ -392,7 +392,7 @@ def _look(options: argparse.Namespace, bundle: Bundle) -> Look | None:
     from crashhunt.replays import Look
 
     if options.json and options.pdb:
-        raise UsageError("--pdb needs a terminal, and --json is for programs", fix="omit one of them")
+        raise UsageError("--pdb needs a terminal, so it cannot be combined with --json", fix="omit one of them")
     if options.sleep is not None and not (options.gui and 0 <= options.sleep < math.inf):
         raise UsageError(f"--sleep is {options.sleep:g}", fix="give at least 0, and --gui, which it slows down")
     until = _last_step(options, bundle)

@@ -48,7 +48,7 @@ def add_suite(commands: Commands) -> None:
         description="Plan every run as a folder of DIR, and run all that have not ended, even if some fail. The same "
         "command resumes the suite. Exits with 1 if a hunt could not run.",
     )
-    run.add_argument("file", metavar="FILE", type=Path, help="a suite.toml")
+    run.add_argument("file", metavar="FILE", type=Path, help="the file that lists the hunts, such as suite.toml")
     run.add_argument("directory", metavar="DIR", type=Path, help="directory of the suite; created if it does not exist")
     run.add_argument("parallel", metavar="PARALLEL", type=integer, nargs="?", default=0,
                      help="trials at a time, of all hunts together; default: one per core")  # fmt: skip

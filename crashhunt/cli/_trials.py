@@ -31,7 +31,7 @@ def add_trials(commands: Commands) -> None:
     trials.add_argument("directory", metavar="DIR", type=Path, help="directory of the hunt")
     trials.add_argument(
         "--format", choices=("csv", "json", "jsonl", "parquet"), default="csv",
-        help="default: csv; parquet needs --out and pip install 'crashhunt[parquet]'",
+        help="format of the table; default: csv; parquet needs --out and pip install 'crashhunt[parquet]'",
     )  # fmt: skip
     trials.add_argument("--out", metavar="FILE", type=Path, help="file to write; default: standard output")
     trials.add_argument(

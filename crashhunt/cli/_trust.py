@@ -47,7 +47,7 @@ def _trust(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.crashes import list_trusted, remove_trusted
 
     if options.places and options.remove:
-        raise UsageError("DIR and --remove contradict each other", fix="run the command twice")
+        raise UsageError("DIR and --remove cannot be combined", fix="run the command once with each of them")
     if options.remove:
         removed = remove_trusted(options.remove)
         for origin in removed:
@@ -96,7 +96,7 @@ def _trust_place(place: Path) -> list[TrustedOrigin]:
             hunts |= set(find_cases([place]))  # a case is laid out as a hunt is
     found = [origin for hunt in sorted(hunts) for origin in trust_hunt(hunt, place)]
     if not found:
-        raise BundleError("has no code that could run", fix="give the directory of a hunt", where=str(place))
+        raise BundleError("the folder has no code that could run", fix="give the directory of a hunt", where=str(place))
     return found
 
 

@@ -146,6 +146,6 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
         got: Got = json.loads(done.stdout)["cases"][0]["got"]
     except (ValueError, KeyError, IndexError):
         raise CrashhuntError(
-            f"the case could not be run: {done.stderr.strip()[-300:]}", fix="run crashhunt corpus run on it"
+            f"the corpus case could not be run: {done.stderr.strip()[-300:]}", fix="see the error: crashhunt corpus run"
         ) from None
     return got

@@ -140,7 +140,9 @@ def _read_index(archive: zipfile.ZipFile, path: Path) -> ArchiveIndex:
         typed(index, {"schema": int})
         if index["schema"] != SCHEMA:
             raise BundleError(
-                f"schema {index['schema']} is not {SCHEMA}", fix="use the version that wrote the trial", where=str(path)
+                f"schema version {index['schema']} is not supported (supported: {SCHEMA})",
+                fix="use the version that wrote the trial",
+                where=str(path),
             )
         typed(index, {"files": FILES})
         for entry in index["files"].values():

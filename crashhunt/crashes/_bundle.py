@@ -311,7 +311,7 @@ class Bundle:
         if not log.exists() and (self.hunt / layout.CASE).is_file():
             raise BundleError(
                 "the case has no log, because an earlier crashhunt did not save it",
-                fix=f"crashhunt corpus run {self.hunt} --keep out runs it, and out/{self.hunt.name} has a log",
+                fix=f"run crashhunt corpus run {self.hunt} --keep out, and use out/{self.hunt.name}",
                 where=str(self.path),
             )
         found = read_log(log)
@@ -320,7 +320,7 @@ class Bundle:
         # The views for people, which have no part in the digest of the trial.
         wrong = changed_file(log, self.files[log.name]) if log.name in self.files else ""
         if wrong:
-            raise BundleError(f"it {wrong} since it was written", fix=_UNDAMAGED, where=str(log))
+            raise BundleError(f"the log {wrong} since it was written", fix=_UNDAMAGED, where=str(log))
         return found
 
     def faults(self) -> list[str]:
@@ -436,7 +436,7 @@ def read_bundle(path: Path) -> Bundle:
         typed(data, {"schema": int})
         if not 1 <= data["schema"] <= SCHEMA:
             raise BundleError(
-                f"schema {data['schema']} is above {SCHEMA}",
+                f"schema version {data['schema']} is not supported (supported: 1 to {SCHEMA})",
                 fix="use the version that wrote the trial",
                 where=str(file),
             )

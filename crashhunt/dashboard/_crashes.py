@@ -120,7 +120,9 @@ class CrashList:
         root = self._found.path
         if not is_inside(folder.resolve(), [root]) or (name := outside_link(folder, root, _FILES)):
             what = name if is_inside(folder.resolve(), [root]) else folder.name
-            raise BundleError(f"{what} is a link to a place outside of the hunt", where=str(folder))
+            raise BundleError(
+                f"{what} is a symbolic link to a file outside the directory of the hunt", where=str(folder)
+            )
         return read_bundle(folder)
 
     def _is_unknown(self, name: str) -> bool:

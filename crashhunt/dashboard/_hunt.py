@@ -101,7 +101,7 @@ class HuntView:
 
     def _refresh(self, *, points: bool) -> HuntState:
         if name := outside_link(self.path, self.found.root):
-            raise HuntDirectoryError(f"{name} is a link to a place outside of the folders that are shown")
+            raise HuntDirectoryError(f"{name} is a symbolic link to a place outside the folders of the dashboard")
         self._read_settings()
         ledger = self.path / layout.LEDGER
         if not has_begun(ledger):
@@ -109,7 +109,7 @@ class HuntView:
             return HuntState(str(self.path), "finished") if self.found.exported else hunt_state(self.path)
         if self.settings is None:
             raise HuntDirectoryError(
-                f"it has no {layout.HUNT}", fix=f"run crashhunt check {self.path} to see what is left"
+                f"the directory has no {layout.HUNT}", fix=f"run crashhunt check {self.path} to see what is left"
             )
         key = (_sign(ledger), _sign(ledger.with_name(f"{ledger.name}-wal")))
         if key != self._key or self.counts is None or (points and self.sample is None):

@@ -93,7 +93,7 @@ def _whose(name: str, agents: Sequence[str], shown: str) -> tuple[str, str]:
         raise UsageError(f"{shown}: there is no controlled vehicle {agent!r}", fix=one_of(agent, agents))
     if not dot and len(agents) > 1:
         fix = f"write {agents[0]}.{name}@…"
-        raise UsageError(f"{shown} names no agent, but there are several: {', '.join(agents)}", fix=fix)
+        raise UsageError(f"{shown} names no agent, but the scenario has several: {', '.join(agents)}", fix=fix)
     return agent or agents[0], what
 
 
@@ -127,7 +127,10 @@ def parse_rates(words: Iterable[str]) -> dict[str, float]:
     for word in given:
         if word == NONE:
             if len(given) > 1:
-                raise UsageError(f"{_SHOWN} {','.join(given)}: none excludes all others", fix="omit it or the others")
+                raise UsageError(
+                    f"{_SHOWN} {','.join(given)}: none cannot be combined with other disturbances",
+                    fix="omit none, or the other disturbances",
+                )
             continue
         if is_fixed(word):
             continue
@@ -175,7 +178,9 @@ def disturber_of(
         model: DisturbanceModel = locate_model(name)
         if rate * step_length_s > 1:
             fix = f"give at most {1 / step_length_s:g} a second"
-            raise UsageError(f"{_SHOWN} {name}={rate:g}: more than one per step of {step_length_s:g} s", fix=fix)
+            raise UsageError(
+                f"{_SHOWN} {name}={rate:g}: the rate exceeds one disturbance per step of {step_length_s:g} s", fix=fix
+            )
         _refuse_what_it_cannot(name, model.what, known, simulator)
         twin = next((other for other, made in models.items() if made.what == model.what), None)
         if twin is not None:

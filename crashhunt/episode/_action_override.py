@@ -106,7 +106,7 @@ class Keeping:
         self._idle = _idle(form)
         if self._idle is None and tuple(form.names) != ("target_speed", "lane_change"):
             raise InvalidEpisodeError(
-                f"the speed of {agent} cannot be held: its actions have no known lanes and speeds"
+                f"the speed of {agent} cannot be held: the lanes and speeds that its actions mean are unknown"
             )
         self._driver, self._simulator, self._agent, self._form = driver, simulator, agent, form
         self._after, self._stays = after, keeps == "lane"
@@ -252,13 +252,15 @@ class ReferenceDriver:
     def __init__(self, driver: Agent, simulator: Simulator, overruled: Overruled) -> None:
         if not supports(simulator, SeesSurroundings):
             raise InvalidEpisodeError(
-                f"{overruled.agent} has no reference driver: its simulator reports no surroundings"
+                f"a reference driver cannot drive {overruled.agent}: the simulator reports no surroundings of the "
+                "vehicle"
             )
         form = simulator.actions[overruled.agent]
         self._meanings = tuple(form.space.meanings) if supports(form.space, HasMeanings) else ()
         if tuple(form.names) != ("target_speed", "lane_change") and not {"IDLE", "SLOWER"} <= {*self._meanings}:
             raise InvalidEpisodeError(
-                f"{overruled.agent} has no reference driver: its actions have no known lanes and speeds"
+                f"a reference driver cannot drive {overruled.agent}: the lanes and speeds that its actions mean are "
+                "unknown"
             )
         self._driver, self._form, self._agent = driver, form, overruled.agent
         self._see = simulator.surroundings

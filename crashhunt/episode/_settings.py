@@ -116,10 +116,9 @@ class WorkerSettings(Serializable):
         tables = [backend.table for _, backend in installed_backends()] if data.get("requires") else []
         unknown = not_understood(data.get("requires") or (), cls, Scenario, *tables)
         if data.get("schema") != _SCHEMA or unknown:
-            how = f"with {', '.join(unknown)}, which this one does not know" if unknown else "in another way"
+            how = f"with {', '.join(unknown)}, which {__version__} does not support" if unknown else "in another way"
             raise CrashhuntError(
-                f"the snapshot has crashhunt {__version__}, and the one that replays is of a version that runs trials "
-                f"{how}",
+                f"the snapshot contains crashhunt {__version__}, but the crashhunt that replays it runs trials {how}",
                 fix=f"pip install crashhunt=={__version__}, or replay with --code current",
             )
         scenario = dict(data["scenario"])

@@ -400,7 +400,7 @@ def salvage(found: Checked, to: Path) -> dict[str, int]:
     """
     if found.kind != "hunt":
         raise HuntDirectoryError(
-            f"{str(found.dir)!r} is not a hunt with recoverable parts", fix="give the directory of a hunt"
+            f"{str(found.dir)!r} has no part of a hunt that can be recovered", fix="give the directory of a hunt"
         )
     settings = _settings(found.dir)
     try:

@@ -311,7 +311,9 @@ class HuntResults:
         with closing(self._ledger()) as ledger:
             found = ledger.result(number)
         if found is None:
-            raise UsageError(f"trial {number} has not ended", fix=f"{self.state.trials_run} trials have")
+            raise UsageError(
+                f"trial {number} has not ended", fix=f"choose one of the {self.state.trials_run} trials that have ended"
+            )
         return found
 
     def trials(self) -> NDArray[np.generic]:

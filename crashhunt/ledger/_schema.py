@@ -213,7 +213,7 @@ def _refuse_unreadable(database: sqlite3.Connection, path: Path, version: int) -
     except (sqlite3.Error, ValueError, TypeError):
         pass
     raise HuntDirectoryError(
-        f"a ledger of version {version}, but this crashhunt reads versions up to {VERSION}",
+        f"the ledger has version {version}, but this crashhunt reads versions up to {VERSION}",
         fix="use the crashhunt that made it, or run with --overwrite to begin again",
         where=str(path),
     )
@@ -318,7 +318,7 @@ def plain_trial(row: Row, path: Path, *, trusted: bool) -> JsonObject:
             spec, closest = data["spec"], data["closest"]
             said = (spec["number"], spec["seed"], data["outcome"], data["steps"], *closest.values(), data["wall_s"])
             if row[:8] != said:
-                raise ValueError("its columns and its text differ")
+                raise ValueError("the columns of a row differ from the JSON text in it")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise damaged(path, f"trial {row[0]} cannot be read: {error}") from None
     return data
@@ -412,7 +412,7 @@ def removed(path: Path, was: os.stat_result) -> bool:
     except FileNotFoundError:
         return True
     raise HuntDirectoryError(
-        "another file was put in the place of the ledger while the hunt ran",
+        "another file replaced the ledger while the hunt ran",
         fix="run the hunt again, in a directory that no other process writes to",
         where=str(path),
     )

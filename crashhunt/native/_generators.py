@@ -66,7 +66,7 @@ def reseed_generators(library: str, seed: int) -> int:
     first, last, _ = (ctypes.c_void_p * 3).in_dll(loaded, _LANES)
     size = (last or 0) - (first or 0)
     if first is None or size <= 0 or size % _GENERATOR_BYTES:
-        raise RuntimeError(f"libsumo's lanes have generators of another layout ({size} bytes)")
+        raise RuntimeError(f"the random generators in libsumo's lanes have an unknown memory layout ({size} bytes)")
     places = [first + offset for offset in range(0, size, _GENERATOR_BYTES)]
     places += [ctypes.addressof((ctypes.c_char * _GENERATOR_BYTES).in_dll(loaded, name)) for name in _SINGLE]
     set_seed, get_seed = loaded[_SEED], loaded[_READ]
@@ -77,5 +77,5 @@ def reseed_generators(library: str, seed: int) -> int:
     for place, value in zip(places, drawn.tolist(), strict=True):
         set_seed(place, False, value)
         if get_seed(place) != value:
-            raise RuntimeError("libsumo's generators do not keep their seed")
+            raise RuntimeError("a random generator of libsumo does not keep the seed that was written to it")
     return len(places)

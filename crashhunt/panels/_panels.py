@@ -524,7 +524,7 @@ def _paint_distribution(panel: ActionDistribution, canvas: Canvas) -> None:
         raise ValueError("give probabilities, or mean and std")
     mean, std = _numbers(panel.mean).ravel(), np.maximum(_numbers(panel.std).ravel(), 1e-9)
     if len(mean) != len(std):
-        raise ValueError(f"mean has {len(mean)} parts, std {len(std)}")
+        raise ValueError(f"mean has {len(mean)} values, but std has {len(std)}")
     there = np.isfinite(mean) & np.isfinite(std)
     if not there.any():
         return
@@ -546,7 +546,7 @@ def _paint_picture(panel: Picture, canvas: Canvas) -> None:
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if pixels.ndim != 3 or 0 in pixels.shape:
-        raise ValueError(f"give an image, not shape {pixels.shape}")
+        raise ValueError(f"give an image of shape (height, width) or (height, width, channels), not {pixels.shape}")
     if pixels.shape[2] < 3:
         pixels = np.repeat(pixels[:, :, :1], 3, axis=2)
     scale = min((canvas.width - 12) / pixels.shape[1], (canvas.height - _TOP - 6) / pixels.shape[0])
@@ -606,7 +606,7 @@ def _bars(canvas: Canvas, names: Sequence[str], values: NDArray[np.float64], low
 def _matrix_of(values: ArrayLike) -> NDArray[np.float64]:
     matrix = np.atleast_2d(_numbers(values))
     if matrix.ndim != 2 or 0 in matrix.shape:
-        raise ValueError(f"give a matrix, not shape {matrix.shape}")
+        raise ValueError(f"give a matrix with two dimensions that are not empty, not shape {matrix.shape}")
     return matrix
 
 

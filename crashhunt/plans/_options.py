@@ -296,7 +296,9 @@ class RunOptions(_Options):
         """
         found = super().checked()
         if found.most and not found.until_rate:
-            raise UsageError(f"--most is {found.most} without --until-rate", fix="give TRIALS, or --until-rate as well")
+            raise UsageError(
+                f"--most {found.most} needs --until-rate", fix="add --until-rate, or give TRIALS instead of --most"
+            )
         if found.until_rate and (found.distinct or found.only_at_fault):
             other = "--distinct" if found.distinct else "--only-at-fault"
             raise UsageError(f"--until-rate and {other} both end a hunt", fix=f"omit {other}")
@@ -304,10 +306,12 @@ class RunOptions(_Options):
             message = f"--keep {found.keep} requires a hunt that continues after a crash"
             raise UsageError(message, fix="give --keep-going or --distinct as well")
         if found.by_cause and not (found.distinct or found.keep):
-            raise UsageError(f"--by-cause {found.by_cause} counts nothing", fix="give --distinct or --keep as well")
+            raise UsageError(f"--by-cause {found.by_cause} has no effect alone", fix="add --distinct or --keep")
         if found.by_cause and found.distinct and found.deterministic:
             message = "--deterministic and --by-cause contradict each other with --distinct"
-            raise UsageError(f"{message}: the analysed crashes would depend on which trials end first", fix="omit one")
+            raise UsageError(
+                f"{message}: which crashes are analysed would depend on which trials end first", fix="omit one"
+            )
         return replace(found, keep_going=True) if found.distinct or found.until_rate else found
 
 

@@ -457,9 +457,9 @@ def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
 def _check_branch(settings: HuntSettings) -> None:
     if settings.branch and not parse_rates(settings.disturb):
         fix = "give rates, such as --disturb brake=0.02,cut_in=0.02"
-        raise UsageError("--branch needs disturbances, and there are none", fix=fix)
+        raise UsageError("--branch needs disturbances, but the hunt has none", fix=fix)
     if settings.branch and sys.platform != "linux":
-        raise UsageError("--branch: forks need Linux", fix="omit it")
+        raise UsageError("--branch forks processes, which needs Linux", fix="omit it")
 
 
 _MAX_RARE_CHANCE = 0.2  # per step: above that a first onset is no rare event, and plain trials are cheaper
@@ -470,11 +470,11 @@ def _check_rare(settings: HuntSettings, scenario: Scenario) -> None:
     run = settings.run
     if not settings.rare:
         if run.until_error:
-            raise UsageError(f"--until-error {run.until_error} is for --rare", fix="add --rare")
+            raise UsageError(f"--until-error {run.until_error} needs --rare", fix="add --rare")
         return
     if not parse_rates(settings.disturb):
         fix = "say how often what happens, such as --disturb brake=0.02,cut_in=0.02"
-        raise UsageError("--rare needs disturbances with rates, and there are none", fix=fix)
+        raise UsageError("--rare needs disturbances with rates, but the hunt has none", fix=fix)
     agents = tuple(settings.agents)
     if fixed := parse_fixed(settings.disturb, agents):
         message = f"--rare: --disturb {word_of(fixed[0], agents)} begins in every trial"
@@ -496,7 +496,7 @@ def _check_rare(settings: HuntSettings, scenario: Scenario) -> None:
             message = f"--rare: --disturb {name}={rate:g} has a chance of {sampler.chance(name):.2g} per step"
             raise UsageError(message, fix=f"give at most {most:g} a second, or omit --rare")
     if sys.platform != "linux":
-        raise UsageError("--rare: forks need Linux", fix="omit it")
+        raise UsageError("--rare forks processes, which needs Linux", fix="omit it")
 
 
 def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:

@@ -151,8 +151,8 @@ class RateTest:
         bets = self.bets
         if not (0 <= events <= bets.most_events and 0 <= exposure <= bets.most_exposure * (1 + _PRECISION)):
             raise ValueError(
-                f"a unit has {events:g} events and exposure {exposure:g}; "
-                f"must be at most {bets.most_events:g} and {bets.most_exposure:g}"
+                f"one trial has {events:g} events and exposure {exposure:g}; allowed are at most {bets.most_events:g} "
+                f"events and exposure {bets.most_exposure:g}"
             )
         if times:
             self.count += times

@@ -96,7 +96,10 @@ def read_log(path: Path) -> Recording:
             if version is None:
                 raise refuse("this MCAP file was not written by crashhunt", "give a log.mcap of a crash bundle")
             if version != SCHEMA:
-                raise refuse(f"its schema is {version}, not {SCHEMA}", "use the version of crashhunt that wrote it")
+                raise refuse(
+                    f"the schema version of the log is {version}; this crashhunt reads {SCHEMA}",
+                    "use the version of crashhunt that wrote it",
+                )
             evidence = [
                 _Message(
                     sequence=sequence, topic=channel.topic, data=data, schema=schema.name, metadata=channel.metadata

@@ -223,7 +223,7 @@ class _Decoder:
         """Return the value of a JSON value."""
         if not isinstance(plain, dict):
             if isinstance(plain, list):
-                raise ValueError("not a recorded value: a bare list")
+                raise ValueError("a list without a type is not a recorded value")
             return plain
         ((kind, content),) = plain.items()
         if kind == "opaque":

@@ -483,5 +483,5 @@ def main() -> None:
 
 def _opened(simulator: Simulator, job: _Job) -> _Window:
     if not supports(simulator, HasWindow):
-        raise UsageError(f"a {type(simulator).__name__} has no window", fix="watch it with --video")
+        raise UsageError(f"the simulator {type(simulator).__name__} has no window", fix="make a film with --video")
     return _Window(simulator, job)

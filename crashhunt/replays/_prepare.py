@@ -173,7 +173,8 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     if code == "log":
         if edits.all:
             raise UsageError(
-                f"recorded actions belong to the recorded trial, and {edits.all[0]}", fix="replay with --code snapshot"
+                f"recorded actions are valid only for the unchanged trial, and {edits.all[0]}",
+                fix="replay with --code snapshot",
             )
         if not trusted:
             refuse_side_effects(scenario, settings, spec.scenario_arguments)

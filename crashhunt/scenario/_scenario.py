@@ -305,7 +305,7 @@ def with_action(scenario: Scenario, agent: str, action: str) -> Scenario:
         ScenarioError: there is no such form.
     """
     if action not in ("continuous", "meta"):
-        raise ScenarioError(f"there is no form of action {action!r}", fix="give continuous or meta")
+        raise ScenarioError(f"{action!r} is not a form of action", fix="give continuous or meta")
     setup = replace(scenario.agents[agent], action=action)  # type: ignore[arg-type]
     return replace(scenario, agents={**scenario.agents, agent: setup})
 

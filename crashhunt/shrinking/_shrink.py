@@ -144,7 +144,7 @@ def shrink(
     if budget < 1:
         raise UsageError(f"the budget is {budget}", fix="give at least 1 trial")
     if time_s is not None and not time_s > 0:
-        raise UsageError(f"the time is {time_s} s", fix="give more than 0")
+        raise UsageError(f"the time limit is {time_s} s", fix="give more than 0")
     rerun = prepare(bundle, ReplayOptions(trusted=trusted))
     signature = signature_of(bundle)
     memory = bundle.path.with_name(f".{shrunk_name(bundle.id)}.jsonl")

@@ -123,7 +123,7 @@ def cast(action: object, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
         TypeError, ValueError: The conversion would change the action by more than rounding.
     """
     if is_masked(action):
-        raise ValueError("a part of the action is masked")
+        raise ValueError("the action has masked elements, and these have no value")
     given = np.asarray(action)
     if given.dtype == dtype:
         return given.copy()  # the agent may change its own array afterwards
@@ -132,7 +132,7 @@ def cast(action: object, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
     # Integers that are too large wrap around silently, and floats that are too large become infinite.
     same = array == given if dtype.kind in "biu" else np.isfinite(array) == np.isfinite(given)
     if not np.all(same):
-        raise ValueError("the data type cannot hold the value")
+        raise ValueError("the data type of the action space cannot represent the value")
     return array
 
 

@@ -128,7 +128,7 @@ class Snapshot:
             typed(found, {"schema": int, "paths": list[str], "files": FILES})
             if not 1 <= found["schema"] <= SCHEMA:
                 raise BundleError(
-                    f"schema {found['schema']} is above {SCHEMA}",
+                    f"schema version {found['schema']} is not supported (supported: 1 to {SCHEMA})",
                     fix="use the version that wrote the trial",
                     where=str(file),
                 )

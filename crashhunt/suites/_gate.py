@@ -295,7 +295,7 @@ class _Run:
             )
             if is_other:
                 raise HuntDirectoryError(
-                    "the directory has a gate of other versions, hunts or seed",
+                    "the directory has a gate with other versions, hunts or seeds",
                     fix="give --keep another directory", where=str(self._place),
                 )  # fmt: skip
             seed = before["seed"] if before is not None and given is None else given

@@ -55,7 +55,7 @@ def check_plain(data: JsonObject) -> None:
     parts = (data.get("collision"), data.get("failure"), data.get("escape"), data.get("event"))
     check_parts(data.get("closest", {}), *parts)
     if min(data["steps"], data.get("setup_steps") or 0, spec["number"], spec["seed"], spec["max_steps"]) < 0:
-        raise ValueError("a number is below 0")
+        raise ValueError("a count of steps, a trial number or a seed is below 0")
 
 
 def check_disturbances(disturbances: Sequence[JsonObject] | None) -> None:
@@ -69,7 +69,7 @@ def check_disturbances(disturbances: Sequence[JsonObject] | None) -> None:
         typed({"disturbance": one}, {"disturbance": dict})
         _check(one, Disturbance)
         if one["step"] < 1 or not math.isfinite(one["how_strong"]) or not 0 < one["how_long"] < math.inf:
-            raise ValueError("a disturbance is out of its range")
+            raise ValueError("the step, strength or duration of a disturbance is out of its range")
 
 
 def check_parts(

@@ -54,7 +54,7 @@ class Outcome(StrEnum):
             ValueError: The name is invalid, or the outcome of that name has another category.
         """
         if category not in get_args(Category):
-            raise ValueError(f"{category!r} is no category")
+            raise ValueError(f"{category!r} is not a category of outcomes")
         outcome = cls(name)
         if outcome.is_own:
             _CATEGORIES[name] = category

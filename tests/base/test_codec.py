@@ -84,7 +84,7 @@ def test_unknown_keys_are_ignored_and_missing_keys_are_the_defaults():
     [
         ({}, "'part' is missing"),
         ({"part": {}}, "part: 'name' is missing"),
-        ({"part": "near"}, "part: 'near' is no JSON object"),
+        ({"part": "near"}, "part: 'near' is not a JSON object"),
         ({"part": {"name": "a"}, "parts": [{"gap_m": 1}]}, "parts: 'name' is missing"),
         ({"part": {"name": "a"}, "colour": "blue"}, "colour: 'blue' is not a valid Colour"),
         ({"part": {"name": "a"}, "by_name": [1]}, "by_name: 'list' object has no attribute 'items'"),

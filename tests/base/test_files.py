@@ -18,7 +18,7 @@ from crashhunt.errors import HuntDirectoryError
         ("missing/file", "cannot be written: No such file or directory"),
         ("pipe", "is a device or a pipe"),
         ("/dev/null", "is a device or a pipe"),
-        ("/dev/crashhunt.html", "is in the folder of devices"),
+        ("/dev/crashhunt.html", "is in the folder of device files"),
     ],
 )
 def test_file_that_cannot_be_written_is_an_error_with_its_name(tmp_path, name, says):

@@ -160,8 +160,8 @@ def test_what_has_changed_is_refused(bundle):
 @pytest.mark.parametrize(
     ("values", "says"),
     [
-        ({"schema": 6}, "schema 6 is above 5"),
-        ({"schema": 0}, "schema 0"),
+        ({"schema": 6}, "schema version 6 is not supported"),
+        ({"schema": 0}, "schema version 0"),
         ({"seed": 2**31}, "out of range"),
         ({"seed": -1}, "out of range"),
         ({"trial": -1}, "out of range"),

@@ -407,7 +407,7 @@ def test_command_lists_and_removes(place, capsys):
     for words, says in (
         ((place / "thiers",), "does not exist"),
         ((place / "toy",), "has no code that could run"),
-        ((place / "theirs", "--remove", "x"), "contradict each other"),
+        ((place / "theirs", "--remove", "x"), "cannot be combined"),
         (("--remove", "x"), "no such origin is trusted"),
     ):
         code, _, err = crashhunt(*words)

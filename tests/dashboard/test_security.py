@@ -143,12 +143,12 @@ def test_links_out_of_the_folders_are_not_followed(hunt, tmp_path):
         rows = dashboard.hunts()
         assert "linked" not in rows
         assert rows["ledger"]["state"] == "error"
-        assert "ledger.sqlite is a link to a place outside" in rows["ledger"]["detail"]
+        assert "ledger.sqlite is a symbolic link to a place outside" in rows["ledger"]["detail"]
         assert rows["one"]["state"] == "crashed"  # the others are as they were
         one = f"/api/hunts/{rows['one']['id']}"
         listed = {row["id"]: row for row in dashboard.get(f"{one}/crashes")["crashes"]}
         for name in (crash.name, "999999-collision"):
-            assert "is a link to a place outside" in listed[name]["damaged"]
+            assert "is a symbolic link to a file outside" in listed[name]["damaged"]
             for what in ("", "/log", "/export"):
                 reply = dashboard.ask(f"{one}/crashes/{name}{what}")
                 assert reply.status in (404, 422)

@@ -58,7 +58,7 @@ def test_any_word_is_a_rate_or_refused(word):
         (["brake=nan"], "'nan' is not a rate"),
         (["brake=inf"], "'inf' is not a rate"),
         (["brake=1", "brake=1"], "gives 'brake' twice"),
-        (["none", "brake=1"], "none excludes all others"),
+        (["none", "brake=1"], "none cannot be combined with other"),
     ],
 )
 def test_what_is_no_rate_is_refused(words, says):
@@ -85,7 +85,7 @@ def fails():
 @pytest.mark.parametrize(
     ("found", "says"),
     [
-        ({"brake": 10.1}, "brake=10.1: more than one per step of 0.1 s"),
+        ({"brake": 10.1}, "brake=10.1: the rate exceeds one disturbance per step of 0.1 s"),
         ({"braek": 1}, "no disturbance 'braek'"),
         ({"cut_in": 1}, "the toy cannot do 'cut_in'"),
         ({"brake": 1, "test_rates:other_brake": 1}, "both about 'brake'"),

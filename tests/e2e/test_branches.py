@@ -84,6 +84,6 @@ def test_a_hunt_stops_at_what_a_branch_has_found(shell):
 def test_branches_need_disturbances(shell):
     done = shell.crashhunt("run", "h", "1", "3", "60", "--branch", expect=2)
     assert done.err == (
-        "crashhunt: --branch needs disturbances, and there are none; give rates, "
+        "crashhunt: --branch needs disturbances, but the hunt has none; give rates, "
         "such as --disturb brake=0.02,cut_in=0.02\n"
     )

@@ -222,7 +222,7 @@ def test_hunt_with_too_many_invalid_trials_ends_with_a_line(toy):
         (("--until-rate", "3/hour", "--sampler", "guided"), "omit --sampler guided"),
         (("--until-rate", "3/hour", "--seeds", "2"), "omit --seeds"),
         (("--until-rate", "3/hour", "--distinct", "2"), "omit --distinct"),
-        (("--most", "9"), "--most is 9 without --until-rate"),
+        (("--most", "9"), "--most 9 needs --until-rate"),
     ],
 )
 def test_option_that_contradicts_a_bar_is_refused(toy, words, says):

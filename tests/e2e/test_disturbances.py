@@ -124,9 +124,9 @@ def hunt_refused(shell, *more):
     [
         ("brake", "'brake' has no rate; write NAME=RATE"),
         ("brake=-1", "'-1' is not a rate"),
-        ("brake=11", "more than one per step of 0.1 s"),
+        ("brake=11", "the rate exceeds one disturbance per step of 0.1 s"),
         ("cut_in=0.1", "cannot do 'cut_in'; it can do brake, late_action"),
-        ("none,brake=1", "none excludes all others"),
+        ("none,brake=1", "none cannot be combined with other"),
         ("brake@101=ahead:4:2", "brake@101: a trial has only 9 steps"),
         ("cut_in@5=left:4:2", "cannot do 'cut_in'; it can do brake, late_action"),
     ],

@@ -82,7 +82,7 @@ def test_worse_agent_fails_the_gate_and_the_hunts_stay_for_compare(drivers):
     assert {**again, "base": 0, "head": 0} == {**found, "base": 0, "head": 0}
     assert len(specs(drivers.folder / "kept" / "head")) == trials  # decided before, so nothing runs
     refused = drivers.crashhunt("gate", CALM, TWIN, *TOY, *SEED, "--keep", "kept", expect=2)
-    assert "the directory has a gate of other versions, hunts or seed" in refused.err
+    assert "the directory has a gate with other versions, hunts or seeds" in refused.err
     refused = drivers.crashhunt("gate", CALM, WILD, *TOY, *SEED, "--keep", "kept", "--set", "gap_m=5", expect=2)
     assert "--set" in refused.err  # given twice
 

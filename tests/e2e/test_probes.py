@@ -99,7 +99,7 @@ def test_an_agent_that_cannot_be_copied_is_refused_at_its_first_step(shell):
     (shell.folder / "threads.py").write_text(THREADS)
     words = ("--scenario", "toy.toml", "--agent", "threads:Threads", "--seed", "1", "--probe", "1s", "--overwrite")
     done = shell.crashhunt("run", "h", "1", "2", "30", *words, expect=2)
-    why = "a fork copies no threads, and 1 further thread runs"
+    why = "a process with several threads cannot be forked: 1 further thread runs"
     said = f"--probe: trials with threads:Threads cannot be copied: {why}; correct threads:Threads, or omit --probe"
     assert said in done.err
     done = shell.crashhunt("run", "h", "1", "2", "30", *words, "--arg", "after=15", "--json")

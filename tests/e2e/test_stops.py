@@ -166,7 +166,7 @@ def test_another_ledger_in_its_place_ends_the_hunt(toy):
     (toy.folder / "other").rename(toy.folder / "h" / "ledger.sqlite")
     out, err = process.communicate(timeout=300)
     assert process.returncode == 2
-    assert "another file was put in the place of the ledger" in json.loads(out)["error"]["message"]
+    assert "another file replaced the ledger" in json.loads(out)["error"]["message"]
     assert err.count("\n") == 2  # the first says that it hunts
 
 

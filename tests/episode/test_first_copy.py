@@ -22,8 +22,8 @@ def test_system_without_a_process_to_spare_is_asked_again_at_the_next_step():
         if first.is_due(episode):
             first.ask(episode)
     assert (ended, refused) == ([{}], [])
-    left.append(CannotForkError("a fork copies no threads"))
+    left.append(CannotForkError("a process with several threads cannot be forked"))
     first = FirstCopy(refused.append)
     first.ask(SimpleNamespace(steps=1, fork=fork))
-    assert refused == ["a fork copies no threads"]
+    assert refused == ["a process with several threads cannot be forked"]
     assert not first.is_due(SimpleNamespace(steps=2))

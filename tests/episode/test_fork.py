@@ -63,11 +63,11 @@ def test_a_copy_and_a_copy_of_it_continue_to_the_same_bits(ask, scenario):
 def test_what_has_no_copy_is_named(ask):
     assert ask("refused") == {
         "nothing": "",
-        "thread": "a fork copies no threads, and 1 further thread runs",
-        "process": "a fork copies no child processes",
+        "thread": "a process with several threads cannot be forked: 1 further thread runs",
+        "process": "a process with child processes cannot be forked",
         "socket": Words("a fork cannot copy a connection to others: socket:"),
         "pipe": Words("a fork cannot copy a connection to others: pipe:"),
-        "memory": "a fork copies no memory that is shared with other processes: /dev/zero (deleted)",
+        "memory": "a process that shares memory with other processes cannot be forked: /dev/zero (deleted)",
     }
 
 
@@ -108,7 +108,7 @@ def test_probes_find_the_mildest_that_crashes_and_change_nothing(ask):
     assert found["by itself"]["margin"] == 0.0
     assert found["by itself"]["disturbance"] is None
     stress, why_not = found["thread"]
-    assert why_not == "a fork copies no threads, and 1 further thread runs"
+    assert why_not == "a process with several threads cannot be forked: 1 further thread runs"
     assert (stress["margin"], stress["why_unasked"]) == (None, why_not)
     assert (stress["moments"], stress["moments_asked"], stress["probes"]) == (5, 0, 0)
 

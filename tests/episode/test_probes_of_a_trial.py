@@ -370,14 +370,18 @@ def test_an_answer_between_failures_keeps_the_asking_going():
 def test_what_has_no_copy_is_reported_and_its_time_counts():
     class Refused(Road):
         def fork(self, work, *, observed=True):
-            raise CannotForkError("a fork copies no threads", fix="none")
+            raise CannotForkError("a process with several threads cannot be forked", fix="none")
 
     asker, waited = prober()
     asker.ask(Refused({}))
-    assert asker.why_not == "a fork copies no threads"
+    assert asker.why_not == "a process with several threads cannot be forked"
     assert len(waited) == 1
     stress = stress_of(asker)
-    assert (stress.margin, stress.extent, stress.why_unasked) == (None, "asked 0 of 1", "a fork copies no threads")
+    assert (stress.margin, stress.extent, stress.why_unasked) == (
+        None,
+        "asked 0 of 1",
+        "a process with several threads cannot be forked",
+    )
     assert not stress.may_be_asked_again
 
 

@@ -94,9 +94,12 @@ def test_answer_begins_the_count_again():
 def test_what_cannot_be_copied_is_not_tried_again():
     told = []
     questions = Questions("probes", told.append)
-    attempt, rest = attempts(CannotForkError("a fork copies no threads"), ANSWER)
+    attempt, rest = attempts(CannotForkError("a process with several threads cannot be forked"), ANSWER)
     assert questions.ask(attempt) is None
-    assert (questions.why_not, questions.why_unanswered) == ("a fork copies no threads", "a fork copies no threads")
+    assert (questions.why_not, questions.why_unanswered) == (
+        "a process with several threads cannot be forked",
+        "a process with several threads cannot be forked",
+    )
     assert (len(rest), questions.may_be_answered, told) == (1, False, [])
 
 

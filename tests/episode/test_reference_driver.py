@@ -181,5 +181,5 @@ def test_a_simulator_that_knows_no_surroundings_is_refused():
         def __init__(self):
             self.actions = {"ego": SpeedAndLaneChange()}
 
-    with pytest.raises(InvalidEpisodeError, match="its simulator reports no surroundings"):
+    with pytest.raises(InvalidEpisodeError, match="the simulator reports no surroundings"):
         driver(Blind(), "none")

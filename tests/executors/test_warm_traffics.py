@@ -137,7 +137,9 @@ def test_traffic_that_cannot_be_forked_is_not_shared(pool):
         notes = sharing.notes()
     assert [(one.outcome, one.setup_steps) for one in found] == [(Outcome.SURVIVED, 40)] * 3
     (note,) = notes
-    assert note.startswith("trials in the same traffic do not share its warm-up: a fork copies no threads")
+    assert note.startswith(
+        "trials in the same traffic do not share its warm-up: a process with several threads cannot be forked"
+    )
 
 
 def deepest_process_below(pid):

@@ -52,7 +52,7 @@ def _folder(tmp_path, monkeypatch):
         ({"disturb": ["stop=0.01"], "probe": "4s"}, "--rare and --probe exclude each other"),
         ({"disturb": ["stop=0.01"], "distinct": 2}, "--rare and --distinct exclude each other"),
         ({"disturb": ["stop=3"]}, "stop=3 has a chance of 0.3 per step"),
-        ({"rare": False, "until_error": "30%"}, "--until-error 30% is for --rare"),
+        ({"rare": False, "until_error": "30%"}, "--until-error 30% needs --rare"),
         ({"disturb": ["stop=0.01"], "until_error": "300%"}, "--until-error is 300%"),
         ({"disturb": ["stop=0.01"], "until_error": "soon"}, "--until-error is soon"),
     ],

@@ -76,7 +76,7 @@ def test_trials_are_rows_columns_and_results(hunt):
     assert len(list(found.trial_rows())) == 4
     assert found.trial(2).steps == 59
     assert [crash.id for crash in found.crashes] == ["000000-collision", "000002-collision"]
-    with pytest.raises(UsageError, match=r"trial 4 has not ended.*4 trials have"):
+    with pytest.raises(UsageError, match=r"trial 4 has not ended.*4 trials that have ended"):
         found.trial(4)
 
 

@@ -223,7 +223,7 @@ def test_a_ledger_that_was_removed_is_written_again(path, tmp_path):
         assert reader.finished() == {0, 1}
     path.unlink()
     path.write_text("another")
-    with pytest.raises(HuntDirectoryError, match="another file was put in the place"):
+    with pytest.raises(HuntDirectoryError, match="another file replaced the ledger"):
         writer.restore()
     path.unlink()
     moved = tmp_path.rename(f"{tmp_path}-moved")
@@ -248,9 +248,12 @@ def test_in_a_ledger_without_digests_two_places_may_not_contradict_each_other(pa
             database.execute(f"ALTER TABLE {table} DROP COLUMN digest")
         database.execute("PRAGMA user_version = 1")
         database.execute(f"UPDATE trials SET {change}")
-    with closing(Ledger(path)) as reader, pytest.raises(HuntDirectoryError, match="its columns and its text differ"):
+    with (
+        closing(Ledger(path)) as reader,
+        pytest.raises(HuntDirectoryError, match="the columns of a row differ from the JSON text"),
+    ):
         list(reader.results())
-    with pytest.raises(HuntDirectoryError, match="its columns and its text differ"):
+    with pytest.raises(HuntDirectoryError, match="the columns of a row differ from the JSON text"):
         Ledger(path, writable=True)
 
 

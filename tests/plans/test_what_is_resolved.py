@@ -167,7 +167,7 @@ def test_what_an_agent_needs_has_to_be_given(folder):
         ({"scenario_arguments": {"gap": "3"}}, "the scenario has no argument 'gap'"),
         ({"agents": {"other": "drives:Agent"}}, "other"),
         ({"action": "meta"}, "--action meta is for"),
-        ({"branch": True}, "--branch needs disturbances, and there are none"),
+        ({"branch": True}, "--branch needs disturbances, but the hunt has none"),
         ({"disturb": ["brake@101=ahead:4:2"]}, "--disturb brake@101: a trial has only 100 steps"),
         ({"crash_on": ["red-light"]}, "did you mean 'red_light'"),
     ],

@@ -188,7 +188,7 @@ def test_width_at_30_crashes_is_at_most_1_83_times_that_of_clopper_and_pearson(t
 
 @pytest.mark.parametrize("unit", [(1.5, 1.0), (-0.1, 1.0), (0.0, 1.01), (0.0, math.nan)])
 def test_a_unit_beyond_its_bounds_is_refused(unit):
-    with pytest.raises(ValueError, match="must be at most 1 and 1"):
+    with pytest.raises(ValueError, match="at most 1 events and exposure 1"):
         RateTest().add(*unit)
 
 

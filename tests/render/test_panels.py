@@ -47,7 +47,7 @@ def test_whatever_an_agent_shows_becomes_a_picture_or_one_clear_error(panel, siz
     try:
         picture = panel.draw(*size, label="any")
     except ValueError as error:
-        assert "give " in str(error) or "parts" in str(error)
+        assert "give " in str(error) or "values" in str(error)
         return
     assert picture.shape == (size[1], size[0], 3)
     assert picture.dtype == np.uint8
@@ -130,7 +130,7 @@ def test_a_distribution_of_discrete_actions_is_bars_up_to_one():
 
 def test_a_distribution_of_a_continuous_action_has_a_curve_for_each_part():
     assert {BLUE, (213, 94, 0)} <= set(colors(ActionDistribution(mean=[0.0, 2.0], std=[1.0, 0.5]).draw()))
-    with pytest.raises(ValueError, match="mean has 2 parts, std 1"):
+    with pytest.raises(ValueError, match="mean has 2 values, but std has 1"):
         ActionDistribution(mean=[0.0, 1.0], std=[1.0]).draw()
 
 

@@ -36,13 +36,16 @@ def town(tmp_path):
 @pytest.mark.parametrize(
     ("ego", "says"),
     [
-        ("nobody", "--ego 'nobody': there is no vehicle 'nobody' in its files; there are left.0, van & co, odd.one"),
+        (
+            "nobody",
+            "--ego 'nobody': the files of the scenario have no vehicle 'nobody'; there are left.0, van & co, odd.one",
+        ),
         ("od.one", "did you mean 'odd.one'?"),
         ("left", "'left' is a flow; name one of its vehicles: left.0, left.1"),
-        ("ego", "there is no vehicle 'ego'"),  # which is a type
+        ("ego", "the files of the scenario have no vehicle 'ego'"),  # which is a type
         ("lft.2", "did you mean 'left.0'?"),
-        ("route=wya", "--ego 'route=wya': there is no route 'wya' in its files; did you mean 'way'?"),
-        ("edges=south,eest", "there is no edge 'eest'"),
+        ("route=wya", "--ego 'route=wya': the files of the scenario have no route 'wya'; did you mean 'way'?"),
+        ("edges=south,eest", "the files of the scenario have no edge 'eest'"),
     ],
 )
 def test_who_is_not_there_is_refused_at_once(town, ego, says):
@@ -78,10 +81,26 @@ def test_where_the_files_do_not_tell_nothing_is_refused(town, more):
 @pytest.mark.parametrize(
     ("line", "wrong", "says"),
     [
-        ('type = "ego"', 'type = "egoo"', "agents.ego.type: there is no type 'egoo' in its files; did you mean 'ego'?"),
-        ('route = "counterclockwise"', 'route = "clockwize"', "agents.ego.route: there is no route 'clockwize'"),
-        ('route = "counterclockwise"', 'edges = ["south", "eats"]', "agents.ego.edges: there is no edge 'eats'"),
-        ('route = "counterclockwise"', "existing = true", "agents.ego: there is no vehicle 'ego' in its files"),
+        (
+            'type = "ego"',
+            'type = "egoo"',
+            "agents.ego.type: the files of the scenario have no type 'egoo'; did you mean 'ego'?",
+        ),
+        (
+            'route = "counterclockwise"',
+            'route = "clockwize"',
+            "agents.ego.route: the files of the scenario have no route 'clockwize'",
+        ),
+        (
+            'route = "counterclockwise"',
+            'edges = ["south", "eats"]',
+            "agents.ego.edges: the files of the scenario have no edge 'eats'",
+        ),
+        (
+            'route = "counterclockwise"',
+            "existing = true",
+            "agents.ego: the files of the scenario have no vehicle 'ego'",
+        ),
     ],
 )
 def test_names_in_a_scenario_are_looked_up(tmp_path, line, wrong, says):

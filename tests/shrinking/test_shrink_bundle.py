@@ -28,8 +28,8 @@ def crash(tmp_path):
     ("options", "message"),
     [
         ({"budget": 0}, "the budget is 0; give at least 1 trial"),
-        ({"time_s": 0}, "the time is 0 s; give more than 0"),
-        ({"time_s": float("nan")}, "the time is nan s; give more than 0"),
+        ({"time_s": 0}, "the time limit is 0 s; give more than 0"),
+        ({"time_s": float("nan")}, "the time limit is nan s; give more than 0"),
     ],
 )
 def test_a_budget_or_time_that_is_none_is_refused(crash, options, message):

@@ -66,7 +66,7 @@ class ArrayForm(Form):
     def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
         """Return their bytes."""
         if prologue is None:
-            raise ValueError("an array precedes the beginning of the recording")
+            raise ValueError("an array of an agent comes before the first record")
         return np.array(list(message.values), getattr(prologue.agents[aux], self._what)).tobytes()
 
 

@@ -160,13 +160,15 @@ def _read_step(reading: Reading, _aux: int, payload: bytes) -> None:
     rewards, values = values[: len(agents)], values[len(agents) :]
     count = len(reading.roster)
     if step != len(steps) or len(rewards) != len(agents) or len(values) != 4 * count:
-        raise ValueError(f"step {step} follows step {len(steps) - 1}")
+        raise ValueError(
+            f"the scene of step {step} follows that of step {len(steps) - 1}, but steps must be consecutive"
+        )
     points = list(zip(values[: 2 * count : 2], values[1 : 2 * count : 2], strict=True))
     headings, speeds = values[2 * count : 3 * count], values[3 * count :]
     parts: SceneParts = {"heights": [], "grades": [], **reading.scene}
     scene = current.scene = Scene(time_s, reading.roster, points, headings, speeds, **parts)
     if len(scene.heights) not in (0, count) or any(row >= count for row in scene.spines):
-        raise ValueError(f"step {step} has more actors than the recording")
+        raise ValueError(f"the scene of step {step} has more actors than the recording has named")
     scene.events = reading.events
     scene.previous = steps[-1].scene if steps else None
     current.step = step

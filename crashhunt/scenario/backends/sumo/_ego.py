@@ -209,7 +209,7 @@ def _on_any_route(files: list[Path], path: Path) -> Ego:
             note = f"no vehicle departs that the files name: one is added on the route {route.get('id')!r}"
             return Ego(agent=_EGO, setup=AgentSetup(route=str(route.get("id"))), note=note, arguments={})
     raise ScenarioError(
-        "no vehicle and no route is defined in its files", fix="give --ego edges=FROM,TO", where=str(path)
+        "the files of the scenario define no vehicle and no route", fix="give --ego edges=FROM,TO", where=str(path)
     )
 
 

@@ -87,7 +87,7 @@ def _check(key: str, kind: str, name: str, texts: list[bytes], where: str) -> No
         return
     known = [other for other in _ids(_TAGS[kind], texts) if not other.startswith(":")]
     fix = f"{did_you_mean(name, known)} there are {listed(known)}".lstrip()
-    raise ScenarioError(f"{key}: there is no {kind} {name!r} in its files", fix=fix, where=where)
+    raise ScenarioError(f"{key}: the files of the scenario have no {kind} {name!r}", fix=fix, where=where)
 
 
 def _check_vehicle(name: str, texts: list[bytes], key: str, where: str) -> None:
@@ -104,7 +104,7 @@ def _check_vehicle(name: str, texts: list[bytes], key: str, where: str) -> None:
         return
     known = [f"{other}.0" if other in flows else other for other in _ids(_VEHICLES, texts)]
     fix = f"{did_you_mean(name, known)} there are {listed(known)}".lstrip()
-    raise ScenarioError(f"{key}: there is no vehicle {name!r} in its files", fix=fix, where=where)
+    raise ScenarioError(f"{key}: the files of the scenario have no vehicle {name!r}", fix=fix, where=where)
 
 
 def _defined(name: str, texts: list[bytes]) -> bool:
