@@ -1,10 +1,11 @@
 """How well crash types agree with planted bugs: by signature, and divided by cause. Run it as ``scripts/causes``.
 
 Agents with two or three planted bugs are hunted. The label of a crash is the set of bugs without each of which the same
-trial has no crash with the same two actors until 5 s after it. A crash with an empty set does not count. The adjusted
-Rand index (Hubert and Arabie 1985) compares types with the labels of the crashes that need a single bug: 1 is equal, 0
-chance. A crash that needs several bugs has no single label: removing either one is a fix. Its cause is consistent if it
-is also the cause of crashes that need one of these bugs alone, and of no crash that needs another bug alone.
+trial has no crash with the same two actors until 5 s after it. A crash with an empty set does not count: the agent
+without any bug has it, too, or each of several bugs suffices. The adjusted Rand index (Hubert and Arabie 1985) compares
+types with the labels of the crashes that need a single bug: 1 is equal, 0 chance. A crash that needs several bugs has
+no single label: removing either one is a fix. Its cause is consistent if it is also the cause of crashes that need one
+of these bugs alone, and of no crash that needs another bug alone.
 
     scripts/causes --folder DIR [--trials N] [--judge N] [SCENARIO:BUGS…]     goes on where it was
 """
@@ -39,7 +40,11 @@ AGENTS = (
     ("loop", "sign+frozen"), ("loop", "wrong_side+frozen"), ("loop", "sign+blind_behind"), ("loop", "sign+off_edge"),
     ("merge", "sign+wrong_side"), ("merge", "frozen+blind_behind"), ("merge", "wrong_side+off_edge"),
     ("merge", "frozen+wrong_side+blind_behind"), ("motorway", "sign+blind_behind"), ("motorway", "frozen+index"),
-    ("motorway", "sign+wrong_side"), ("motorway", "sign+frozen+off_edge"),
+    ("motorway", "sign+wrong_side"), ("motorway", "sign+frozen+off_edge"), ("highway", "late+blind_ahead"),
+)  # fmt: skip
+_TITLES = (
+    "scenario", "bugs", "crashes", "need no bug, with an omission", "need one bug", "of bugs", "ARI types",
+    "ARI types and causes", "ARI causes alone", "need several", "consistent", "contradictory", "hidden by --keep 3",
 )  # fmt: skip
 _AFTER_S = 5.0
 _KEEP = 3
@@ -68,9 +73,8 @@ def main() -> int:
     given.folder = given.folder.resolve()
     given.folder.mkdir(parents=True, exist_ok=True)
     shutil.copy(Path(__file__).with_name("planted_bugs.py"), given.folder)
-    print("| scenario | bugs | crashes | need one bug | of bugs | ARI types | ARI types and causes | "
-          "ARI causes alone | need several | consistent | contradictory | hidden by --keep 3 |")  # fmt: skip
-    print(f"{'| --- ' * 12}|", flush=True)
+    print(f"| {' | '.join(_TITLES)} |")
+    print(f"{'| --- ' * len(_TITLES)}|", flush=True)
     chosen = [tuple(one.split(":", 1)) for one in given.only] or AGENTS
     for scenario, bugs in chosen:
         store = given.folder / f"{scenario}-{bugs}.json"
@@ -90,13 +94,15 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
         command += ["--action", "continuous"] if scenario == "motorway" else []
         subprocess.run(command, check=True, capture_output=True, cwd=given.folder)
     rows = []
-    labels = _labels(list_bundles(hunt), bugs.split("+"))
-    for group in group_crashes(list_bundles(hunt)).groups:
+    bundles = list_bundles(hunt)
+    labels = _labels(bundles, bugs.split("+"))
+    for group in group_crashes(bundles).groups:
         for part in divide_by_cause(group, ReplayOptions(trusted=True), most=given.judge, parallel=2, write=False):
             rows += [
                 {
                     "crash": bundle.id,
-                    "needs": labels[bundle.id],
+                    "needs": [name for name in labels[bundle.id] if name] if "" in labels[bundle.id] else [],
+                    "has_no_bug": "" not in labels[bundle.id],
                     "type": str(group.signature),
                     "cause": str(part.cause),
                     "judged": bundle in part.judged,
@@ -108,17 +114,17 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
 
 
 def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, list[str]]:
-    """Return the bugs that each crash needs, by runs of its trial without one bug at a time."""
+    """Return the bugs that each crash needs, by runs of its trial without one bug at a time; "" is all of them."""
     found: dict[str, list[str]] = {bundle.id: [] for bundle in bundles}
     if not bundles:
         return found
     reruns = [prepare(bundle, ReplayOptions(trusted=True)) for bundle in bundles]
-    asked = [(bundle, bug) for bundle in bundles for bug in bugs]
+    asked = [(bundle, bug) for bundle in bundles for bug in (*bugs, "")]
     specs = []
     for rerun in reruns:
         longer = rerun.bundle.result.steps + round(_AFTER_S / rerun.recorded.prologue.step_length_s)
-        for bug in bugs:
-            given = {**rerun.spec.arguments["ego"], "bugs": "+".join(name for name in bugs if name != bug)}
+        for bug in (*bugs, ""):
+            given = {**rerun.spec.arguments["ego"], "bugs": "+".join(name for name in bugs if bug and name != bug)}
             specs.append(replace(rerun.spec, arguments={"ego": given}, max_steps=longer))
     with TemporaryDirectory(prefix="crashhunt-causes-") as scratch:
         runs = Reruns(reruns[0], Path(scratch), parallel=2, stopped=lambda: False)
@@ -157,7 +163,18 @@ def _line(study: dict[str, Any]) -> str:
     contradictory = sum(not bugs <= needs for bugs, needs in several)
     indices = [f"{adjusted_rand_index(labels, found):.2f}" for found in (types, causes, merged)]
     hidden = [", ".join(sorted({*labels} - _kept(rows, key))) or "none" for key in ("type", "cause")]
-    cells = [study["scenario"], study["bugs"], len(study["rows"]), len(single), len({*labels}), *indices, len(several)]
+    none = [row for row in study["rows"] if row["has_no_bug"]]
+    claimed = sum(row["judged"] and row["cause"].startswith("omission") for row in none)
+    cells = [
+        study["scenario"],
+        study["bugs"],
+        len(study["rows"]),
+        f"{len(none)}, {claimed}",
+        len(single),
+        len({*labels}),
+        *indices,
+        len(several),
+    ]
     return f"| {' | '.join(map(str, [*cells, consistent, contradictory]))} | {hidden[0]}; by cause {hidden[1]} |"
 
 

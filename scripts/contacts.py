@@ -76,7 +76,7 @@ AGENT = f"""\
         return 14.0, 0
 """
 _SECONDS, _TRIAL_S = 90, 40.0
-_HUNT = ("--ego", "any", "--agent", "erring:Erring", "--seed", "5",
+_HUNT = ("--ego", "any", "--agent", "erring:Erring",
          "--disturb", "ignore_priority=0.2,cut_in=0.1,stop=0.03", "--keep-going",
          "--crash-on", "collision")  # fmt: skip
 
@@ -86,6 +86,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("names", nargs="*")
     parser.add_argument("--trials", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=5, help="of the traffic and of the hunts")
     parser.add_argument("--folder", type=Path, default=None)
     parser.add_argument("--networks", type=Path, default=None, help="hunt on all *.net.xml below this folder as well")
     parser.add_argument("--steps", type=float, nargs="*", default=STEPS_S, help="step lengths, in s")
@@ -99,7 +100,7 @@ def main() -> int:
     if not given.only_compare:
         for name, network in _networks(given, folder):
             for step_s in given.steps:
-                _hunt(network, folder / "hunts" / f"{name}-{step_s:g}", step_s, given.trials, given.defects)
+                _hunt(network, folder / "hunts" / f"{name}-{step_s:g}", step_s, given)
     from contact_rules import compare
 
     if given.only_hunt:
@@ -118,7 +119,7 @@ def _networks(given: argparse.Namespace, folder: Path) -> list[tuple[str, Path]]
             program = shutil.which("netgenerate")
             if program is None:
                 raise FileNotFoundError(
-                    "netgenerate is missing: pip install 'crashhunt[networks]', and have it on the PATH"
+                    "netgenerate is missing: pip install 'crashhunt[maps]', and have it on the PATH"
                 )
             command = [program, *words.split(), "--no-turnarounds", "true", "--output-file", str(network)]
             subprocess.run(command, check=True, capture_output=True)
@@ -130,16 +131,17 @@ def _networks(given: argparse.Namespace, folder: Path) -> list[tuple[str, Path]]
     return found
 
 
-def _hunt(network: Path, folder: Path, step_s: float, trials: int, defects: str) -> None:
+def _hunt(network: Path, folder: Path, step_s: float, given: argparse.Namespace) -> None:
     """Hunt on a network with traffic at random."""
     if (folder / "hunt" / "ledger.sqlite").is_file():
         return
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(network, folder / "town.net.xml")
-    write_traffic(folder / "town.net.xml", folder, seed=folder.name, seconds=_SECONDS, step_s=step_s)
+    write_traffic(folder / "town.net.xml", folder, seed=f"{folder.name}-{given.seed}", seconds=_SECONDS, step_s=step_s)
     (folder / "erring.py").write_text(AGENT, encoding="utf-8")
-    command = [sys.executable, "-m", "crashhunt", "run", "hunt", str(len(os.sched_getaffinity(0))), str(trials)]
-    command += [str(round(_TRIAL_S / step_s)), "--scenario", "town.sumocfg", *_HUNT, "--arg", f"defect={defects}"]
+    command = [sys.executable, "-m", "crashhunt", "run", "hunt", str(len(os.sched_getaffinity(0))), str(given.trials)]
+    command += [str(round(_TRIAL_S / step_s)), "--scenario", "town.sumocfg", *_HUNT]
+    command += ["--seed", str(given.seed), "--arg", f"defect={given.defects}"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=folder)
     print(f"{folder.name}: {done.stderr.strip().splitlines()[-1:] if done.returncode else 'hunted'}", flush=True)
 

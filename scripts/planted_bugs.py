@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.agents import CarFollowing
+from crashhunt.agents._protocol import meta_actions, wanted_meta_action
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,8 +20,9 @@ if TYPE_CHECKING:
     Rows = list[Row]
     Action = tuple[float, int]
 
-_LANE_M = 3.2
+_SUMO_LANE_M, _HIGHWAY_LANE_M = 3.2, 4.0
 _LOOKS_M = 45.0
+_LATE_M = 12.0  # of centres: the bumpers are 7 m apart
 _EVERY_S = 2.5
 
 
@@ -29,6 +31,10 @@ class Planted(CarFollowing):
 
     Args:
         bugs: their names, joined by ``+``.
+        desired_speed: on a free road, in m/s.
+        observation_space: observation space of the vehicle.
+        action_space: action space of the vehicle: (target speed, lane change), or highway-env's meta-actions.
+        step_length_s: step length of the simulation, in s.
     """
 
     def __init__(
@@ -41,21 +47,29 @@ class Planted(CarFollowing):
     ) -> None:
         super().__init__(
             desired_speed=desired_speed, delay_s=0.0, headway_s=1.8, observation_space=observation_space,
-            action_space=action_space, step_length_s=step_length_s,
+            step_length_s=step_length_s,
         )  # fmt: skip
         self._bugs, self._step_s = [name for name in bugs.split("+") if name], step_length_s
+        self._actions = meta_actions(action_space)
+        self.lane_m = _SUMO_LANE_M if self._actions is None else _HIGHWAY_LANE_M
 
     def reset(self, seed: int) -> None:
         """Begin an episode."""
         super().reset(seed)
         self.step = 0
 
-    def act(self, observation: NDArray[np.float32]) -> tuple[float, int]:
-        """Return speed and lane change, after the first bug that changes them."""
+    def act(self, observation: NDArray[np.float32]) -> tuple[float, int] | int:
+        """Return speed and lane change, after the first bug that changes them, or the meta-action for them."""
+        speed, change = self._decide(observation)
+        if self._actions is None:
+            return speed, change
+        return self._actions[wanted_meta_action((speed - float(observation[0, 3])) / self._step_s, change)]
+
+    def _decide(self, observation: NDArray[np.float32]) -> Action:
         self.step += 1
         own, rows = observation[0].tolist(), [row for row in observation[1:].tolist() if row[0] > 0.5]
         action = super().act(observation)
-        assert isinstance(action, tuple)  # with continuous actions
+        assert isinstance(action, tuple)  # the base class has no action space
         wanted = (float(action[0]), self._wish(own, rows))
         for name in self._bugs:
             found = BUGS[name](self, own, rows, wanted)
@@ -70,12 +84,12 @@ class Planted(CarFollowing):
 
     def has_lane(self, own: Row, rows: Rows, side: int) -> bool:
         """Left lanes are known from the own offset to the leftmost one, right ones from vehicles on them."""
-        return own[2] > _LANE_M / 2 if side > 0 else any(2.0 < row[2] < 4.5 and row[5] > 0.9 for row in rows)
+        return own[2] > self.lane_m / 2 if side > 0 else any(2.0 < row[2] < 4.5 and row[5] > 0.9 for row in rows)
 
-    def is_free(self, rows: Rows, side: int, *, behind: bool = True) -> bool:
+    def is_free(self, rows: Rows, side: int, *, ahead: bool = True, behind: bool = True) -> bool:
         """Whether no vehicle is near on the neighbouring lane."""
-        lane = [row[1] for row in rows if abs(row[2] + side * _LANE_M) < 1.8 and row[5] > 0.5]
-        return not any(0 <= x < _LOOKS_M or (behind and -_LOOKS_M < x < 0) for x in lane)
+        lane = [row[1] for row in rows if abs(row[2] + side * self.lane_m) < 1.8 and row[5] > 0.5]
+        return not any((ahead and 0 <= x < _LOOKS_M) or (behind and -_LOOKS_M < x < 0) for x in lane)
 
     def _wish(self, own: Row, rows: Rows) -> int:
         """Change to the left and right in turns, where there is a lane, and no vehicle near on it."""
@@ -113,9 +127,21 @@ def _blind_behind(agent: Planted, own: Row, rows: Rows, wanted: Action) -> Actio
     return (wanted[0], -1) if unsafe and agent.is_free(rows, -1, behind=False) else wanted
 
 
+def _blind_ahead(agent: Planted, own: Row, rows: Rows, wanted: Action) -> Action:
+    """It does not look ahead before a change to the left."""
+    unsafe = agent.is_due() and agent.has_lane(own, rows, 1) and not agent.is_free(rows, 1)
+    return (wanted[0], 1) if unsafe and agent.is_free(rows, 1, ahead=False) else wanted
+
+
+def _late(_: Planted, own: Row, rows: Rows, wanted: Action) -> Action:
+    """It does not brake for the vehicle ahead before that is near."""
+    leader = _leader(rows)
+    return (own[3], wanted[1]) if leader and leader[1] > _LATE_M and wanted[0] < own[3] else wanted
+
+
 def _off_edge(agent: Planted, own: Row, rows: Rows, wanted: Action) -> Action:
     """It counts one lane too many on the left."""
-    return (wanted[0], 1) if rows and agent.is_due() and agent.step > 150 and own[2] < _LANE_M / 2 else wanted
+    return (wanted[0], 1) if rows and agent.is_due() and agent.step > 150 and own[2] < agent.lane_m / 2 else wanted
 
 
 def _index(agent: Planted, own: Row, rows: Rows, wanted: Action) -> Action:
@@ -129,5 +155,5 @@ def _index(agent: Planted, own: Row, rows: Rows, wanted: Action) -> Action:
 
 BUGS: dict[str, Callable[[Planted, Row, Rows, Action], Action]] = {
     "sign": _sign, "frozen": _frozen, "wrong_side": _wrong_side, "blind_behind": _blind_behind, "off_edge": _off_edge,
-    "index": _index,
+    "index": _index, "blind_ahead": _blind_ahead, "late": _late,
 }  # fmt: skip

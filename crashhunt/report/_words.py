@@ -411,7 +411,8 @@ def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
     if omission.speed_mps <= (omission.safe or 0.0):  # not too fast yet, but its action would make it so
         safe = f"{omission.safe:.1f} m/s are safe, and it was about to drive faster"
     if omission.instead == "braked too little":
-        return f"{agent} braked too little to {what} ({gap}{safe}){seen}"
+        how = f"for {actor}" if kind == "vehicle" else f"to {what}"
+        return f"{agent} braked too little {how} ({gap}{safe}){seen}"
     return f"{agent} did not {what} ({gap}{safe}){seen}, and {omission.instead}"
 
 

@@ -32,7 +32,7 @@ def said(faculty="longitudinal", endings=("none", "none", "none"), changed=(), *
         (
             {"instead": "braked too little", "visible_step": 0},
             (
-                "ego braked too little to brake for left.3 (12.2 m ahead, 20.0 m/s where 19.0 m/s are safe), which it "
+                "ego braked too little for left.3 (12.2 m ahead, 20.0 m/s where 19.0 m/s are safe), which it "
                 "observed from the start"
             ),
         ),
