@@ -82,14 +82,14 @@ def prepare(asked: HuntCall) -> Hunt:
 def _prepared(asked: HuntCall) -> Hunt:
     # Refuse values out of range before large imports: the user waits at a terminal.
     request = request_of(asked, trials=asked.trials, max_steps=asked.max_steps, parallel=asked.parallel).checked()
-    from crashhunt.plans import plan
+    from crashhunt.plans import plan_with_code
 
     def survey(scenario: Scenario, request: Request, settings: HuntSettings) -> Scenario:
         from crashhunt.hunts import TrafficSurveyor
 
         return TrafficSurveyor(Path(asked.directory), overwrite=asked.overwrite)(scenario, request, settings)
 
-    found, settings = plan(request, survey=survey)
+    found, settings, code = plan_with_code(request, survey=survey)
     from crashhunt.hunts import Hunt
     from crashhunt.snapshots import SnapshotOptions
 
@@ -102,6 +102,7 @@ def _prepared(asked: HuntCall) -> Hunt:
         overwrite=asked.overwrite,
         seed_given=asked.seed is not None,
         snapshot=snapshot,
+        imported=code.imported,
     )
 
 

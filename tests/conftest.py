@@ -318,8 +318,8 @@ def _modules_of_its_own() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def _no_tests_in_snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep test modules, and with them the whole repository, out of the snapshots of hunts in this process."""
-    modules = _take._top_level_modules
-    monkeypatch.setattr(_take, "_top_level_modules", lambda: {name for name in modules() if not _is_ours(name)})
+    found = _take._not_installed
+    monkeypatch.setattr(_take, "_not_installed", lambda places: {name for name in found(places) if not _is_ours(name)})
 
 
 def _is_ours(name: str) -> bool:

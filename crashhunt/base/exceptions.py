@@ -261,7 +261,7 @@ def is_users(filename: str) -> bool:
     return not filename.startswith((_OURS, *_OTHERS, *_NOBODYS))
 
 
-def blamed(what: str, error: Exception, *, fix: str = "correct the code") -> PluginError:
+def blamed(what: str, error: BaseException, *, fix: str = "correct the code") -> PluginError:
     """Return the error for user code that fails: the failed action, the reason and the place.
 
     Args:

@@ -24,6 +24,7 @@ import faulthandler
 import fcntl
 import gc
 import json
+import math
 import os
 import random
 import select
@@ -259,6 +260,7 @@ class Copy:
     Args:
         work: the work; its return value must be expressible as JSON.
         known: resources that were open before user code ran.
+        keeps: descriptors that the work needs.
 
     Raises:
         CannotForkError: this process cannot be copied.
@@ -269,7 +271,7 @@ class Copy:
         no_answer: why `answer` has returned None.
     """
 
-    def __init__(self, work: Callable[[], Plain], known: Held | None = None) -> None:
+    def __init__(self, work: Callable[[], Plain], known: Held | None = None, *, keeps: Collection[int] = ()) -> None:
         self.raised, self._children = "", children_now()
         self.no_answer: NoAnswer | None = None
         self._end, theirs = os.pipe()
@@ -286,14 +288,14 @@ class Copy:
                 text = text[os.write(theirs, text) :]
 
         try:
-            self.pid = fork(answer, known, keeps=(theirs,))
+            self.pid = fork(answer, known, keeps=(theirs, *keeps))
         except BaseException:
             self._close()
             raise
         finally:
             os.close(theirs)
 
-    def answer(self, timeout_s: float) -> Plain | None:
+    def answer(self, timeout_s: float = math.inf) -> Plain | None:
         """Wait for the answer, then end the fork; return None if the work raised, died or exceeded the time limit.
 
         Args:

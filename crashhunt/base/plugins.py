@@ -7,6 +7,7 @@ import os
 import pkgutil
 import re
 import sys
+from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -18,11 +19,12 @@ from crashhunt.base.text import did_you_mean, one_of
 
 if TYPE_CHECKING:
     import types
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator, Mapping
     from importlib.metadata import Distribution, EntryPoint
 
 __all__ = [
     "Group",
+    "ImportedModules",
     "distributions",
     "import_module",
     "is_foreign",
@@ -100,12 +102,72 @@ def locate(group: Group, name: str) -> Any:
 def is_foreign(group: Group, name: str) -> bool:
     """Whether `locate` would run code that is not crashhunt's, and that this process has not run yet."""
     points = registered(group)
-    return is_foreign_module((points[name].value if name in points else name).partition(":")[0])
+    target = points[name].value if name in points else name
+    return ":" in target and is_foreign_module(target.partition(":")[0])
 
 
 def is_foreign_module(name: str) -> bool:
     """Whether importing a module would run code that is not crashhunt's, and that this process has not run yet."""
     return name.partition(".")[0] != "crashhunt" and name not in sys.modules
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedModules:
+    """The modules that a process has imported, of which a snapshot takes the files.
+
+    Args:
+        places: file, and folders if it is a package, of each top-level module.
+        path: the folders from which modules are imported.
+        named: the top-level modules that were imported by name.
+        agents: the files of the agents' modules.
+        variables: the environment variables, which modules may set.
+    """
+
+    places: Mapping[str, tuple[str | None, tuple[str, ...]]]
+    path: tuple[str, ...] = ()
+    named: frozenset[str] = frozenset()
+    agents: tuple[str, ...] = ()
+    variables: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def here(cls, locators: Iterable[str] = (), modules: Iterable[str] = ()) -> ImportedModules:
+        """Import agents and modules in this process, and return what it has imported then.
+
+        Args:
+            locators: locators of agents.
+            modules: names of further modules.
+
+        Raises:
+            PluginError: one cannot be imported.
+        """
+        driving = list(locators)
+        named = {locate("agents", locator).__module__ for locator in driving}
+        for name in modules:
+            import_module(name)
+            named.add(name)
+        agents = (getattr(sys.modules.get(locator.partition(":")[0]), "__file__", None) for locator in driving)
+        places = {}
+        for name, found in list(sys.modules.items()):
+            if "." not in name:
+                folders = tuple(map(str, getattr(found, "__path__", None) or ()))
+                places[name] = getattr(found, "__file__", None), folders
+        return cls(
+            places=places, path=tuple(sys.path), named=frozenset(name.partition(".")[0] for name in named),
+            agents=tuple(file for file in agents if file), variables=dict(os.environ),
+        )  # fmt: skip
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> ImportedModules:
+        """Return the modules that `to_json` has described."""
+        places = {name: (file, tuple(folders)) for name, (file, folders) in data["places"].items()}
+        return cls(places, tuple(data["path"]), frozenset(data["named"]), tuple(data["agents"]), data["variables"])
+
+    def to_json(self) -> dict[str, object]:
+        """Return a description that can be written as JSON."""
+        return {
+            "places": dict(self.places), "path": self.path, "named": sorted(self.named), "agents": self.agents,
+            "variables": dict(self.variables),
+        }  # fmt: skip
 
 
 def load_object(target: str, *, shown: str = "") -> Any:

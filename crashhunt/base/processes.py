@@ -12,14 +12,19 @@ import os
 import signal
 import sys
 import time
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 __all__ = [
     "adopt_orphans",
     "children_of",
     "die_with",
     "end_descendants",
+    "exits_refused",
     "has_child",
     "is_alive",
     "kill",
@@ -49,6 +54,26 @@ def die_with(parent: int, number: int = signal.SIGKILL) -> None:
     _prctl(_PR_SET_PDEATHSIG, number)
     if os.getppid() != parent:  # it died before the prctl call
         os._exit(1)
+
+
+@contextmanager
+def exits_refused() -> Iterator[None]:
+    """Have `os._exit` raise `SystemExit` in this process meanwhile.
+
+    A command that foreign code ends looks as if it were done. A fork of this process may end itself.
+    """
+    leave, owner = os._exit, os.getpid()
+
+    def refuse(status: int) -> NoReturn:
+        if os.getpid() != owner:
+            leave(status)
+        raise SystemExit(f"os._exit({status})")
+
+    os._exit = refuse
+    try:
+        yield
+    finally:
+        os._exit = leave
 
 
 def outlive_parent() -> None:

@@ -6,7 +6,8 @@ A fork shares three things with its parent:
 - the content of files without a name,
 - memory that is mapped as shared (`mmap.mmap(-1, …)`, `multiprocessing.Value`).
 
-A change of any of these by one fork is visible to all others.
+A change of any of these by one fork is visible to all others. So is what a fork reads from a pipe or a socket, and
+these have no copies: they are reported.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ _MAX_COPIED_BYTES: Final = 16 << 20  # of a file without a name, or of a mapping
 _MAP_FIXED: Final = 0x10
 _KEPT_FLAGS: Final = os.O_ACCMODE | os.O_APPEND | os.O_NONBLOCK | os.O_SYNC  # others say how a file was created
 _NAME: Final = "crashhunt-own"
+_CONNECTIONS: Final = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +61,7 @@ class SharedState:
         known: descriptors that stay open.
 
     Attributes:
-        remaining: description of files that are too large to copy; empty if there are none.
+        remaining: description of a file that is too large to copy, or of a pipe or socket; empty if there is none.
     """
 
     def __init__(self, known: Collection[int] = ()) -> None:
@@ -91,7 +93,10 @@ class SharedState:
     def _add_file(self, descriptor: int, known: Collection[int]) -> None:
         found = os.fstat(descriptor)
         flags = fcntl.fcntl(descriptor, fcntl.F_GETFL)
-        if descriptor in known or not stat.S_ISREG(found.st_mode) or flags & os.O_PATH:  # which has no position
+        if descriptor in known or flags & os.O_PATH:  # which has no position
+            return
+        if not stat.S_ISREG(found.st_mode):
+            self.remaining = _CONNECTIONS.get(stat.S_IFMT(found.st_mode), self.remaining)
             return
         inode = found.st_dev, found.st_ino
         is_nameless = found.st_nlink == 0

@@ -140,7 +140,7 @@ def _check_agent(name: str) -> None:
     from crashhunt.base.plugins import is_foreign, locate
     from crashhunt.trial import Signature, signature_of
 
-    def described() -> Plain:
+    def described(_report: object = None) -> Plain:
         return signature_of(locate("agents", name)).to_json()
 
     # A module of the user may end or stop the process that imports it.

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_run", "short_help"]
 
+_leave = os._exit  # which is refused to samplers, also while they are imported
 _LONG_WAIT_S = 3.0  # after which people wonder
 
 
@@ -183,4 +184,4 @@ def _leave_at_once(*, as_json: bool) -> NoReturn:
     if as_json:
         os.write(1, json.dumps(error.to_json()).encode() + b"\n")
     os.write(2, f"crashhunt: {error}\n".encode())
-    os._exit(INTERRUPTED)
+    _leave(INTERRUPTED)

@@ -1,3 +1,4 @@
+from ._apart import ModelApart as ModelApart, described_model as described_model
 from ._models import (
     Choices as Choices,
     brake as brake,
@@ -28,6 +29,8 @@ from ._rates import (
     DisturbanceSampler as DisturbanceSampler,
     disturber_of as disturber_of,
     is_fixed as is_fixed,
+    locate_model as locate_model,
+    modules_of_models as modules_of_models,
     parse_fixed as parse_fixed,
     parse_rates as parse_rates,
     word_of as word_of,

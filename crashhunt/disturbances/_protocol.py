@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-__all__ = ["DisturbanceModel", "Drawn", "Enumerates"]
+__all__ = ["Closes", "DisturbanceModel", "Drawn", "Enumerates"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,3 +57,11 @@ class Enumerates(Protocol):
 
     def possibilities(self) -> Iterable[tuple[Drawn, float]]:
         """Return everything that `DisturbanceModel.draw` can return, each with its probability; the sum is 1."""
+
+
+@runtime_checkable
+class Closes(Protocol):
+    """A model that has something to end."""
+
+    def close(self) -> None:
+        """End it; may be called twice."""

@@ -16,17 +16,29 @@ from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.text import one_of
-from crashhunt.disturbances._protocol import Drawn
+from crashhunt.disturbances._protocol import Closes, Drawn
 from crashhunt.trial import CELLS, KINDS, OF_AGENT, Disturbance, in_turn, why_not
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from crashhunt.disturbances._protocol import DisturbanceModel
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["FORM", "NONE", "DisturbanceSampler", "disturber_of", "is_fixed", "parse_fixed", "parse_rates", "word_of"]
+__all__ = [
+    "FORM",
+    "NONE",
+    "DisturbanceSampler",
+    "disturber_of",
+    "draw_checked",
+    "is_fixed",
+    "locate_model",
+    "modules_of_models",
+    "parse_fixed",
+    "parse_rates",
+    "word_of",
+]
 
 
 # ``brake@124=ahead:4:2``: a disturbance that every trial has, in a given step.
@@ -158,6 +170,7 @@ def _rate(name: str, text: str) -> float:
 def disturber_of(
     rates: Mapping[str, float], *, agents: Sequence[str], step_length_s: float, known: Sequence[str] | None = None,
     simulator: str = "the simulator", fixed: Sequence[Disturbance] = (),
+    find: Callable[[str], DisturbanceModel] | None = None,
 ) -> DisturbanceSampler:  # fmt: skip
     """Return the sampler of the disturbances of trials.
 
@@ -168,6 +181,7 @@ def disturber_of(
         known: the kinds that the simulator supports; None if that is unknown.
         simulator: its name in messages.
         fixed: what every trial has besides.
+        find: returns the model of a name; by default `locate_model`.
 
     Raises:
         PluginError: there is no such model.
@@ -175,7 +189,7 @@ def disturber_of(
     """
     models: dict[str, DisturbanceModel] = {}
     for name, rate in rates.items():
-        model: DisturbanceModel = locate_model(name)
+        model = (find or locate_model)(name)
         if rate * step_length_s > 1:
             fix = f"give at most {1 / step_length_s:g} a second"
             raise UsageError(
@@ -207,6 +221,11 @@ def _refuse_what_it_cannot(name: str, what: str, known: Sequence[str] | None, si
     raise UsageError(message, fix=f"it can do {', '.join(able)}" if able else "omit the option")
 
 
+def modules_of_models(words: Iterable[str]) -> list[str]:
+    """Return the modules of the models that words name as ``module:attribute``; nothing is imported."""
+    return [name.partition(":")[0] for name in parse_rates(words) if ":" in name]
+
+
 def locate_model(name: str) -> DisturbanceModel:
     """Return the model of a name, or of a ``module:attribute``.
 
@@ -228,7 +247,12 @@ def locate_model(name: str) -> DisturbanceModel:
     return made
 
 
-def _drawn(name: str, model: DisturbanceModel, rng: np.random.Generator) -> Drawn:
+def draw_checked(name: str, model: DisturbanceModel, rng: np.random.Generator) -> Drawn:
+    """Return what a model draws.
+
+    Raises:
+        PluginError: the model fails, or what it draws is no disturbance.
+    """
     try:
         drawn = model.draw(rng)
         fine = drawn.who in CELLS and math.isfinite(drawn.how_strong) and 0 < drawn.how_long < math.inf
@@ -339,7 +363,7 @@ class DisturbanceSampler:
 
     def draw_one(self, step: int, name: str, agent: str, rng: np.random.Generator) -> Disturbance:
         """Return a disturbance that a model begins around an agent in a step."""
-        drawn = _drawn(name, self.models[name], rng)
+        drawn = draw_checked(name, self.models[name], rng)
         strong, long = float(drawn.how_strong), float(drawn.how_long)
         one = Disturbance(
             step=step, who=drawn.who, what=self.models[name].what, how_strong=strong, how_long=long, agent=agent
@@ -384,6 +408,12 @@ class DisturbanceSampler:
         there = {(one.step, one.agent, one.what) for one in result.disturbances}
         drawn = [one for one in result.spec.disturbances if (one.step, one.agent, one.what) in there]
         return self.log_likelihood(drawn, result.steps_begun)
+
+    def close(self) -> None:
+        """End the processes in which models draw."""
+        for model in self.models.values():
+            if isinstance(model, Closes):
+                model.close()
 
     def chance(self, name: str) -> float:
         """Return the probability that a model begins a disturbance around an agent in one step."""

@@ -128,13 +128,16 @@ class TrialProcess:
                 ready_recorder(self._simulator)
         return self._simulator
 
-    def record_shared_state(self) -> str:
+    def record_shared_state(self, control: int) -> str:
         """Record which files and memory the processes of trials need to have their own.
+
+        Args:
+            control: descriptor of the zygote's own connection, which no trial has.
 
         Returns:
             The resources that they share nevertheless, in words; empty for nothing.
         """
-        self._shared = SharedState(known={0, 1, 2, self._stack.fileno()})
+        self._shared = SharedState(known={0, 1, 2, self._stack.fileno(), control})
         return self._shared.remaining
 
     def run(self, job: Job, reset: Reset | None = None) -> NoReturn:

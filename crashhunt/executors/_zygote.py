@@ -397,7 +397,7 @@ class _Zygote:
             self._say(_why_not(error))
             return
         self._staged = self._changed_at()
-        if remaining := self._trial.record_shared_state():
+        if remaining := self._trial.record_shared_state(self._control.fileno()):
             self._notices.append(f"trials are not wholly apart: a module shares {remaining} with every one of them")
         gc.freeze()  # a collection in a fork would copy the page of every object
         self._say({"ready": os.getpid()})

@@ -34,7 +34,7 @@ from crashhunt.hunts._state import (
 )
 from crashhunt.hunts._verification import Audit, AuditsLeft, Confirmation, TrialReruns, VerificationRuns, is_settled
 from crashhunt.ledger import Ledger
-from crashhunt.plans import core_of, disturber, parallel_here, sampler_of
+from crashhunt.plans import core_of, disturber_apart, parallel_here, sampler_of
 from crashhunt.rates import make_rate
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.training import held_out_traffics
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
+    from crashhunt.base.plugins import ImportedModules
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.executors import Executor
     from crashhunt.ledger import Facts, Noted
@@ -73,6 +74,7 @@ class Hunt:
         overwrite: whether a new hunt replaces an existing one.
         seed_given: whether the user chose the seed; if not, a resumed hunt keeps its own seed.
         snapshot: options of the snapshot of the code.
+        imported: the modules that trials import, as `take_snapshot` takes them.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class Hunt:
         overwrite: bool = False,
         seed_given: bool = True,
         snapshot: SnapshotOptions | None = None,
+        imported: ImportedModules | None = None,
     ) -> None:
         self.directory = directory
         self.scenario = scenario
@@ -94,6 +97,7 @@ class Hunt:
         self._overwrite = overwrite
         self._seed_given = seed_given
         self._snapshot_options = snapshot
+        self._imported = imported
         self._stops: Sequence[int] = ()
         self._progress: Progress | None = None  # once the ledger says that the hunt runs
 
@@ -142,9 +146,11 @@ class Hunt:
 
     def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
         settings = self.settings
-        snapshot = take_snapshot(self.directory / layout.SNAPSHOTS, self.scenario, settings, self._snapshot_options)
+        snapshot = take_snapshot(
+            self.directory / layout.SNAPSHOTS, self.scenario, settings, self._snapshot_options, imported=self._imported
+        )
         sampler = sampler_of(settings)
-        self._disturber = disturber(self.scenario, settings.disturb, tuple(settings.agents))
+        self._disturber = disturber_apart(self.scenario, settings)
         progress = Progress()
         finished = ledger.finished()
         # It was killed between saving the one and the other. Where the trial is from, only its proposal says.
@@ -228,6 +234,8 @@ class Hunt:
             return self._run_with(runs_again, ledger, trials, snapshot, progress, finished, watch)
         finally:
             runs_again.executors.close()
+            if self._disturber is not None:
+                self._disturber.close()
 
     def _run_with(
         self,

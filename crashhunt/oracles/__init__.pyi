@@ -7,6 +7,7 @@ from ._protocol import (
     OracleChoice as OracleChoice,
     SeesMap as SeesMap,
     chosen_oracles as chosen_oracles,
+    described_oracle as described_oracle,
     merge_findings as merge_findings,
     modules_of as modules_of,
     oracle_name as oracle_name,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from crashhunt.base.errors import ArgumentError, CrashhuntError, UsageError
@@ -12,7 +13,7 @@ from crashhunt.base.plugins import locate
 from crashhunt.trial import Constant, Outcome, parse_spec, signature_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from crashhunt.trial import Category, Collision, Value
     from crashhunt.world import Event, Lane, Scene
@@ -26,6 +27,7 @@ __all__ = [
     "OracleChoice",
     "SeesMap",
     "chosen_oracles",
+    "described_oracle",
     "merge_findings",
     "modules_of",
     "oracle_name",
@@ -138,14 +140,18 @@ class OracleChoice:
             raise blamed(f"the oracle {self.name!r} cannot be created", error, fix=fix) from error
         return made
 
-    def outcomes(self) -> tuple[Outcome, ...]:
-        """The outcomes that it brings.
+    def outcomes(self) -> dict[str, Category]:
+        """The outcomes that it brings, and their categories.
 
         Raises:
             CrashhuntError: as of `make`.
         """
         made = self.make()
-        return tuple(map(Outcome, made.outcomes)) if isinstance(made, BringsOutcomes) else ()
+        return (
+            {str(name): category for name, category in made.outcomes.items()}
+            if isinstance(made, BringsOutcomes)
+            else {}
+        )
 
 
 def oracle_name(text: str) -> str:
@@ -188,11 +194,21 @@ def parse_oracle(text: str) -> OracleChoice:
     return OracleChoice(name, arguments, factory)
 
 
-def chosen_oracles(asked: Sequence[str]) -> tuple[str, ...]:
+def described_oracle(text: str) -> dict[str, Category]:
+    """Make a chosen oracle, and return the outcomes that it brings, with their categories.
+
+    Raises:
+        CrashhuntError: it cannot be had.
+    """
+    return parse_oracle(text).outcomes()
+
+
+def chosen_oracles(asked: Sequence[str], described: Collection[str] = ()) -> tuple[str, ...]:
     """Return the oracles of a hunt in the order of their checks: the default ones, then the chosen ones.
 
     Args:
         asked: what ``--oracle`` was given, as often as it was; ``none`` drops the default ones.
+        described: those that another process has made, so that they are not made here.
 
     Raises:
         CrashhuntError: an oracle cannot be made, or none is chosen.
@@ -202,14 +218,25 @@ def chosen_oracles(asked: Sequence[str]) -> tuple[str, ...]:
     if not found:
         raise UsageError("--oracle none leaves no oracle to detect crashes", fix="add another --oracle")
     for text in added:
-        parse_oracle(text).make()
+        if text not in described:
+            parse_oracle(text).make()
     return found
 
 
-def outcomes_brought(oracles: Iterable[str]) -> tuple[Outcome, ...]:
+def outcomes_brought(
+    oracles: Iterable[str], described: Mapping[str, Mapping[str, Category]] = MappingProxyType({})
+) -> tuple[Outcome, ...]:
     """Return the outcomes that oracles bring, beyond those that every hunt stops on.
+
+    Args:
+        oracles: the chosen oracles.
+        described: the outcomes of those that another process has made, with their categories.
 
     Raises:
         CrashhuntError: one of them cannot be had.
     """
-    return tuple(dict.fromkeys(outcome for text in oracles for outcome in parse_oracle(text).outcomes()))
+    brought: dict[Outcome, None] = {}
+    for text in oracles:
+        outcomes = described[text] if text in described else described_oracle(text)
+        brought |= {Outcome.own(name, category): None for name, category in outcomes.items()}
+    return tuple(brought)

@@ -1,3 +1,4 @@
+from ._code import CodeFacts as CodeFacts, describe_code as describe_code, imported_by as imported_by
 from ._declaration import (
     RATE_PERS as RATE_PERS,
     Given as Given,
@@ -24,10 +25,12 @@ from ._plan import (
     agent_of as agent_of,
     core_of as core_of,
     disturber as disturber,
+    disturber_apart as disturber_apart,
     load_order_change as load_order_change,
     load_order_of as load_order_of,
     parse_crash_on as parse_crash_on,
     plan as plan,
+    plan_with_code as plan_with_code,
     sampler_of as sampler_of,
     takes_of as takes_of,
     with_recorded_load_order as with_recorded_load_order,

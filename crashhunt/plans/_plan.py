@@ -14,24 +14,23 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.base.apart import work_apart
 from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, UsageError
-from crashhunt.base.plugins import is_foreign, locate, registered
+from crashhunt.base.plugins import is_foreign, registered
 from crashhunt.base.text import did_you_mean, listed, one_of
-from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates, word_of
+from crashhunt.disturbances import ModelApart, disturber_of, locate_model, parse_fixed, parse_rates, word_of
 from crashhunt.oracles import chosen_oracles, outcomes_brought
+from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code
 from crashhunt.plans._options import TrialOptions
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
 from crashhunt.scenario import Scenario, backend_of, load_scenario, scenario_digest, titles, with_action
-from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, Signature, parse_spec, signature_of
+from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, Signature, parse_spec
 from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
-    from crashhunt.base.json_types import Plain
-    from crashhunt.disturbances import DisturbanceSampler
+    from crashhunt.disturbances import DisturbanceModel, DisturbanceSampler
     from crashhunt.plans._settings import Request
     from crashhunt.trial import Value
 
@@ -44,10 +43,12 @@ __all__ = [
     "Takes",
     "agent_of",
     "disturber",
+    "disturber_apart",
     "load_order_change",
     "load_order_of",
     "parse_crash_on",
     "plan",
+    "plan_with_code",
     "sampler_of",
     "takes_of",
     "with_recorded_load_order",
@@ -257,7 +258,12 @@ def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None)
 
 
 def plan(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario, HuntSettings]:
-    """Resolve a request.
+    """Resolve a request; see `plan_with_code`."""
+    return plan_with_code(request, survey=survey)[:2]
+
+
+def plan_with_code(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario, HuntSettings, CodeFacts]:
+    """Resolve a request, and return what was found out about the code that it names.
 
     Args:
         request: what was asked.
@@ -269,24 +275,28 @@ def plan(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario,
     """
     request = request.checked()
     loaded = load_scenario(request.scenario, ego=request.ego)
-    known: dict[str, Signature] = {}
-    scenario, settings = _planned(request, loaded, known)
+    scenario, settings, code = _planned(request, loaded, None)
     if survey is not None and (surveyed := survey(loaded, request, settings)) is not loaded:
-        scenario, settings = _planned(request, surveyed, known)
-    return scenario, settings
+        scenario, settings, code = _planned(request, surveyed, code)
+    return scenario, settings, code
 
 
-def _planned(request: Request, scenario: Scenario, known: dict[str, Signature]) -> tuple[Scenario, HuntSettings]:
-    """Resolve a request in a scenario; ``known`` holds the signatures of agents, and gets those it lacks."""
+def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tuple[Scenario, HuntSettings, CodeFacts]:
+    """Resolve a request in a scenario, with facts about its code where they are known."""
     scenario = _acting(
         scenario.with_agents(_locators(request, scenario)), dict.fromkeys(scenario.agents, request.action)
     )
+    with _said_by(request, scenario):
+        disturb = _disturb(request, scenario)
+    if code is None or any(setup.agent not in code.signatures for setup in scenario.agents.values()):
+        code = describe_code(
+            scenario, oracles=request.oracles, disturb=disturb, sampler=request.sampler,
+            executor=request.run.executor, timeout_s=request.run.timeout_s,
+        )  # fmt: skip
     hunted = not varies_only_asked(request.sampler)
-    locators = {setup.agent for setup in scenario.agents.values()}
-    known |= _signatures(sorted(locators - known.keys()), request.run.timeout_s)
-    signatures = {agent: known[setup.agent] for agent, setup in scenario.agents.items()}
-    oracles = chosen_oracles(request.oracles)
-    brought = outcomes_brought(oracles)
+    signatures = {agent: code.signatures[setup.agent] for agent, setup in scenario.agents.items()}
+    oracles = chosen_oracles(request.oracles, code.oracles)
+    brought = outcomes_brought(oracles, code.oracles)
     crash_on, limits = parse_crash_on(request.crash_on, brought)
     if crash_on == CRASHES:  # the default
         crash_on += tuple(outcome for outcome in brought if outcome not in crash_on)
@@ -294,9 +304,8 @@ def _planned(request: Request, scenario: Scenario, known: dict[str, Signature]) 
     options |= {
         "seed": request.seed if request.seed is not None else secrets.randbits(32),
         "crash_on": crash_on,
+        "disturb": disturb,
     }
-    with _said_by(request, scenario):
-        options["disturb"] = _disturb(request, scenario)
     settings = HuntSettings(
         **options,
         scenario=str(request.scenario),
@@ -313,31 +322,15 @@ def _planned(request: Request, scenario: Scenario, known: dict[str, Signature]) 
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
     scenario = _with_untold(_noted(scenario, request.run), crash_on)
+    find = partial(_model_apart, code, request.run.timeout_s)
     with _said_by(request, scenario):
-        disturber(scenario, settings.disturb, tuple(settings.agents))  # it refuses what cannot be meant
+        disturber(scenario, settings.disturb, tuple(settings.agents), find=find)  # it refuses what cannot be meant
     _check_branch(settings)
-    _check_rare(settings, scenario)
+    _check_rare(settings, scenario, find)
     sampler_of(settings)  # it refuses what it cannot sample
     # Last, as looking for the executor imports what runs trials: what is refused is refused sooner.
     run = replace(settings.run, keep_going=True) if settings.rare else settings.run
-    return scenario, replace(settings, run=sized(run))
-
-
-def _signatures(locators: Sequence[str], timeout_s: float) -> dict[str, Signature]:
-    """Return what agents take, by locator; foreign ones are imported in a process of their own."""
-
-    def described(locator: str) -> Plain:
-        return signature_of(locate("agents", locator)).to_json()
-
-    found: dict[str, Signature] = {}
-    for locator in locators:
-        if is_foreign("agents", locator):
-            task = f"{locator!r} cannot be imported"
-            data = work_apart(partial(described, locator), task=task, timeout_s=_ASK_S + timeout_s)
-            found[locator] = Signature.from_json(data)
-        else:
-            found[locator] = signature_of(locate("agents", locator))
-    return found
+    return scenario, replace(settings, run=sized(run)), code
 
 
 def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
@@ -390,13 +383,20 @@ def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
     return scenario
 
 
-def disturber(scenario: Scenario, disturb: Sequence[str], agents: Sequence[str]) -> DisturbanceSampler | None:
+def disturber(
+    scenario: Scenario,
+    disturb: Sequence[str],
+    agents: Sequence[str],
+    *,
+    find: Callable[[str], DisturbanceModel] | None = None,
+) -> DisturbanceSampler | None:
     """Return what draws the disturbances of trials; None if there are none.
 
     Args:
         scenario: scenario in which they take place.
         disturb: how often what happens: ``NAME=RATE`` each; or what happens when.
         agents: the agents around which disturbances take place.
+        find: returns the model of a name; by default it is imported in this process.
 
     Raises:
         CrashhuntError: there is no such disturbance, or the simulator cannot do it.
@@ -412,7 +412,25 @@ def disturber(scenario: Scenario, disturb: Sequence[str], agents: Sequence[str])
         known=backend.disturbances,
         simulator=backend.title or "the simulator",
         fixed=fixed,
+        find=find,
     )
+
+
+def disturber_apart(scenario: Scenario, settings: HuntSettings) -> DisturbanceSampler | None:
+    """Return what draws the disturbances of a hunt; a foreign model draws in a process of its own.
+
+    Raises:
+        CrashhuntError: as of `disturber`.
+    """
+    find = partial(_model_apart, None, settings.run.timeout_s)
+    return disturber(scenario, settings.disturb, tuple(settings.agents), find=find)
+
+
+def _model_apart(code: CodeFacts | None, timeout_s: float, name: str) -> DisturbanceModel:
+    known = code.disturbances.get(name, "") if code is not None else ""
+    if known or is_foreign("disturbances", name):
+        return ModelApart(name, known, timeout_s=IMPORT_S + timeout_s)
+    return locate_model(name)
 
 
 def sampler_of(settings: HuntSettings) -> NamedSampler:
@@ -465,7 +483,7 @@ def _check_branch(settings: HuntSettings) -> None:
 _MAX_RARE_CHANCE = 0.2  # per step: above that a first onset is no rare event, and plain trials are cheaper
 
 
-def _check_rare(settings: HuntSettings, scenario: Scenario) -> None:
+def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str], DisturbanceModel]) -> None:
     """Refuse what `--rare` has no law for."""
     run = settings.run
     if not settings.rare:
@@ -488,7 +506,7 @@ def _check_rare(settings: HuntSettings, scenario: Scenario) -> None:
     }  # fmt: skip
     if given := next((flag for flag, value in excluded.items() if value), None):
         raise UsageError(f"--rare and {given} exclude each other", fix=f"omit {given}")
-    sampler = disturber(scenario, settings.disturb, agents)
+    sampler = disturber(scenario, settings.disturb, agents, find=find)
     assert sampler is not None
     for name, rate in sampler.rates.items():
         if sampler.chance(name) > _MAX_RARE_CHANCE:

@@ -37,6 +37,7 @@ __all__ = [
     "Request",
     "RunSettings",
     "SizesItself",
+    "executor_name",
     "executor_of",
     "fields_of",
     "parallel_here",
@@ -310,9 +311,14 @@ def executor_of(word: str) -> Callable[..., Any]:
     return make
 
 
+def executor_name(word: str) -> str:
+    """Return the registered name or ``module:attribute`` in a choice of an executor; nothing is imported."""
+    return _parts(word)[0]
+
+
 def sizes_itself(word: str) -> bool:
     """Whether the named executor decides what PARALLEL 0 means."""
-    factory = locate("executors", _parts(word)[0])
+    factory = locate("executors", executor_name(word))
     return isinstance(factory, SizesItself) and factory.sizes_itself
 
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING, NotRequired, TypedDict
+from functools import partial
+from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 
+from crashhunt.base.apart import work_apart
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.plugins import locate, registered
+from crashhunt.base.plugins import is_foreign, locate, registered
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.trial import signature_of, without_folder
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from crashhunt.base.json_types import Plain
     from crashhunt.base.plugins import Group
     from crashhunt.trial import Argument, Kind, Value
 
@@ -25,6 +28,9 @@ __all__ = [
     "list_oracles",
     "list_scenarios",
 ]
+
+
+_IMPORT_S = 60.0
 
 
 class ArgumentEntry(TypedDict):
@@ -69,14 +75,23 @@ def _list(group: Group) -> list[ListingEntry]:
     found: list[ListingEntry] = []
     for name, point in registered(group).items():
         entry: ListingEntry = {"name": name, "locator": point.value, "title": "", "arguments": []}
+        looked_up = partial(_described, group, name)
         try:
-            factory = locate(group, name)
-            entry["title"] = (inspect.getdoc(factory) or "").partition("\n")[0]
-            entry["arguments"] = _arguments(signature_of(factory).arguments.values())
+            if is_foreign(group, name):  # which may end the process that imports it
+                described = work_apart(looked_up, task=f"{name!r} cannot be imported", timeout_s=_IMPORT_S)
+            else:
+                described = looked_up()
+            entry |= cast("ListingEntry", described)
         except CrashhuntError as error:
             entry["warning"] = str(error)
         found.append(entry)
     return found
+
+
+def _described(group: Group, name: str, _report: object = None) -> Plain:
+    factory = locate(group, name)
+    title = (inspect.getdoc(factory) or "").partition("\n")[0]
+    return {"title": title, "arguments": _arguments(signature_of(factory).arguments.values())}
 
 
 def list_scenarios() -> list[ListingEntry]:

@@ -53,7 +53,8 @@ class Watcher:
         self._notes = notes
         self._title = one_line(title)
         self._last_line, self._last_phase = -math.inf, ""
-        self._live = Live(console=console, refresh_per_second=8, transient=True) if console.is_terminal else None
+        # Rich's own refresh needs a thread, and with a thread this process could not be forked (`base/apart.py`).
+        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
 
     def __enter__(self) -> Self:
         if self._live is not None:
@@ -70,7 +71,7 @@ class Watcher:
         """Show a status."""
         self.tell_notes()
         if self._live is not None:
-            self._live.update(self._screen(status))
+            self._live.update(self._screen(status), refresh=True)
         elif time.monotonic() - self._last_line >= _LINE_EVERY_S or self._is_new_phase(status):
             self._last_line, self._last_phase = time.monotonic(), status.phase
             self._console.print(_line(status), soft_wrap=True, highlight=False)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from crashhunt.base.errors import CrashhuntError, PluginError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.plugins import locate
+from crashhunt.base.processes import exits_refused
 from crashhunt.samplers._protocol import HuntFacts, Independent, OnlyAsked, PlainStream, Proposal, Versioned, WantsHunt
 
 if TYPE_CHECKING:
@@ -44,10 +45,11 @@ class NamedSampler:
         make = _maker(name)
         more = {"hunt": hunt} if isinstance(make, WantsHunt) and make.wants_hunt else {}
         try:
-            self._sampler: Sampler = make(space, points=points, **more)
-        except CrashhuntError:
+            with exits_refused():
+                self._sampler: Sampler = make(space, points=points, **more)
+        except (CrashhuntError, KeyboardInterrupt):
             raise
-        except Exception as error:  # of a user's sampler
+        except BaseException as error:  # of a user's sampler; SystemExit too, or the command ends as if it were done
             self._blame("cannot be made", error)
         missing = [member for member in ("learns", "ask", "tell") if not hasattr(self._sampler, member)]
         if missing:
@@ -85,10 +87,11 @@ class NamedSampler:
             PluginError: it fails, or what it answers is none.
         """
         try:
-            answer = self._sampler.ask(number, rng)
-        except CrashhuntError:
+            with exits_refused():
+                answer = self._sampler.ask(number, rng)
+        except (CrashhuntError, KeyboardInterrupt):
             raise
-        except Exception as error:
+        except BaseException as error:
             self._blame(f"fails when it is asked for trial {number}", error)
         proposal = answer if isinstance(answer, Proposal) else Proposal(answer)
         wrong = self._wrong_with(proposal)
@@ -105,10 +108,11 @@ class NamedSampler:
             PluginError: it fails.
         """
         try:
-            self._sampler.tell(result)
-        except CrashhuntError:
+            with exits_refused():
+                self._sampler.tell(result)
+        except (CrashhuntError, KeyboardInterrupt):
             raise
-        except Exception as error:
+        except BaseException as error:
             self._blame(f"fails on the result of trial {result.spec.number}", error)
 
     def _wrong_with(self, proposal: Proposal) -> str:
@@ -132,7 +136,7 @@ class NamedSampler:
             return f"the origin {proposal.origin!r}, not a word"
         return ""
 
-    def _blame(self, what: str, error: Exception) -> NoReturn:
+    def _blame(self, what: str, error: BaseException) -> NoReturn:
         raise blamed(f"the sampler {self._name!r} {what}", error) from error
 
 
@@ -148,7 +152,8 @@ def varies_only_asked(name: str) -> bool:
 
 def _maker(name: str) -> Any:
     if not name.lower().startswith("optuna:"):
-        return locate("samplers", name)
+        with exits_refused():
+            return locate("samplers", name)
     from crashhunt.samplers._optuna import optuna_maker  # no other sampler imports Optuna
 
     return optuna_maker(name)

@@ -8,7 +8,6 @@ import json
 import os
 import platform
 import shutil
-import sys
 from contextlib import suppress
 from functools import cached_property, lru_cache
 from importlib import metadata
@@ -28,7 +27,7 @@ from crashhunt.base.integrity import (
     read_object,
     typed,
 )
-from crashhunt.base.plugins import distributions as installed
+from crashhunt.base.plugins import ImportedModules, distributions as installed
 from crashhunt.plans import HuntSettings, read_settings
 from crashhunt.scenario import Scenario, digest_of_described, installed_backends, load_scenario
 
@@ -363,12 +362,16 @@ _VERSIONED = ("crashhunt", "numpy")  # besides those of simulators
 _VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "OMP_NUM_THREADS", "VIRTUAL_ENV")
 
 
-def environment() -> Environment:
+def environment(imported: ImportedModules | None = None) -> Environment:
     """Return the content of ``environment.json``.
 
     ``loaded`` lists the distributions with an imported module, and those of simulators. Results may depend on them.
+
+    Args:
+        imported: The imported modules; by default those of this process.
     """
-    modules = {name.partition(".")[0] for name in list(sys.modules)}
+    imported = imported or ImportedModules.here()
+    modules, variables = imported.places.keys(), imported.variables
     distributions: dict[str, str] = {}
     named = versions()
     loaded: set[str] = set()
@@ -389,7 +392,7 @@ def environment() -> Environment:
         "versions": named,
         "distributions": dict(sorted(distributions.items(), key=lambda item: item[0].lower())),
         "loaded": sorted(loaded, key=str.lower),
-        "variables": {name: os.environ[name] for name in _variables() if name in os.environ},
+        "variables": {name: variables[name] for name in _variables() if name in variables},
     }
 
 

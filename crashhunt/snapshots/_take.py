@@ -7,24 +7,20 @@ import os
 import shutil
 import stat
 import subprocess
-import sys
 import sysconfig
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.apart import work_apart
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import BundleError, SnapshotError, UsageError
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree
 from crashhunt.base.git import environment_of_git
 from crashhunt.base.integrity import describe_files, digest_of_content, digest_of_data, digest_of_file
-from crashhunt.base.plugins import import_module, is_foreign, is_foreign_module, locate
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
-from crashhunt.oracles import modules_of
-from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, load_order_of, write_settings
+from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, load_order_of, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, digest_of_described
 from crashhunt.snapshots._snapshot import SCHEMA, Snapshot, code_of_manifest, environment
 from crashhunt.trial import Choice, Constant
@@ -32,8 +28,8 @@ from crashhunt.trial import Choice, Constant
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from crashhunt.base.codec import JsonObject
     from crashhunt.base.integrity import FileEntry
+    from crashhunt.base.plugins import ImportedModules
     from crashhunt.snapshots._snapshot import Environment, Manifest
 
 
@@ -61,38 +57,17 @@ class Sources:
     trees: list[Path] = field(default_factory=list)
     excluded: list[str] = field(default_factory=list)
 
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Sources:
-        """Return the sources that `to_json` has described."""
-        return cls(dict(data["files"]), list(data["paths"]), list(map(Path, data["trees"])), list(data["excluded"]))
 
-    def to_json(self) -> JsonObject:
-        """Return a description that can be written as JSON."""
-        return {
-            "files": self.files,
-            "paths": self.paths,
-            "trees": list(map(str, self.trees)),
-            "excluded": self.excluded,
-        }
-
-
-def find_sources(
-    locators: Iterable[str],
-    modules: Iterable[str] = (),
-    *,
-    roots: Sequence[Path] = (),
-    without: Path | None = None,
-) -> Sources:
+def find_sources(imported: ImportedModules, *, roots: Sequence[Path] = (), without: Path | None = None) -> Sources:
     """Find crashhunt itself, the project of each agent, and all other imported modules that are not installed.
 
-    An installed module that is named is included, too, unless its wheel has libraries next to it (``NAME.libs``).
-    A project is the git work tree that holds a module, with its tracked files in their current state and its untracked
-    files that git does not ignore. A module outside of work trees comes with its package, or alone. Links that lead out
-    of a work tree are not followed. The directories of hunts are excluded.
+    An installed module that was imported by name is included, too, unless its wheel has libraries next to it
+    (``NAME.libs``). A project is the git work tree that holds a module, with its tracked files in their current state
+    and its untracked files that git does not ignore. A module outside of work trees comes with its package, or alone.
+    Links that lead out of a work tree are not followed. The directories of hunts are excluded.
 
     Args:
-        locators: The locators of the agents.
-        modules: Further modules to include.
+        imported: The imported modules.
         roots: Further files and folders to include.
         without: A folder to exclude.
 
@@ -101,17 +76,14 @@ def find_sources(
     """
     found = Sources()
     _real_folder.cache_clear()  # a link may lead elsewhere than at the snapshot before
-    names = {locate("agents", locator).__module__.partition(".")[0] for locator in locators}
-    for module in modules:
-        import_module(module)
-        names.add(module.partition(".")[0])
-    names |= {name for name in _top_level_modules() if not _is_installed(_place_of(name))}
-    _take_module("crashhunt", found)
+    places = {name: _place_of(*place) for name, place in imported.places.items()}
+    names = imported.named | _not_installed(places)
+    _take_module("crashhunt", imported, found)
     # A replay never reads the pages of the guide.
     found.files = {place: file for place, file in found.files.items() if not _is_page(place)}
     work_tree_of = cache(_work_tree_of)  # a project has many modules in one folder, and git takes milliseconds
     for name in sorted(names - {"crashhunt"}):
-        place = _place_of(name)
+        place = places.get(name)
         if place is None:
             continue
         if _is_installed(place) and (place / f"{name}.libs").is_dir():
@@ -120,11 +92,11 @@ def find_sources(
         tree = None if _is_installed(place) else work_tree_of(place)
         listing = None if tree is None else _listing_that_has(tree, place / name, found)
         if listing is None:
-            _take_module(name, found)
+            _take_module(name, imported, found)
         else:
-            _take_tree(*listing, found, imports=[place], without=without)
+            _take_tree(*listing, found, imports=[place, *map(Path, imported.path)], without=without)
     for root in roots:
-        _take_root(root, found, without)
+        _take_root(root, imported, found, without)
     for odd in [name for name in found.files if "\\" in name]:
         found.excluded.append(f"{found.files.pop(odd)}: its name has a backslash, which elsewhere parts folders")
     return found
@@ -140,8 +112,8 @@ def git(folder: Path, *arguments: str) -> bytes | None:
     return done.stdout if done.returncode == 0 else None
 
 
-def _top_level_modules() -> set[str]:
-    return {name.partition(".")[0] for name in list(sys.modules)} - {"__main__", "__mp_main__", "crashhunt"}
+def _not_installed(places: Mapping[str, Path | None]) -> set[str]:
+    return {name for name in places.keys() - {"__main__", "__mp_main__"} if not _is_installed(places[name])}
 
 
 def _is_installed(place: Path | None) -> bool:
@@ -156,13 +128,10 @@ def _installed_places() -> tuple[str, ...]:
     return tuple({f"{Path(path).resolve()}{os.sep}" for path in sysconfig.get_paths().values()})
 
 
-def _place_of(name: str) -> Path | None:
+def _place_of(file: str | None, folders: Sequence[str]) -> Path | None:
     """Return the folder that contains a top-level module or package; None for a module built into Python."""
-    module = sys.modules.get(name)
-    file = getattr(module, "__file__", None)
-    if file is None:
-        paths = list(getattr(module, "__path__", ()))  # a package without __init__.py
-        return Path(paths[0]).resolve().parent if len(paths) == 1 else None
+    if file is None:  # perhaps a package without __init__.py
+        return Path(folders[0]).resolve().parent if len(folders) == 1 else None
     # Hundreds of modules lie in a few folders, so resolve each folder once.
     folder, own_name = os.path.split(file)
     path = Path(file).resolve() if os.path.islink(file) else _real_folder(folder) / own_name  # noqa: PTH114
@@ -174,11 +143,10 @@ def _real_folder(folder: str) -> Path:
     return Path(folder).resolve()
 
 
-def _take_module(name: str, found: Sources) -> None:
+def _take_module(name: str, imported: ImportedModules, found: Sources) -> None:
     """Add a package, or a module that is a single file."""
-    module = sys.modules.get(name)
-    file = getattr(module, "__file__", None)
-    for folder in map(Path, getattr(module, "__path__", ())):
+    file, folders = imported.places.get(name, (None, ()))
+    for folder in map(Path, folders):
         for path in _walk(folder):
             found.files[f"{layout.CODE}/{name}/{path}"] = f"{folder}/{path}"
         return
@@ -246,8 +214,7 @@ def _take_tree(
         for name in listed:
             for place, path in _resolved(tree, name, listed, found):
                 found.files[f"{base}/{place}"] = str(path)
-    entries = [*map(Path, imports), *(Path(entry or ".").resolve() for entry in sys.path)]
-    for entry in entries:
+    for entry in (place.resolve() for place in imports):
         if entry.is_relative_to(tree):
             below = entry.relative_to(tree).as_posix()
             place = base if below == "." else f"{base}/{below}"
@@ -281,7 +248,7 @@ def _resolved(tree: Path, name: str, listed: Sequence[str], found: Sources) -> I
                 yield f"{name}/{other.removeprefix(prefix)}", tree / other
 
 
-def _take_root(root: Path, found: Sources, without: Path | None) -> None:
+def _take_root(root: Path, imported: ImportedModules, found: Sources, without: Path | None) -> None:
     path = root.resolve()
     if path.is_file():
         found.files[f"{layout.CODE}/@{path.parent.name}/{path.name}"] = str(path)
@@ -289,12 +256,11 @@ def _take_root(root: Path, found: Sources, without: Path | None) -> None:
     if not path.is_dir():
         raise SnapshotError(f"--snapshot-root {str(root)!r} does not exist", fix="correct the path")
     names = list(_listed(path)) or list(_walk(path))
-    _take_tree(path, names, found, imports=[path], without=without)
+    _take_tree(path, names, found, imports=[path, *map(Path, imported.path)], without=without)
 
 
 _MEGABYTE = 10**6
 _SMALL = 1 << 20  # bytes
-_LOOK_S = 60.0  # besides the time limit of a trial, for the modules of agents to be imported
 
 
 @clear_constructor
@@ -331,7 +297,12 @@ class SnapshotOptions:
 
 
 def take_snapshot(
-    snapshots: Path, scenario: Scenario, settings: HuntSettings, options: SnapshotOptions | None = None
+    snapshots: Path,
+    scenario: Scenario,
+    settings: HuntSettings,
+    options: SnapshotOptions | None = None,
+    *,
+    imported: ImportedModules | None = None,
 ) -> Snapshot:
     """Store the scenario, the agents' own projects, the files that their arguments name, and crashhunt itself.
 
@@ -342,41 +313,27 @@ def take_snapshot(
         scenario: The scenario with its agents.
         settings: The settings of the hunt.
         options: The options of the snapshot.
+        imported: The modules that are imported for a trial, as `plan_with_code` returns them. By default, a process of
+            its own imports them now.
 
     Raises:
         SnapshotError: The snapshot is too large, or a file cannot be read or written.
     """
     options = options or SnapshotOptions()
-    locators = [setup.agent for setup in scenario.agents.values()]
-    modules = [*scenario.modules(), *modules_of(settings.oracles)] if options.code else []
-
-    def look() -> JsonObject:
-        """Import the agents, and describe what a snapshot needs to know of the imported modules."""
-        for locator in locators:
-            locate("agents", locator)
-        agents = [getattr(sys.modules.get(locator.partition(":")[0]), "__file__", None) for locator in locators]
-        found = Sources(paths=[])
-        if options.code:
-            found = find_sources(locators, modules, roots=options.roots, without=snapshots.parent)
-        return {"sources": found.to_json(), "agents": list(filter(None, agents)), "environment": environment()}
-
-    foreign = [locator for locator in locators if is_foreign("agents", locator)]
-    foreign += filter(is_foreign_module, modules)
-    if foreign:
-        task = f"{foreign[0]!r} cannot be imported"
-        seen: Any = work_apart(look, task=task, timeout_s=_LOOK_S + settings.run.timeout_s)
-    else:
-        seen = look()
-    found = Sources.from_json(seen["sources"])
+    if imported is None:
+        imported = imported_by(scenario, settings)
+    found = Sources(paths=[])
+    if options.code:
+        found = find_sources(imported, roots=options.roots, without=snapshots.parent)
     argument_files = _argument_files(settings) if options.code else {}
-    argument_files |= _training_records(seen["agents"], argument_files)
+    argument_files |= _training_records(imported.agents, argument_files)
     files = found.files | {place: path for path, place in argument_files.items()}
     _check_size(files, options.limit_mb)
     try:
         snapshots.mkdir(exist_ok=True)
         remove_ended(snapshots)
         with temporary_beside(snapshots / layout.MANIFEST, name=f"{layout.BUILDING}{this_process().token}") as building:
-            return _build(building, files, found, argument_files, scenario, settings, seen["environment"])
+            return _build(building, files, found, argument_files, scenario, settings, environment(imported))
     except OSError as error:
         raise SnapshotError(
             f"the snapshot cannot be made: {error.strerror or error}",

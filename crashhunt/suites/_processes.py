@@ -33,7 +33,7 @@ from crashhunt.plans import (
     SnapshotChoices,
     executor_of,
     fields_of,
-    plan,
+    plan_with_code,
     read_settings,
     with_settings,
 )
@@ -42,6 +42,7 @@ from crashhunt.snapshots import Snapshot, SnapshotOptions, latest_snapshot
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from crashhunt.base.plugins import ImportedModules
     from crashhunt.crashes import TrustedOrigin
     from crashhunt.plans import Given, HuntSettings
     from crashhunt.scenario import Scenario
@@ -272,9 +273,10 @@ def _main(folder: Path, run: Given, parent: int) -> None:
 
     try:
         asked = RunRequest.read(folder / REQUEST)
-        scenario, settings = _planned(folder, asked.request, run)
+        scenario, settings, imported = _planned(folder, asked.request, run)
         snapshot = SnapshotOptions.of(asked.snapshot)
-        hunt = Hunt(folder, scenario, settings, command=["crashhunt", "suite", "run"], snapshot=snapshot)
+        command = ["crashhunt", "suite", "run"]
+        hunt = Hunt(folder, scenario, settings, command=command, snapshot=snapshot, imported=imported)
         deadline = time.monotonic() + _BUSY_S
         while True:
             try:
@@ -292,8 +294,11 @@ def _main(folder: Path, run: Given, parent: int) -> None:
         _fail(folder, f"{type(error).__name__}: {error}", traceback.format_exc())
 
 
-def _planned(folder: Path, request: Request, machine: Given) -> tuple[Scenario, HuntSettings]:
-    """The hunts to run: existing ones or new ones; ``trials`` in the options replaces their number of trials."""
+def _planned(folder: Path, request: Request, machine: Given) -> tuple[Scenario, HuntSettings, ImportedModules | None]:
+    """The hunts to run: existing ones or new ones; ``trials`` in the options replaces their number of trials.
+
+    The last value is the modules that trials import, where they are known.
+    """
     run = dict(machine)
     trials = run.pop("trials", None)
     begun, snapshot = (folder / layout.HUNT).exists(), latest_snapshot(folder)
@@ -301,15 +306,15 @@ def _planned(folder: Path, request: Request, machine: Given) -> tuple[Scenario, 
         from crashhunt.hunts import TrafficSurveyor
 
         survey = TrafficSurveyor(folder, overwrite=False)
-        scenario, settings = plan(replace(request, run=replace(request.run, **run)), survey=survey)
+        scenario, settings, code = plan_with_code(replace(request, run=replace(request.run, **run)), survey=survey)
         if not begun:
-            return scenario, settings
+            return scenario, settings, code.imported
     else:
         scenario = snapshot.scenario()
     settings = read_settings(folder / layout.HUNT)
     if trials is not None:
         settings = replace(settings, trials=trials)
-    return with_settings(scenario, settings), replace(settings, run=replace(settings.run, **run))
+    return with_settings(scenario, settings), replace(settings, run=replace(settings.run, **run)), None
 
 
 def _fail(folder: Path, message: str, trace: str) -> None:

@@ -19,7 +19,7 @@ SCRIPT = """
 import os, subprocess, sys, time
 from crashhunt.base.apart import work_apart
 
-def work():
+def work(report):
     started = subprocess.Popen(["sleep", "600"], start_new_session=True)
     with open(sys.argv[1] + ".new", "w") as file:
         file.write(str(started.pid))
@@ -76,3 +76,52 @@ def test_a_program_that_the_work_has_started_ends_with_the_command(tmp_path, num
     process.send_signal(number)
     process.communicate(timeout=60)
     assert has_ended(started)
+
+
+SERVER = """
+import os, signal, sys
+from crashhunt.base.apart import ServerApart
+from crashhunt.base.errors import PluginError, UsageError
+
+def answer(request):
+    if "leave" in request:
+        os.fork() or signal.pause()  # a copy of it holds what it has inherited
+        os._exit(0)
+    if "wait" in request:
+        os.read(os.pipe()[0], 1)
+    if "refuse" in request:
+        raise UsageError("no", fix="another")
+    seen.append(request["say"])
+    return {"pid": os.getpid(), "seen": seen}
+
+seen = []
+server = ServerApart(answer, task="it fails", fix="correct it", timeout_s=0.3)
+first, second = server.ask({"say": 1}), server.ask({"say": 2})
+assert first["pid"] == second["pid"] != os.getpid()
+assert (second["seen"], seen) == ([1, 2], [])
+for request, kind, says in (
+    ({"refuse": 1}, UsageError, "no; another"),
+    ({sys.argv[1]: 1}, PluginError, sys.argv[2]),
+    ({"say": 3}, PluginError, "it fails: its process has ended; correct it"),
+):
+    try:
+        server.ask(request)
+    except kind as error:
+        assert says == str(error), str(error)
+    else:
+        raise AssertionError(request)
+server.close()
+"""
+
+
+@pytest.mark.parametrize(
+    ("does", "says"),
+    [
+        ("leave", "it fails: its process exited with 0 meanwhile; correct it"),
+        ("wait", "it fails: it took longer than 0.3 s; correct it"),
+    ],
+)
+def test_a_server_answers_until_its_process_ends(does, says):
+    words = [sys.executable, "-c", SERVER, does, says]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
 import crashhunt
@@ -14,6 +17,7 @@ from crashhunt.cli import main
 from crashhunt.crashes import Bundle, find_bundle
 from crashhunt.errors import BundleError, CallError, CrashhuntError, PluginError, UsageError
 from crashhunt.plans import Request, RunSettings, plan
+from crashhunt.samplers import NamedSampler
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
@@ -143,6 +147,29 @@ def test_a_crash_that_is_none_or_several_lists_them(tmp_path, word, says):
     with pytest.raises(BundleError) as caught:
         find_bundle(tmp_path, word)
     assert says in str(caught.value)
+
+
+class Leaving:
+    """A sampler that ends its process."""
+
+    learns = False
+
+    def __init__(self, space, points=1):
+        self.ask = {2: lambda *_: sys.exit(0), 3: lambda *_: os._exit(0)}[points]
+
+    def tell(self, result):
+        raise SystemExit
+
+
+@pytest.mark.parametrize(("points", "says"), [(2, "SystemExit: 0"), (3, "SystemExit: os._exit(0)")])
+def test_a_sampler_cannot_end_the_command(monkeypatch, points, says):
+    monkeypatch.setattr(os, "_exit", lambda status: pytest.fail(f"left with {status}"))
+    sampler = NamedSampler(f"{__name__}:Leaving", {}, points=points)
+    with pytest.raises(PluginError, match="fails when it is asked for trial 7") as caught:
+        sampler.ask(7, np.random.default_rng(1))
+    assert says in caught.value.message
+    with pytest.raises(PluginError, match="fails on the result of trial 0"):
+        sampler.tell(TrialResult(TrialSpec(0, 1, {}, {}, max_steps=1), Outcome.SURVIVED))
 
 
 class Careless:

@@ -7,8 +7,10 @@ import gc
 import mmap
 import multiprocessing
 import os
+import socket
 import sys
 import tempfile
+from pathlib import Path
 
 import pytest
 
@@ -95,16 +97,17 @@ def test_mapping_of_a_file_with_a_name_stays_shared(tmp_path):
 
 def test_what_is_too_large_is_reported_and_stays_shared():
     gc.collect()  # what other tests have left open
-    if before := SharedState().remaining:
+    known = [int(file.name) for file in [*Path("/proc/self/fd").iterdir()] if file.exists()]
+    if before := SharedState(known).remaining:
         pytest.skip(f"this process shares {before} already")
     with mmap.mmap(-1, 17 << 20) as mapped:
-        assert SharedState().remaining == "shared memory of 17 MB"
+        assert SharedState(known).remaining == "shared memory of 17 MB"
         assert in_fork(lambda: mapped.__setitem__(0, 9)) == "None"
         assert mapped[0] == 9
     with tempfile.TemporaryFile() as file:
         file.truncate(18 << 20)
-        assert SharedState().remaining == "a file without a name of 18 MB"
-    assert SharedState().remaining == ""
+        assert SharedState(known).remaining == "a file without a name of 18 MB"
+    assert SharedState(known).remaining == ""
 
 
 def test_file_that_was_closed_since_is_no_obstacle(tmp_path):
@@ -113,3 +116,16 @@ def test_file_that_was_closed_since_is_no_obstacle(tmp_path):
     shared = SharedState()
     file.close()
     shared.separate()
+
+
+def test_pipes_and_sockets_of_modules_are_reported():
+    assert SharedState(known=range(1000)).remaining == ""
+    receive, send = os.pipe()
+    first, second = socket.socketpair()
+    with first, second:
+        others = set(range(1000)) - {receive, send}
+        assert SharedState(known=others).remaining == "a pipe"
+        assert SharedState(known=others | {receive, send}).remaining == ""
+        assert SharedState(known=set(range(1000)) - {first.fileno()}).remaining == "a socket"
+    os.close(receive)
+    os.close(send)

@@ -9,7 +9,16 @@ import pytest
 from hypothesis import given, strategies as st
 
 from crashhunt.base.plugins import locate, registered
-from crashhunt.disturbances import Choices, DisturbanceSampler, Drawn, brake, cut_in, disturber_of, parse_rates
+from crashhunt.disturbances import (
+    Choices,
+    DisturbanceSampler,
+    Drawn,
+    ModelApart,
+    brake,
+    cut_in,
+    disturber_of,
+    parse_rates,
+)
 from crashhunt.errors import PluginError, UsageError
 from crashhunt.testing import DisturbanceContract
 from crashhunt.trial import KINDS, Disturbance, TrialResult
@@ -247,3 +256,15 @@ def test_the_strongest_that_a_model_may_draw_comes_first_and_is_as_likely_as_any
             assert 10 < step <= 15
             assert all(math.isfinite(draws.log_likelihood([one], 60)) for one in each)
         assert found == draws.draw_strongest(3, number, 10, 5) != draws.draw_strongest(4, number, 10, 5)
+
+
+def test_foreign_model_draws_in_its_own_process_as_it_would_here():
+    own, apart = brake(), ModelApart("brake", timeout_s=60)
+    one, other = np.random.default_rng(5), np.random.default_rng(5)
+    drawn = own.draw(one)
+    assert apart.draw(other) == drawn
+    assert other.bit_generator.state == one.bit_generator.state
+    assert apart.log_likelihood(drawn) == own.log_likelihood(drawn)
+    assert apart.log_likelihood(Drawn("ahead", 1e9, 1.0)) == -math.inf
+    assert apart.what == own.what
+    apart.close()

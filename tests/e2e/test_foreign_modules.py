@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+
 import pytest
 
 GYM = """
@@ -34,6 +36,71 @@ def test_an_environment_that_ends_the_process_that_imports_it_is_an_error(toy):
     (toy.folder / "gym.toml").write_text(GYM)
     done = toy.crashhunt("run", "h", "1", "2", "5", "--scenario", "gym.toml", expect=2)
     assert "'harmful' cannot be imported: its process exited with 0 meanwhile" in done.err
+
+
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        (("--oracle", "harmful:It"), "the oracle 'harmful:It' cannot be created"),
+        (("--disturb", "harmful:It=0.1"), "the disturbance 'harmful:It' cannot be created"),
+        (("--sampler", "harmful:It"), "the sampler 'harmful:It' cannot be imported"),
+        (("--executor", "harmful:It"), "the executor 'harmful:It' cannot be imported"),
+    ],
+)
+def test_a_plugin_that_ends_the_process_that_imports_it_is_an_error(toy, option, says):
+    (toy.folder / "harmful.py").write_text("import os\nos._exit(0)\n")
+    done = toy.crashhunt("run", "h", "1", "2", "5", "--scenario", "toy", *option, expect=2)
+    assert f"{says}: its process exited with 0 meanwhile" in done.err
+    assert len(done.err.splitlines()) == 1
+
+
+PLUGINS = """
+import os
+from crashhunt.agents import KeepLaneWithSpeed as Agent
+from crashhunt.disturbances import brake as _brake
+
+with open("imports", "a") as file:
+    file.write(f"{os.getpid()}\\n")
+
+class Oracle:
+    name = "near"
+    outcomes = {"too_near": "traffic crash"}
+
+    def check(self, scene, agents):
+        return []
+
+class Brake:
+    what = "brake"
+
+    def draw(self, rng):
+        with open("draws", "a") as file:
+            file.write(f"{os.getpid()}\\n")
+        return _brake().draw(rng)
+
+    def log_likelihood(self, drawn):
+        return _brake().log_likelihood(drawn)
+"""
+
+
+def test_a_foreign_module_is_imported_once_to_describe_it_and_once_for_trials(toy):
+    (toy.folder / "plugins.py").write_text(PLUGINS)
+    words = ["--scenario", "toy", "--agent", "plugins:Agent", "--arg", "speed=1", "--oracle", "plugins:Oracle"]
+    toy.crashhunt("run", "h", "1", "2", "5", *words)
+    assert len((toy.folder / "imports").read_text().split()) == 2
+    assert '"too_near"' in (toy.folder / "h" / "hunt.toml").read_text()
+
+
+@pytest.mark.nightly  # by day, plans/test_what_is_resolved.py sees that a hunt does not draw them itself
+def test_foreign_disturbances_are_drawn_in_their_own_process(toy):
+    (toy.folder / "plugins.py").write_text(PLUGINS)
+    toy.crashhunt("run", "h", "1", "3", "60", "--scenario", "loop", "--disturb", "plugins:Brake=1", "--keep-going")
+    imports, draws = ((toy.folder / name).read_text().split() for name in ("imports", "draws"))
+    assert len(set(draws)) == 1
+    assert draws[0] in imports
+    assert len(imports) == 2  # the first process has described the model
+    rows = list(csv.DictReader(toy.crashhunt("trials", "h", "--format", "csv").out.splitlines()))
+    assert len(rows) == 3
+    assert all(row["log_likelihood"] for row in rows)
 
 
 def test_a_module_of_an_agent_changes_nothing_in_the_process_of_the_command(toy):

@@ -9,9 +9,19 @@ from pathlib import Path
 
 import pytest
 
+from crashhunt.disturbances import ModelApart
 from crashhunt.errors import ArgumentError, HuntDirectoryError, ScenarioError, UsageError
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
-from crashhunt.plans import HuntOptions, Request, hunt_options, plan, read_settings, request_of, write_settings
+from crashhunt.plans import (
+    HuntOptions,
+    Request,
+    disturber_apart,
+    hunt_options,
+    plan,
+    read_settings,
+    request_of,
+    write_settings,
+)  # fmt: skip
 from crashhunt.plans._plan import Owners, Takes, agent_of, takes_of
 from crashhunt.plans._settings import executor_of, parallel_here, sizes_itself
 
@@ -339,3 +349,13 @@ def test_keys_of_a_later_version_are_kept_and_slips_are_refused(folder):
     path.write_text(text.replace("max_steps = ", "max_step = "))
     with pytest.raises(HuntDirectoryError, match="max_step"):
         read_settings(path)
+
+
+def test_foreign_disturbances_of_a_hunt_are_drawn_elsewhere(folder):
+    (folder / "errs.py").write_text("from crashhunt.disturbances import brake as Brake, stop as Stop\n")
+    scenario, settings = plan(replace(asked(disturb=["errs:Brake=0.5", "stop=0.5"]), scenario="loop"))
+    found = disturber_apart(scenario, settings)
+    assert isinstance(found.models["errs:Brake"], ModelApart)
+    assert not isinstance(found.models["stop"], ModelApart)
+    assert "errs" not in sys.modules
+    found.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pty
 import threading
@@ -288,3 +289,13 @@ def test_running_rate_is_on_the_screen_and_in_the_line(rate, words):
     with console.capture() as shown:
         console.print(Watcher(console, TITLE)._screen(found))
     assert words in shown.get()
+
+
+def test_screen_of_a_terminal_needs_no_thread():
+    """With a thread, the command could not be forked, and would import foreign modules itself."""
+    before = threading.active_count()
+    console = Console(width=100, height=12, force_terminal=True, color_system=None, file=io.StringIO())
+    with Watcher(console, TITLE) as watcher:
+        watcher(status(1))
+        assert threading.active_count() == before
+        assert TITLE[:60] in console.file.getvalue()

@@ -5,11 +5,12 @@ import sys
 
 import pytest
 
+from crashhunt.base.plugins import ImportedModules
 from crashhunt.snapshots._take import find_sources, git
 
 
 def test_crashhunt_comes_along_without_the_pages_of_its_guide():
-    kept = find_sources([]).files
+    kept = find_sources(ImportedModules.here()).files
     assert {"code/crashhunt/__init__.py", "code/crashhunt/guide/__init__.py", "code/crashhunt/py.typed"} <= set(kept)
     pages = "code/crashhunt/guide/"
     assert not [place for place in kept if place.startswith(pages) and place.endswith(".md")]
@@ -35,7 +36,7 @@ def test_git_is_asked_once_for_each_folder_of_a_project(tmp_path, monkeypatch):
         return git(folder, *arguments)
 
     monkeypatch.setattr("crashhunt.snapshots._take.git", counting)
-    kept = find_sources([], ["driver_one", "driver_two"]).files
+    kept = find_sources(ImportedModules.here([], ["driver_one", "driver_two"])).files
     base = f"code/@{tmp_path.name}"
     assert {f"{base}/driver_one.py", f"{base}/driver_two.py"} <= set(kept)
     assert asked == ["rev-parse", "ls-files"]
@@ -46,7 +47,7 @@ def test_a_name_that_would_be_folders_elsewhere_is_excluded_and_reported(tmp_pat
     """A snapshot is refused that has one, as it might be unpacked anywhere; a hunt is not, as its project has one."""
     for name in ("unit-x2d\\x2d1.service", "kept.txt"):
         (tmp_path / name).write_text("")
-    found = find_sources([], roots=[tmp_path])
+    found = find_sources(ImportedModules.here(), roots=[tmp_path])
     assert f"code/@{tmp_path.name}/kept.txt" in found.files
     assert not [place for place in found.files if "\\" in place]
     (said,) = found.excluded
@@ -60,7 +61,7 @@ def test_installed_package_with_libraries_next_to_it_is_not_copied(tmp_path, mon
         (installed / name / "__init__.py").write_text("")
     (installed / "boxed_world.libs").mkdir()
     monkeypatch.syspath_prepend(installed)
-    kept = find_sources([], ["boxed_world", "plain_world"]).files
+    kept = find_sources(ImportedModules.here([], ["boxed_world", "plain_world"])).files
     for name in ("boxed_world", "plain_world"):
         monkeypatch.delitem(sys.modules, name)
     assert "code/plain_world/__init__.py" in kept

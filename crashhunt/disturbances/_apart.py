@@ -1,0 +1,94 @@
+"""Foreign models of disturbances, which draw in a process of their own."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crashhunt.base.apart import ServerApart
+from crashhunt.base.errors import CrashhuntError, PluginError
+from crashhunt.base.exceptions import blamed
+from crashhunt.disturbances._protocol import Drawn
+from crashhunt.disturbances._rates import draw_checked, locate_model
+
+if TYPE_CHECKING:
+    from crashhunt.base.json_types import Plain
+    from crashhunt.disturbances._protocol import DisturbanceModel
+
+__all__ = ["ModelApart", "described_model"]
+
+
+def described_model(name: str) -> str:
+    """Make a model in this process, and return its kind.
+
+    Raises:
+        CrashhuntError: there is no such model, or it cannot be made.
+    """
+    kind: object = locate_model(name).what
+    if not isinstance(kind, str):
+        message = f"{name!r} is not a disturbance model: its what is a {type(kind).__name__}"
+        raise PluginError(message, fix="see crashhunt.testing")
+    return str(kind)
+
+
+class ModelApart:
+    """A model that runs in its own process. The process starts when it is needed first.
+
+    Args:
+        name: name of the model, or ``module:attribute``.
+        kind: kind of the model, if it is known.
+        timeout_s: time limit of each draw, in s of wall time; the first one imports the model.
+    """
+
+    def __init__(self, name: str, kind: str = "", *, timeout_s: float) -> None:
+        self._name, self._kind, self._timeout_s = name, kind, timeout_s
+        self._server: ServerApart | None = None
+        self._model: DisturbanceModel | None = None  # only in its process
+
+    @property
+    def what(self) -> str:
+        """Kind of the model."""
+        if not self._kind:
+            self._kind = self._ask({})["what"]
+        return self._kind
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        """Return what the model draws. The generator is as if the model had drawn in this process."""
+        found = self._ask({"generator": rng.bit_generator.state})
+        rng.bit_generator.state = found["generator"]
+        return Drawn(*found["drawn"])
+
+    def log_likelihood(self, drawn: Drawn) -> float:
+        """Return the natural logarithm of the probability that a disturbance of the model is this one."""
+        likely: float = self._ask({"drawn": [drawn.who, drawn.how_strong, drawn.how_long]})["likely"]
+        return likely
+
+    def close(self) -> None:
+        """End the process; may be called twice."""
+        if self._server is not None:
+            self._server.close()
+
+    def _ask(self, request: Plain) -> Any:
+        if self._server is None:
+            task, fix = f"the disturbance {self._name!r} cannot be drawn", "correct the code"
+            self._server = ServerApart(self._answer, task=task, fix=fix, timeout_s=self._timeout_s)
+        return self._server.ask(request)
+
+    def _answer(self, request: Plain) -> Plain:
+        model = self._model = self._model or locate_model(self._name)
+        asked: Any = request
+        if "generator" in asked:
+            rng = np.random.default_rng()
+            rng.bit_generator.state = asked["generator"]
+            drawn = draw_checked(self._name, model, rng)
+            values = [drawn.who, float(drawn.how_strong), float(drawn.how_long)]
+            return {"drawn": values, "generator": rng.bit_generator.state}
+        if "drawn" in asked:
+            try:
+                return {"likely": float(model.log_likelihood(Drawn(*asked["drawn"])))}
+            except CrashhuntError:
+                raise
+            except Exception as error:  # of user code
+                raise blamed(f"the disturbance {self._name!r} has no likelihood", error) from error
+        return {"what": described_model(self._name)}

@@ -1,0 +1,136 @@
+"""Facts about the code that a hunt names, found without running foreign code in this process.
+
+A foreign module may end or stop the process that imports it. One fork of this process imports all of them, returns
+what the command has to know, and ends. Only processes of trials import them again.
+
+Samplers and executors are parts of the hunt itself, so this process imports them afterwards. A module of theirs that
+ends or stops its process has then been refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.apart import work_apart
+from crashhunt.base.plugins import ImportedModules, is_foreign, is_foreign_module, locate
+from crashhunt.disturbances import described_model, modules_of_models, parse_rates
+from crashhunt.oracles import described_oracle, modules_of, oracle_name
+from crashhunt.plans._settings import executor_name
+from crashhunt.trial import Signature, signature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from crashhunt.base.apart import Report
+    from crashhunt.base.json_types import Plain
+    from crashhunt.base.plugins import Group
+    from crashhunt.plans._settings import HuntSettings
+    from crashhunt.scenario import Scenario
+    from crashhunt.trial import Category
+
+
+__all__ = ["IMPORT_S", "CodeFacts", "describe_code", "imported_by"]
+
+IMPORT_S = 60.0  # besides the time limit of a trial
+
+
+@dataclass(frozen=True, slots=True)
+class CodeFacts:
+    """What a command knows of the code that a hunt names.
+
+    Args:
+        signatures: arguments of each agent, by locator.
+        oracles: outcomes and their categories of each foreign oracle, by its choice.
+        disturbances: the kind of each foreign model of disturbances, by name.
+        imported: the modules that a process with all of it has imported; None if no module is foreign.
+    """
+
+    signatures: Mapping[str, Signature]
+    oracles: Mapping[str, Mapping[str, Category]] = field(default_factory=dict)
+    disturbances: Mapping[str, str] = field(default_factory=dict)
+    imported: ImportedModules | None = None
+
+
+def describe_code(
+    scenario: Scenario, *, oracles: Sequence[str], disturb: Sequence[str], sampler: str, executor: str, timeout_s: float
+) -> CodeFacts:
+    """Return the facts about the agents of a scenario, and about the code that options name.
+
+    Args:
+        scenario: the scenario with its agents.
+        oracles: as ``--oracle`` has them.
+        disturb: as ``--disturb`` has them.
+        sampler: as ``--sampler`` has it.
+        executor: as ``--executor`` has it.
+        timeout_s: time limit of a trial in s; imports may take 60 s longer.
+
+    Raises:
+        CrashhuntError: foreign code cannot be imported, or has ended or stopped its process.
+    """
+    locators = sorted({setup.agent for setup in scenario.agents.values()})
+    chosen = [text for text in oracles if is_foreign("oracles", oracle_name(text)) and text != "none"]
+    models = [name for name in parse_rates(disturb) if is_foreign("disturbances", name)]
+    modules = [*scenario.modules(), *modules_of(oracles), *modules_of_models(disturb)]
+    machinery: list[tuple[Group, str]] = [("samplers", sampler), ("executors", executor_name(executor))]
+    machinery = [(group, name) for group, name in machinery if is_foreign(group, name) and not _is_of_optuna(name)]
+    foreign = [locator for locator in locators if is_foreign("agents", locator)]
+
+    def described(report: Report) -> Plain:
+        signatures, outcomes, kinds = {}, {}, {}
+        for locator in locators:
+            report(f"{locator!r} cannot be imported")
+            signatures[locator] = signature_of(locate("agents", locator)).to_json()
+        for text in chosen:
+            report(f"the oracle {oracle_name(text)!r} cannot be created")
+            outcomes[text] = described_oracle(text)
+        for name in models:
+            report(f"the disturbance {name!r} cannot be created")
+            kinds[name] = described_model(name)
+        for group, name in machinery:
+            report(f"the {group.removesuffix('s')} {name!r} cannot be imported")
+            locate(group, name)
+        imported = _import(locators, modules, report)
+        return {"signatures": signatures, "oracles": outcomes, "disturbances": kinds, "imported": imported.to_json()}
+
+    if not (foreign or chosen or models or machinery or any(map(is_foreign_module, modules))):
+        return CodeFacts({locator: signature_of(locate("agents", locator)) for locator in locators})
+    data: Any = work_apart(described, task="what it names cannot be imported", timeout_s=IMPORT_S + timeout_s)
+    signatures = {locator: Signature.from_json(found) for locator, found in data["signatures"].items()}
+    return CodeFacts(
+        signatures=signatures, oracles=data["oracles"], disturbances=data["disturbances"],
+        imported=ImportedModules.from_json(data["imported"]),
+    )  # fmt: skip
+
+
+def imported_by(scenario: Scenario, settings: HuntSettings) -> ImportedModules:
+    """Return the modules that trials import. Where one is foreign, a process of its own imports them.
+
+    Raises:
+        CrashhuntError: a module cannot be imported, or has ended or stopped its process.
+    """
+    locators = sorted({setup.agent for setup in scenario.agents.values()})
+    modules = [*scenario.modules(), *modules_of(settings.oracles), *modules_of_models(settings.disturb)]
+    foreign = any(is_foreign("agents", locator) for locator in locators) or any(map(is_foreign_module, modules))
+    if not foreign:
+        return ImportedModules.here(locators, modules)
+    data: Any = work_apart(
+        lambda report: _import(locators, modules, report).to_json(), task="what it names cannot be imported",
+        timeout_s=IMPORT_S + settings.run.timeout_s,
+    )  # fmt: skip
+    return ImportedModules.from_json(data)
+
+
+def _import(locators: Sequence[str], modules: Sequence[str], report: Callable[[str], None]) -> ImportedModules:
+    """Import agents and modules, and report each before."""
+
+    def each(names: Sequence[str]) -> Iterator[str]:
+        for name in names:
+            report(f"{name!r} cannot be imported")
+            yield name
+
+    return ImportedModules.here(each(locators), each(modules))
+
+
+def _is_of_optuna(name: str) -> bool:
+    return name.lower().startswith("optuna:")
