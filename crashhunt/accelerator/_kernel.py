@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from highway_env.vehicle.kinematics import Vehicle
 
 
-__all__ = ["CompiledNetwork", "Snapshot", "Traffic", "kernel", "why_not"]
+__all__ = ["CompiledNetwork", "Contents", "Snapshot", "Traffic", "kernel", "why_not"]
 
 
 _MODULE = "_crashhunt_highway"
-_INTERFACE = 3
+_INTERFACE = 4
 
 
 class Traffic(Protocol):
@@ -46,14 +46,10 @@ class Traffic(Protocol):
     def collide(self, dt: float, /) -> None:
         """Do what `Road.step` does after the movement: check all pairs for collisions."""
 
-    def conflicts(self, predicted: dict[int, bytes], /) -> list[tuple[int, int, bool]] | None:
+    def conflicts(self) -> list[tuple[int, int, bool]] | None:
         """Return the pairs of `RegulatedRoad.is_conflict_possible`, each with whether that is certain.
 
-        Args:
-            predicted: The paths of vehicles that the kernel cannot predict, by row.
-
-        Returns:
-            None if highway-env must decide.
+        None if highway-env must decide.
         """
 
     def fill_times(self, *given: object) -> None:
@@ -80,6 +76,13 @@ class Snapshot(Protocol):
         """Return the number of the first namespace with another size or member; -1 if there is none."""
 
 
+class Contents(Protocol):
+    """The contents of containers at one time."""
+
+    def is_same(self) -> bool:
+        """Whether all containers still have the same members in the same order, and all arrays the same bytes."""
+
+
 _Check = tuple[str, Any, "Sequence[tuple[float, ...]]"]  # the kernel's name of a function, NumPy's function, arguments
 
 
@@ -88,8 +91,11 @@ class _Module(Protocol):
     Network: Callable[..., CompiledNetwork]
     Traffic: Callable[..., Traffic]
     Snapshot: Callable[..., Snapshot]
+    Contents: Callable[[list[object]], Contents]
 
     def bind(self, *given: object) -> None: ...
+
+    def bind_turn(self, rounds: int, /) -> None: ...
 
     def compute(self, name: str, /, *numbers: float) -> float: ...
 
@@ -117,8 +123,28 @@ def _found() -> tuple[_Module | None, str]:
             return None, str(error)
         wrong = _differs(module)
         if not wrong:
+            _bind_turn(module)
             return module, ""
     return None, f"on this processor, it computes {wrong} otherwise than NumPy"
+
+
+def _bind_turn(module: _Module) -> None:
+    """Find out how NumPy rounds a product of a matrix and a vector.
+
+    Where no known way has its bits, highway-env computes the dynamic bicycle model.
+    """
+    rng = np.random.default_rng(2)
+    numbers = [(a, b, 20 * c, d) for a, b, c, d in rng.normal(size=(300, 4)).tolist()]
+    numbers += [(-0.0, 1.0, 0.0, -0.0), (0.0, -1.0, 0.0, 0.0), (1.0, -0.0, -0.0, 0.0)]
+    right = [np.array(((a, b), (-b, a))) @ np.array([c, d]) for a, b, c, d in numbers]
+    for rounds in (3, 2, 1, 0):
+        module.bind_turn(rounds)
+        if rounds == 0 or all(
+            module.compute("turned", *row, c, d).hex() == float(value).hex()
+            for (a, b, c, d), values in zip(numbers, right, strict=True)
+            for row, value in zip(((a, b), (-b, a)), values, strict=True)
+        ):
+            return
 
 
 def _slide(vehicle: Vehicle, dt: float) -> None:

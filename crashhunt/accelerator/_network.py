@@ -16,7 +16,7 @@ from crashhunt.accelerator._versions import are_numbers, is_plain
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from crashhunt.accelerator._kernel import CompiledNetwork
+    from crashhunt.accelerator._kernel import CompiledNetwork, Contents
 
 
 __all__ = ["Network"]
@@ -40,10 +40,8 @@ class Network:
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network
         self.keys, self.lanes = _laid_out(network)
-        self._seen = _values(self.lanes)
-        self._arrays = [value for values in self._seen for value in values if isinstance(value, np.ndarray)]
-        self._contents = [array.tobytes() for array in self._arrays]
         self._reach = _reach()
+        self._contents = _contents(network, self.lanes)
         self.index = {key: number for number, key in enumerate(self.keys)}
         self.number = {id(lane): number for number, lane in enumerate(self.lanes)}
         self.compiled: dict[bool, CompiledNetwork] = {}
@@ -51,14 +49,7 @@ class Network:
 
     def is_of(self, network: RoadNetwork) -> bool:
         """Whether the network still has the same lane objects with unchanged keys and attributes."""
-        keys, lanes = _laid_out(network)
-        if network is not self.network or keys != self.keys or list(map(id, lanes)) != list(map(id, self.lanes)):
-            return False
-        try:  # comparing two different array objects raises ValueError
-            same = _values(lanes) == self._seen and self._reach == _reach()
-        except ValueError:
-            return False
-        return same and [array.tobytes() for array in self._arrays] == self._contents
+        return network is self.network and self._contents.is_same() and self._reach == _reach()
 
     def in_kernel(self, *, looks_further: bool) -> CompiledNetwork:
         """Return the lanes in the kernel, which must exist.
@@ -108,10 +99,16 @@ class Network:
 
 
 def _laid_out(network: RoadNetwork) -> tuple[list[tuple[str, str, int]], list[AbstractLane]]:
-    """Return all keys and lanes in highway-env's order of comparison; empty if the network has its own methods."""
-    keys, lanes = [], []
-    if type(network) is RoadNetwork and vars(network).keys() == {"graph"}:
+    """Return all keys and lanes in highway-env's order of comparison; empty if the network is unusual.
+
+    An unusual network has its own methods, or its graph has containers of other types.
+    """
+    keys: list[tuple[str, str, int]] = []
+    lanes: list[AbstractLane] = []
+    if type(network) is RoadNetwork and vars(network).keys() == {"graph"} and type(network.graph) is dict:
         for start, ends in network.graph.items():
+            if type(ends) is not dict or any(type(row) is not list for row in ends.values()):
+                return [], []
             for end, row in ends.items():
                 for number, lane in enumerate(row):
                     keys.append((start, end, number))
@@ -119,8 +116,23 @@ def _laid_out(network: RoadNetwork) -> tuple[list[tuple[str, str, int]], list[Ab
     return keys, lanes
 
 
-def _values(lanes: list[AbstractLane]) -> list[tuple[object, ...]]:
-    return [tuple(vars(lane).values()) if type(lane) in _KNOWN else () for lane in lanes]
+def _contents(network: RoadNetwork, lanes: list[AbstractLane]) -> Contents:
+    """Return everything about a network that must stay the same: its lanes in their order, and their attributes."""
+    module = kernel()
+    assert module is not None
+    containers: list[object] = []
+    if type(network) is RoadNetwork:
+        graph = vars(network).get("graph")
+        ends = [*graph.values()] if type(graph) is dict else []
+        rows = [row for by_end in ends if type(by_end) is dict for row in by_end.values()]
+        containers += [network, *[part for part in (graph, *ends, *rows) if type(part) in (dict, list)]]
+    known = [lane for lane in lanes if type(lane) in _KNOWN]
+    containers += [*known, *[value for lane in known for value in vars(lane).values() if _is_array(value)]]
+    return module.Contents(containers)
+
+
+def _is_array(value: object) -> bool:
+    return type(value) is np.ndarray and value.dtype in _DTYPES and value.flags.c_contiguous
 
 
 def _reach() -> list[float]:
@@ -140,7 +152,7 @@ def _is_known(lane: AbstractLane) -> bool:
         are_numbers(values.get(name) for name in _NUMBERS[kind])
         and (values.get("speed_limit") is None or are_numbers([values["speed_limit"]]))
         and "forbidden" in values
-        and all(type(array) is np.ndarray and array.shape == (2,) and array.dtype in _DTYPES for array in arrays)
+        and all(type(array) is np.ndarray and array.shape == (2,) and _is_array(array) for array in arrays)
     )
 
 

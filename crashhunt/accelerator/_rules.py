@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 from typing import TYPE_CHECKING
 
-import numpy as np
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 
 if TYPE_CHECKING:
     from highway_env.road.regulation import RegulatedRoad
     from highway_env.road.road import Road
-    from highway_env.vehicle.kinematics import Vehicle
 
     from crashhunt.accelerator._kernel import Traffic
-    from crashhunt.accelerator._versions import Kind
 
 
 __all__ = ["collide_one_by_one", "enforce", "finish"]
@@ -36,23 +32,18 @@ def collide_one_by_one(road: Road, dt: float) -> None:
             vehicle.handle_collisions(other, dt)
 
 
-def enforce(road: RegulatedRoad, traffic: Traffic, kinds: list[Kind]) -> bool:
+def enforce(road: RegulatedRoad, traffic: Traffic) -> bool:
     """Do what `RegulatedRoad.enforce_road_rules` does, with one prediction per vehicle.
 
     Args:
         road: The road.
         traffic: Its vehicles in the kernel, with their current state.
-        kinds: The properties of the class of each vehicle, then of each object.
 
     Returns:
         False, with nothing changed, if highway-env must predict a path.
     """
     vehicles = road.vehicles
-    predicted = {
-        row: _foresee(vehicle) for row, (vehicle, kind) in enumerate(zip(vehicles, kinds, strict=False))
-        if kind.base == "nothing"
-    }  # fmt: skip
-    conflicts = traffic.conflicts(predicted)
+    conflicts = traffic.conflicts()
     if conflicts is None:
         return False
     for vehicle in vehicles:
@@ -74,18 +65,3 @@ def enforce(road: RegulatedRoad, traffic: Traffic, kinds: list[Kind]) -> bool:
             yielding.is_yielding = True
             yielding.yield_timer = 0
     return True
-
-
-def _foresee(vehicle: Vehicle) -> bytes:
-    """Return the poses of `Vehicle.predict_trajectory_constant_speed`, without a copy of the whole road."""
-    if vehicle.prediction_type not in ("zero_steering", "constant_steering"):
-        raise ValueError("Unknown predition type")  # as highway-env
-    steering = 0.0 if vehicle.prediction_type == "zero_steering" else vehicle.action["steering"]
-    ahead = copy.copy(vehicle)
-    ahead.road, ahead.position = None, vehicle.position.copy()  # without a road, the copy does not search for its lane
-    ahead.action = {"acceleration": 0.0, "steering": steering}
-    poses = []
-    for dt in np.diff(np.arange(0, 3, 0.25)):
-        ahead.step(dt)
-        poses.append((*ahead.position, ahead.heading))
-    return np.array(poses).tobytes()

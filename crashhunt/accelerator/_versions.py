@@ -203,7 +203,7 @@ _VALUES = (
     "road", "position", "heading", "speed", "lane_index", "lane", "collidable", "solid", "check_collisions", "diagonal",
     "crashed", "hit", "impact", "prediction_type", "action", "history", "target_lane_index", "target_speed", "route",
     "timer", "enable_lane_change", "speed_index", "target_speeds", "is_yielding", "yield_timer", "color", "log", "data",
-    "collecting_data", "ACCELERATION_PARAMETERS", "STEERING_PARAMETERS",
+    "collecting_data", "lateral_speed", "yaw_rate", "ACCELERATION_PARAMETERS", "STEERING_PARAMETERS",
 )  # fmt: skip
 """Attributes of vehicles that must be plain values, so that the accelerator may read them any number of times."""
 _BASES = {

@@ -6,12 +6,15 @@
 // - Sine, cosine and their like are the inner loops of NumPy's own functions, because NumPy has several versions of them
 //   for different processors. crashhunt/accelerator/_kernel.py compares all of them with NumPy when a process starts.
 // - What the kernel does not know, it refuses: `read` returns False, and highway-env does the work. For two events it
-//   calls highway-env's own methods: the end of a lane, and a movement by the dynamic bicycle model.
+//   calls highway-env's own methods: the end of a lane, and a movement by the dynamic bicycle model to numbers that are
+//   not finite.
 //
 // Its parts are kernel_numbers.hpp (arithmetic), kernel_lanes.hpp, kernel_actors.hpp (state), kernel_policies.hpp
-// (decisions), kernel_movement.hpp, kernel_collisions.hpp and kernel_predictions.hpp. This file has what Python calls.
+// (decisions), kernel_movement.hpp, kernel_collisions.hpp, kernel_predictions.hpp, and kernel_snapshots.hpp (what must
+// stay the same). This file has what Python calls.
 
 #include "kernel_predictions.hpp"
+#include "kernel_snapshots.hpp"
 
 namespace {
 
@@ -166,14 +169,10 @@ PyObject *traffic_new(PyTypeObject *type, PyObject *args, PyObject *) {
     return reinterpret_cast<PyObject *>(self);
 }
 
-// conflicts(predicted): the pairs of vehicles whose predicted outlines touch, each with whether that is certain; None if
-// highway-env must decide. `predicted` has the paths that the kernel cannot predict, by row.
-PyObject *traffic_conflicts(Traffic *self, PyObject *predicted) {
-    if (!PyDict_CheckExact(predicted)) {
-        PyErr_SetString(PyExc_TypeError, "the predicted paths must be a dictionary");
-        return nullptr;
-    }
-    const std::vector<Path> paths = predict_all(self, predicted);
+// conflicts(): the pairs of vehicles whose predicted outlines touch, each with whether that is certain; None if
+// highway-env must decide.
+PyObject *traffic_conflicts(Traffic *self, PyObject *) {
+    const std::vector<Path> paths = predict_all(self);
     if (PyErr_Occurred()) {
         return nullptr;
     }
@@ -242,7 +241,7 @@ PyMethodDef traffic_methods[] = {
     {"collide", reinterpret_cast<PyCFunction>(traffic_collide), METH_O, nullptr},
     {"completed", reinterpret_cast<PyCFunction>(traffic_completed), METH_NOARGS, nullptr},
     {"run", reinterpret_cast<PyCFunction>(traffic_run), METH_VARARGS, nullptr},
-    {"conflicts", reinterpret_cast<PyCFunction>(traffic_conflicts), METH_O, nullptr},
+    {"conflicts", reinterpret_cast<PyCFunction>(traffic_conflicts), METH_NOARGS, nullptr},
     {"fill_times", reinterpret_cast<PyCFunction>(traffic_fill_times), METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
@@ -451,90 +450,6 @@ PyType_Slot network_slots[] = {
 };
 PyType_Spec network_spec = {"_crashhunt_highway.Network", sizeof(Network), 0, Py_TPFLAGS_DEFAULT, network_slots};
 
-// --------------------------------------------------------------------------------------------------------------- Snapshot
-
-// The members that namespaces had at one time, to find out whether they still have them.
-struct Snapshot {
-    PyObject_HEAD
-    PyObject *spaces, *names, *values; // tuples: modules' dictionaries or classes, tuples of names, tuples of values
-};
-
-void snapshot_dealloc(Snapshot *self) {
-    Py_XDECREF(self->spaces);
-    Py_XDECREF(self->names);
-    Py_XDECREF(self->values);
-    PyTypeObject *type = Py_TYPE(self);
-    type->tp_free(reinterpret_cast<PyObject *>(self));
-    Py_DECREF(type);
-}
-
-// Snapshot(spaces, names, values)
-PyObject *snapshot_new(PyTypeObject *type, PyObject *args, PyObject *) {
-    PyObject *spaces, *names, *values;
-    if (!PyArg_ParseTuple(args, "O!O!O!", &PyTuple_Type, &spaces, &PyTuple_Type, &names, &PyTuple_Type, &values)) {
-        return nullptr;
-    }
-    const Py_ssize_t count = PyTuple_GET_SIZE(spaces);
-    bool usual = PyTuple_GET_SIZE(names) == count && PyTuple_GET_SIZE(values) == count;
-    for (Py_ssize_t at = 0; usual && at < count; at++) {
-        PyObject *space = PyTuple_GET_ITEM(spaces, at), *row = PyTuple_GET_ITEM(names, at);
-        usual = (PyDict_CheckExact(space) || PyType_Check(space)) && PyTuple_CheckExact(row) &&
-                PyTuple_CheckExact(PyTuple_GET_ITEM(values, at)) &&
-                PyTuple_GET_SIZE(row) == PyTuple_GET_SIZE(PyTuple_GET_ITEM(values, at));
-    }
-    if (!usual) {
-        PyErr_SetString(PyExc_TypeError, "each namespace needs as many names as values");
-        return nullptr;
-    }
-    Snapshot *self = reinterpret_cast<Snapshot *>(type->tp_alloc(type, 0));
-    if (self) {
-        self->spaces = Py_NewRef(spaces);
-        self->names = Py_NewRef(names);
-        self->values = Py_NewRef(values);
-    }
-    return reinterpret_cast<PyObject *>(self);
-}
-
-// first_changed(sizes): the first namespace with another size or member; -1 if there is none.
-PyObject *snapshot_first_changed(Snapshot *self, PyObject *sizes) {
-    const Py_ssize_t count = PyTuple_GET_SIZE(self->spaces);
-    if (!PyList_CheckExact(sizes) || PyList_GET_SIZE(sizes) != count) {
-        PyErr_SetString(PyExc_TypeError, "one size is needed for each namespace");
-        return nullptr;
-    }
-    for (Py_ssize_t at = 0; at < count; at++) {
-        PyObject *space = PyTuple_GET_ITEM(self->spaces, at), *names = PyTuple_GET_ITEM(self->names, at);
-        PyObject *values = PyTuple_GET_ITEM(self->values, at);
-        PyObject *members = PyDict_CheckExact(space) ? space : reinterpret_cast<PyTypeObject *>(space)->tp_dict;
-        bool same = PyDict_GET_SIZE(members) == PyLong_AsSsize_t(PyList_GET_ITEM(sizes, at));
-        for (Py_ssize_t which = 0; same && which < PyTuple_GET_SIZE(names); which++) {
-            PyObject *found = PyDict_GetItemWithError(members, PyTuple_GET_ITEM(names, which));
-            same = found == PyTuple_GET_ITEM(values, which);
-        }
-        if (PyErr_Occurred()) {
-            return nullptr;
-        }
-        if (!same) {
-            return PyLong_FromSsize_t(at);
-        }
-    }
-    return PyLong_FromLong(-1);
-}
-
-PyMethodDef snapshot_methods[] = {
-    {"first_changed", reinterpret_cast<PyCFunction>(snapshot_first_changed), METH_O, nullptr},
-    {nullptr, nullptr, 0, nullptr},
-};
-
-PyType_Slot snapshot_slots[] = {
-    {Py_tp_new, reinterpret_cast<void *>(snapshot_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(snapshot_dealloc)},
-    {Py_tp_methods, snapshot_methods},
-    {Py_tp_doc, const_cast<char *>("The members of namespaces at one time.")},
-    {0, nullptr},
-};
-PyType_Spec snapshot_spec = {"_crashhunt_highway.Snapshot", sizeof(Snapshot), 0, Py_TPFLAGS_DEFAULT, snapshot_slots};
-
 // ----------------------------------------------------------------------------------------------------------------- module
 
 // bind(float64, int64, float32, ndarray, zeros, slide, [sin, cos, ...], fused, product_fused, exponent_step): NumPy's types and functions, and
@@ -609,6 +524,9 @@ PyObject *compute(PyObject *, PyObject *args) {
         const double one[3] = {a, b, c}, two[3] = {d, e, f};
         return PyFloat_FromDouble(dot(one, two));
     }
+    if (!std::strcmp(name, "turned")) {
+        return PyFloat_FromDouble(turned(a, b, c, d));
+    }
     if (!std::strcmp(name, "square")) {
         return PyFloat_FromDouble(square(a));
     }
@@ -619,8 +537,22 @@ PyObject *compute(PyObject *, PyObject *args) {
     return nullptr;
 }
 
+// bind_turn(rounds): how NumPy multiplies a matrix by a vector.
+PyObject *bind_turn(PyObject *, PyObject *number) {
+    const long rounds = PyLong_AsLong(number);
+    if (rounds < UNKNOWN || rounds >= TURNS) {
+        if (!PyErr_Occurred()) {
+            PyErr_Format(PyExc_ValueError, "unknown way of rounding %ld", rounds);
+        }
+        return nullptr;
+    }
+    turn_rounds = static_cast<int>(rounds);
+    Py_RETURN_NONE;
+}
+
 PyMethodDef methods[] = {
     {"bind", bind, METH_VARARGS, nullptr},
+    {"bind_turn", bind_turn, METH_O, nullptr},
     {"compute", compute, METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
@@ -658,6 +590,16 @@ bool intern_names() {
         {&s_data, "data"},
         {&s_solid, "solid"},
         {&s_hit, "hit"},
+        {&s_prediction_type, "prediction_type"},
+        {&s_lateral_speed, "lateral_speed"},
+        {&s_yaw_rate, "yaw_rate"},
+        {&s_mass, "MASS"},
+        {&s_length_a, "LENGTH_A"},
+        {&s_length_b, "LENGTH_B"},
+        {&s_inertia_z, "INERTIA_Z"},
+        {&s_friction_front, "FRICTION_FRONT"},
+        {&s_friction_rear, "FRICTION_REAR"},
+        {&s_max_angular_speed, "MAX_ANGULAR_SPEED"},
     };
     for (const auto &name : names) {
         *name.place = PyUnicode_InternFromString(name.text);
@@ -675,7 +617,7 @@ PyMODINIT_FUNC PyInit__crashhunt_highway() {
     const struct {
         const char *name;
         PyType_Spec *spec;
-    } types[] = {{"Network", &network_spec}, {"Traffic", &traffic_spec}, {"Snapshot", &snapshot_spec}};
+    } types[] = {{"Network", &network_spec}, {"Traffic", &traffic_spec}, {"Snapshot", &snapshot_spec}, {"Contents", &contents_spec}};
     for (const auto &type : types) {
         PyObject *made = module ? PyType_FromSpec(type.spec) : nullptr;
         if (!made || PyModule_AddObjectRef(module, type.name, made)) {

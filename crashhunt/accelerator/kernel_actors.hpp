@@ -21,6 +21,11 @@ struct Parameters {
     double lane_change_delay, lane_change_min_acc_gain, lane_change_max_braking_imposed, delta;
 };
 
+// The parameters of the dynamic bicycle model.
+struct Bicycle {
+    double mass, length_a, length_b, inertia_z, friction_front, friction_rear, max_angular_speed;
+};
+
 // A number of Python with its type, because later arithmetic depends on it.
 struct Number {
     double value = 0;
@@ -34,7 +39,7 @@ struct Actor {
     bool is_open;            // whether `position` is
     int model;
     bool moves;              // a vehicle
-    bool slides;             // moves by the dynamic bicycle model, which is highway-env's
+    bool slides;             // moves by the dynamic bicycle model
     bool is_landmark;        // not a neighbour
     bool is_obstacle;        // is not pushed by a collision
     bool has_target;         // has a target lane
@@ -61,18 +66,21 @@ struct Actor {
     double radius;           // half the diagonal
     double acceleration_parameters[3], steering_parameters[2]; // of a linear vehicle
     bool collects_data;
+    Bicycle bicycle;
+    Number lateral_speed, yaw_rate; // of the dynamic bicycle model
 };
 
 PyObject *s_position, *s_heading, *s_speed, *s_lane, *s_lane_index, *s_target_lane_index, *s_target_speed, *s_timer,
     *s_crashed, *s_impact, *s_action, *s_steering, *s_acceleration, *s_route, *s_enable_lane_change, *s_check_collisions,
     *s_collidable, *s_diagonal, *s_follow_road, *s_handle_collisions, *s_acceleration_parameters,
-    *s_steering_parameters, *s_collecting_data, *s_data, *s_solid, *s_hit;
+    *s_steering_parameters, *s_collecting_data, *s_data, *s_solid, *s_hit, *s_prediction_type, *s_lateral_speed, *s_yaw_rate, *s_mass,
+    *s_length_a, *s_length_b, *s_inertia_z, *s_friction_front, *s_friction_rear, *s_max_angular_speed;
 PyObject *numpy_float; // the type np.float64
 PyObject *numpy_int;   // the type np.int64
 PyObject *numpy_short; // the type np.float32
 PyObject *numpy_array; // the type np.ndarray
 PyObject *make_array;  // the function np.zeros
-PyObject *slide;       // the function that moves a vehicle with the dynamic bicycle model
+PyObject *slide;       // the function that moves a vehicle with highway-env's dynamic bicycle model
 
 const size_t NO_ROW = static_cast<size_t>(-1);
 
@@ -346,6 +354,31 @@ bool read_linear(Actor &actor) {
            (!actor.collects_data || read_data(actor));
 }
 
+// Reads the parameters and the velocities of the dynamic bicycle model.
+bool read_bicycle(Actor &actor) {
+    Bicycle &bicycle = actor.bicycle;
+    const std::pair<PyObject *, double *> parameters[] = {
+        {s_mass, &bicycle.mass},
+        {s_length_a, &bicycle.length_a},
+        {s_length_b, &bicycle.length_b},
+        {s_inertia_z, &bicycle.inertia_z},
+        {s_friction_front, &bicycle.friction_front},
+        {s_friction_rear, &bicycle.friction_rear},
+        {s_max_angular_speed, &bicycle.max_angular_speed},
+    };
+    for (const auto &[name, place] : parameters) {
+        Number number;
+        if (!read_number(actor.object, name, number) || !std::isfinite(number.value)) {
+            return false;
+        }
+        *place = number.value;
+    }
+    // Python raises an error for a division by zero.
+    return bicycle.mass != 0 && bicycle.length_a != 0 && bicycle.inertia_z != 0 &&
+           read_number(actor.object, s_lateral_speed, actor.lateral_speed) &&
+           read_number(actor.object, s_yaw_rate, actor.yaw_rate);
+}
+
 bool read_vehicle(const Network *network, Actor &actor, std::vector<const void *> &actions) {
     PyObject *object = actor.object;
     actor.changed_target = actor.reset_timer = actor.moved = false;
@@ -361,7 +394,7 @@ bool read_vehicle(const Network *network, Actor &actor, std::vector<const void *
                                  read_bool(object, s_enable_lane_change, actor.enable_lane_change))) {
         return false;
     }
-    return actor.model != LINEAR || read_linear(actor);
+    return (actor.model != LINEAR || read_linear(actor)) && (!actor.slides || read_bicycle(actor));
 }
 
 bool are_different(std::vector<const void *> &pointers) {
@@ -460,12 +493,20 @@ bool publish_movement(Traffic *self, Actor &actor) {
         return true;
     }
     actor.moved = false;
-    double *place = static_cast<double *>(actor.position.buf);
-    place[0] = actor.x;
-    place[1] = actor.y;
     PyObject *object = actor.object;
-    if (!actor.slides &&
-        (!set(object, s_heading, as_python(actor.heading, true)) || !set(object, s_speed, as_python(actor.speed)))) {
+    if (actor.slides) { // the dynamic bicycle model makes a new array
+        const double place[2] = {actor.x, actor.y};
+        if (!set(object, s_position, as_array(place, 2)) ||
+            !set(object, s_lateral_speed, as_python(actor.lateral_speed)) ||
+            !set(object, s_yaw_rate, as_python(actor.yaw_rate))) {
+            return false;
+        }
+    } else {
+        double *place = static_cast<double *>(actor.position.buf);
+        place[0] = actor.x;
+        place[1] = actor.y;
+    }
+    if (!set(object, s_heading, as_python(actor.heading, true)) || !set(object, s_speed, as_python(actor.speed))) {
         return false;
     }
     if (PyObject_SetAttr(object, s_lane_index, PyList_GET_ITEM(self->network->keys, actor.lane)) ||

@@ -53,9 +53,74 @@ int closest_lane(Traffic *self, size_t row) {
     return nearest;
 }
 
+const int STATES = 6; // x, y, heading, speed, lateral speed and yaw rate
+
+// `BicycleVehicle.derivative_func`
+void derivative(const Actor &actor, const double *state, double *found) {
+    const Bicycle &bicycle = actor.bicycle;
+    double heading = state[2], speed = state[3], lateral_speed = state[4], yaw_rate = state[5];
+    double front_slip = call(ARCTAN2, lateral_speed + bicycle.length_a * yaw_rate, speed);
+    double rear_slip = call(ARCTAN2, lateral_speed - bicycle.length_b * yaw_rate, speed);
+    double front = 2 * bicycle.friction_front * (actor.steering.value - front_slip);
+    double rear = 2 * bicycle.friction_rear * (0 - rear_slip);
+    if (std::fabs(speed) < 1) {
+        front = -bicycle.mass * lateral_speed - bicycle.inertia_z / bicycle.length_a * yaw_rate;
+        rear = -bicycle.mass * lateral_speed + bicycle.inertia_z / bicycle.length_a * yaw_rate;
+    }
+    double c = call(COS, heading), s = call(SIN, heading);
+    found[0] = turned(c, -s, speed, lateral_speed);
+    found[1] = turned(s, c, speed, lateral_speed);
+    found[2] = yaw_rate;
+    found[3] = actor.acceleration.value;
+    found[4] = 1 / bicycle.mass * (front + rear) - yaw_rate * speed;
+    found[5] = 1 / bicycle.inertia_z * (bicycle.length_a * front - bicycle.length_b * rear);
+}
+
+// Moves a vehicle by the dynamic bicycle model. False, with nothing changed: highway-env must do it.
+bool slide_in_kernel(Actor &actor, double dt) {
+    if (turn_rounds == UNKNOWN) {
+        return false;
+    }
+    const Number steering = actor.steering, acceleration = actor.acceleration;
+    const bool changed_action = actor.changed_action;
+    clip_actions(actor);
+    actor.steering = {clip(actor.steering.value, -PI / 2, PI / 2), true, false};
+    double most = actor.bicycle.max_angular_speed, yaw_rate = clip(actor.yaw_rate.value, -most, most);
+    const double state[STATES] = {actor.x, actor.y, actor.heading, actor.speed.value, actor.lateral_speed.value, yaw_rate};
+    double steps[4][STATES], ahead[STATES]; // of the method of Runge and Kutta
+    derivative(actor, state, steps[0]);
+    const double lengths[3] = {dt / 2, dt / 2, dt};
+    for (int step = 1; step < 4; step++) {
+        for (int part = 0; part < STATES; part++) {
+            ahead[part] = state[part] + steps[step - 1][part] * lengths[step - 1];
+        }
+        derivative(actor, ahead, steps[step]);
+    }
+    bool finite = true;
+    for (int part = 0; part < STATES; part++) {
+        double sum = steps[0][part] + 2 * steps[1][part] + 2 * steps[2][part] + steps[3][part];
+        ahead[part] = state[part] + dt / 6 * sum;
+        finite = finite && std::isfinite(ahead[part]);
+    }
+    if (!finite) {
+        actor.steering = steering;
+        actor.acceleration = acceleration;
+        actor.changed_action = changed_action;
+        return false;
+    }
+    actor.x = ahead[0];
+    actor.y = ahead[1];
+    actor.heading = ahead[2];
+    actor.speed = {ahead[3], true, false};
+    actor.lateral_speed = {ahead[4], true, false};
+    actor.yaw_rate = {ahead[5], true, false};
+    actor.moved = true;
+    return true;
+}
+
 // Lets highway-env move a vehicle with the dynamic bicycle model. False: an error.
 bool slide_vehicle(Traffic *self, Actor &actor, PyObject *dt) {
-    if (!publish_contact(actor)) {
+    if (!publish_contact(actor) || !publish_decision(self, actor) || !publish_movement(self, actor)) {
         return false;
     }
     PyObject *done = PyObject_CallFunctionObjArgs(slide, actor.object, dt, nullptr);
@@ -106,7 +171,7 @@ Moved move_all(Traffic *self, double dt, PyObject *as_object) {
         Actor &actor = (*self->actors)[row];
         if (!actor.slides) {
             move(actor, dt);
-        } else if (!slide_vehicle(self, actor, as_object)) {
+        } else if (!slide_in_kernel(actor, dt) && !slide_vehicle(self, actor, as_object)) {
             break; // highway-env has moved the vehicles before this one
         }
         finite = finite && is_finite(actor);

@@ -32,6 +32,9 @@ const char *const NAMES[FUNCTIONS] = {"sin", "cos", "tan", "arcsin", "arctan", "
 Function functions[FUNCTIONS];
 bool fused = false;           // whether NumPy's scalar product of two vectors uses fused multiply-adds
 bool product_fused = false;   // whether NumPy's product of two matrices does
+// How NumPy multiplies a matrix by a vector: UNKNOWN, rounding both products of a row, or only one of them.
+enum { UNKNOWN, BOTH, ONLY_SECOND, ONLY_FIRST, TURNS };
+int turn_rounds = UNKNOWN;
 Py_ssize_t exponent_step = 0; // the stride with which NumPy passes the exponent of a power of two numbers
 
 const double PI = 3.14159265358979323846;
@@ -69,7 +72,15 @@ double dot(double ax, double ay, double bx, double by) { return sum_of_products(
 // An element of the product of two matrices: of a row with two numbers and a column with two numbers.
 double product(double ax, double ay, double bx, double by) { return sum_of_products(product_fused, ax, ay, bx, by); }
 
-// The same for vectors of three numbers.
+// An element of the product of a matrix and a vector, of two numbers each.
+double turned(double ax, double ay, double bx, double by) {
+    double found = turn_rounds == ONLY_SECOND  ? std::fma(ax, bx, ay * by)
+                   : turn_rounds == ONLY_FIRST ? std::fma(ay, by, ax * bx)
+                                               : ax * bx + ay * by;
+    return found + 0.0; // BLAS adds it to 0, which decides the sign of a zero result
+}
+
+// The same as `dot` for vectors of three numbers.
 double dot(const double *a, const double *b) {
     double found = dot(a[0], a[1], b[0], b[1]);
     return fused ? std::fma(a[2], b[2], found) : found + a[2] * b[2];

@@ -108,33 +108,41 @@ Answer is_conflict_possible(const Actor &one, const Path &path, const Actor &two
     return found;
 }
 
-// Reads poses that Python has predicted: MOMENTS rows of x, y and heading.
-bool read_path(PyObject *numbers, Path &path) {
-    if (!PyBytes_CheckExact(numbers) || PyBytes_GET_SIZE(numbers) != static_cast<Py_ssize_t>(MOMENTS * sizeof(Pose))) {
-        PyErr_SetString(PyExc_ValueError, "a predicted path must have eleven poses");
-        return false;
+// `Vehicle.predict_trajectory_constant_speed`. False: highway-env must decide.
+bool foresee_passive(const Actor &actor, Path &path) {
+    PyObject *kind = attribute(actor.object, s_prediction_type);
+    const bool is_straight = kind && PyUnicode_Check(kind) && !PyUnicode_CompareWithASCIIString(kind, "zero_steering");
+    const bool is_turning = kind && PyUnicode_Check(kind) && !PyUnicode_CompareWithASCIIString(kind, "constant_steering");
+    Py_XDECREF(kind);
+    if (!is_straight && !is_turning) {
+        return false; // raises an error
     }
-    path.resize(MOMENTS);
-    std::memcpy(path.data(), PyBytes_AS_STRING(numbers), MOMENTS * sizeof(Pose));
+    Actor ahead = actor;
+    ahead.steering.value = is_turning ? actor.steering.value : 0;
+    ahead.acceleration.value = 0;
+    for (int moment = 1; moment <= MOMENTS; moment++) {
+        if (!actor.slides) {
+            move(ahead, INTERVAL_S);
+        } else if (!slide_in_kernel(ahead, INTERVAL_S)) {
+            return false;
+        }
+        path.push_back({ahead.x, ahead.y, ahead.heading});
+    }
     return true;
 }
 
-// Predicts the paths of all vehicles; the dictionary has those that Python has predicted, by row. An empty result, maybe
-// with an error: highway-env must decide.
-std::vector<Path> predict_all(Traffic *self, PyObject *predicted) {
+// Predicts the paths of all vehicles. An empty result: highway-env must decide.
+std::vector<Path> predict_all(Traffic *self) {
     std::vector<Path> paths(self->vehicles);
     for (size_t row = 0; row < self->vehicles; row++) {
-        PyObject *number = PyLong_FromSize_t(row);
-        PyObject *given = number ? PyDict_GetItemWithError(predicted, number) : nullptr; // borrowed
-        Py_XDECREF(number);
-        bool done = !PyErr_Occurred();
-        if (done && given) {
-            done = read_path(given, paths[row]);
-        } else if (done) {
-            const Actor &actor = (*self->actors)[row];
-            PyObject *route = actor.has_target ? attribute(actor.object, s_route) : nullptr;
+        const Actor &actor = (*self->actors)[row];
+        bool done;
+        if (actor.has_target) {
+            PyObject *route = attribute(actor.object, s_route);
             done = route && foresee(self, row, route, paths[row]);
             Py_XDECREF(route);
+        } else {
+            done = foresee_passive(actor, paths[row]);
         }
         if (!done) {
             return {};
