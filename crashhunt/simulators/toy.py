@@ -173,7 +173,8 @@ class ToySimulator:
         return self._arguments.get(name, default)
 
     def _fail_on_purpose(self) -> None:
-        time.sleep(float(self._argument("step_wall_s", 0.0)))
+        if pause_s := float(self._argument("step_wall_s", 0.0)):  # a sleep of 0 s leaves the processor at every step
+            time.sleep(pause_s)
         if self._step == self._argument("fail_at_step", 0):
             raise SimulatorError("the toy simulator fails as its scenario arguments demand")
         if self._step == self._argument("exit_at_step", 0):
