@@ -58,12 +58,12 @@ _made: dict[str, tuple[types.CodeType, bytes]] = {}  # what a module of crashhun
 _imported: dict[str, dict[str, tuple[types.ModuleType, types.CodeType, dict[str, bytes]]]] = {}
 _BEGIN_WITH = ("crashhunt.executors._fork_server", "crashhunt.executors._fresh")
 # What these import as soon as they have read what is to be done.
-_SCENARIO = "crashhunt.scenario._load"
+_ALL = ("crashhunt.scenario._load", "crashhunt.crashes._escape", "crashhunt.recording._foxglove")
 _GO_ON_WITH = {
-    "": (_SCENARIO, "crashhunt.scenario.backends.toy", "crashhunt.simulators.toy"),
-    "gym": (_SCENARIO,),
-    "highway": (_SCENARIO,),  # whose accelerator knows the folder that it was imported from
-    "sumo": (_SCENARIO, "crashhunt.scenario.backends.sumo._backend", "crashhunt.simulators.sumo._simulator"),
+    "": (*_ALL, "crashhunt.scenario.backends.toy", "crashhunt.simulators.toy"),
+    "gym": _ALL,
+    "highway": _ALL,  # whose accelerator knows the folder that it was imported from
+    "sumo": (*_ALL, "crashhunt.scenario.backends.sumo._backend", "crashhunt.simulators.sumo._simulator"),
 }
 
 
