@@ -8,6 +8,7 @@ import stat
 import zipfile
 
 import pytest
+from conftest import add_toy
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from crashhunt.base.integrity import digest_of_content
@@ -25,20 +26,35 @@ class Agent:
 """
 
 
-def archived(shell):
+def archived(shell, *words):
     shell.environment["XDG_STATE_HOME"] = str(shell.folder / "state")
     (shell.folder / "mine.py").write_text(AGENT)
-    shell.crashhunt("run", "h", "1", "1", "60", "--agent", "mine:Agent", "--set", "vehicles=10")
+    shell.crashhunt("run", "h", "1", "1", "60", "--agent", "mine:Agent", *words)
     shell.crashhunt("export", "h", "crash ä.zip")
     shutil.rmtree(shell.folder / "h")
     (shell.folder / "mine.py").unlink()
+
+
+def archived_toy(shell):
+    archived(add_toy(shell), "--scenario", "toy")
+
+
+def archived_sumo(shell):
+    archived(shell, "--set", "vehicles=10")
 
 
 @pytest.fixture
 def exported(shell, made_once):
     """A crash of an own agent as ``crash.zip``, the hunt and the agent gone."""
     shell.environment["XDG_STATE_HOME"] = str(shell.folder / "state")
-    return made_once(archived, shell)
+    return made_once(archived_toy, shell)
+
+
+@pytest.fixture
+def exported_on_sumo(shell, made_once):
+    """The same on SUMO."""
+    shell.environment["XDG_STATE_HOME"] = str(shell.folder / "state")
+    return made_once(archived_sumo, shell)
 
 
 def test_it_replays_here_and_elsewhere_if_trusted(exported):
@@ -56,10 +72,10 @@ def test_it_replays_here_and_elsewhere_if_trusted(exported):
 
 def rewritten(source, target, change):
     """Copy a zip file; ``change`` is given every (name, data) and returns what to write instead."""
-    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as new:
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
         for info in old.infolist():
             for name, data in change(info.filename, old.read(info)):
-                new.writestr(name, data)
+                new.writestr(name, data, zipfile.ZIP_DEFLATED if len(data) > 10_000_000 else zipfile.ZIP_STORED)
     return target
 
 
@@ -130,16 +146,19 @@ def test_what_should_not_be_there_is_refused(exported, tmp_path):
             (added("crashes/extra"), "has changed"),
             (grown, "larger than it says"),
             (cut, "'hunt.toml' is missing"),
-            (with_index(lambda index: index.update(schema=99)), "schema 99"),
+            (with_index(lambda index: index.update(schema=99)), "schema version 99"),
             (with_index(lambda index: index.pop("files")), "not an exported crash"),
             (lambda name, data: [] if name == "archive.json" else [(name, data)], "not an exported crash"),
         ]
     ):
         bad = rewritten(source, tmp_path / f"bad-{number}.zip", change)
-        done = exported.crashhunt("show", str(bad), expect=2)
-        assert says in done.err
-        assert len(done.err.strip().splitlines()) == 1
-    assert not list(tmp_path.glob("**/evil"))
+        with pytest.raises(BundleError) as raised, open_archive(bad):
+            pass
+        assert says in str(raised.value)
+    done = exported.crashhunt("show", str(bad), expect=2)
+    assert says in done.err
+    assert len(done.err.strip().splitlines()) == 1
+    assert not [*tmp_path.glob("**/evil"), *exported.folder.glob("**/evil")]
 
 
 def test_a_bomb_is_refused(exported, tmp_path):
@@ -185,7 +204,7 @@ def test_any_damage_is_refused_or_harmless(small_archive, tmp_path, data):
         ("scenario/traffic.rou.xml", "<routes>", '<routes><event commandPosix="evil"/>', "<event>"),
     ],
 )  # fmt: skip
-def test_a_strangers_recorded_actions_do_nothing_but_simulate(exported, tmp_path, file, before, after, says):
+def test_a_strangers_recorded_actions_do_nothing_but_simulate(exported_on_sumo, tmp_path, file, before, after, says):
     import hashlib
 
     changed = []
@@ -204,8 +223,8 @@ def test_a_strangers_recorded_actions_do_nothing_but_simulate(exported, tmp_path
             data = json.dumps(index)
         return [(name, data)]
 
-    bad = rewritten(exported.folder / "crash ä.zip", tmp_path / "bad.zip", change)
-    refused = exported.crashhunt("replay", str(bad), "--from-log", "--force", expect=2)
+    bad = rewritten(exported_on_sumo.folder / "crash ä.zip", tmp_path / "bad.zip", change)
+    refused = exported_on_sumo.crashhunt("replay", str(bad), "--from-log", "--force", expect=2)
     assert says in refused.err
     assert "a stranger's" in refused.err
 
@@ -213,7 +232,7 @@ def test_a_strangers_recorded_actions_do_nothing_but_simulate(exported, tmp_path
 def test_where_an_archive_cannot_be_written_or_made(exported):
     exported.environment.pop("XDG_STATE_HOME")
     (exported.folder / "mine.py").write_text(AGENT)
-    exported.crashhunt("run", "h", "1", "1", "60", "--agent", "mine:Agent", "--set", "vehicles=10")
+    exported.crashhunt("run", "h", "1", "1", "60", "--agent", "mine:Agent", "--scenario", "toy")
     assert "missing/x.zip" in exported.crashhunt("export", "h", "missing/x.zip", expect=2).err
     (log,) = (exported.folder / "h" / "crashes").glob("*/log.mcap")
     log.write_bytes(log.read_bytes()[:-100])
