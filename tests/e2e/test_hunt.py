@@ -276,8 +276,6 @@ def test_a_full_disk_is_one_clear_line_and_nothing_is_lost(shell):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ((), "COMMAND"),
-        (("frobnicate",), "frobnicate"),
         (("run", "h", "2", "ten", "10"), "'ten'"),
         (("run", "h", "2", "0", "10"), "TRIALS is 0"),
         (("run", "h", "-1", "3", "10"), "PARALLEL is -1"),
@@ -293,7 +291,7 @@ def test_a_full_disk_is_one_clear_line_and_nothing_is_lost(shell):
         (("run", "h", "2", "3", "10", "--arg", "speed=9:3"), "3.0:9.0"),
         (("run", "h", "2", "3", "10", "--arg", "speed=fast"), "'fast'"),
         (("run", "h", "2", "3", "10", "--arg", "speed"), "NAME=VALUE"),
-        (("run", "h", "2", "3", "10", "--arg", "speed=1", "--arg", "speed=2"), "given already"),
+        (("run", "h", "2", "3", "10", "--arg", "speed=1", "--arg", "speed=2"), "is given twice"),
         (("run", "h", "2", "3", "10", "--arg", "vehicles=3"), "--set vehicles="),
         (("run", "h", "2", "3", "10", "--set", "speed=3"), "no argument 'speed'"),
         (("run", "h", "2", "3", "10", "--crash-on", "boredom"), "'boredom'"),
@@ -306,14 +304,23 @@ def test_a_full_disk_is_one_clear_line_and_nothing_is_lost(shell):
     ],
 )
 def test_bad_input_is_one_clear_line_and_leaves_nothing_behind(shell, words, says):
+    done = shell.crashhunt(*words, "--json", expect=2)
+    assert says in done.err
+    assert len(done.err.strip().splitlines()) == 1
+    assert sorted(path.name for path in shell.folder.iterdir() if path.name != "__pycache__") == ["faulty.py"]
+    assert set(done.json) == {"error"}
+    assert set(done.json["error"]) == {"message", "fix", "where"}
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [((), "COMMAND"), (("frobnicate",), "frobnicate"), (("replay", "h"), "does not exist")],
+)
+def test_bad_input_prints_no_json_unless_asked(shell, words, says):
     done = shell.crashhunt(*words, expect=2)
     assert says in done.err
     assert len(done.err.strip().splitlines()) == 1
     assert done.out == ""
-    assert sorted(path.name for path in shell.folder.iterdir() if path.name != "__pycache__") == ["faulty.py"]
-    as_json = shell.crashhunt(*words, "--json", expect=2).json
-    assert set(as_json) == {"error"}
-    assert set(as_json["error"]) == {"message", "fix", "where"}
 
 
 def test_a_name_that_is_no_text_is_refused_before_anything_is_made(shell):
