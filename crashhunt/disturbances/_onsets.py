@@ -25,11 +25,12 @@ Order within a step: disturbances of the agent first, because the agent notices 
 around it in the next step are not known. Models later in this order are drawn as ever in the step of the onset. Models
 before it are drawn on the condition that they are not effective.
 
-Second onsets: a copy after its first onset is a root again. It has either no further effective onset before it ends, or
-a second one, with the same closed form from the next step on. So a copy may run without later disturbances, and copies
-of it begin with one forced second onset each. The copy itself then counts with the probability of no second onset. The
-choice of these copies does not depend on their results, so there is no bias. Forcing says for which first onsets it
-pays. In addition one copy of each root does it, because the hunt learns from that where it pays.
+Second onsets: a copy with its first onset is a root again. It has either no further effective onset before it ends, or
+a second one, with the same closed form: of the models after the first in the step of the first, and of all models from
+the next step on. So a copy may run without later disturbances, and copies of it begin with one forced second onset
+each. The copy itself then counts with the probability of no second onset. The choice of these copies does not depend on
+their results, so there is no bias. Forcing says for which first onsets it pays: at first for all, because the hunt
+learns from that where it pays. Later one copy of each root does it in addition.
 
 Source: stratified importance sampling (Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 and 9).
 Cost: per step of the root one look at each place around the agent at which a model may find a vehicle.
@@ -88,8 +89,9 @@ class Onset:
         weight: probability of the onsets that it represents.
         step: in which it begins.
         planned: the onset and all later disturbances of the copy, in turn.
-        alone: the same without those of later steps, for a copy on which second onsets are forced.
+        alone: the onset itself, for a copy on which second onsets are forced.
         number: number of the onset in its root.
+        place: its place in the order within a step.
     """
 
     cell: str
@@ -98,6 +100,7 @@ class Onset:
     planned: tuple[Disturbance, ...]
     alone: tuple[Disturbance, ...] = ()
     number: int = 0
+    place: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +115,7 @@ class _Cell:
 class _Place:
     """One model around one agent, with its cells by the disturbance that is asked for a target."""
 
+    order: int  # within a step
     agent: str
     name: str
     what: str
@@ -125,7 +129,10 @@ def cell_of(name: str, how_strong: float | None = None) -> str:
 
 
 def first_forcing(sampler: DisturbanceSampler, last: int) -> Forcing:
-    """Return the forcing of the first roots: the law itself, and the spacing for eight copies at most.
+    """Return the forcing of the first roots: the law itself, at most eight copies, and second onsets on all of them.
+
+    If only later roots had second onsets, crashes that need two onsets would have large weights in the first roots, and
+    small weights in the others. An estimate that has missed the large ones looks precise, and is too low.
 
     Args:
         sampler: sampler of the hunt.
@@ -135,7 +142,16 @@ def first_forcing(sampler: DisturbanceSampler, last: int) -> Forcing:
     log_none = draws * math.fsum(math.log1p(-sampler.chance(name)) for name in sampler.models)
     # 1 - exp() would lose the digits of small chances, and a spacing that is too small makes millions of copies.
     any_onset = max(-math.expm1(log_none), np.finfo(float).tiny * COPIES_PER_ROOT)
-    return Forcing(any_onset / COPIES_PER_ROOT, second_spacing=any_onset / SECONDS_PER_COPY)
+    return Forcing(any_onset / COPIES_PER_ROOT, second=_cells_of(sampler), second_spacing=any_onset / SECONDS_PER_COPY)
+
+
+def _cells_of(sampler: DisturbanceSampler) -> tuple[str, ...]:
+    """Return the keys of all cells, sorted."""
+    found = set()
+    for name, model in sampler.models.items():
+        strengths = [drawn.how_strong for drawn, _ in model.possibilities()] if supports(model, Enumerates) else [None]
+        found |= {cell_of(name, how_strong) for how_strong in strengths}
+    return tuple(sorted(found))
 
 
 class FirstOnsets:
@@ -147,6 +163,7 @@ class FirstOnsets:
         seed: seed of the root.
         last: the last step of the root.
         first: the first step in which an onset is forced.
+        after_place: in that step, only onsets of later places in the order are forced.
         stream: numbers that separate the draws from others with the same seed.
 
     Attributes:
@@ -162,13 +179,16 @@ class FirstOnsets:
         last: int,
         *,
         first: int = FIRST_STEP,
+        after_place: int = -1,
         stream: tuple[int, ...] = (),
     ) -> None:
         self.survival = 1.0
         self.masses: dict[str, float] = {}
         self._sampler, self._forcing, self._seed, self._last = sampler, forcing, seed, last
-        self._first, self._stream = first, stream
-        places = [self._place(agent, name) for agent in sampler.agents for name in sampler.models]
+        self._first, self._after_place, self._stream = first, after_place, stream
+        names = [(agent, name) for agent in sampler.agents for name in sampler.models]
+        names.sort(key=lambda pair: sampler.models[pair[1]].what not in OF_AGENT)
+        places = [self._place(order, agent, name) for order, (agent, name) in enumerate(names)]
         self._of_agent = [place for place in places if place.what in OF_AGENT]
         self._traffic = [place for place in places if place.what not in OF_AGENT]
         self._points = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_POINTS, *stream)))
@@ -188,6 +208,8 @@ class FirstOnsets:
         if self._first <= begins <= self._last:
             skipped: list[tuple[_Place, frozenset[Drawn]]] = []
             for number, place in enumerate(self._traffic):
+                if begins == self._first and place.order <= self._after_place:
+                    continue
                 there = [
                     asked for asked in place.cells if asked is _ANY or has_target(_disturbance(place, asked, begins))
                 ]
@@ -198,6 +220,8 @@ class FirstOnsets:
         begins = step + 2
         if self._first <= begins <= self._last:
             for number, place in enumerate(self._of_agent):
+                if begins == self._first and place.order <= self._after_place:
+                    continue
                 cells = [cell for some in place.cells.values() for cell in some]
                 later = [(one, None) for one in (*self._of_agent[number + 1 :], *self._traffic)]
                 found += [self._onset(place, cell, begins, later, n) for cell, n in self._propose(place, cells)]
@@ -206,7 +230,7 @@ class FirstOnsets:
     def following(self, onset: Onset) -> FirstOnsets | None:
         """Return what proposes the second onsets in the copy of an onset; None if none are forced on it.
 
-        It has to be called after every step of the copy, from the one before the onset on.
+        It has to be called after every step of the copy, from the one after which the copy leaves the root.
         """
         forcing = self._forcing
         is_pilot = onset.number == self._seed % COPIES_PER_ROOT
@@ -217,11 +241,12 @@ class FirstOnsets:
             Forcing(forcing.second_spacing),
             self._seed,
             self._last,
-            first=onset.step + 1,
+            first=onset.step,
+            after_place=onset.place,
             stream=(onset.number,),
         )
 
-    def _place(self, agent: str, name: str) -> _Place:
+    def _place(self, order: int, agent: str, name: str) -> _Place:
         model, ratios = self._sampler.models[name], self._forcing.ratios
         by_place = model.what in KINDS and model.what != _DEPENDS_ON_STRENGTH
         cells: dict[Drawn, list[_Cell]] = {}
@@ -233,7 +258,9 @@ class FirstOnsets:
         else:  # every draw counts, whether it finds a vehicle or not
             cells[_ANY] = [_Cell(key=cell_of(name), drawn=_ANY, share=1.0, ratio=ratios.get(name, 1.0))]
         frozen = {asked: tuple(some) for asked, some in cells.items()}
-        return _Place(agent=agent, name=name, what=model.what, chance=self._sampler.chance(name), cells=frozen)
+        return _Place(
+            order=order, agent=agent, name=name, what=model.what, chance=self._sampler.chance(name), cells=frozen
+        )
 
     def _propose(self, place: _Place, cells: Sequence[_Cell]) -> list[tuple[_Cell, int]]:
         """Return the cells at the points that fall on a place in a step, with their numbers, and move past it."""
@@ -274,13 +301,13 @@ class FirstOnsets:
             planned = [sampler.draw_one(step, place.name, place.agent, rng)]
         else:
             planned = [_disturbance(place, cell.drawn, step)]
+        alone = tuple(planned)
         for other, excluded in in_step:
             begun = sampler.draw_between(step - 1, step, other.name, other.agent, rng)
             while excluded and any(_drawn(one) in excluded for one in begun):
                 begun = sampler.draw_between(step - 1, step, other.name, other.agent, rng)
             # A model that cannot list its draws is effective whenever it begins.
             planned += [] if excluded is not None and _ANY in excluded else begun
-        alone = in_turn(planned)
         for other in (*self._of_agent, *self._traffic):
             planned += sampler.draw_between(step, last, other.name, other.agent, rng)
         return Onset(
@@ -290,6 +317,7 @@ class FirstOnsets:
             planned=in_turn(planned),
             alone=alone,
             number=number,
+            place=place.order,
         )
 
 

@@ -28,7 +28,7 @@ from crashhunt.base.forks import NoAnswer
 from crashhunt.disturbances import SECONDS_PER_COPY, FirstOnsets, disturber_of, parse_rates
 from crashhunt.episode._questions import Questions
 from crashhunt.simulators import SupportsDisturbances
-from crashhunt.trial import Disturbance, Forced, ForcedCopy, Outcome
+from crashhunt.trial import Disturbance, Forced, ForcedCopy, Outcome, in_turn
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -159,9 +159,8 @@ class OnsetForcer:
         ends: list[Plain] = []
         branched = copy.steps
         while copy.result is None:
-            due = copy.steps >= onset.step - 1
-            for second in seconds.after(copy.steps, partial(_has_target, copy)) if due else ():
-                other = copy.fork(partial(_run_second, onset=second), observed=False)
+            for second in seconds.after(copy.steps, partial(_has_target, copy)):
+                other = copy.fork(partial(_run_second, first=onset, onset=second), observed=False)
                 end = other.answer(self._patience_s)
                 if end is None:
                     why = other.no_answer or NoAnswer("did not answer")
@@ -197,8 +196,9 @@ class OnsetForcer:
         )
 
 
-def _run_second(copy: Episode, onset: Onset) -> Plain:
-    copy.replan(onset.planned)
+def _run_second(copy: Episode, first: Onset, onset: Onset) -> Plain:
+    # A new plan begins after the next step, so it includes a first onset that has to begin later.
+    copy.replan(in_turn([*(one for one in first.alone if one.step > copy.steps + 1), *onset.planned]))
     return _run_to_end(copy, onset, within=onset.weight, second=onset.cell)
 
 

@@ -65,8 +65,9 @@ TRIALS_PER_ROOT: Final = 1 + PLAIN_PER_ROOT
 PLAIN_SHARE: Final = 0.1
 """Share of the proposal that is the law itself: no weight is above 10 times that of the law."""
 _PRIOR_COPIES: Final = 4.0  # weight of the common crash share in that of a cell
-MIN_SHARE_OF_SECONDS: Final = 0.1
-"""Share of the crashes from which on second onsets are forced: below that, the copies cost more than they tell."""
+MAX_SHARE_UNFORCED: Final = 0.05
+"""Share of the crashes that may come after a second onset which is not forced. Such crashes are few with large weights,
+so an estimate that has not met one is too low by this share, and looks precise."""
 _PILOT_ROOTS: Final = 128  # after so many without such a cell, no copy has forced second onsets any more
 _MOST_MORE_SECONDS: Final = 8  # times as many as the first forcing would have: a copy may be long, and others short
 MIN_EFFECTIVE: Final = 20.0
@@ -373,6 +374,7 @@ class _Learned:
         # Of copies that could have a second onset, and on which these were forced: their number, and the crash
         # probability after a second onset.
         self._forced: Counter[str] = Counter()
+        self._greatest: defaultdict[str, float] = defaultdict(float)  # probability that one second onset represents
         self._after_second: defaultdict[str, float] = defaultdict(float)
         self._mass = 0.0
 
@@ -389,6 +391,7 @@ class _Learned:
                 self._forced[cell] += 1
                 self._mass += 1.0 - first.within
                 self._after_second[cell] += after_second
+                self._greatest[cell] = max(self._greatest[cell], *(copy.within for copy in seconds), 0.0)
 
     @property
     def second_mass(self) -> float:
@@ -396,13 +399,23 @@ class _Learned:
         return self._mass / self._forced.total() if self._forced else 0.0
 
     def cells_with_seconds(self) -> tuple[str, ...]:
-        """Return the cells in which crashes after a second onset are a considerable part of all crashes."""
+        """Return the cells on whose copies second onsets are to be forced.
+
+        The other cells together have few crashes after a second onset, even if one more than was met is counted for
+        each cell. While no copy has crashed, these are all cells that are known.
+        """
         total = math.fsum(self.masses[cell] * self._values[cell] / count for cell, count in self.copies.items())
-        return tuple(
-            cell
-            for cell, count in sorted(self._forced.items())
-            if self.masses[cell] * self._after_second[cell] / count > MIN_SHARE_OF_SECONDS * total
-        )
+        after = {
+            cell: self.masses[cell] * (self._after_second[cell] + self._greatest[cell]) / count
+            for cell, count in self._forced.items()
+        }
+        unforced, found = 0.0, set(after)
+        for cell in sorted(after, key=lambda cell: (after[cell], cell)):
+            unforced += after[cell]
+            if not total or unforced > MAX_SHARE_UNFORCED * total:
+                break
+            found.remove(cell)
+        return tuple(sorted(found))
 
 
 class RareCounter:

@@ -53,17 +53,21 @@ def test_survival_is_the_product_over_effective_draws():
     assert math.fsum(m for cell, m in onsets.masses.items() if cell.startswith("brake")) > 0
 
 
-def test_second_onsets_follow_the_law_from_the_step_after_the_first():
-    some = sampler(late_action=0.1, brake=0.05)
-    forcing = Forcing(0.02, second=("brake=2.0", "brake=4.0", "brake=6.0"), second_spacing=0.1)
-    first = next(one for one in run(FirstOnsets(some, forcing, 3, LAST)) if one.cell in forcing.second)
-    assert all(one.step == first.step for one in first.alone)
-    assert set(first.alone) <= set(first.planned)
+@pytest.mark.parametrize(("name", "in_step"), [("late_action", 0.95 * 0.97), ("brake", 0.97), ("cut_in", 1.0)])
+def test_second_onsets_follow_the_law_from_the_next_model_in_the_step_of_the_first(name, in_step):
+    some = sampler(late_action=0.1, brake=0.05, cut_in=0.03)
+    start = first_forcing(some, LAST)
+    assert {cell.partition("=")[0] for cell in start.second} == set(MODELS)  # of all first onsets
+    forcing = Forcing(0.02, second=start.second, second_spacing=0.1)
+    first = next(one for one in run(FirstOnsets(some, forcing, 3, LAST)) if one.cell.startswith(name))
+    assert [(one.what, one.step) for one in first.alone] == [(name, first.step)]
+    assert first.alone[0] in first.planned
     law = FirstOnsets(some, forcing, 3, LAST).following(first)
-    found = [one for step in range(first.step - 1, LAST) for one in law.after(step, lambda _: True)]
-    assert law.survival == pytest.approx((0.9 * 0.95) ** (LAST - first.step))
+    forked = first.step - (2 if name == "late_action" else 1)
+    found = [one for step in range(forked, LAST) for one in law.after(step, lambda _: True)]
+    assert law.survival == pytest.approx(in_step * (0.9 * 0.95 * 0.97) ** (LAST - first.step))
     assert law.survival + math.fsum(law.masses.values()) == pytest.approx(1.0)
-    assert all(one.weight == 0.1 and one.step > first.step for one in found)
+    assert all(one.weight == 0.1 and one.step >= first.step for one in found)
     assert abs(len(found) * 0.1 - (1 - law.survival)) <= 0.1
     assert found[0].planned != first.planned
 

@@ -64,7 +64,7 @@ def roots(name, stage, speed, seed, steps, rates=RATES):
         "again": again.forced == root.forced,
         "forced": root.forced.to_json(),
         "starts": [[str(one.outcome), one.steps, one.disturbed] for one in starts],
-        "proposed": [[one.cell, one.weight] for one in other.forced.copies],
+        "proposed": [[one.cell, one.weight / one.within] for one in other.forced.copies],
         "spacing": first.spacing,
         "other_steps": root.other_steps - (root.setup_steps or 0),
         "left": len(children_of(os.getpid())),

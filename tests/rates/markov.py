@@ -186,9 +186,7 @@ def run_copy(episode, kept, onset, following):
     made = episode.fork([*kept, *(onset.planned if following is None else onset.alone)])
     found, steps = [], 0
     while not made.over:
-        for second in (
-            following.after(made.steps, made.has_target) if following and made.steps >= onset.step - 1 else ()
-        ):
+        for second in following.after(made.steps, made.has_target) if following else ():
             other = made.fork([*(one for one in made.planned if one.step > made.steps), *second.planned])
             while not other.over:
                 other.step()
