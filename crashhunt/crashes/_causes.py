@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.crashes import Bundle, Judgement, Omission, Why
+    from crashhunt.crashes import Bundle, Factor, Judgement, Omission, Why
     from crashhunt.recording import Recording
 
 __all__ = ["Cause", "CauseGroup", "Division", "cause_of", "features_of"]
@@ -113,12 +113,23 @@ def _of_omission(bundle: Bundle, omission: Omission) -> Cause:
 def _of_factors(why: Why) -> Cause:
     """Return the first kind of factor, in a fixed order, without which no run crashed."""
     needed = [factor for factor in why.factors if factor.needed and factor.clear > 1]
-    needed += [factor for factor in why.factors if factor.needed and factor.clear == 1 and factor.what == "default"]
+    # An agent with another value meets the same traffic, so its default counts though there is only one such run.
+    needed += [one for one in why.factors if one.needed and one.clear == 1 and one.what == "default" and _is_own(one)]
+    seeds_crash = any(factor.kind == "seed" and factor.crashed for factor in why.factors)
     for kind, word in (("agent", "decision"), ("disturbance", "disturbance"), ("argument", "argument")):
         for factor in needed:
-            if factor.kind == kind:
+            if factor.kind == kind and (kind != "argument" or _is_own(factor) or seeds_crash):
                 return Cause(word, factor.name if kind == "argument" else factor.what)
     return Cause("traffic") if needed else Cause("unknown")
+
+
+def _is_own(factor: Factor) -> bool:
+    """Whether a factor is an argument of an agent, whose name begins with that of the agent.
+
+    Another value of a scenario argument changes the traffic from the start, as another seed does. It is a cause only
+    where other seeds crash as well: otherwise, any other traffic would have avoided the crash.
+    """
+    return factor.kind == "argument" and "." in factor.name
 
 
 def _length(recording: Recording, actor: str) -> float:

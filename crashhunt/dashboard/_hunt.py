@@ -214,11 +214,14 @@ class HuntView:
 
     def kind_firsts(self) -> list[int]:
         """Return the numbers of the trials with which a crash type came first, in order."""
+        dropped = self.facts.get("dropped") or {}
         found = []
         for kind in self.kinds() or []:
+            numbers = list(dropped.get(kind.get("words", ""), ()))  # `--keep` may have deleted the first bundle
             number = str(kind.get("first", "")).partition("-")[0]
             if number.isascii() and number.isdecimal():
-                found.append(int(number))
+                numbers.append(int(number))
+            found += [min(numbers)] if numbers else []
         return sorted(found)
 
     def active_at(self) -> float:

@@ -68,6 +68,9 @@ def test_of_a_lane_change_only_the_side_counts(relation):
         ([factor("other", "braked", "none", "none"), factor("agent", "sped up", "none", "none")], "decision"),
         ([factor("agent", "sped up", "same", "none"), factor("disturbance", "brake", "none", "none")], "disturbance"),
         ([factor("argument", "default", "none", name="ego.speed")], "argument"),
+        ([factor("argument", "default", "none", name="cars")], "unknown"),  # one run, in other traffic
+        ([factor("argument", "drawn", "none", "none", name="cars"), factor("seed", "drawn", "none")], "traffic"),
+        ([factor("argument", "drawn", "none", "none", name="cars"), factor("seed", "drawn", "other")], "argument"),
         ([factor("other", "there", "none", "none", "none")], "traffic"),
         ([factor("agent", "sped up", "same", "same")], "unknown"),
         ([factor("agent", "sped up", "none", "unclear")], "unknown"),  # a single run is chance

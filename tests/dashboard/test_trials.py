@@ -6,6 +6,7 @@ import random
 from collections import Counter
 from contextlib import closing
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from dashboard_hunts import hunted
@@ -213,3 +214,13 @@ def test_a_trial_that_runs_again_is_counted_once(tmp_path, shell, made_once):
     assert after.trials_run == state.trials_run - 1
     assert view.sample is not None
     assert 2 not in [point["number"] for point in view.sample.points]
+
+
+def test_crash_type_came_with_its_first_trial_though_that_bundle_was_deleted():
+    view = HuntView(SimpleNamespace(path=None))
+    view.counts = TrialCounts(CRASH_ON)
+    view.facts = {
+        "kinds": [{"words": "rear end", "first": "000013-collision"}, {"words": "head-on", "first": "000004-collision"}],
+        "dropped": {"rear end": [9, 1], "side swipe": [0]},
+    }
+    assert view.kind_firsts() == [1, 4]
