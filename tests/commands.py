@@ -21,7 +21,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn
 
-from warm import OF_THE_GROUP, Clients, Process, Warm, ask, at_start, connect, leave_after, path_of, pid_of
+from warm import (
+    OF_THE_GROUP, Clients, Process, Warm, ask, at_start, connect, leave_after, path_of, pid_of, prepare_ours,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
@@ -304,7 +306,7 @@ if __name__ == "__main__":
     crashhunt.cli.make_parser = lambda: PARSER  # which every command would make again, and is the same in all of them
     AT_FIRST, PATH = frozenset(sys.modules), sys.path[1:]
     crashhunt.snapshots.environment()  # which looks through all that is installed
-    crashhunt.base.plugins.registered("agents")
+    prepare_ours()
     gc.collect()
     gc.freeze()
     _serve(Clients(socket.socket(fileno=int(sys.argv[1])), sys.argv[4]))

@@ -357,6 +357,7 @@ def _import_ours(simulator: str = "") -> None:
     for begins_with in _BEGIN_WITH:
         for name in (begins_with, *_GO_ON_WITH[simulator]):
             importlib.import_module(name)
+        prepare_ours()
         found = _imported[begins_with] = {}
         for name in filter(_is_ours, [*sys.modules]):
             module = sys.modules.pop(name)
@@ -371,6 +372,14 @@ def _import_ours(simulator: str = "") -> None:
     sys.meta_path.remove(_Known)
     gc.collect()
     gc.freeze()
+
+
+def prepare_ours() -> None:
+    """Have crashhunt find out once what is the same in every process: converters, and what is installed."""
+    prepare = importlib.import_module("crashhunt.base.codec").prepare
+    prepare(importlib.import_module("crashhunt.trial").TrialResult)
+    prepare(importlib.import_module("crashhunt.episode").WorkerSettings)
+    importlib.import_module("crashhunt.base.plugins").registered("agents")
 
 
 def _is_ours(name: str) -> bool:
