@@ -22,8 +22,18 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn
 
 from warm import (
-    OF_THE_GROUP, Clients, Process, Warm, ask, at_start, connect, leave_after, path_of, pid_of, prepare_ours,
-)  # fmt: skip
+    OF_THE_GROUP,
+    Clients,
+    Process,
+    Warm,
+    ask,
+    at_start,
+    connect,
+    leave_after,
+    path_of,
+    pid_of,
+    prepare_ours,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
