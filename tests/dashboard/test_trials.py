@@ -220,7 +220,10 @@ def test_crash_type_came_with_its_first_trial_though_that_bundle_was_deleted():
     view = HuntView(SimpleNamespace(path=None))
     view.counts = TrialCounts(CRASH_ON)
     view.facts = {
-        "kinds": [{"words": "rear end", "first": "000013-collision"}, {"words": "head-on", "first": "000004-collision"}],
+        "kinds": [
+            {"words": "rear end", "first": "000013-collision"},
+            {"words": "head-on", "first": "000004-collision"},
+        ],
         "dropped": {"rear end": [9, 1], "side swipe": [0]},
     }
     assert view.kind_firsts() == [1, 4]
