@@ -473,6 +473,7 @@ class Ending:
     error: BaseException | None
     _on_end: list[Callable[[TrialResult], TrialResult]]
     _scene: Scene | None
+    _look: Callable[[], Scene] | None
     _oracles: tuple[Oracle, ...]
     _observers: tuple[Observer, ...]
 
@@ -565,7 +566,9 @@ class Ending:
 
     def _end(self, outcome: Outcome, **evidence: Any) -> TrialResult:
         """End the episode, and let all observers add their results."""
-        time_s = self.simulator.scene().time_s if self._scene is not None else 0.0
+        # A user's simulator that has failed may fail again. The last scene of crashhunt's own may not have been read.
+        scene = self._scene if self._scene is None or self._look is not None else self.simulator.scene()
+        time_s = 0.0 if scene is None else scene.time_s
         return self._add(TrialResult(self.spec, outcome, steps=self.steps, sim_time_s=time_s, **evidence))
 
     def _add(self, result: TrialResult) -> TrialResult:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -71,7 +72,7 @@ class Env(gymnasium.Env):
         return self.look(), {}
 
     def look(self):
-        if fails == "shape":
+        if fails == "shape" or (fails == "later shape" and self.steps == 2):
             return {"x": np.zeros(3, np.float32), "side": 0}
         if "word" in self.observation_space.spaces:
             return {"x": np.zeros(2, np.float32), "word": "see"}
@@ -221,6 +222,8 @@ class Simulator(ToySimulator):
 
     def scene(self):
         fail("scene")
+        if self._step > 1:
+            fail("later scene")
         return "a picture" if fails == "no scene" else super().scene()
 """
 FOREIGN = {"environment": "place_environment", "agent": "place_agent", "other": "place_others"}
@@ -291,6 +294,7 @@ TABLE = [
     (A, "look", ("agent_error", A, "", "ego")),  # in place of a function of crashhunt's
     (E, "reset", ("invalid", E, "reset", "")),
     (E, "shape", ("invalid", E, "space conversion", "")),
+    (E, "later shape", ("simulator_error", E, "space conversion", "")),
     (E, "side", ("invalid", E, "space conversion", "")),
     (E, "contains {'x': array([0., 0.], dtype=float32), 'word': 'see'}", ("survived", "", "", "")),
     (E, "contains see", ("invalid", E, "space conversion", "")),
@@ -322,6 +326,19 @@ def test_failure_of_an_agent_or_an_environment_is_labelled_by_the_call(
         assert notice.endswith("cannot be closed: KeyError: 'of the environment'")
 
 
+def test_guide_has_a_tested_row_for_each_party_and_place():
+    """The table of the guide and those of these tests must have the same cells, except for `close`."""
+    of_users = [(fails, expected) for _, fails, expected in TABLE]
+    tested = {(party, place, outcome) for _, (outcome, party, place, _) in of_users + OF_ORACLES + OF_SIMULATORS}
+    page = (layout.PACKAGE / "guide" / "reference" / "outcomes.md").read_text(encoding="utf-8")
+    told, party = set(), ""
+    for row in page.partition("| party | place | outcome |")[2].partition("\n\n")[0].splitlines()[2:]:
+        cells = [re.findall(r"`([a-z_ ]+)`", cell) for cell in row.split("|")[1:-1]]
+        party = cells[0][0] if cells[0] else party
+        told |= {(party, place, outcome) for place in cells[1] for outcome in cells[2]}
+    assert {cell for cell in tested if cell[1]} == told
+
+
 def test_environment_that_cannot_be_made_is_a_mistake_in_the_scenario_or_an_invalid_trial(modules, tmp_path):
     simulator = gym(tmp_path)
     modules["environment"].fails = "constructor"
@@ -331,38 +348,39 @@ def test_environment_that_cannot_be_made_is_a_mistake_in_the_scenario_or_an_inva
         gym(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("fails", "expected"),
-    [
-        ("check", ("simulator_error", O, "check", "")),
-        ("garbage", ("simulator_error", O, "check", "")),
-        ("number", ("simulator_error", O, "check", "")),
-        ("see_map", ("simulator_error", O, "see_map", "")),
-        ("close", ("survived", "", "", "")),  # an oracle has no such method, so an episode does not call it
-    ],
-)
+OF_ORACLES = [
+    ("check", ("simulator_error", O, "check", "")),
+    ("garbage", ("simulator_error", O, "check", "")),
+    ("number", ("simulator_error", O, "check", "")),
+    ("see_map", ("simulator_error", O, "see_map", "")),
+    ("close", ("survived", "", "", "")),  # an oracle has no such method, so an episode does not call it
+]
+
+
+@pytest.mark.parametrize(("fails", "expected"), OF_ORACLES)
 def test_failure_of_a_users_oracle_is_the_oracles(modules, tmp_path, fails, expected):
     modules["other"].fails = fails
     oracle = modules["other"].Oracle()
     assert label(run(tmp_path, toy(tmp_path), [oracle])) == expected
 
 
-@pytest.mark.parametrize(
-    ("fails", "expected"),
-    [
-        ("reset", ("invalid", S, "reset", "")),
-        ("reset garbage", ("invalid", S, "reset", "")),
-        ("step", ("simulator_error", S, "step", "")),
-        ("garbage", ("simulator_error", S, "step", "")),
-        ("list", ("simulator_error", S, "step", "")),
-        ("reward", ("simulator_error", S, "step", "")),
-        ("scene", ("invalid", S, "scene", "")),
-        ("no scene", ("invalid", S, "scene", "")),
-        ("encode", ("simulator_error", S, "action conversion", "")),
-        ("first encode", ("invalid", S, "reset", "")),
-        ("close", ("survived", "", "", "")),  # the trial has ended before
-    ],
-)
+OF_SIMULATORS = [
+    ("reset", ("invalid", S, "reset", "")),
+    ("reset garbage", ("invalid", S, "reset", "")),
+    ("step", ("simulator_error", S, "step", "")),
+    ("garbage", ("simulator_error", S, "step", "")),
+    ("list", ("simulator_error", S, "step", "")),
+    ("reward", ("simulator_error", S, "step", "")),
+    ("scene", ("invalid", S, "scene", "")),
+    ("no scene", ("invalid", S, "scene", "")),
+    ("later scene", ("simulator_error", S, "scene", "")),
+    ("encode", ("simulator_error", S, "action conversion", "")),
+    ("first encode", ("invalid", S, "reset", "")),
+    ("close", ("survived", "", "", "")),  # the trial has ended before
+]
+
+
+@pytest.mark.parametrize(("fails", "expected"), OF_SIMULATORS)
 def test_failure_of_a_users_simulator_is_the_simulators(modules, tmp_path, fails, expected):
     simulator = toy(tmp_path, modules["other"].Simulator)
     modules["other"].fails = fails
