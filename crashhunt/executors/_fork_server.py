@@ -63,7 +63,7 @@ def main() -> None:
     except CrashhuntError as error:
         _send(control, error.to_json())
         return
-    prepare(TrialResult)  # here, or each trial's processes do it again: 5 ms
+    prepare(TrialResult)  # here, or the processes of each trial do it again
     gc.freeze()
     orders, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     server, template = os.getpid(), os.fork()
@@ -268,6 +268,7 @@ def fork_zygote(settings: WorkerSettings, *, late: bool = False) -> socket.socke
     """
     ours, theirs = socket.socketpair()
     reports, reported = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    prepare(TrialResult)
     gc.freeze()
     parent, pid = os.getpid(), os.fork()
     if pid == 0:
