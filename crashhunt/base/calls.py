@@ -65,11 +65,10 @@ def called_with(
     """Return a decorator for a public function of one dataclass, which is then called with the fields of the dataclass.
 
     Type checkers and editors see the fields as its arguments. Unknown keywords are refused as by `clear_calls`.
-    have are refused as by `clear_calls`.
 
     Args:
         shape: the dataclass; its ``Args`` become those of the function.
-        documents: further arguments, for the same.
+        documents: descriptions of arguments that are not fields of the dataclass.
     """
     known = _signature_of(shape)
 

@@ -84,7 +84,7 @@ class CrashhuntError(Exception):
         self.where = where
 
     def __str__(self) -> str:
-        """Everything in one line: ``where: message; fix``."""
+        """Return the whole error in one line: ``where: message; fix``."""
         text = f"{self.where}: {self.message}" if self.where else self.message
         return f"{text}; {self.fix}" if self.fix else text
 

@@ -152,7 +152,7 @@ def _links(first: TracebackType | None) -> Iterator[TracebackType]:
 
 
 def _skip_large_sources(files: Iterable[str]) -> None:
-    """Have Python show no source lines of files that it could not read in bounded time, such as ``/dev/zero``.
+    """Prevent that Python reads source lines from files without an end, such as ``/dev/zero``.
 
     The name of a file is whatever a program passes to `compile`.
     """
@@ -166,7 +166,7 @@ def _skip_large_sources(files: Iterable[str]) -> None:
 
 
 def _formatted_chain(error: BaseException) -> Iterator[str]:
-    """Yield the text of an exception after that of those that led to it, the oldest first."""
+    """Yield the texts of an exception and of the exceptions that led to it, the oldest first."""
     newest: list[tuple[BaseException, str]] = []
     oldest: deque[tuple[BaseException, str]] = deque(maxlen=_SHOWN_LINKS)
     seen, count = {id(error)}, 0
@@ -235,7 +235,7 @@ def _qualified_name(error: BaseException) -> str:
 
 
 def _without_middle(text: str, limit: int) -> str:
-    """Return a text of bounded length: of a traceback, the beginning says where, and the end what."""
+    """Return the beginning and the end of a long text; a traceback begins with the place and ends with the error."""
     if len(text) <= limit:
         return text
     half = limit // 2
@@ -265,8 +265,8 @@ def blamed(what: str, error: BaseException, *, fix: str = "correct the code") ->
     """Return the error for user code that fails: the failed action, the reason and the place.
 
     Args:
-        what: as ``the sampler 'mine' cannot be made``.
-        error: which it has raised.
+        what: the failed action, such as ``the sampler 'mine' cannot be made``.
+        error: the exception that the user code has raised.
         fix: what to do about it, as an imperative.
     """
     return PluginError(f"{what}: {in_words(error)}", fix=fix, where=place_of(error))

@@ -84,7 +84,7 @@ _CHECK_EVERY_S = 0.2  # the same, of one whose answer is awaited
 
 @dataclass(frozen=True, slots=True)
 class NoAnswer:
-    """Why a copy did not answer.
+    """The reason why a copy did not answer.
 
     Args:
         why: a clause without a subject: "was killed by SIGKILL", "raised ValueError: …".
@@ -153,10 +153,10 @@ class NoProcessError(CannotForkError):
 
 
 class Watchdog:
-    """Writes the traceback of a process at a time limit; its thread is paused while the process is forked.
+    """Writes the traceback of a process after a time limit. The thread of the watchdog is paused during a fork.
 
     Attributes:
-        file: that receives the traceback; None while the watchdog is not armed.
+        file: the file that receives the traceback; None while the watchdog is not armed.
         threads: ids of its own threads.
     """
 
@@ -344,9 +344,9 @@ def _has_ended(pid: int) -> bool:
 
 
 def end_orphans(children: frozenset[int]) -> None:
-    """End the processes that a killed fork has left to this process.
+    """End the children that this process has inherited from a killed fork, because they would prevent further forks.
 
-    They would prevent further forks. Older children stay.
+    Children that are older than the fork are not ended.
     """
     end_descendants(children | _alive)
 

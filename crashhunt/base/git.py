@@ -67,7 +67,10 @@ def tracked_files(top: Path) -> frozenset[str]:
 
 @lru_cache(maxsize=4)
 def _tracked_files(top: Path, _index: tuple[int, int, int]) -> frozenset[str]:
-    """List the files; a corpus has hundreds of cases, so list them again only when the index has changed."""
+    """List the files that git tracks.
+
+    The list is cached until git's index changes, because a corpus may have hundreds of cases.
+    """
     found = _run_git(top, "ls-files", "-z") or b""
     return frozenset(map(os.fsdecode, found.split(b"\0")))
 

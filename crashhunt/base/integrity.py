@@ -126,7 +126,7 @@ def read_object(path: Path, shape: type[T]) -> T:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it holds no JSON object; the reason is in one line.
+        ValueError: the file contains no JSON object; the reason is in one line.
     """
     return parse_object(path.read_bytes(), shape)
 
@@ -139,7 +139,7 @@ def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the ty
         shape: as for `read_object`.
 
     Raises:
-        ValueError: it is no JSON object; the reason is in one line.
+        ValueError: the text is not a JSON object; the reason is in one line.
     """
     try:
         found = json.loads(text)
@@ -216,7 +216,7 @@ def authentication_code(purpose: str, statement: Mapping[str, object]) -> str:
 
 
 def is_authentic(purpose: str, statement: Mapping[str, object], code: object) -> bool:
-    """Return whether a code is that of this user for a statement; without a code, it is not."""
+    """Return whether this user has made an authentication code for a statement; False for an empty code."""
     if not isinstance(code, str) or not code.isascii():
         return False
     return hmac.compare_digest(code, authentication_code(purpose, statement))
@@ -258,7 +258,7 @@ def state_folders() -> Iterator[Path]:
 
 
 def _kept_key(file: Path) -> bytes | None:
-    """Return the key of a file, which is created where it is missing; None if neither is possible."""
+    """Return the key in a file; create a missing file. None if the file can be neither read nor created."""
     with suppress(OSError):
         key = file.read_bytes()
         # Everybody can compute codes with a key that is cut off: replace the file.

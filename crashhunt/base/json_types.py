@@ -21,7 +21,7 @@ Plain: TypeAlias = Mapping[str, object]
 
 
 class ErrorWords(TypedDict):
-    """What an error says; the traceback is that of a failure of crashhunt itself."""
+    """The texts of an error; the traceback is present only for failures of crashhunt itself."""
 
     message: str
     fix: str
@@ -42,5 +42,5 @@ def finite(value: float) -> float | None:
 
 
 def finite_values(data: Plain) -> dict[str, object]:
-    """Return plain data with null instead of what is not a finite number."""
+    """Return plain data in which null replaces every number that is not finite."""
     return {name: finite(value) if isinstance(value, float) else value for name, value in data.items()}

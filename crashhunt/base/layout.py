@@ -1,4 +1,4 @@
-"""The names of everything that crashhunt keeps on disk, and where it lies itself."""
+"""The names of all files and folders that crashhunt writes, and the folder of its own code."""
 
 from __future__ import annotations
 

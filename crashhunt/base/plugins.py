@@ -1,4 +1,4 @@
-"""Names to objects: entry points of installed packages, and ``module:attribute`` everywhere."""
+"""Finds the object for a name: an entry point of an installed package, or ``module:attribute``."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def registered(group: Group) -> dict[str, EntryPoint]:
 
 
 def distributions() -> Iterator[Distribution]:
-    """Yield what is installed, as `importlib.metadata` does, but the very same objects again until that changes."""
+    """Yield the installed distributions as `importlib.metadata` does, but cached until a distribution changes."""
     # To look through all that is installed takes milliseconds, and a hunt asks some twenty times.
     for place in sys.path:
         yield from _lying_in(place, _changed_at(place))
@@ -65,7 +65,7 @@ def _lying_in(place: str, changed_at: int) -> list[Distribution]:  # noqa: ARG00
 
 @lru_cache(maxsize=1024)
 def _points_of(distribution: Distribution) -> tuple[str, dict[str, dict[str, EntryPoint]]]:
-    """The name of a distribution, and its entry points for us: group to name to entry point."""
+    """Return the name of a distribution, and its entry points of crashhunt's groups: group to name to entry point."""
     found: dict[str, dict[str, EntryPoint]] = {}
     for point in distribution.entry_points:
         package, _, group = point.group.partition(".")
@@ -75,7 +75,7 @@ def _points_of(distribution: Distribution) -> tuple[str, dict[str, dict[str, Ent
 
 
 def _changed_at(place: str) -> int:
-    """When something was last installed or removed there, in ns."""
+    """Return the time of the last installation or removal in a folder, in ns."""
     try:
         return Path(place).stat().st_mtime_ns
     except OSError:
@@ -88,7 +88,7 @@ def locate(group: Group, name: str) -> Any:
     Modules are looked for in the current directory as well, as with ``python -m``.
 
     Raises:
-        PluginError: there is no such thing, or importing it failed.
+        PluginError: the object does not exist, or its import failed.
     """
     points = registered(group)
     target = points[name].value if name in points else name
@@ -178,7 +178,7 @@ def load_object(target: str, *, shown: str = "") -> Any:
         shown: how errors name it.
 
     Raises:
-        PluginError: there is no such thing, or importing it failed.
+        PluginError: the object does not exist, or its import failed.
     """
     found = load_attribute(target, shown=shown)
     if not callable(found):
@@ -196,7 +196,7 @@ def load_attribute(target: str, *, shown: str = "") -> Any:
         shown: how errors name it.
 
     Raises:
-        PluginError: there is no such thing, or importing it failed.
+        PluginError: the object does not exist, or its import failed.
     """
     name = shown or target
     module_name, _, attribute = target.partition(":")
@@ -234,7 +234,7 @@ def import_module(name: str, *, shown: str = "") -> types.ModuleType:
 
 
 def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
-    """Tell a module that is not there from one that is and fails."""
+    """Return the error for a failed import: either the module does not exist, or the module raises an exception."""
     said = in_words(error)
     if isinstance(error, SyntaxError):  # whose message repeats the place
         said = " ".join(f"{type(error).__name__}: {error.msg}"[:_MAX_LINE_CHARACTERS].split())

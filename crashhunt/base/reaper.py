@@ -167,7 +167,7 @@ def _wait(child: int, lifeline: int, resume: Callable[[int], None]) -> int | Non
 
 
 def _leave(status: int | None) -> None:
-    """Exit as the child has exited, so that the owner sees the same status as without a keeper."""
+    """Exit with the status of the child, so the owner sees the same status as without a keeper."""
     if status is None:
         os._exit(1)
     code = os.waitstatus_to_exitcode(status)

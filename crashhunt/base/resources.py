@@ -75,6 +75,6 @@ def free_memory(root: Path = Path("/")) -> float:
 
 
 def _numbers(path: Path) -> dict[str, int]:
-    """What each of the first lines has after its name."""
+    """Return the numbers after the names in the first lines of a file."""
     lines = path.read_text(encoding="ascii").splitlines()[:_LINES]
     return {name.rstrip(":"): int(number) for name, number, *_ in map(str.split, lines)}

@@ -1,4 +1,4 @@
-"""Landlock: the kernel sees to it that this process writes nowhere but in its own folder."""
+"""Landlock: the kernel prevents this process from writing outside its own folder."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ def landlock_version() -> int:
 def confine(folder: Path, readable: Iterable[Path | str] = ()) -> bool:
     """Restrict this process and its children to write below one folder only. This cannot be undone.
 
-    It reads what is installed, that folder and what is named; it opens no port, and sends no other process a signal,
-    as far as the kernel knows these.
+    The process can still read installed packages, this folder and the named files. If the kernel's version of Landlock
+    supports it, the process can open no port and send no signal to other processes.
 
     Args:
         folder: where it may write.
         readable: further files and folders that it may read.
 
     Returns:
-        Whether the kernel does so; where it cannot, nothing changes.
+        Whether the kernel restricts the process; False if it cannot.
     """
     version = landlock_version()
     if not version:
@@ -83,7 +83,7 @@ def _newest(table: dict[int, int], version: int) -> int:
 
 
 def _installed() -> set[Path]:
-    """What Python imports from, and what that needs of the system."""
+    """Return the folders of Python's modules, and the system folders that they need."""
     paths = {Path(path) for path in _SYSTEM.split()} | {PACKAGE, PACKAGE.parent / "scenarios"}
     paths |= {
         Path(path).resolve()

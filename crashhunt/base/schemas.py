@@ -43,7 +43,7 @@ def json_schema(kind: Any, title: str, names: Mapping[str, Any] = _ABSTRACT) -> 
     Args:
         kind: a `TypedDict`, a `Serializable` dataclass, or a type made of these.
         title: title of the schema.
-        names: what annotations name that their modules import for the type checker only.
+        names: objects that annotations use but that their modules import only for the type checker.
 
     Raises:
         NameError: an annotation has a name that neither its module nor ``names`` has.
@@ -53,7 +53,7 @@ def json_schema(kind: Any, title: str, names: Mapping[str, Any] = _ABSTRACT) -> 
 
 
 def describe_type(hint: Any, names: Mapping[str, Any] = _ABSTRACT) -> JsonObject:
-    """Return the schema of a type; ``{}``, which allows everything, of a type that has no one shape in JSON."""
+    """Return the schema of a type; ``{}``, which allows everything, if the type has several shapes in JSON."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Required, NotRequired):
         return describe_type(inner[0], names)

@@ -55,7 +55,7 @@ class _Mapping:
 
 
 class SharedState:
-    """What this process would share with its forks. Each fork first calls `separate`.
+    """The files and memory that this process shares with its forks. Each fork first calls `separate`.
 
     Args:
         known: descriptors that stay open.
@@ -146,7 +146,7 @@ class SharedState:
 
 
 def _map_own(mapping: _Mapping, copy: int | None) -> None:
-    """Put memory with the same content in the place of a mapping; forks of this process share it with this one."""
+    """Replace a mapping by private memory with the same content."""
     libc = ctypes.CDLL(None, use_errno=True)
     libc.mmap.restype = ctypes.c_void_p
     types = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long)

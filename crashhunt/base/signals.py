@@ -39,7 +39,7 @@ _interrupts: Final[list[int]] = []
 
 
 def remember_interrupts() -> None:
-    """Have the next `stop_requests` learn of a Ctrl-C whose `KeyboardInterrupt` Python dropped.
+    """Report a Ctrl-C to the next `stop_requests` if Python has dropped its `KeyboardInterrupt`.
 
     Python drops what is raised in a callback of a weak reference, and importing a module runs one of these each time.
     """
@@ -58,7 +58,7 @@ class _EndedError(BaseException):
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Have SIGTERM and a hang-up end this process as they do by default, but after everything temporary is removed."""
+    """Remove all temporary files before SIGTERM or a hang-up ends this process."""
     asked: list[int] = []
 
     def end(number: int, _frame: object) -> None:
@@ -85,10 +85,10 @@ def ended_by_signals() -> Iterator[None]:
 
 
 def block_signals() -> None:
-    """Have no signal handler of Python run in this thread from now on.
+    """Prevent that signal handlers of Python run in this thread from now on.
 
-    Where there are other threads, the kernel may hand a signal for the process to one of them; then a handler runs. A
-    handler whose signal has come before may run once more meanwhile, and what it raises is dropped.
+    If there are other threads, the kernel may deliver a signal of the process to one of them, and then a handler runs.
+    The handler of an earlier signal may still run once, and its exceptions are dropped.
     """
     for _ in range(2):
         try:
@@ -99,7 +99,7 @@ def block_signals() -> None:
 
 @contextmanager
 def blocked_signals() -> Iterator[None]:
-    """Have no signal handler of Python run in this thread meanwhile; signals that come are handled afterwards."""
+    """Prevent that signal handlers of Python run in this thread inside the context; signals are handled afterwards."""
     before = _set_mask(signal.SIG_BLOCK, ())
     try:
         block_signals()
@@ -110,11 +110,11 @@ def blocked_signals() -> Iterator[None]:
 
 @contextmanager
 def stop_requests() -> Iterator[list[int]]:
-    """Collect requests to stop, as numbers of signals, instead of ending; a later second one ends the process at once.
+    """Collect requests to stop as signal numbers instead of ending the process; a second request ends it at once.
 
-    An interrupt that `remember_interrupts` has seen is collected at once: the command has gone on, so it was dropped.
-    Hang-ups stay ignored where they are ignored already, as under nohup. In a thread other than the main one nothing is
-    collected, because the embedding program handles signals there.
+    An interrupt that `remember_interrupts` has seen is collected at once, because Python has dropped it. Hang-ups stay
+    ignored where they are ignored already, as under nohup. In a thread other than the main one nothing is collected,
+    because the embedding program handles signals there.
     """
     asked = [*_interrupts[:1]]
     first_at: list[float] = []

@@ -1,23 +1,23 @@
 """Temporary files and folders of a process. All are removed, however the process ends.
 
-Each process has one folder for temporary things, ``crashhunt-temporary-UID/TOKEN`` in the system's folder for temporary
+Each process has one folder for temporary files, ``crashhunt-temporary-UID/TOKEN`` in the system's folder for temporary
 files (``TMPDIR``, else ``/tmp``). `Owner` says what the token is. The folder holds
 
 * the folders that only this process needs (`temporary_folder`), and
-* a symbolic link for each temporary thing that has to lie elsewhere (`temporary_beside`), because a rename makes it
-  permanent, or because the disk is chosen by the user. The link is made before the thing, and removed after it.
+* a symbolic link for each temporary file or folder in another place (`temporary_beside`). Such files become permanent
+by a rename, or the user has chosen their disk. The link is made before the file, and removed after it.
 
 `remove_leftovers` removes what killed processes left. Each command calls it when it starts, and each process calls it
-before it makes its first temporary thing. It removes a leftover only if all of this holds:
+before it makes its first temporary file. It removes a leftover only if all of this holds:
 
 * its process has certainly ended (`has_ended`), and no process holds the lock of its folder,
-* it belongs to this user, and its name has the token of that process,
+* the leftover belongs to this user, and its name has the token of that process,
 * it is a folder or a regular file. A symbolic link that looks like a leftover stays, and so does its target.
 
-A crash of the machine leaves things that no later process can tell from those of other hosts. The next hunt in a
-directory removes the scratch there, and the system clears its folder for temporary files.
+After a crash of the machine, no process can distinguish its temporary files from those of other hosts. The next hunt in
+a directory removes the scratch there, and the system clears its folder for temporary files.
 
-The page `reference/files.md` of the guide lists every temporary thing.
+The page `reference/files.md` of the guide lists every temporary file.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ _TOKEN = re.compile(r"(?<![0-9])([0-9]{1,10})-([0-9]{1,20})-([0-9a-f]{12})-([0-9
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """A process, as the names of its temporary things give it.
+    """A process, as identified by the names of its temporary files.
 
     Args:
         pid: process id in its own PID namespace.
@@ -121,7 +121,7 @@ def _owner(pid: int) -> Owner:
 
 
 def _namespace(kind: str) -> str:
-    """Return what names a namespace of this process; nothing if the kernel is too old to have any of that kind."""
+    """Return the identifier of a namespace of this process; empty if the kernel has no namespaces of this kind."""
     try:
         return str(Path(_NAMESPACES, kind).readlink())
     except FileNotFoundError:
@@ -217,7 +217,7 @@ def release_shared_memory(scratch: Path, *, of_ended: bool = False) -> None:
 
     Args:
         scratch: the folder.
-        of_ended: only those of processes that have ended.
+        of_ended: whether to remove only segments of processes that have ended.
     """
     name = _RECORDS.format("*")
     for records in [*scratch.glob(name), *([] if of_ended else scratch.glob(f"*/{name}"))]:
@@ -291,11 +291,11 @@ def temporary_folder(purpose: str) -> Iterator[Path]:
 def temporary_beside(path: Path, *, name: str = "") -> Iterator[Path]:
     """Yield a temporary path in the same folder, and remove it at the end.
 
-    The caller makes a file or a folder there, and renames it where it is to stay.
+    The caller makes a file or a folder under this path, and renames it to its final path.
 
     Args:
-        path: what is being made; its name and its folder give those of the temporary thing.
-        name: name of the temporary thing, where it is another one; has to have the token of this process.
+        path: the final path; the temporary path has a similar name in the same folder.
+        name: another name for the temporary file; it must contain the token of this process.
     """
     there = path.with_name(name or temporary_name(path, ".part"))
     target = there.absolute()  # wherever this process goes meanwhile
@@ -313,7 +313,7 @@ def temporary_beside(path: Path, *, name: str = "") -> Iterator[Path]:
 
 
 def temporary_name(path: Path, suffix: str = "") -> str:
-    """Return a hidden name with the token of this process, for something temporary in the folder of a path.
+    """Return a hidden name with the token of this process, for a temporary file in the folder of a path.
 
     Args:
         path: path of what is being made.
@@ -328,7 +328,7 @@ def temporary_name(path: Path, suffix: str = "") -> str:
 
 
 def remove_leftovers() -> None:
-    """Remove what processes left that have ended without removing it; costs one look into a folder."""
+    """Remove the temporary files of processes that have ended; this lists one folder."""
     _things.swept = True
     place, prefix = _place()
     try:
@@ -346,7 +346,7 @@ def remove_leftovers() -> None:
 
 
 def remove_ended(folder: Path) -> None:
-    """Remove what in one folder has a hidden name with the token of a process that has ended."""
+    """Remove the files in one folder whose hidden names contain the token of a process that has ended."""
     with suppress(OSError):
         for path in list(folder.iterdir()):
             owner = owner_in(path.name) if path.name.startswith(".") else None
@@ -367,7 +367,7 @@ def remove_scratch(path: Path) -> None:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a file or a folder with everything in it, also where its permissions are in the way.
+    """Remove a file or a folder with everything in it, also if its permissions forbid that.
 
     Errors are ignored. A symbolic link is removed, not its target.
     """
@@ -394,7 +394,7 @@ class _Things:
         os.register_at_fork(after_in_child=self._forget)
 
     def _forget(self) -> None:
-        """Begin with nothing: in a new process, and in a fork, which owns nothing of what its parent has."""
+        """Forget the temporary files of the parent process, because a fork does not own them."""
         self._lock = threading.Lock()
         self._folder: Path | None = None
         self._is_shared = False
@@ -402,10 +402,10 @@ class _Things:
         self._count = self._serial = 0
 
     def make(self, made: Callable[[Path], Path]) -> Path:
-        """Have something made in the folder of this process, and return it.
+        """Create a file or folder in the temporary folder of this process, and return it.
 
         Raises:
-            OSError: it cannot be made.
+            OSError: the file or folder cannot be created.
         """
         if not self.swept:
             remove_leftovers()
@@ -425,7 +425,7 @@ class _Things:
         raise AssertionError
 
     def end(self, path: Path, *, removed: bool = True) -> None:
-        """Remove something that was made, and the folder with the last.
+        """Remove a temporary file; with the last file, also remove the folder.
 
         Args:
             path: path of it.
@@ -438,7 +438,7 @@ class _Things:
             self._leave()
 
     def next_name(self, purpose: str) -> str:
-        """Return a name that nothing in the folder has."""
+        """Return a name that is not used in the folder."""
         self._serial += 1
         return f"{purpose}-{self._serial}"
 
@@ -491,7 +491,7 @@ def _end(path: Path, pid: int) -> None:
 
 
 def _place() -> tuple[Path, str]:
-    """Return the folder for the folders of all processes of this user, and what their names begin with there."""
+    """Return the folder with the temporary folders of all processes of this user, and the prefix of their names."""
     usual = _temporary_files()
     place = usual / f"crashhunt-temporary-{os.getuid()}"
     try:
@@ -505,7 +505,7 @@ def _place() -> tuple[Path, str]:
 
 
 def _temporary_files() -> Path:
-    """Return the folder that `tempfile` chooses too; to import that takes longer than a look into the folder."""
+    """Return the folder for temporary files that `tempfile` would choose, without the slow import of `tempfile`."""
     named = (os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))
     for path in (*named, "/tmp", "/var/tmp", "/usr/tmp"):
         if path and os.path.isdir(path) and os.access(path, os.W_OK | os.X_OK):  # noqa: PTH112
@@ -550,7 +550,7 @@ def _remove_if_ours(path: Path, token: str) -> bool:
 
 
 def _is_there(path: Path) -> bool:
-    """Return whether there is anything of that name, a broken symbolic link too."""
+    """Return whether a path exists; a broken symbolic link counts."""
     try:
         path.lstat()
     except OSError:

@@ -1,7 +1,7 @@
 """Text from outside: agents, simulators, networks, the operating system, and senders of crashes.
 
-A name may hold any character, and a terminal obeys some of them: it moves the cursor, clears lines, retitles its
-window, or reorders letters. Files keep the original text. Printed text is made visible first.
+A name may contain control characters that move the cursor of a terminal, clear lines, retitle its window, or reorder
+letters. Files keep the original text. Printed text is made visible first.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _BREAKS = re.compile(r"[^\S\n]*(?:\r\n|[\n\r\v\f\x1c-\x1e\x85\u2028\u2029])\s*")
 
 
 def encodable(text: str) -> str:
-    """Return the text so that it can be written as UTF-8: half a pair of surrogates, as in names of files, is spelt."""
+    """Return a text that can be written as UTF-8: single surrogates, as in names of files, become escapes."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def visible(text: str) -> str:
-    """Return a text in which every character that a terminal would obey is written out, but for newline and tab."""
+    """Return a text in which escapes replace all control characters except newline and tab."""
     if _ASCII.fullmatch(text):
         return text
     return "".join(map(_seen, text.replace("\r\n", "\n")))
@@ -71,8 +71,8 @@ def near_path(path: Path, *endings: str) -> str:
     """Return ``did you mean 'PATH'? `` for a missing path: a folder with a similar name, or a file with an ending.
 
     Args:
-        path: that is not there.
-        endings: endings of the files that would do as well.
+        path: the missing path.
+        endings: the endings of files that are also accepted.
     """
     try:
         siblings = sorted(path.parent.iterdir())
@@ -88,7 +88,7 @@ def near_path(path: Path, *endings: str) -> str:
 
 
 def listed(known: Iterable[str], *, none: str = "none") -> str:
-    """Return names in one line; of very many, the first."""
+    """Return names in one line; a long list is cut."""
     names = list(known)
     more = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
     return f"{', '.join(names[:_SHOWN])}{more}" or none
@@ -98,10 +98,10 @@ def one_of(name: str, known: Iterable[str], *, give: str = "give one of", none: 
     """Return the fix for an unknown name: the most similar name, and all names.
 
     Args:
-        name: the one that is not known.
-        known: those that are.
-        give: what to say before them.
-        none: what to say instead where there are none.
+        name: the unknown name.
+        known: the known names.
+        give: the text before the known names.
+        none: the text if there are no known names.
     """
     names = list(known)
     return f"{did_you_mean(name, names)} {give} {listed(names, none=none)}".lstrip()
@@ -112,12 +112,12 @@ def out_of(done: int, planned: int, separator: str = " of ") -> str:
 
     Args:
         done: number of trials that have ended.
-        planned: number of planned trials; 0 for no limit. A resumed hunt may have fewer of them than have ended.
+        planned: number of planned trials; 0 for no limit. In a resumed hunt, it may be smaller than ``done``.
         separator: text between the two numbers.
     """
     return f"{done}{separator}{planned}" if planned and done <= planned else str(done)
 
 
 def _plain(name: str) -> str:
-    """A name without what people mix up: upper and lower case, ``-`` and ``_``."""
+    """Return a name in lower case, with ``_`` in place of ``-``, so that similar names can be compared."""
     return name.lower().replace("_", "-")

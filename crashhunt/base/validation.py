@@ -1,4 +1,4 @@
-"""Validated dataclasses: pydantic validates, and its finding becomes one line of ours.
+"""Validates dataclasses with pydantic, and reports its first error as one line of crashhunt.
 
 Data that match exactly are built without pydantic, because its import and schemas take a third of a worker's start.
 """
@@ -44,11 +44,12 @@ def validate(
 
     Args:
         kind: the dataclass.
-        data: as it was read from TOML or JSON.
+        data: the data that were read from TOML or JSON.
         where: the file, for the error.
-        error: the error to raise; its message has key and value, its fix says what would do.
-        under: the key of the table that this is, where it is one of a file.
-        keys: returns what a file may have at its top, where that is not what the dataclass has.
+        error: the class of the error; its message has key and value, and its fix says which values are valid.
+        under: the key of the table in its file; empty for the whole file.
+        keys: returns the keys that are allowed at the top of the file, if these differ from the fields of the
+            dataclass.
     """
     try:
         return cast(T, _built(kind, data))
@@ -67,11 +68,11 @@ class _Place:
 
 
 class _NotToTheLetterError(Exception):
-    """Data that do not match exactly: they may be wrong, or pydantic may convert them."""
+    """The data do not match the dataclass exactly: they may be wrong, or pydantic may convert them."""
 
 
 def _built(kind: Any, data: Any) -> Any:
-    """Build the object that pydantic would build, for the types of our tables; raise where the result is doubtful."""
+    """Build the object that pydantic would build; raise an error for types or values that only pydantic handles."""
     if is_dataclass(kind):
         return _dataclass_built(cast(type, kind), data)
     if kind in (Any, object) or type(data) is kind:
@@ -141,7 +142,7 @@ def _validated(kind: type[T], data: object, place: _Place) -> T:
 
 
 def _telling(errors: Sequence[ErrorDetails]) -> ErrorDetails:
-    """Return the first of several mistakes; a misspelt key is preferred to the missing key that it causes."""
+    """Return the error to report; a misspelt key is preferred to the missing key that it causes."""
     first = errors[0]
     if first["type"] in _MISSING:
         for other in errors[1:]:

@@ -163,7 +163,7 @@ def _explained(error: Exception) -> CrashhuntError:
 
     frames = traceback.extract_tb(error.__traceback__)
     where = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
-    fix = "CRASHHUNT_TRACEBACK=1 shows how it came to it; if no module of yours is to blame, report it"
+    fix = "set CRASHHUNT_TRACEBACK=1 to see the traceback; if none of your modules is to blame, please report it"
     return CrashhuntError(f"this should not happen: {in_words(error)}", fix=fix, where=where)
 
 

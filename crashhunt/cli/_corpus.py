@@ -158,7 +158,8 @@ def _summary_of(reports: list[CaseReport], count: int) -> str:
     lines += [f"{report.path.name}: {report.line}" for report in reports if report.ok and report.got == "still"]
     tighter = [report for report in reports if report.may_be_tightened]
     lines += [
-        f"{report.path.name}: fixed, and may be tightened: {report.path / layout.CASE} may say fixed"
+        f"{report.path.name}: fixed; to be warned if it crashes again, set expect = 'fixed' in "
+        f"{report.path / layout.CASE}"
         for report in tighter
     ]
     counts = ", ".join(

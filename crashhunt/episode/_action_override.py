@@ -29,15 +29,15 @@ _SPEEDS = ("FASTER", "SLOWER")
 
 
 def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -> Agent:
-    """Return an agent that drives as another one up to a step.
+    """Return an agent that drives like a given agent up to a step, and is overridden after it.
 
     Args:
-        driver: the other actor.
-        simulator: which has been reset.
-        overruled: how, and from when on.
+        driver: the given agent.
+        simulator: the simulator, after its reset.
+        overruled: the kind of override, and the step after which it begins.
 
     Raises:
-        InvalidEpisodeError: the simulator does not know how.
+        InvalidEpisodeError: the simulator does not support this override.
     """
     if overruled.reference:
         return ReferenceDriver(driver, simulator, overruled)
@@ -51,7 +51,7 @@ class Braking:
 
     Args:
         driver: the agent.
-        simulator: which knows how the vehicle brakes.
+        simulator: the simulator, which provides the action for full braking.
         agent: the vehicle.
         after: the step after which it brakes.
         manoeuvre: as in `Overruled`.
@@ -75,7 +75,7 @@ class Braking:
         self._driver.reset(seed)
 
     def act(self, observation: object) -> object:
-        """Return the driver's action, or that of braking."""
+        """Return the driver's action, or the braking action after the step."""
         step, self._step = self._step, self._step + 1
         if step == self._after:
             return self._first
@@ -88,14 +88,14 @@ class Braking:
 
 
 class Keeping:
-    """Lets an agent drive, and from a step on keeps it from changing lanes, or from changing its speed.
+    """Lets an agent drive, and from a step on prevents lane changes or speed changes of its vehicle.
 
     Args:
         driver: the agent.
-        simulator: which knows how fast the vehicle is.
+        simulator: the simulator, which reports the speed of the vehicle.
         agent: the vehicle.
-        after: the step after which it is kept from that.
-        keeps: ``lane`` keeps it from changing lanes, ``speed`` holds its speed.
+        after: the step after which the vehicle is held.
+        keeps: ``lane`` prevents lane changes, ``speed`` holds the speed.
 
     Raises:
         InvalidEpisodeError: The action form has no known lanes and speeds.
@@ -143,11 +143,10 @@ class Keeping:
 
 
 class TakingOver:
-    """Plays the recorded actions of a vehicle up to a step, and asks its agent from that step on.
+    """Plays the recorded actions of a vehicle up to a step, and lets its agent act from that step on.
 
-    The agent is made before the first step, as in every trial. It is reset after the last recorded action, with the
-    seed of the trial, and the first observation that it is shown is that after the step. The new agent has no
-    observation of earlier steps.
+    The agent is made before the first step, as in every trial. The agent is reset after the last recorded action, with
+    the seed of the trial. Its first observation is the one after this step, so it has no observation of earlier steps.
 
     Args:
         driver: the agent.
@@ -165,7 +164,7 @@ class TakingOver:
         self._recorded.reset(seed)
 
     def act(self, observation: object) -> object:
-        """Return the recorded action, or that of the agent."""
+        """Return the recorded action, or the agent's action after the handover."""
         step, self._step = self._step, self._step + 1
         if step < self._after:
             return self._recorded.act(observation)
@@ -180,16 +179,16 @@ class TakingOver:
 
 
 def _idle(form: ActionForm) -> int | None:
-    """The action of doing nothing; None if there is none."""
+    """Return the action that changes nothing; None if there is none."""
     space = form.space
     return tuple(space.meanings).index("IDLE") if supports(space, HasMeanings) and "IDLE" in space.meanings else None
 
 
 def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
-    """The action that changes lanes, and brakes where one action can say both.
+    """Return the action that changes lanes, and also brakes if one action can do both.
 
     Raises:
-        InvalidEpisodeError: the vehicle has none.
+        InvalidEpisodeError: the vehicle has no action for a lane change.
     """
     form = simulator.actions[agent]
     if tuple(form.names) == ("target_speed", "lane_change"):
@@ -221,7 +220,7 @@ _LANE_OFFSETS = {"LANE_LEFT": 1, "LANE_RIGHT": -1}
 
 @dataclass(slots=True)
 class _Response:
-    """A period in which the reference driver answers in the same way to the same actor."""
+    """A period in which the reference driver reacts in the same way to the same actor."""
 
     faculty: str
     kind: str
@@ -238,11 +237,11 @@ class _Response:
 
 
 class ReferenceDriver:
-    """Lets an agent drive, and from a step on answers for one of its faculties where its action is not safe.
+    """Lets an agent drive, and from a step on corrects its unsafe speeds, lane changes, or both.
 
     Args:
         driver: the agent.
-        simulator: which knows the surroundings of the vehicle.
+        simulator: the simulator, which reports the surroundings of the vehicle.
         overruled: the vehicle, the step, and the faculty.
 
     Raises:
@@ -274,7 +273,7 @@ class ReferenceDriver:
 
     @property
     def responses(self) -> list[JsonObject]:
-        """The periods in which the reference driver answered, or would have, as plain data, in the order of steps."""
+        """The periods in which the reference driver corrected the agent, or would have, as plain data by step."""
         return [one.to_json() for one in self._responses]
 
     def reset(self, seed: int) -> None:
@@ -284,7 +283,7 @@ class ReferenceDriver:
         self._driver.reset(seed)
 
     def act(self, observation: object) -> object:
-        """Return the agent's action where it is safe, and otherwise the answer of the reference driver."""
+        """Return the agent's action if it is safe, and otherwise the corrected action."""
         step, self._step = self._step, self._step + 1
         action = self._driver.act(observation)
         if step < self._after:
@@ -322,13 +321,13 @@ class ReferenceDriver:
         return action
 
     def _reached(self, target: float, around: Surroundings) -> float:
-        """Return the speed after the step with a target speed, in m/s."""
+        """Return the speed that the vehicle has one step after an action with this target speed, in m/s."""
         speed = around.speed_mps
         highest = speed + around.acceleration_mps2 * self._step_s
         return max(min(target, highest), speed - around.braking_mps2 * self._step_s)
 
     def _limit(self, step: int, target: float, reached: float, around: Surroundings) -> float | None:
-        """Return the safe speed where the vehicle would be faster after the step, in m/s; None if it is safe."""
+        """Return the safe speed if the vehicle would be faster after the step, in m/s; None if its speed is safe."""
         neighbors = [*around.ahead]
         neighbors += [stop for one in around.crossing if (stop := self._stop_before(one, target, around)) is not None]
         limit, why = min(((self._safe_speed(one, around), one) for one in neighbors), key=_first, default=(None, None))
@@ -376,7 +375,7 @@ class ReferenceDriver:
         )
 
     def _allowed_change(self, step: int, change: int, around: Surroundings) -> bool:
-        """Return whether a lane change is safe: both gaps of the target lane are."""
+        """Return whether a lane change is safe: the gaps ahead and behind in the target lane are safe."""
         side = around.sides.get(change) if change else None
         if side is None:
             return True

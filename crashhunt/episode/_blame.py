@@ -1,4 +1,4 @@
-"""Whose code an exception comes from: the simulator's, a user's environment or oracle, or crashhunt's own."""
+"""Finds the party whose code raised an exception: the simulator, a user's environment or oracle, or crashhunt."""
 
 from __future__ import annotations
 
@@ -70,8 +70,9 @@ def party_of_simulator(simulator: Simulator) -> Party:
 def blame(error: BaseException, simulator: Simulator, place: str = "") -> Blame:
     """Return the party that wrote the code of an exception, if it is not an agent.
 
-    The wrapper of a boundary says it. Without a wrapper the exception is crashhunt's own. Two kinds are not: an error
-    that an adapter raises on purpose (`SimulatorError`), and an error that has come through `foreign_packages`.
+    The wrapper of a boundary names the party. An exception without a wrapper is crashhunt's own, with two exceptions:
+    an error that an adapter raises on purpose (`SimulatorError`), and an error that has passed through
+    `foreign_packages`.
 
     Args:
         error: The exception.
@@ -93,7 +94,7 @@ def blame(error: BaseException, simulator: Simulator, place: str = "") -> Blame:
 
 
 def has_users_code(error: BaseException) -> bool:
-    """Whether an exception, or what led to it, has come through code that is neither crashhunt's nor a library's."""
+    """Return whether an exception or its cause has passed through a user's code."""
     seen: set[int] = set()
     left: list[BaseException | None] = [error]
     while left and len(seen) < _MAX_CAUSES:
@@ -111,7 +112,7 @@ def has_users_code(error: BaseException) -> bool:
 
 
 def _has_passed(error: BaseException, packages: Sequence[str]) -> bool:
-    """Whether an exception is of a class of one of these packages, or has come through code of them."""
+    """Return whether an exception's class belongs to these packages, or it passed through their code."""
     modules: set[object] = {type.__dict__["__module__"].__get__(type(error))}
     link: TracebackType | None = error.__traceback__
     while link is not None:
@@ -186,7 +187,7 @@ def internal_error(error: BaseException, trial: int | None = None, steps: int | 
     Args:
         error: The exception.
         trial: Number of the trial; None if it is not known.
-        steps: Number of steps that were complete, -1 for the set-up; None if it is not known.
+        steps: Number of completed steps; -1 if the trial was being set up; None if unknown.
     """
     if type(error) is InternalError:
         return error

@@ -71,11 +71,11 @@ class _Crashed:
     """A branch that crashed.
 
     Args:
-        took_place: those of its disturbances that took place.
-        branched: step after which it was branched.
-        outcome: outcome of it.
-        step: at which it ended.
-        log_likelihood: as `Branch` has it.
+        took_place: the disturbances of the branch that took place.
+        branched: step after which the branch began.
+        outcome: outcome of the branch.
+        step: step at which the branch ended.
+        log_likelihood: as in `Branch`.
     """
 
     took_place: tuple[Disturbance, ...]
@@ -121,7 +121,7 @@ class Brancher(Observer):
 
     @property
     def why_not(self) -> str:
-        """Why there are no branches any more, in words; empty if there are."""
+        """The reason why branches have ended, in words; empty if there are still branches."""
         return self._questions.why_not
 
     def stop(self, why_not: str) -> None:
@@ -129,7 +129,7 @@ class Brancher(Observer):
         self._questions.stop(why_not)
 
     def begin(self, episode: Episode) -> None:
-        """Note how long a second is; the next episode begins."""
+        """Begin the next episode, and compute the number of steps per second."""
         self._second = steps_of(1.0, episode.simulator.step_length_s)
         self._frames = deque(maxlen=_WINDOW_S * self._second + 1)
         self._branches, self._draws, self._rests_until = Branches(), 0, 0
@@ -186,7 +186,7 @@ class Brancher(Observer):
         return self._asleep[-1]
 
     def close(self) -> None:
-        """End all copies, unless an agent has forked, and this is what it has forked: they are not its own."""
+        """End all copies, except in a process that an agent has forked itself: the copies are not its children."""
         while self._asleep and os.getpid() == self._owner:
             self._asleep.pop().copy.end()
 
@@ -225,7 +225,7 @@ class Brancher(Observer):
         return True
 
     def _ask_for_everything(self, episode: Episode, sleeper: _Sleeper) -> None:
-        """Run a branch with all disturbances at once; while it crashes, run it with one disturbance less."""
+        """Run a branch with all disturbances at once; while it crashes, repeat it with one disturbance less."""
         self._strongest_at = episode.steps + _STRONGEST_S * self._second
         if self._is_spent(episode):
             return
@@ -253,7 +253,7 @@ class Brancher(Observer):
                 self._take(episode, found)
 
     def _look(self, episode: Episode, now: int) -> None:
-        """Ask the copies from a moment that was near to a crash, and nearer than those around it."""
+        """Run branches from a moment whose criticality is high, and higher than that of the moments around it."""
         second = self._second
         if not self._asleep or now < self._rests_until:
             return
@@ -288,16 +288,16 @@ class Brancher(Observer):
             self._take(episode, found)
 
     def _span(self, sleeper: _Sleeper) -> tuple[int, int]:
-        """The step after which disturbances of a branch begin, and the one in which it ends."""
+        """Return the step after which the disturbances of a branch begin, and the step in which the branch ends."""
         return sleeper.step + _BEGINS - 1, sleeper.step + round(_HORIZON_S * self._second)
 
     def _branch(
         self, episode: Episode, sleeper: _Sleeper, choices: Sequence[Sequence[Disturbance]], until: int
     ) -> _Crashed | None:
-        """Run a branch with other disturbances: of each choice, the first one with a target vehicle.
+        """Run a branch with other disturbances: from each choice, the first disturbance with a target vehicle.
 
         Returns:
-            None if it has not crashed, or no copy has answered.
+            None if the branch has not crashed, or has no result.
         """
         job: Plain = {"choices": [[one.to_json() for one in some] for some in choices], "until": until}
 
@@ -334,7 +334,7 @@ class Brancher(Observer):
         return self._asleep[-1].copy
 
     def _take(self, episode: Episode, found: _Crashed) -> None:
-        """Take a crash in, as a specification from the start."""
+        """Add a crashed branch, as a specification from the start."""
         begun = [one for one in episode.spec.disturbances if one.step <= found.branched + _BEGINS - 1]
         planned = in_turn([*begun, *found.took_place])
         branch = Branch(

@@ -106,14 +106,14 @@ class DisturbanceInjector:
         self._before: Mapping[str, Array] = {}
 
     def add(self, disturbance: Disturbance) -> None:
-        """Plan one more; not before the step after the next."""
+        """Plan one more disturbance, which begins at the earliest in the step after the next."""
         waits = self._agent_waits if disturbance.what in OF_AGENT else self._traffic_waits
         waits.append(disturbance)
         waits.sort(key=lambda one: (one.agent, one.what))  # as a specification has those of one step
         waits.sort(key=lambda one: one.step, reverse=True)
 
     def replan(self, disturbances: Sequence[Disturbance]) -> None:
-        """Plan others in place of those that were planned for after the next step."""
+        """Replace the disturbances that were planned for the steps after the next."""
         for waits in (self._traffic_waits, self._agent_waits):
             waits[:] = [one for one in waits if one.step <= self._step + 1]
         for one in disturbances:
@@ -127,7 +127,7 @@ class DisturbanceInjector:
         )
 
     def first(self, observations: Observations) -> Observations:
-        """Return what agents are shown in the first step."""
+        """Return the observations of the agents for the first step."""
         return self._shown(observations)
 
     def step(self, actions: Mapping[str, Array]) -> StepResult:
@@ -147,11 +147,11 @@ class DisturbanceInjector:
         return self._shown(observations), *rest  # type: ignore[return-value]
 
     def end(self, result: TrialResult) -> TrialResult:
-        """Return the result with what took place."""
+        """Return the result with the disturbances that took place."""
         return in_effect(result, self._reported)
 
     def _is_due(self, step: int) -> bool:
-        """Whether a vehicle begins to err in this step, or an agent in the next, before which it is shown something."""
+        """Return whether a disturbance begins: of a vehicle in this step, or of an agent in the next step."""
         traffic, agents = self._traffic_waits, self._agent_waits
         return bool((traffic and traffic[-1].step <= step) or (agents and agents[-1].step <= step + 1))
 
@@ -167,7 +167,7 @@ class DisturbanceInjector:
         return steps_of(seconds, self._dt)
 
     def _begin(self, planned: Disturbance) -> None:
-        """Have a vehicle err from this step on, where there is one that can."""
+        """Disturb a vehicle from this step on, if there is a suitable vehicle."""
         last = self._step + self._steps(planned.how_long) - 1
         vehicle = self._target(planned)
         active = None
@@ -205,7 +205,7 @@ class DisturbanceInjector:
         return found
 
     def _shown(self, observations: Observations) -> Observations:
-        """Return what agents are shown in the next step."""
+        """Return the observations of the agents for the next step, with their disturbances."""
         step, found = self._step + 1, dict(observations)
         while self._agent_waits and self._agent_waits[-1].step <= step:
             self._begin_of_agent(self._agent_waits.pop(), found)
@@ -217,7 +217,7 @@ class DisturbanceInjector:
         return found
 
     def _begin_of_agent(self, planned: Disturbance, observations: Observations) -> None:
-        """Have an agent see or act late from the next step on, where it does not already."""
+        """Begin a disturbance of an agent's observations or actions in the next step, unless one is active."""
         agent, kind = planned.agent, planned.what
         going_on = (going for going in self._going if going.last > self._step)  # others are let go in the next step
         already = any(going.vehicle == agent and going.what == kind for going in going_on)

@@ -108,30 +108,31 @@ ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # never written to
 
 
 class Episode(Forkable, Ending):
-    """One trial, a step at a time; between two steps, everything about it can be looked at.
+    """One trial that runs step by step; between two steps, its whole state can be examined.
 
-    Whatever agent, simulator, oracles or observers raise ends the episode, and is in its result. Of a simulator that
-    is one for the process, only one episode runs at a time. The random generators of the process are left alone.
+    An exception of agent, simulator, oracle or observer ends the episode and is in its result. If a process can have
+    only one simulator of a kind, only one episode may run at a time. The episode does not seed the random generators of
+    the process.
 
     Args:
         spec: which trial.
         simulator: where.
-        make_agent: called with agent id, simulator and arguments; returns the agent at the wheel.
-        oracles: what decides whether a step is a crash.
+        make_agent: called with agent id, simulator and arguments; returns the agent that drives.
+        oracles: the oracles, which decide whether a step is a crash.
         crash_on: The outcomes that end the episode; after other traffic crashes and events, the episode continues.
         observers: Observers, called in this order.
         forks: Whether the episode may be forked; it then notes the open files before the agents are made.
-        reset: what resets the simulator, where it is not the simulator itself.
+        reset: a function that resets the simulator; None for the simulator's own `reset`.
 
     Attributes:
         spec: which trial.
         simulator: where.
         names: all actors, in the order of their numbers; empty before the start.
-        agents: agents by name; one that is replaced between two steps is asked from the next one on.
-        acting: the numbers of those that act in the next step.
+        agents: agents by name; an agent that is replaced between two steps acts from the next step on.
+        acting: the numbers of the agents that act in the next step.
         steps: number of completed steps.
         result: The result; None while the episode runs.
-        error: the exception that ended it, where one did; until it is closed.
+        error: the exception that ended the episode, until `close`; None if there was none.
         setup_s: wall time that `start` took, in s.
         setup_steps: number of steps before the first one; None if the simulator does not report it.
     """
@@ -199,7 +200,7 @@ class Episode(Forkable, Ending):
 
     @property
     def rewards(self) -> Mapping[str, float]:
-        """The rewards of the last step, of the agents that acted in it."""
+        """The rewards of the agents that acted in the last step."""
         return self._rewards
 
     @property
@@ -216,7 +217,7 @@ class Episode(Forkable, Ending):
         """Reset the simulator and make the agents.
 
         Returns:
-            None if the first step can be taken, the result where not.
+            None if the first step can be taken, otherwise the result.
 
         Raises:
             RecorderError: the disk is full.
@@ -233,14 +234,14 @@ class Episode(Forkable, Ending):
         """Get the actions of the agents, advance the simulator by one step, and check the result with the oracles.
 
         Args:
-            given: by name, the encoded actions of agents that are not asked in this step.
+            given: agent id to encoded action, for agents that do not act themselves in this step.
 
         Returns:
             None if the next step can be taken, the result where not.
 
         Raises:
             RecorderError: the disk is full.
-            RuntimeError: it is over, or has not been started.
+            RuntimeError: the episode has ended or has not been started.
         """
         if self.result is not None or self._scene is None:
             raise RuntimeError("the episode is over" if self.result is not None else "the episode has not been started")
@@ -325,17 +326,17 @@ class Episode(Forkable, Ending):
         self._look_away()  # observers may hold the episode
 
     def disturb(self, disturbance: Disturbance) -> None:
-        """Have one more disturbance take place than was planned, not before the step after the next.
+        """Add a disturbance that was not planned; it begins at the earliest in the step after the next.
 
         Raises:
-            RuntimeError: the episode was not made for it, with ``forks``.
+            RuntimeError: the episode was not made with ``forks``.
         """
         if self._disturbed is None:
             raise RuntimeError("only an episode that may be forked can get disturbances while it runs")
         self._disturbed.add(disturbance)
 
     def replan(self, disturbances: Sequence[Disturbance]) -> None:
-        """Have others take place than what was planned for after the next step; the specification says so as well."""
+        """Replace the disturbances that are planned for the steps after the next, also in the specification."""
         if self._disturbed is not None:
             self._disturbed.replan(disturbances)
         begun = [one for one in self.spec.disturbances if one.step <= self.steps + 1]
@@ -457,7 +458,7 @@ class Episode(Forkable, Ending):
         return self._end(Outcome.SURVIVED) if self.steps >= self._max_steps else None
 
     def _find(self, scene: Scene) -> Finding | None:
-        """What the oracles find in a scene, of what ends the episode."""
+        """Return the findings of the oracles in a scene that end the episode."""
         findings: list[Finding] = []
         for check in self._checks:
             if found := check(scene, self.names):
@@ -471,7 +472,7 @@ def _require_reseeding(simulator: Simulator) -> None:
     """Check that a simulator's generators can get another seed.
 
     Raises:
-        InvalidEpisodeError: they cannot.
+        InvalidEpisodeError: the generators cannot get another seed.
     """
     if not supports(simulator, Reseeds):
         raise InvalidEpisodeError("its simulator offers no way to re-seed its random generators")

@@ -1,4 +1,4 @@
-"""How an episode fails: which part of it an exception comes from, what is reported of it, and how the episode ends."""
+"""Failures of episodes: the part that raised an exception, the reported evidence, and the end of the episode."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _KINDS: tuple[tuple[type[BaseException], str], ...] = (
 
 
 def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str = "", place: str = "") -> Failure:
-    """Return what a result says about an exception.
+    """Return the evidence of an exception for the result of a trial.
 
     Args:
         error: The exception. A long message or traceback is cut, with a note.
@@ -90,7 +90,7 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str 
 
 @contextmanager
 def _deep_enough() -> Iterator[None]:
-    """Have Python recurse as deep as it does by default, whatever an agent has set."""
+    """Restore Python's default recursion limit, which an agent may have changed."""
     limit = sys.getrecursionlimit()
     sys.setrecursionlimit(max(limit, _MIN_RECURSION_LIMIT))
     try:
@@ -109,12 +109,12 @@ def is_emptied() -> bool:
 
 
 def message_of_error(error: BaseException) -> str:
-    """Return the message of an exception, which may be of a class that cannot even say it; a long one is cut."""
+    """Return the message of an exception, also if its class cannot produce one; a long message is cut."""
     return message_of(error)
 
 
 def close_agent(agent: Agent) -> None:
-    """Close an agent; whatever comes of that, the episode is over."""
+    """Close an agent, and ignore its exceptions, because the episode is over."""
     try:
         if supports(agent, Closes):
             agent.close()
@@ -154,7 +154,7 @@ class Attribution:
 
     Args:
         agent: identifier of the agent; empty if it is one of several.
-        cause: what an agent has done to make another part fail, as a clause; empty if its own code raised.
+        cause: the action of an agent that made another part fail, as a clause; empty if the agent's own code raised.
     """
 
     agent: str
@@ -163,7 +163,7 @@ class Attribution:
 
 @dataclass(slots=True)
 class _Originals:
-    """What code of the process was like before a trial ran."""
+    """The functions and limits of the process before a trial ran."""
 
     packages: frozenset[str]
     functions: dict[str, dict[str, object]]
@@ -179,7 +179,7 @@ _originals: list[_Originals] = []
 def record_originals() -> None:
     """Record the functions of simulators and their libraries, and the limits of this process.
 
-    What an agent replaces later is found by comparison, when something fails. Call it once all code is imported and
+    After a failure, a comparison shows which functions an agent has replaced. Call it once all code is imported and
     before a trial runs.
     """
     packages = _packages_of_simulators()
@@ -236,7 +236,7 @@ def is_tampered() -> bool:
 
 
 def _is_users_or_nothing(value: object) -> bool:
-    """Whether what stands in the place of a function is none, or a user's."""
+    """Return whether the replacement of a function is no function, or a function of the user."""
     return not callable(value) or _is_users_module(_module_of_value(value))
 
 
@@ -252,9 +252,9 @@ def _packages_of_simulators() -> frozenset[str]:
 def attribute_error(
     error: BaseException, agents: Mapping[str, object], simulator: object, observing: Sequence[object] = ()
 ) -> Attribution | None:
-    """Return which agent an exception comes from; None if it comes from another part, or that is not known.
+    """Return which agent an exception comes from; None if it comes from another part, or the part is not known.
 
-    It is an agent's where
+    The exception is attributed to an agent if
 
     - a function on its traceback, or on that of its cause, is a method of the agent's class, or defined in a module
       that only the agent uses. A module that environment, oracles or observers use as well counts as theirs.
@@ -330,7 +330,7 @@ def _agent_on_stack(
 
 
 def _frames_of(error: BaseException) -> Iterator[FrameType]:
-    """Yield the frames that an exception came through, the innermost first, and then those of its causes."""
+    """Yield the frames of an exception's traceback, the innermost first, and then the frames of its causes."""
     one: BaseException | None = error
     for _ in range(_MAX_CAUSES):
         if one is None:
@@ -345,7 +345,7 @@ def _frames_of(error: BaseException) -> Iterator[FrameType]:
 
 
 def _classes_of(thing: object) -> Iterator[tuple[str, str]]:
-    """Yield module and qualified name of the classes of an object and of what it consists of, but for crashhunt's."""
+    """Yield module and qualified name of the classes of an object and of its parts, except crashhunt's classes."""
     left: list[tuple[object, int]] = [(thing, 0)]
     seen: set[int] = set()
     while left and len(seen) < _MAX_HELD:
@@ -381,7 +381,7 @@ def _is_instance(value: object) -> bool:
 
 
 def _with_helpers(modules: Iterable[str]) -> set[str]:
-    """Return modules of a user's, and those of the user's that they refer to, directly or by others."""
+    """Return some modules of a user, and all modules of the user that they refer to, directly or indirectly."""
     found: set[str] = set()
     left = list(modules)
     while left and len(found) < _MAX_MODULES:
@@ -414,9 +414,9 @@ def _is_users_module(name: str) -> bool:
 
 
 def _replaced_function(frames: list[FrameType], others: set[str]) -> str:
-    """Return what an agent has replaced of the functions that frames refer to, as a clause; empty for nothing.
+    """Return which function on the frames an agent has replaced, as a clause; empty for none.
 
-    crashhunt itself, the libraries that are watched, environments and oracles replace functions by some of their own.
+    Replacements by crashhunt, the watched libraries, environments and oracles do not count.
     """
     if not _originals:
         return ""
@@ -442,7 +442,7 @@ def _replaced_function(frames: list[FrameType], others: set[str]) -> str:
 
 
 def _lowered_limit(error: BaseException) -> str:
-    """Return which limit an agent has lowered that an exception is due to, as a clause; empty for none."""
+    """Return which limit that caused an exception was lowered by an agent, as a clause; empty for none."""
     if not _originals:
         return ""
     before = _originals[0]
@@ -487,12 +487,12 @@ class Ending:
         party: Party = Party.AGENT,
         place: str = "",
     ) -> TrialResult:
-        """End with an exception of foreign code, by default an agent's."""
+        """End the episode with an exception of foreign code, by default of an agent."""
         self.error = error
         return self._end(outcome, failure=failure_of(error, agent, cause=cause, party=party, place=place))
 
     def _fail_in_simulator(self, error: BaseException, place: str = "step") -> TrialResult:
-        """End with an exception that was raised while the simulator was running, by itself or by code of an agent.
+        """End the episode with an exception that the simulator or an agent raised during a step of the simulator.
 
         Raises:
             RecorderError: the disk is full.
@@ -507,7 +507,7 @@ class Ending:
         return self._fail(Outcome.SIMULATOR_ERROR, blamed.error, party=party, place=blamed.place)
 
     def _fail_in_set_up(self, error: BaseException) -> TrialResult:
-        """End with an exception that was raised before the first step, outside of the agents' own methods.
+        """End the episode with an exception that was raised before the first step, outside the agents' own methods.
 
         Raises:
             RecorderError: the disk is full.
@@ -522,7 +522,7 @@ class Ending:
         return self._fail(Outcome.INVALID, blamed.error, party=party, place=blamed.place)
 
     def _fail_in_conversion(self, error: BaseException, agent: str) -> TrialResult:
-        """End with an exception that was raised while an agent's action was encoded.
+        """End the episode with an exception that was raised while an agent's action was encoded.
 
         Raises:
             RecorderError: the disk is full.
@@ -550,7 +550,7 @@ class Ending:
         return blamed, found
 
     def end_by_agent(self, error: BaseException) -> TrialResult | None:
-        """End with an exception that an agent's code has raised between two steps, as a signal handler may.
+        """End the episode with an exception that an agent's code raised between two steps, as in a signal handler.
 
         Returns:
             The result; None if the exception does not come from an agent.
@@ -561,7 +561,7 @@ class Ending:
         return None if found is None else self._fail(Outcome.AGENT_ERROR, error, found.agent, found.cause)
 
     def _attribute(self, error: BaseException) -> Attribution | None:
-        """Return which agent has made something fail; None if none has, as far as is known."""
+        """Return the agent that caused a failure; None if no agent is known to have caused it."""
         return attribute_error(error, self.agents, self.simulator, (*self._oracles, *self._observers))
 
     def _end(self, outcome: Outcome, **evidence: Any) -> TrialResult:
@@ -582,7 +582,7 @@ class Ending:
 
         Raises:
             RecorderError: the disk is full.
-            InternalError: it is crashhunt's own, and no agent has caused it as far as is known.
+            InternalError: the exception is crashhunt's own, and no agent is known to have caused it.
         """
         blamed, found = self._blame(error)
         if found is None and blamed.party is Party.CRASHHUNT and not blamed.is_resource:

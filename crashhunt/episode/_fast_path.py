@@ -4,12 +4,13 @@
 runs each part of each step in Python. After a step of the core, the simulator and the attributes of the episode hold an
 older state. Every public attribute first brings them to the state of the core.
 
-The core leaves a step where an event needs Python code: an agent appears, a vehicle has an unknown property, a signal
-changes the action. `FastPath` then completes the step, or gives its rest to `Episode`. An observer, oracle or simulator
-that needs each part of each step gets an episode without the core (`make_fast_path`).
+The core does not complete a step if an event needs Python code: an agent appears, a vehicle has an unknown property, a
+signal changes the action. `FastPath` then completes the step, or gives its rest to `Episode`. An observer, oracle or
+simulator that needs each part of each step gets an episode without the core (`make_fast_path`).
 
 Why: on the scenario ``loop``, trials of 600 steps take 1.20 times the processor time without the core's own steps
-(median of 7 pairs, in turns). A subclass in place of branches in `Episode` takes 1.02 times: no more than the noise.
+(median of 7 pairs, in turns). A subclass, compared with branches in `Episode`, takes 1.02 times the time, which is
+within the noise.
 """
 
 from __future__ import annotations
@@ -59,15 +60,15 @@ class FastPath:
     """Completes steps that the core has left, as long as no event needs Python code.
 
     Args:
-        at_once: the simulator's.
+        at_once: the simulator's object that runs uneventful steps.
         recorder: recorder of the episode.
-        agent: the only one of the episode.
-        encode: encodes its actions.
+        agent: the only agent of the episode.
+        encode: encodes the agent's actions.
 
     Attributes:
-        cannot_record: whether recording is what has failed, where something has.
-        is_resuming: whether the core was reading the simulator's state when something failed.
-        is_encoding: whether the agent's action was being encoded when something failed.
+        cannot_record: whether a failure was in the recording.
+        is_resuming: whether a failure occurred while the core read the simulator's state.
+        is_encoding: whether a failure occurred while the agent's action was encoded.
     """
 
     def __init__(
@@ -111,7 +112,7 @@ class FastPath:
         return True
 
     def _record_roster(self) -> None:
-        """Have the core record steps of the visible actors."""
+        """Make the core record steps of the visible actors."""
         self.cannot_record = True
         self._recorder.lend(self.at_once.core, self.at_once.roster)
         self.cannot_record = False
@@ -127,11 +128,11 @@ def make_fast_path(
     """Return the fast path; None if an observer needs each part of each step.
 
     Args:
-        simulator: which has been reset.
+        simulator: the simulator, after its reset.
         observers: observers of the episode.
         oracles: oracles of the episode.
         max_steps: largest number of steps of the episode.
-        encoders: encoders of the actions of each agent.
+        encoders: agent id to the function that encodes its actions.
     """
     first = observers[0] if observers else None
     if not isinstance(first, Recorder) or type(first) is not Recorder or not supports(simulator, StepsAtOnce):
@@ -151,7 +152,7 @@ def make_fast_path(
 
 
 class FastEpisode(Episode):
-    """An `Episode` whose uneventful steps the compiled core runs, where it can; results are bit-identical."""
+    """An `Episode` whose uneventful steps run in the compiled core, with bit-identical results."""
 
     _fast: FastPath | None = None
     _take: Callable[[Mapping[str, Agent]], int] | None = None
@@ -180,7 +181,7 @@ class FastEpisode(Episode):
         return self._scene
 
     def step(self, given: Mapping[str, NDArray[np.generic]] = ASK_ALL) -> TrialResult | None:
-        """Run a step, in the core where it can; `Episode.step` says the rest."""
+        """Run a step as `Episode.step` does, in the core if possible."""
         if self._take is None or given:
             self._catch_up()
             return super().step(given)
@@ -195,14 +196,14 @@ class FastEpisode(Episode):
         return None
 
     def _catch_up(self) -> None:
-        """Read the state of the core."""
+        """Bring the episode to the state of the core."""
         if self._is_behind and self._fast is not None:
             self._is_behind = False
             self._observations, self._rewards, self._terminations, *_ = self._fast.at_once.catch_up()
             self._scene = self.simulator.scene()
 
     def _finish_step(self, come: int) -> TrialResult | None:
-        """Complete a step that the core has left because of an event."""
+        """Complete a step that the core has left to Python because of an event."""
         fast = self._fast
         assert fast is not None
         try:
@@ -238,7 +239,7 @@ class FastEpisode(Episode):
             return self._break(error)
 
     def _fail_in_core(self, error: BaseException) -> TrialResult:
-        """End with an exception that has come through the core.
+        """End the episode with an exception that has passed through the core.
 
         Raises:
             RecorderError: the disk is full.

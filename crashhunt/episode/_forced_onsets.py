@@ -1,16 +1,15 @@
 """Forced onsets: copies of a root run to the end of its trial, each with a first disturbance that is forced on it.
 
-`crashhunt.disturbances.FirstOnsets` proposes the onsets with their weights. This module asks it after every step of the
-root, makes a copy for each onset, and notes how the copy ended.
+`crashhunt.disturbances.FirstOnsets` proposes the onsets with their weights. After every step of the root, this module
+makes a copy for each proposed onset, and records how the copy ended.
 
 Invariant: the root itself is a plain trial without disturbances after step 1. Looking for vehicles and making copies
 changes no bit of it.
 
-Where second onsets are forced too, a copy runs without later disturbances and is copied again for each of them. These
-copies are made by the copy itself, which answers for all of them.
-
-A copy always runs to the end of its trial: a horizon would bias the estimate, because crashes after it would be lost.
-A root with a copy that has no answer counts as incomplete, since a lost copy may have been the one that crashed.
+Where second onsets are forced too, a copy runs without later disturbances and is copied again for each of them. The
+copy makes these further copies itself, and returns the results of all of them. A copy always runs to the end of its
+trial, because a shorter run would miss later crashes and bias the estimate. If a copy has no result, its root counts as
+incomplete, since this copy may have crashed.
 
 Cost: the steps of the copies, and a fork of the process for each.
 """
@@ -52,7 +51,7 @@ class OnsetForcer:
         crash_on: the outcomes that count as a crash.
         patience_s: time limit of a copy, in s of wall time.
         delay: called with the wall time that copies have taken, in s.
-        tell: called with what the user should know.
+        tell: called with messages for the user.
     """
 
     def __init__(
@@ -75,7 +74,7 @@ class OnsetForcer:
 
     @property
     def why_not(self) -> str:
-        """Why no copies can be made any more, in words; empty if they can."""
+        """The reason why no more copies can be made, in words; empty if they can."""
         return self._questions.why_not
 
     def stop(self, why_not: str) -> None:
@@ -83,11 +82,11 @@ class OnsetForcer:
         self._questions.stop(why_not)
 
     def is_due(self, episode: Episode) -> bool:
-        """Whether the trial is a root: the law needs every step of it."""
+        """Return whether the trial is a root; every step of a root is needed."""
         return episode.spec.forcing is not None
 
     def ask(self, episode: Episode) -> None:
-        """Make the copies that leave the root after the step that is complete; also called before the first step."""
+        """Make the copies that leave the root after the completed step; also called before the first step."""
         if self._onsets is None:
             self._onsets = self._begin(episode)
         for onset in self._onsets.after(episode.steps, partial(_has_target, episode)):
@@ -104,7 +103,7 @@ class OnsetForcer:
                 self._delay(time.monotonic() - began)
 
     def result(self, result: TrialResult) -> TrialResult:
-        """Return the result of the root with what its copies have found; the next trial begins."""
+        """Return the result of the root with the results of its copies, and begin the next trial."""
         onsets, copies, steps, asked = self._onsets, tuple(self._copies), self._steps, self._questions
         self._onsets, self._copies, self._steps = None, [], 0
         if onsets is None:
@@ -129,7 +128,7 @@ class OnsetForcer:
         return FirstOnsets(self._sampler, spec.forcing, spec.seed, spec.max_steps)
 
     def _follow(self, episode: Episode, onset: Onset) -> None:
-        """Run a copy to the end of its trial, with copies of its own for second onsets, and note how they ended."""
+        """Run a copy to the end of its trial, with further copies for second onsets, and record how they ended."""
         assert self._onsets is not None
         seconds = self._onsets.following(onset)
         patience_s = self._patience_s * (1 if seconds is None else _PATIENCE_WITH_SECONDS)
@@ -155,7 +154,7 @@ class OnsetForcer:
             self._note(onset, end)
 
     def _run_with_seconds(self, copy: Episode, onset: Onset, seconds: FirstOnsets) -> Plain:
-        """Run a copy without later disturbances, and copies of it with second onsets; return how they ended."""
+        """Run a copy without later disturbances, and copies of it with second onsets; return their results."""
         ends: list[Plain] = []
         branched = copy.steps
         while copy.result is None:
@@ -171,7 +170,7 @@ class OnsetForcer:
         return {"ends": [alone, *ends]}
 
     def _note(self, first: Onset, end: JsonObject) -> None:
-        """Note how a copy ended."""
+        """Record how a copy ended."""
         outcome, step, within = str(end["outcome"]), cast(int, end["step"]), cast(float, end["within"])
         branched = cast(int, end["branched"])
         self._steps += step - branched
@@ -210,7 +209,7 @@ def _run_to_end(copy: Episode, onset: Onset, *, within: float = 1.0, second: str
 
 
 def _end_of(copy: Episode, onset: Onset, branched: int, *, within: float, second: str = "") -> Plain:
-    """Return how a copy ended, with the names of `ForcedCopy`; it ends with its process."""
+    """Return the result of a copy as a dict with the names of `ForcedCopy`."""
     result = copy.result
     assert result is not None
     return {

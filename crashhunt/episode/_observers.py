@@ -1,6 +1,6 @@
 """Observers of an episode: their protocol, their connections, and the two observers of every trial.
 
-One measures how near to a crash the episode comes, one records it in the black box.
+One measures the criticality of the episode, and one records the episode in the black box.
 """
 
 from __future__ import annotations
@@ -80,52 +80,52 @@ class Observer:
     """
 
     def begin(self, episode: Episode) -> None:
-        """The simulator has been reset, and `Episode.names` has all actors; no agent exists yet."""
+        """Called after the simulator's reset, when `Episode.names` has all actors; no agent exists yet."""
 
     def making(self, number: int) -> None:
-        """An agent is about to be made and reset.
+        """Called before an agent is made and reset.
 
         Args:
-            number: number of the agent, in `Episode.names`; -1 once every agent has been.
+            number: number of the agent, in `Episode.names`; -1 when all agents have been made.
         """
 
     def observation(self, number: int, observation: NDArray[np.generic]) -> None:
-        """An agent is about to be shown something.
+        """Called before an agent receives an observation.
 
         Args:
             number: number of the agent, in `Episode.names`.
-            observation: as it is recorded: flattened, where the agent is shown something structured.
+            observation: the observation as it is recorded; a structured observation is flattened.
         """
 
     def action(self, number: int, action: NDArray[np.generic]) -> None:
-        """An agent has answered.
+        """Called after an agent has acted.
 
         Args:
             number: number of the agent, in `Episode.names`.
-            action: encoded.
+            action: the encoded action.
         """
 
     def disturbance(self, disturbance: Disturbance) -> None:
         """Called for a disturbance that takes place, before the step in which it begins or the step after.
 
         Args:
-            disturbance: as it takes place, with who is meant; a vehicle that is not there is empty.
+            disturbance: the disturbance with its target vehicle; the vehicle is empty if there is no target.
         """
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
-        """A step is complete.
+        """Called when a step is complete.
 
         Args:
-            step: its number; 0 for the scene before the first step.
+            step: number of the step; 0 for the scene before the first step.
             scene: the current scene.
-            rewards: rewards of every agent, in the order of `Episode.names`; 0 of those that did not act.
+            rewards: reward of every agent, in the order of `Episode.names`; 0 if the agent did not act.
         """
 
     def copied(self) -> None:
-        """This process has become a copy of the one in which the episode runs, which is not to notice it."""
+        """Called in a fork of the process in which the episode runs; the fork must not affect the original."""
 
     def end(self, result: TrialResult) -> TrialResult:
-        """The episode is over; return its result, with what this observer has found out about it.
+        """Called at the end of the episode; return its result, with the data of this observer added.
 
         The hook is called again, with another result, if an observer has failed at the end.
         """
@@ -136,10 +136,10 @@ class Observer:
 
 
 def options_of(spec: TrialSpec, simulator: Simulator) -> Options:
-    """Return what a simulator is asked for with its reset.
+    """Return the options for the simulator's reset.
 
     Raises:
-        InvalidEpisodeError: it cannot do it.
+        InvalidEpisodeError: the simulator does not support an option.
     """
     options: Options = {"arguments": spec.scenario_arguments}
     if spec.only is not None:
@@ -154,12 +154,12 @@ def options_of(spec: TrialSpec, simulator: Simulator) -> Options:
 
 
 def agent_seed(seed: int, number: int) -> int:
-    """Return a seed of each agent's own, which differs from the simulator's."""
+    """Return the seed of an agent, which differs from the simulator's seed."""
     return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
 
 
 def observation_restorers(simulator: Simulator) -> dict[str, Callable[[NDArray[np.generic]], object]]:
-    """Return, by agent, what makes a structured observation again of its recorded array."""
+    """Return for each agent the function that restores a structured observation from its recorded array."""
     if not supports(simulator, FlattensObservations):
         return {}
     if supports(simulator, RestoresObservations):
@@ -188,8 +188,7 @@ class Nearness(Observer):
     """Measures the closest approach, the criticality and the driven distance, and adds them to the result.
 
     Args:
-        take_frames: returns the scenes since it was last called, such as `BlackBox.take_frames`: there they lie as
-            columns already.
+        take_frames: returns the scenes since its last call as columns, such as `BlackBox.take_frames`.
     """
 
     EVERY: ClassVar = 256
@@ -218,7 +217,7 @@ class Nearness(Observer):
         self._driven = DrivenMeter(episode.names, episode.simulator.step_length_s)
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
-        """Take in what there is, now and then."""
+        """Measure the new scenes from time to time."""
         if step and step % self.EVERY == 0:
             self._take_in()
             if sum(len(frame.columns) for frame in self._waiting) >= _AT_ONCE:
@@ -263,7 +262,7 @@ class Nearness(Observer):
 class Recorder(Observer):
     """Writes the records of an episode; adds the digest and the number of traffic events to the result.
 
-    It comes first of all observers: a step is complete when it is recorded.
+    It is the first of all observers, because a step is complete when it is recorded.
 
     Args:
         box: the black box, after a call of `BlackBox.begin`.
@@ -283,7 +282,7 @@ class Recorder(Observer):
         self.action = box.action  # type: ignore[assignment, method-assign]
 
     def lend(self, steps: UsualSteps, roster: Roster) -> None:
-        """Have the core record steps of these actors."""
+        """Let the core record steps of these actors."""
         if roster is not self._roster:
             self._note_roster(roster)
         self._box.lend(steps, roster)
@@ -301,15 +300,15 @@ class Recorder(Observer):
         self._box.prologue(Prologue(tuple(channels), simulator.step_length_s).encode(), len(channels))
 
     def making(self, number: int) -> None:
-        """Note which agent is being made, as its constructor may end the process."""
+        """Record which agent is being made, because its constructor may end the process."""
         self._box.mark(Phase.SETUP if number < 0 else Phase.ACT, max(number, 0))
 
     def observation(self, number: int, observation: NDArray[np.generic]) -> None:
-        """Record what an agent is about to be shown."""
+        """Record the observation that an agent is about to receive."""
         self._box.observation(number, observation)
 
     def action(self, number: int, action: NDArray[np.generic]) -> None:
-        """Record what an agent answered."""
+        """Record the action of an agent."""
         self._box.action(number, action)
 
     def disturbance(self, disturbance: Disturbance) -> None:
@@ -317,7 +316,7 @@ class Recorder(Observer):
         self._box.append(Tag.DISTURBANCE, 0, encode_disturbance(disturbance))
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
-        """Record a scene, and before it whatever is new about it."""
+        """Record a scene, and before it any changes of actors and lanes."""
         if scene.roster is not self._roster:
             self._note_roster(scene.roster)
         if scene.lanes:
@@ -353,7 +352,7 @@ class Recorder(Observer):
         self._roster = roster
 
     def copied(self) -> None:
-        """Record elsewhere from now on, after a copy of what there is."""
+        """Continue recording in a private copy."""
         self._box.copy()
 
     def end(self, result: TrialResult) -> TrialResult:
@@ -367,7 +366,7 @@ _ready: dict[int, tuple[ActionForm, NDArray[np.generic]]] = {}  # by identity, w
 
 
 def ready_recorder(simulator: Simulator) -> None:
-    """Encode an action of each agent ahead of the first episode, whose recorder then need not.
+    """Encode an action of each agent before the first episode, so that its recorder starts faster.
 
     Seeding a space takes longer than many steps. A fork inherits the generators of the spaces as this leaves them, so
     an agent that samples from its action space gets the same. Only for simulators whose `reset` leaves them alone.

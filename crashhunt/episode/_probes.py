@@ -1,7 +1,7 @@
 """Robustness probes: at intervals, forks of a running episode search the minimal disturbance that causes a crash.
 
 Each fork continues with one disturbance and ends after some seconds. Only disturbances milder than the mildest known
-crash are tried, so most questions need one fork.
+crash are tried, so most searches need only one fork.
 """
 
 from __future__ import annotations
@@ -41,15 +41,16 @@ _BEGINS = 2  # steps on: what an agent sees late is noticed a step before
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """A kind of disturbance that copies try, and the order of its strengths.
+    """A kind of disturbance that probes try, and the order of its strengths.
 
     Args:
         what: the kind.
         who: the places in the grid around the agent, tried in this order.
-        most: the strongest that is plausible, in the unit of its kind.
-        how_long: the longest, in s.
-        least: greatest value without an effect, in the unit of its kind.
-        grade: what is varied: its strength, its length, or nothing: then it happens, which counts as half, or not.
+        most: the strongest plausible value, in the unit of the kind.
+        how_long: the longest duration, in s.
+        least: the greatest value without an effect, in the unit of the kind.
+        grade: the varied property: strength or duration. A kind without either happens or not; a crash then counts as
+            half.
     """
 
     what: str
@@ -60,10 +61,10 @@ class Probed:
     grade: Literal["strength", "length", "whether"] = "strength"
 
     def shares(self, step_length_s: float) -> tuple[float, ...]:
-        """Return how much of it is asked for, from the mildest on, up to a sixteenth less than all of it.
+        """Return the strengths to try, as shares of the maximum, from the mildest on, in steps of a sixteenth.
 
-        Where it is graded in s, that are as many as differ in whole steps: with steps of 1 s, nothing comes a sixteenth
-        of a second late. What is more than the worst by that is not asked for, and the worst is as if a sixteenth less.
+        For durations, only shares that differ in whole steps are tried: with steps of 1 s, nothing can be a sixteenth
+            of a second late. The maximum itself counts as a sixteenth less.
         """
         if self.grade == "whether":
             return (_HALF,)
@@ -77,13 +78,13 @@ class Probed:
         return tuple(min(share, sixteenths[-1]) for share in shares if share <= 1 + _NOTHING)
 
     def disturbance(self, share: float, who: str, agent: str, step: int) -> Disturbance:
-        """Return one.
+        """Return a disturbance of this kind.
 
         Args:
             share: share of the plausible maximum, from 0 to 1.
             who: the chosen place.
             agent: The agent at the centre of the grid.
-            step: in which it begins.
+            step: the step in which the disturbance begins.
         """
         strong = self.least + share * (self.most - self.least) if self.grade == "strength" else self.most
         long = share * self.how_long if self.grade == "length" else self.how_long
@@ -118,14 +119,14 @@ class _Question:
 
 
 class Prober:
-    """Asks copies of one episode after another.
+    """Runs the probes of one episode after another.
 
     Args:
         every_s: time between two probes, in s of simulation time.
-        crash_on: what counts as a crash.
+        crash_on: the outcomes that count as a crash.
         delay: called with the wall time that copies have taken, in s.
         budget: steps that copies may take for each step of their trial.
-        tell: called with what people should know.
+        tell: called with messages for the user.
     """
 
     def __init__(
@@ -147,15 +148,15 @@ class Prober:
 
     @property
     def why_not(self) -> str:
-        """Why copies cannot be asked any more, in words; empty if they can."""
+        """The reason why probes cannot run any more, in words; empty if they can."""
         return self._questions.why_not
 
     def stop(self, why_not: str) -> None:
-        """Ask no copies any more."""
+        """Run no more probes."""
         self._questions.stop(why_not)
 
     def is_due(self, episode: Episode) -> bool:
-        """Whether copies are to be asked after the step that has just been taken."""
+        """Return whether probes run after the completed step."""
         return episode.steps % steps_of(self._every_s, episode.simulator.step_length_s) == 0
 
     def ask(self, episode: Episode) -> None:
@@ -190,7 +191,7 @@ class Prober:
 
     @property
     def _least(self) -> float:
-        """The least share that has made a copy crash so far; 1 where none has."""
+        """Return the least share that has made a probe crash so far; 1 if no probe has crashed."""
         assert self._stress.margin is not None
         return self._stress.margin
 
@@ -198,7 +199,7 @@ class Prober:
         return self._stress.steps >= self._budget * episode.steps
 
     def _questions_at(self, episode: Episode) -> list[_Question]:
-        """Return the questions with a target vehicle, which is looked up in a fork as well."""
+        """Return the probes that have a target vehicle; the target is looked up in a fork."""
         simulator = episode.simulator
         kinds = simulator.disturbing_kinds if supports(simulator, SupportsDisturbances) else ()
         every = [
@@ -244,7 +245,7 @@ class Prober:
         return replace(result, stress=stress)
 
     def _mildest(self, episode: Episode, question: _Question) -> bool:
-        """Ask one question; return whether there is any point in asking another."""
+        """Search the mildest strength of one kind; return whether other kinds need to be tried."""
         kind, step = question.kind, episode.steps + _BEGINS
         every = kind.shares(episode.simulator.step_length_s)
         shares = [share for share in every if share < self._least - _NOTHING]
@@ -272,7 +273,7 @@ class Prober:
         return self._least > 1 / _SHARES
 
     def _copy(self, episode: Episode, disturbance: Disturbance | None) -> tuple[str, int]:
-        """Return how a copy crashed, and at which step; nothing if it did not, or did not answer."""
+        """Return the outcome and the step of a crashed probe; empty if it did not crash or has no result."""
         horizon = _BEGINS + steps_of(_HORIZON_S, episode.simulator.step_length_s)
 
         def follow(copy: Episode) -> Plain:
@@ -295,7 +296,7 @@ class Prober:
         return (outcome, cast(int, answer["step"])) if crashed else ("", 0)
 
     def _in_copy(self, episode: Episode, work: Callable[[Episode], Plain]) -> Plain:
-        """Return what a copy answers; nothing if none does."""
+        """Return the result of a copy; empty if no copy gives a result."""
 
         def attempt() -> tuple[Plain | None, NoAnswer | None]:
             began = time.monotonic()

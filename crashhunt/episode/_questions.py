@@ -1,4 +1,4 @@
-"""Questions to copies of an episode: which are asked again, which stay without an answer, and when the asking ends."""
+"""Runs of copies of an episode (questions): which are repeated, which stay without a result, and when they end."""
 
 from __future__ import annotations
 
@@ -27,24 +27,23 @@ _MAX_REASON_LENGTH: Final = 200  # characters; an agent's exception may say anyt
 
 
 class Questions:
-    """Runs the copies, and records the questions without an answer.
+    """Runs copies, and counts the questions without a result.
 
-    A copy that something outside ended (the kernel's out-of-memory killer, an administrator) says nothing about the
-    trial: another copy is asked. A copy that raised, crashed or hung by itself would do so again, and is not.
-
-    Three questions in turn without an answer end the asking: of this trial where the cause was outside, of this process
-    where copies failed by themselves.
+    A copy that something outside ended (the kernel's out-of-memory killer, an administrator) is replaced by another
+    copy. A copy that raised an exception, crashed or hung by itself would do so again, so it is not replaced. After
+    three questions in a row without a result, no more copies run: in this trial if the cause was outside, in this
+    process if copies failed by themselves.
 
     Args:
         what: name of the questions, in the plural: ``probes``.
-        tell: called with what people should know.
+        tell: called with messages for the user.
 
     Attributes:
-        why_not: why this process asks no copies any more, in words; empty if it does.
-        unanswered: number of questions of this trial without an answer.
-        why_unanswered: the reason for the first of them, in words; empty if all have an answer.
-        may_be_answered: whether a cause was outside, so that the same trial, run again, may have all answers.
-        has_answer: whether the last question has an answer.
+        why_not: why this process runs no more copies, in words; empty if it does.
+        unanswered: number of questions of this trial without a result.
+        why_unanswered: the reason for the first missing result, in words; empty if all have a result.
+        may_be_answered: whether a cause was outside, so that another run of the trial may have all results.
+        has_answer: whether the last question has a result.
     """
 
     def __init__(self, what: str, tell: Callable[[str], None] = lambda _: None) -> None:
@@ -55,7 +54,7 @@ class Questions:
         self.begin_trial()
 
     def begin_trial(self) -> None:
-        """Forget what belongs to the last trial."""
+        """Reset the counts for the next trial."""
         self.unanswered = 0
         self.why_unanswered = ""
         self.may_be_answered = False
@@ -65,7 +64,7 @@ class Questions:
 
     @property
     def is_over(self) -> bool:
-        """Whether copies of this trial are not asked any more."""
+        """Return whether no more copies of this trial run."""
         return bool(self.why_not or self._paused_because)
 
     def ask(
@@ -73,11 +72,11 @@ class Questions:
         attempt: Callable[[], tuple[Plain | None, NoAnswer | None]],
         can_retry: Callable[[], bool] = lambda: True,
     ) -> Plain | None:
-        """Return the answer of a copy, or None if no copy answers, which is counted.
+        """Return the result of a copy; None if no copy gives one, which is counted.
 
         Args:
-            attempt: asks one copy; returns its answer, or None and the reason.
-            can_retry: whether there can be another copy of the same moment.
+            attempt: runs one copy; returns its result, or None and the reason.
+            can_retry: whether another copy of the same moment can be made.
         """
         reason = NoAnswer("")
         for number in range(_ATTEMPTS):
@@ -102,7 +101,7 @@ class Questions:
         return None
 
     def miss(self, reason: NoAnswer) -> None:
-        """Count a question that no copy has answered."""
+        """Count a question without a result."""
         why = f"a copy {reason.why}"
         if reason.is_from_outside:
             self._killed += 1
@@ -116,11 +115,11 @@ class Questions:
         self.skip(why, is_from_outside=reason.is_from_outside)
 
     def skip(self, why: str = "", *, is_from_outside: bool = False) -> None:
-        """Count a question without an answer, which says nothing about the next one.
+        """Count a question without a result, without an effect on the next questions.
 
         Args:
-            why: the reason, in words; if empty, that the asking is over.
-            is_from_outside: whether the same trial, run again, may have an answer.
+            why: the reason, in words; empty if no more copies run.
+            is_from_outside: whether another run of the trial may have a result.
         """
         if not why:
             why, is_from_outside = self.why_not or self._paused_because, not self.why_not
@@ -130,7 +129,7 @@ class Questions:
         self.may_be_answered = self.may_be_answered or is_from_outside
 
     def stop(self, why_not: str) -> None:
-        """Ask no copies any more in this process."""
+        """Run no more copies in this process."""
         self.why_not = self.why_not or why_not
 
 
@@ -142,10 +141,10 @@ def _shortened(reason: NoAnswer) -> NoAnswer:
 
 
 class FirstCopy:
-    """Copies the first episode of a process after its first step, and does nothing with that.
+    """Makes one copy of the first episode of a process, only to check that copies are possible.
 
     Args:
-        refused: called with why it could not be copied, in words.
+        refused: called with the reason why the episode cannot be copied.
     """
 
     def __init__(self, refused: Callable[[str], None]) -> None:
@@ -153,11 +152,11 @@ class FirstCopy:
         self._tried = False
 
     def is_due(self, episode: Episode) -> bool:
-        """Whether it has not been tried."""
+        """Return whether the check is still to be done."""
         return not self._tried and episode.steps > 0
 
     def ask(self, episode: Episode) -> None:
-        """Try it."""
+        """Check that the episode can be copied."""
         try:
             episode.fork(lambda _copy: {}, observed=False).end()
         except NoProcessError:

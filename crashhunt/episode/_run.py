@@ -80,19 +80,19 @@ def run_episode(
     Args:
         spec: which trial.
         simulator: where.
-        make_agent: called with agent id, simulator and arguments; returns the agent at the wheel.
-        box: what records it; `BlackBox.begin` has been called.
-        oracles: what decides whether a step is a crash.
+        make_agent: called with agent id, simulator and arguments; returns the agent that drives.
+        box: the black box that records the trial, after `BlackBox.begin`.
+        oracles: the oracles, which decide whether a step is a crash.
         crash_on: The outcomes that end the episode; other traffic crashes and events are only recorded.
         observers: Further observers, called after the recorder.
-        reset: what resets the simulator, where it is not the simulator itself.
-        prober: asks copies of it how little it would take for a crash.
-        first_copy: sees at once whether there can be copies.
+        reset: a function that resets the simulator; None for the simulator's own `reset`.
+        prober: runs robustness probes; None for none.
+        first_copy: checks in the first step whether the episode can be copied.
         brancher: Runs forks with other disturbances where another actor is near.
         forcer: Makes forks with a forced first onset; None if the trial is not a root.
 
     Returns:
-        The result. Whatever agent or simulator raise is in it.
+        The result. Exceptions of agent and simulator are in the result.
 
     Raises:
         RecorderError: the disk is full.
@@ -148,7 +148,7 @@ def seed_everything(seed: int) -> None:
 
 
 def generators() -> tuple[Any, ...]:
-    """Return where the generators of the process are."""
+    """Return the state of the process's random generators."""
     torch = sys.modules.get("torch")
     ours = np.random.get_state()  # noqa: NPY002 - agents may use the global generator
     return random.getstate(), ours, torch.get_rng_state() if torch is not None else None
@@ -174,7 +174,7 @@ _set_limit = sys.setrecursionlimit
 
 
 def bound_recursion() -> None:
-    """Have `sys.setrecursionlimit` set `MAX_RECURSION_LIMIT` where it is asked for more.
+    """Make `sys.setrecursionlimit` accept at most `MAX_RECURSION_LIMIT`.
 
     Python allocates the frames of Python functions on the heap, so endless recursion without a limit fills the memory
     of the machine in minutes. With the bound it ends in a `RecursionError`.
@@ -212,8 +212,8 @@ class Parts:
     def load(self, report: Callable[[str], None] = lambda _: None) -> None:
         """Import everything that trials need, always in the same order.
 
-        What modules do when they are imported, such as setting constants of a simulator's classes, is done before the
-        first episode: so it holds in every one of them, whichever comes first.
+        Modules may, for example, set constants of a simulator's classes when they are imported. Because all imports
+        come before the first episode, these settings hold in every episode.
 
         Args:
             report: Called before each import with the error to show if the import does not return, such as "the module
@@ -256,7 +256,7 @@ class Parts:
         """Make the agent of a vehicle; files that its arguments name come from the snapshot.
 
         Raises:
-            CrashhuntError: its module comes from elsewhere than the snapshot that has it.
+            CrashhuntError: the module comes from another place than the snapshot that contains it.
             ForeignError: its constructor failed.
             InternalError: crashhunt itself failed.
         """
@@ -316,7 +316,7 @@ def seal(settings: WorkerSettings) -> None:
 
 
 def require_origin(module: str, code: tuple[str, ...]) -> None:
-    """See that a module comes from the snapshot, if it is there at all, and not from where it is developed."""
+    """Check that a module of the snapshot was imported from the snapshot, not from the developer's folder."""
     top = module.partition(".")[0]
     file = getattr(sys.modules[module], "__file__", None)
     for folder in code:

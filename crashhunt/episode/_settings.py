@@ -1,4 +1,4 @@
-"""Everything that a process needs to run trials of one hunt, and where it writes. It crosses process boundaries."""
+"""The settings with which a process runs trials of one hunt. They are sent to other processes."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ class WorkerSettings(Serializable):
         code: folders whose modules win over installed ones, the first one first: the snapshot. Empty for none.
         argument_files: The file of the snapshot for each argument value that names a file.
         timeout_s: wall-clock limit of a trial, in s.
-        keep_trials: whether the scratch folder of every trial is kept, not of crashes only.
-        sealed: of a stranger's crash, what the process may read besides what is installed and its scratch
-            folder, where alone it may write; None if it may do everything.
-        find_escapes: whether it is found out until when braking would have avoided a collision, by running the trial a
-            few times more; only in a fresh process.
+        keep_trials: whether the scratch folder of every trial is kept, not only of crashes.
+        sealed: for an untrusted crash, the files that the process may read in addition to installed packages and its
+            scratch folder. It may write only in the scratch folder. None for no restrictions.
+        find_escapes: whether further runs of the trial find the last step at which braking avoids a collision; only in
+            a fresh process.
         audit: the share of trials without a crash whose scratch folder is kept, because they are run again.
-        hunt_seed: what decides which.
-        warm_copies: number of traffics for which a worker of a pool keeps a warmed-up copy of itself; 0 for none.
+        hunt_seed: seed of the hunt, which determines the audited trials.
+        warm_copies: number of traffics for which a worker keeps a suspended fork after the warm-up; 0 for none.
         probe_s: time between two probes of a trial, in s of simulation time; 0 for no probes.
         branch: The rates of disturbances in branches, ``NAME=RATE`` each; empty for no branches.
         force: The rates of disturbances of forks with a forced first onset, ``NAME=RATE`` each; empty for none.
@@ -88,7 +88,7 @@ class WorkerSettings(Serializable):
     )  # fmt: skip
 
     def is_audited(self, result: TrialResult) -> bool:
-        """Whether a trial belongs to the sample that is run again, which its number and the hunt's seed decide."""
+        """Return whether a trial belongs to the audited sample; its number and the hunt's seed determine this."""
         if self.audit <= 0.0 or result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
             return False
         draw = np.random.SeedSequence(self.hunt_seed, spawn_key=(result.spec.number, _AUDIT)).generate_state(1)[0]
@@ -109,7 +109,8 @@ class WorkerSettings(Serializable):
         """Return the settings from the data of `to_json` of any version; unknown keys are ignored.
 
         Raises:
-            CrashhuntError: a crashhunt of another version wrote it, and it needs what this one does not know.
+            CrashhuntError: another version of crashhunt wrote the data, and they need a feature that this version does
+                not have.
         """
         from crashhunt.scenario import installed_backends, scenario_from_dict
 
@@ -128,7 +129,7 @@ class WorkerSettings(Serializable):
 
 
 def _asked(value: object) -> Any:
-    """Plain data, in which a dataclass has only the fields that are not at their default."""
+    """Return plain data in which a dataclass has only the fields that differ from their defaults."""
     if is_dataclass(value):
         pairs = ((item, getattr(value, item.name)) for item in fields(value))
         return {item.name: _asked(held) for item, held in pairs if held != _default(item)}
@@ -142,7 +143,7 @@ def _default(item: Field[object]) -> object:
 
 
 def scratch_of(scratch: Path, number: int) -> Path:
-    """Return the folder that a running trial writes to, and that stays if it is kept."""
+    """Return the scratch folder of a trial, which remains if the trial is kept."""
     return scratch / f"trial-{number:06d}"
 
 

@@ -71,8 +71,8 @@ class Vehicles(Protocol):
 
         Args:
             controlled: The vehicles around which this group was selected.
-            squared: A squared distance, in m². If it is not 0 and the group of nearer vehicles differs from this group,
-                the method returns the ids of the nearer vehicles.
+            squared: A squared distance, in m²; 0 for none. If the vehicles within this distance are not those of this
+                group, the method returns their ids.
         """
 
 

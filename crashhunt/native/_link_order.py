@@ -41,7 +41,10 @@ class LinkOrder:
             self._library.crashhunt_link_order_use(use)
 
     def check_load(self) -> str:
-        """Return why the links of the last load are not ordered; empty if they are. Call this method once per load."""
+        """Return why the links of the last load have no fixed order; empty if they have one.
+
+        Call this method once per load.
+        """
         ordered, unordered = self._counted()
         before, self._loads = self._loads, (ordered, unordered)
         if self.reason or ordered > before[0]:

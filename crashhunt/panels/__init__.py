@@ -1,4 +1,4 @@
-"""Panels: what an agent shows of itself. Plain data; Pillow is imported when one is drawn."""
+"""Panels: plain data that show an agent's internal state; Pillow is imported when a panel is drawn."""
 
 import lazy_loader
 

@@ -62,12 +62,12 @@ def scope(name: str) -> Iterator[None]:
 
 
 def current_scope() -> tuple[str, ...]:
-    """Return the names of the scopes around, outermost first."""
+    """Return the names of the current scopes, the outermost first."""
     return _scopes.get()
 
 
 def labelled(nest: object) -> list[tuple[str, Panel]]:
-    """Return every panel in a nest of mappings and sequences, with its label; whatever is no panel is passed over.
+    """Return every panel in nested mappings and sequences, with its label; other objects are ignored.
 
     A label is made of the scopes in which the panel was made, its keys in the nest, and its title. Of two panels with
     the same label, the second gets a number.
@@ -114,8 +114,8 @@ class Panel:
             label: above it; its title by default.
 
         Raises:
-            TypeError: it is of a class of your own, which then has to have this method.
-            ValueError: what it shows has the wrong shape.
+            TypeError: the panel has a class of the user without a method `draw`.
+            ValueError: its content has the wrong shape.
         """
         return painted(self, width, height, label or self.title)
 
@@ -297,12 +297,12 @@ def map_colors(values: NDArray[np.float64], low: float, high: float) -> NDArray[
 
 
 def span_of(low: float, high: float) -> float:
-    """Return how far apart two limits are; 1 where they are not."""
+    """Return the distance of two limits; 1 if they are equal."""
     return high - low if high - low > _NEAREST else 1.0
 
 
 def number(value: float) -> str:
-    """Return a number for a label."""
+    """Return a number as text for a label."""
     return f"{value:.3g}" if math.isfinite(value) else "-"
 
 
@@ -338,8 +338,8 @@ class Canvas:
         title: above it.
 
     Attributes:
-        image: what is drawn.
-        draw: what draws.
+        image: the picture.
+        draw: Pillow's object that draws on the picture.
     """
 
     def __init__(self, width: int, height: int, title: str) -> None:
@@ -366,7 +366,7 @@ def as_array(image: Image.Image) -> NDArray[np.uint8]:
 
 
 def _line(text: object) -> str:
-    """A name on one line, and no longer than anybody could read."""
+    """Return a name as one line of limited length."""
     return " ".join(str(text)[:_LONGEST].split())
 
 
@@ -380,7 +380,7 @@ def painted(panel: Panel, width: int, height: int, label: str) -> NDArray[np.uin
 
     Raises:
         TypeError: the panel has no known type.
-        ValueError: what it shows has the wrong shape.
+        ValueError: its content has the wrong shape.
     """
     canvas = Canvas(width, height, label)
     with np.errstate(all="ignore"):  # agents show what they have
@@ -558,7 +558,7 @@ def _paint_picture(panel: Picture, canvas: Canvas) -> None:
 
 
 class _Axes:
-    """A frame with labels, and values to pixels."""
+    """Axes with labels, and the conversion of values to pixels."""
 
     def __init__(self, canvas: Canvas, left: float, right: float, low: float, high: float) -> None:
         self._draw = canvas.draw
@@ -619,14 +619,14 @@ def _limits(values: NDArray[np.generic], low: float | None, high: float | None) 
 
 
 def _numbers(values: ArrayLike) -> NDArray[np.float64]:
-    """Values as floats; what is so large that drawing it would overflow is no number."""
+    """Return values as floats; values that are too large to draw become NaN."""
     found = np.array(values, float)
     found[~(np.abs(found) < _HUGE)] = np.nan
     return found
 
 
 def _finite_runs(x: NDArray[np.generic], y: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """The stretches of a curve that have values."""
+    """Return the parts of a curve without missing values."""
     there = np.isfinite(y) & np.isfinite(x)
     if there.all():
         return [np.stack((x, y), 1).astype(float)] if len(y) else []

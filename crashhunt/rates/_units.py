@@ -239,7 +239,7 @@ class UnitSequence:
                 f"an agent was trained on the traffic of all {self.trained_on} trials; run another --seed, or train "
                 "with a test share"
             )
-        return "no valid trial counts yet"
+        return "no valid trial has finished"
 
     @property
     def invalid_share(self) -> float:

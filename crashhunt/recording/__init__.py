@@ -1,6 +1,7 @@
-"""Recordings: the black box while it happens, ``log.mcap`` of what is kept, and the comparison of two.
+"""Recordings: the black box during a trial, ``log.mcap`` of kept trials, and the comparison of two recordings.
 
-Writing and reading logs needs MCAP and protobuf, which a worker never does: they are imported at first use.
+Writing and reading logs needs MCAP and protobuf, which a worker never does, so these libraries are imported at first
+use.
 """
 
 import lazy_loader

@@ -3,10 +3,10 @@
 Nothing is encoded while the episode runs, and the pages belong to the kernel, so that the records outlive a process
 that is killed in the middle of a step. Layout: a header of 64 bytes, then records, each of 8 bytes of head (tag, aux,
 length) and its payload, padded to 8 bytes. Everything is little-endian. Only what lies before the header's
-``committed`` offset counts. The header also says where the process was: which step, which phase, which agent.
+``committed`` offset counts. The header also has the position of the process: step, phase and agent.
 
-Behind the records, the process of a finished trial leaves one report, which the header announces by its length. It is
-no record: it belongs neither to the digest nor to the log.
+Behind the records, the process of a finished trial leaves one report, which the header announces by its length. The
+report is not a record: it belongs neither to the digest nor to the log.
 """
 
 from __future__ import annotations
@@ -102,10 +102,7 @@ MAPPED = 64 << 20  # bytes of addresses, not of memory: mapping again moves ever
 
 
 class Phase(IntEnum):
-    """What the process was doing.
-
-    ``ACT`` before the scene of step 0 means that the agent is being made.
-    """
+    """The current task of the process. ``ACT`` before the scene of step 0 means that the agent is being made."""
 
     SETUP = 0
     ACT = 1
@@ -120,20 +117,20 @@ _ACT, _SIMULATE = int(Phase.ACT), int(Phase.SIMULATE)
 
 
 class Record(NamedTuple):
-    """One record."""
+    """One record of the black box: tag, aux and payload."""
 
     tag: int
     aux: int
     payload: bytes
 
     def encode(self) -> bytes:
-        """Return its bytes in the black box; the trace digest runs over these."""
+        """Return the bytes of the record in the black box; the trace digest is computed over these bytes."""
         return _HEAD.pack(self.tag, self.aux, len(self.payload)) + self.payload + bytes(-len(self.payload) % 8)
 
 
 @dataclass(frozen=True, slots=True)
 class BlackBoxHeader:
-    """Where a process was when it last wrote, and how many steps it had simulated before the first one."""
+    """The position of a process at its last write, and the number of steps before the first step of the trial."""
 
     pid: int
     trial: int
@@ -150,8 +147,7 @@ class BlackBox:
 
     Args:
         path: the file to create.
-        begun: how much of it another process has reserved that has begun the next trial there, in bytes; 0 if it is
-            to be created.
+        begun: size that another process has reserved in the file, in bytes; 0 to create the file.
 
     Raises:
         RecorderError: the disk is full.
@@ -180,7 +176,7 @@ class BlackBox:
 
     @property
     def reserved(self) -> int:
-        """How much of the file there is, in bytes."""
+        """The reserved size of the file, in bytes."""
         return self._reserved
 
     def begin(self, *, pid: int, trial: int, started: float) -> None:
@@ -195,17 +191,17 @@ class BlackBox:
         self._aside.clear()
 
     def set_up(self, steps: int) -> None:
-        """Note how many steps have been simulated before the first one."""
+        """Record the number of simulated steps before the first step."""
         _SETUP.pack_into(self._map, _SETUP_OFFSET, min(steps, 2**32 - 1))
 
     def prologue(self, payload: bytes, agents: int) -> None:
-        """Record what the trial consists of; ``agents`` is how many rewards each step has."""
+        """Record the prologue of the trial; ``agents`` is the number of rewards in each step."""
         self._agents = agents
         self._steps = {}
         self.append(PROLOGUE.tag, 0, payload)
 
     def append(self, tag: int, aux: int, payload: bytes) -> None:
-        """Record something rare, of any type."""
+        """Record rare data of any type."""
         self._take_back()
         offset, length = self._offset, len(payload)
         if offset + length + 16 > self._reserved:
@@ -219,7 +215,7 @@ class BlackBox:
         self.mark(Phase.SETUP if self._roster is None else Phase.SIMULATE)
 
     def report(self, report: bytes) -> None:
-        """Leave a report behind the records; nothing can be recorded after it."""
+        """Write a report behind the records; after that, nothing can be recorded."""
         self._take_back()
         end = self._offset + len(report)
         if end > self._reserved:
@@ -228,15 +224,15 @@ class BlackBox:
         REPORT.pack_into(self._map, REPORT_OFFSET, len(report))
 
     def announce_no_room(self) -> None:
-        """Say that the disk has no room for the recording, which the supervisor checks."""
+        """Report that the disk has no room for the recording; the supervisor checks this."""
         REPORT.pack_into(self._map, REPORT_OFFSET, NO_ROOM)
 
     def announce_damage(self) -> None:
-        """Say that this process cannot report; needs nothing of Python that an agent may have damaged."""
+        """Report that this process cannot write its report, without code that an agent may have damaged."""
         self._map[REPORT_OFFSET:FIRST] = _DAMAGE_ANNOUNCED
 
     def note(self, payload: bytes) -> None:
-        """Record what is no part of the digest."""
+        """Record data that are no part of the digest."""
         self.append(NOTES.tag, 0, payload)
 
     def observation(self, agent: int, array: NDArray[np.generic]) -> None:
@@ -248,11 +244,11 @@ class BlackBox:
         self._raw(_ACTION, agent, array, _SIMULATE)
 
     def lend(self, steps: UsualSteps, roster: Roster) -> None:
-        """Have the core record steps of one agent by itself, until anything else is asked of this black box.
+        """Let the core record steps of one agent until the next call of another method of this black box.
 
         Args:
             steps: steps of the core.
-            roster: who the steps are of; it must have been recorded.
+            roster: the actors of these steps, which must have been recorded.
         """
         self._take_back()
         self._roster = roster
@@ -290,7 +286,7 @@ class BlackBox:
         _WHERE.pack_into(mapped, _WHERE_OFFSET, end, self._step, phase, agent)
 
     def step(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
-        """Record that a step is complete; the scene's roster must have been recorded."""
+        """Record a completed step; the roster of the scene must have been recorded."""
         if self._lent is not None:
             self._take_back()
         offset, count = self._offset, len(scene.roster)
@@ -325,7 +321,7 @@ class BlackBox:
         self._offset, self._step = end, step
 
     def mark(self, phase: int, agent: int = 0) -> None:
-        """Say where the process is, and commit."""
+        """Write the position of the process, and commit."""
         self._take_back()
         _WHERE.pack_into(self._map, _WHERE_OFFSET, self._offset, self._step, phase, agent)
 
@@ -348,20 +344,20 @@ class BlackBox:
         return memoryview(self._map)[FIRST : self._offset]
 
     def evidence(self) -> list[memoryview]:
-        """The bytes of all records so far over which the digest runs."""
+        """The bytes of all records so far that belong to the digest."""
         self._take_back()
         whole = memoryview(self._map)
         edges = [FIRST, *chain.from_iterable(self._aside), self._offset]
         return [whole[begins:ends] for begins, ends in zip(edges[::2], edges[1::2], strict=True)]
 
     def detach(self) -> None:
-        """Write to nowhere from now on: this process is a copy of the one that records."""
+        """Discard all further records, because this process is a copy of the recording process."""
         self._take_back()
         self._map = mmap.mmap(-1, self._mapped)
         self._file = os.open(os.devnull, os.O_RDWR)
 
     def delay(self, wall_s: float) -> None:
-        """Count so much of the time since the trial began as not its own, in s."""
+        """Exclude some seconds from the wall time of the trial."""
         magic, pid, setup_steps, trial, started, *where = HEADER.unpack_from(self._map, 0)
         HEADER.pack_into(self._map, 0, magic, pid, setup_steps, trial, started + wall_s, *where)
 
@@ -403,7 +399,7 @@ class BlackBox:
 
 
 def cannot_record(error: OSError, path: Path) -> RecorderError:
-    """Return the error that a trial is ended by whose recording has no room."""
+    """Return the error that ends a trial when the disk has no room for its recording."""
     return RecorderError(
         f"the trial cannot be recorded: {error.strerror}",
         fix="free some space and run the same command again",
@@ -456,7 +452,7 @@ def read_black_box(path: Path) -> Iterator[Record]:
 
 
 def readable_bytes(found: os.stat_result) -> int:
-    """Return how much of a black box is read at most, in bytes: the process of a trial may claim any size.
+    """Return the number of bytes to read of a black box; the process of a trial may claim any size.
 
     A file that was made longer without being written takes no space, and reading it would take all memory. A file
     system that compresses may store records in a tenth of their size.
@@ -482,7 +478,7 @@ def decode_records(data: bytes | memoryview) -> Iterator[Record]:
 class BlackBoxFile:
     """The file of a black box, for a process that neither runs nor trusts the trial that writes it.
 
-    It never maps the file: where the trial truncates it, reading a mapped page would kill this process as well.
+    It never maps the file, because reading a mapped page would kill this process if the trial truncates the file.
 
     Args:
         path: the file to create.
@@ -509,7 +505,7 @@ class BlackBoxFile:
 
     @property
     def identity(self) -> os.stat_result:
-        """What the file system says of the file."""
+        """The identity of the file in the file system."""
         return os.fstat(self._file)
 
     def require_room(self) -> None:
@@ -536,7 +532,7 @@ class BlackBoxFile:
         return decode_header(os.pread(self._file, HEADER.size, 0))
 
     def has(self, header: BlackBoxHeader) -> bool:
-        """Whether the file can have as many records as its header claims."""
+        """Return whether the file is large enough for the records that its header claims."""
         return FIRST <= header.committed <= readable_bytes(os.fstat(self._file))
 
     def read_records(self, header: BlackBoxHeader) -> bytes:
@@ -567,7 +563,7 @@ class BlackBoxFile:
         path.write_bytes(content)
 
     def is_reusable(self) -> bool:
-        """Whether the next trial can be recorded here: the file still has its size. Notes how much of it there is."""
+        """Return whether the next trial can be recorded here, because the file still has its size."""
         found = os.fstat(self._file)
         self._reserved = max(self._reserved, min(found.st_blocks * 512 // CHUNK * CHUNK, found.st_size))
         return found.st_size >= MAPPED

@@ -75,7 +75,7 @@ def write_views(log: LogWriter, recording: Recording, lanes: Sequence[Lane], cra
         log: where to.
         recording: what happened.
         lanes: lanes of the map; those far from every controlled vehicle are skipped.
-        crash: how it ended.
+        crash: description of the crash, for the marker.
     """
     scenes = recording.scenes()
     if not scenes or not recording.agents:
@@ -130,7 +130,7 @@ def foxglove_layout(recording: Recording) -> dict[str, object]:
 
 
 def _write_map(log: LogWriter, recording: Recording, scenes: Sequence[Scene], lanes: Sequence[Lane]) -> None:
-    """Both borders of every lane that a controlled vehicle came near, once, at the beginning."""
+    """Write both borders of every lane near a controlled vehicle, once, at the beginning."""
     rows = [(scene, scene.roster.index.get(agent)) for scene in scenes[::10] for agent in recording.agents]
     driven = np.array([scene.points[row] for scene, row in rows if row is not None]).reshape(-1, 2)
     if not len(driven):
@@ -188,7 +188,7 @@ def read_lanes(path: Path) -> list[tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def _shifted(shape: NDArray[np.float64], distance: float) -> NDArray[np.float64]:
-    """A polyline moved sideways, to the left for a positive distance."""
+    """Return a polyline that is moved sideways, to the left for a positive distance."""
     along = np.gradient(shape, axis=0)
     norm = np.hypot(along[:, 0], along[:, 1])
     norm[norm == 0] = 1.0
@@ -264,7 +264,7 @@ def _box(actor: Actor, agents: Sequence[str], parties: Sequence[str], lifetime_n
 
 
 def _bend(entity: SceneEntity, scene: Scene, row: int) -> None:
-    """Make an actor of as many cubes as it has parts in this scene."""
+    """Draw an actor with one cube for each of its parts in this scene."""
     like, actor = entity.cubes[0], scene.roster.actors[row]
     parts = list(zip(outlines(scene, row), levels(scene, row), strict=True))
     while len(entity.cubes) < len(parts):
@@ -291,7 +291,7 @@ def _write_metrics(log: LogWriter, agent: str, scenes: Sequence[Scene]) -> None:
 
 
 def _write_events(log: LogWriter, scenes: Sequence[Scene]) -> None:
-    """What happened in the traffic, as lines of the log."""
+    """Write the traffic events as lines of the log."""
     for scene in scenes:
         for event in scene.events:
             line = Log(level=Log.WARNING, message=f"{event.kind}: {event.what}", name="crashhunt")
@@ -356,8 +356,8 @@ def messages_of(
 ) -> Iterator[tuple[Schema | None, Channel, int, bytes]]:
     """Yield schema, channel, sequence number and content of the messages of an MCAP file, in the order of the file.
 
-    Of each crash, thousands of messages are read. mcap's own reader makes several objects and a dozen calls of each,
-    which takes five times as long.
+    A crash has thousands of messages. mcap's own reader takes five times as long, because it makes several objects for
+    each message.
 
     Args:
         file: the file, open for reading.

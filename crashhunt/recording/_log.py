@@ -1,7 +1,7 @@
-"""``log.mcap``: what is kept of an episode and how it is compressed, in a file that other tools open too.
+"""``log.mcap``: the compressed records of an episode, in a file that other tools can also open.
 
-Evidence channels hold our records, one message each, in their order; the message's sequence number is the record's.
-Reading them gives back the very same records, hence the same digest. View channels (see ``_foxglove``) are for people.
+Evidence channels contain the records of the black box, one message for each record, in the same order. Reading them
+returns identical records, and therefore the same digest. View channels (see ``_foxglove``) are for people.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def write_log(
         recording: what happened.
         lanes: lanes of the map, for viewers.
         metadata: further facts.
-        crash: how it ended, for the crash marker and the log line.
-        views: whether other tools have something to see; without, it is half as large.
+        crash: description of the crash, for the marker and the log line.
+        views: whether to write view channels for other tools; without them, the file is half as large.
 
     Raises:
         HuntDirectoryError: the disk is full, or the folder is not writable.
@@ -81,7 +81,7 @@ def read_log(path: Path) -> Recording:
     """Read the evidence of a log.
 
     Raises:
-        BundleError: it is missing, damaged, not a log of ours, or of another version.
+        BundleError: the file is missing, damaged, not a log of crashhunt, or of another version.
     """
 
     def refuse(message: str, fix: str = "get an undamaged copy of the log") -> BundleError:
@@ -134,7 +134,7 @@ def _compact_from_text(text: str) -> Compact:
 
 
 class _Message(NamedTuple):
-    """A message of the evidence, the name of its schema, and what its channel says."""
+    """A message of the evidence, with the name of its schema and the metadata of its channel."""
 
     sequence: int
     topic: str
@@ -145,7 +145,7 @@ class _Message(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Channel:
-    """Records of one type, and of one agent where each has its own, as messages of a log."""
+    """A channel of the log with the records of one type, and of one agent if records are per agent."""
 
     tag: int
     aux: int
@@ -199,7 +199,7 @@ def _read_evidence(messages: Sequence[_Message]) -> Iterator[Record]:
 
 
 def _unknown(message: _Message) -> _Channel:
-    """The channel of records that came with a later version; what they mean is not known, what they are is."""
+    """Return the channel of records that a later version has written; their bytes are kept without a meaning."""
     tag = int(message.metadata["tag"])  # without one, no version has written it
     name = message.schema[len(NAMESPACE) :]
     form = next((form for form in (TextForm(), BytesForm()) if name in form.messages), None)

@@ -1,4 +1,4 @@
-"""An episode as it was recorded: the agents and their arrays, and the steps that were read."""
+"""The data of a recorded episode: agents, their arrays, and steps."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ __all__ = ["AgentChannel", "Divergence", "Prologue", "Reading", "SceneParts", "S
 
 @dataclass(frozen=True, slots=True)
 class AgentChannel:
-    """What the arrays of one agent look like.
+    """Types and shapes of the arrays of one agent.
 
     Args:
         id: the agent, which is also the id of its vehicle among the actors.
-        observation_dtype: as NumPy writes it, such as ``<f4``.
+        observation_dtype: type of the observations in NumPy's notation, such as ``<f4``.
         observation_shape: observation shape of one observation.
-        action_dtype: likewise.
+        action_dtype: type of the actions, in the same notation.
         action_shape: shape of one action.
-        action_names: what the elements of an action are.
-        observation_names: what the columns of an observation are.
+        action_names: names of the elements of an action.
+        observation_names: names of the columns of an observation.
     """
 
     id: str
@@ -47,7 +47,7 @@ class AgentChannel:
 
 @dataclass(frozen=True, slots=True)
 class Prologue:
-    """What an episode consists of.
+    """The agents and the step length of an episode.
 
     Args:
         agents: agents in the order of their numbers.
@@ -82,15 +82,15 @@ def _columns_prologue(agent: Plain) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class StepRecord:
-    """What was recorded of one step.
+    """The recorded data of one step.
 
     Args:
         step: 0 is the start of the episode, before the first action.
         scene: scene after the step.
         rewards: agent id to reward.
-        observations: what each agent was shown before this step; nothing at step 0.
-        actions: what each agent answered.
-        more: what further types of records say of the step, by their names.
+        observations: the observation of each agent before this step; empty at step 0.
+        actions: the action of each agent.
+        more: data of further types of records, by their names.
         whole: False if the process ended inside the step, so that there is no scene after it.
     """
 
@@ -108,7 +108,7 @@ class StepRecord:
 
 
 class SceneParts(TypedDict, total=False):
-    """What a scene has besides what a step says itself; see `Scene`."""
+    """The parts of a scene that are recorded separately from the step; see `Scene`."""
 
     contacts: tuple[Contact, ...]
     off_road: tuple[str, ...]
@@ -120,16 +120,16 @@ class SceneParts(TypedDict, total=False):
 
 @dataclass(slots=True)
 class Reading:
-    """What has been read of an episode so far.
+    """The part of an episode that has been read so far.
 
     Args:
-        prologue: what it consists of.
-        actors: all that were introduced, in the order of their numbers.
-        steps: those that are complete.
+        prologue: the agents and the step length of the episode.
+        actors: all actors that were introduced, in the order of their numbers.
+        steps: the complete steps.
         current: the step that is being read.
         roster: the actors of the next scene.
-        scene: further arguments of the next scene, by their names; a step takes them and leaves none.
-        events: what else happened in it.
+        scene: further arguments of the next scene, by their names; the next step uses them.
+        events: the other events of the episode.
     """
 
     prologue: Prologue
@@ -177,7 +177,7 @@ class Divergence:
 
 
 def first_difference(left: NDArray[np.generic], right: NDArray[np.generic]) -> tuple[int, ...]:
-    """Return the index at which two arrays of one shape first differ in a bit, where they do."""
+    """Return the index of the first difference in bits between two arrays of the same shape; None if there is none."""
     size = left.itemsize
     was, now = left.tobytes(), right.tobytes()
     flat = next(n for n in range(left.size) if was[n * size : (n + 1) * size] != now[n * size : (n + 1) * size])

@@ -54,7 +54,7 @@ __all__ = [
 
 
 class Recording:
-    """Everything that was recorded of one episode.
+    """The complete recording of one episode.
 
     Args:
         records: records of a black box or of a log, in the order in which they were written.
@@ -112,7 +112,7 @@ class Recording:
         return Recording(compact_records(self.records, near, observations=observations), compact)
 
     def like(self, other: Recording) -> Recording:
-        """Return the recording with the actors and observations that another one has; itself if that one is whole."""
+        """Return this recording with only the actors and observations of another one, which may be compact."""
         if other.compact is None or self.compact is not None:
             return self
         there = Present([step.scene.roster.index.keys() if step.scene is not None else () for step in other.all_steps])
@@ -120,7 +120,7 @@ class Recording:
         return Recording(records, replace(other.compact, digest=self.digest))
 
     def beginning(self, records: int) -> Recording:
-        """Return the recording of its first records."""
+        """Return a recording of the first records only."""
         compact = self.compact and replace(self.compact, digest="")
         return Recording(self.records[:records], compact)
 
@@ -198,13 +198,13 @@ def _stacked(found: list[NDArray[np.generic]], dtype: str, shape: tuple[int, ...
 
 @dataclass(frozen=True, slots=True)
 class Compact:
-    """What is missing in a compact recording.
+    """A description of the parts that a compact recording lacks.
 
     Args:
-        digest: digest of the whole recording; empty if only its beginning is here.
+        digest: digest of the whole recording; empty if this is only its beginning.
         actors: number of actors of the whole recording.
         radius_m: greatest distance to an agent, in m, up to which an actor is recorded.
-        observations: whether the observations are left.
+        observations: whether the recording contains observations.
     """
 
     digest: str
@@ -272,7 +272,7 @@ def compact_records(records: Iterable[Record], choose: Choice, *, observations: 
     Args:
         records: records of the whole recording.
         choose: chooses the actors of each step.
-        observations: whether to keep what the agents observed.
+        observations: whether to keep the observations of the agents.
     """
     actors: list[list[object]] = []  # as their definitions say
     numbers: dict[int, int] = {}  # of the actors that are kept: number there to number here
@@ -319,7 +319,7 @@ def compact_records(records: Iterable[Record], choose: Choice, *, observations: 
 
 
 def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | None:
-    """Return the first difference of bits, or None if the two are bit-identical.
+    """Return the first difference between two recordings; None if they are bit-identical.
 
     Within a step, observations come before actions and actions before the scene, as in the episode. If the first is
     compact, the values of its actors are compared, and the digest of the whole recording.
@@ -363,7 +363,7 @@ def values_around(
 ) -> list[tuple[int, object, object]]:
     """Return (step, recorded value, replayed value) of the field that diverges, in the steps around.
 
-    Nothing where the divergence is not about one value; None if a recording does not have the step.
+    The result is empty if the divergence is not about one value. A value is None if a recording lacks the step.
     """
     if divergence.place is None:
         return []
@@ -383,7 +383,7 @@ def _value(recording: Recording, number: int, divergence: Divergence) -> object:
 
 
 def _differences(agents: tuple[AgentChannel, ...]) -> list[tuple[Difference, AgentChannel | None]]:
-    """How the steps of two recordings are compared, in this order."""
+    """Return the comparisons of the steps of two recordings, in their order."""
     kinds = [(kind.per_agent, kind.difference) for kind in RECORD_TYPES.values() if kind.difference is not None]
     of_agents = [(difference, agent) for agent in agents for per_agent, difference in kinds if per_agent]
     return [*of_agents, *((difference, None) for per_agent, difference in kinds if not per_agent)]

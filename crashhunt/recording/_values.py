@@ -1,7 +1,7 @@
 """Values of any class as text, for observations and actions whose space has no fixed size.
 
 The text is JSON in ASCII. Numbers, texts, None and lists are written as they are. Everything else is an object with one
-key that says what it is: ``tuple``, ``dict``, ``bytes``, ``array``, ``scalar``, ``graph`` and so on. A value of another
+key that names its class: ``tuple``, ``dict``, ``bytes``, ``array``, ``scalar``, ``graph`` and so on. A value of another
 class is written as ``opaque``: the name of its class and a digest of its content. Equal values have equal texts, in
 every process. Pickle is not used.
 """
@@ -35,7 +35,7 @@ _MAX_SHOWN_ARRAY: Final = 12  # elements
 
 
 class OpaqueValue:
-    """What a recording knows of a value of a class that it cannot hold.
+    """A placeholder for a value whose class a recording cannot contain.
 
     Args:
         kind: Module and name of the class.

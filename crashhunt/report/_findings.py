@@ -218,8 +218,8 @@ def corpus_annotations(reports: Sequence[CaseReport]) -> list[str]:
             title, *words = report.describe().splitlines()
             found.append(_command("error", title, "\n".join(words) or title, file, 1))
         elif report.may_be_tightened:
-            words = ["the crash is fixed. Set expect to fixed"]
-            tighter.append(_command("notice", f"{report.path.name}: may be tightened", words[0], file, 1))
+            words = ["Set expect = 'fixed', to be warned if it crashes again"]
+            tighter.append(_command("notice", f"{report.path.name}: is fixed", words[0], file, 1))
     return [*_limited(found, "cases that are not as expected"), *_limited(tighter, "fixed cases")]
 
 

@@ -82,15 +82,15 @@ class ForcedCopy(Serializable):
 
     Args:
         cell: the model and strength of the first onset, as in `Forcing.ratios`.
-        onset: step of the onset; of the second one where that is forced.
+        onset: step of the first onset; of the second onset if that is forced.
         weight: probability of the onsets that this copy represents, given the root.
         branched: the step after which it left the root, or the copy that it is a copy of.
-        crash: the outcome where that is one of the hunt's crashes, else empty.
-        step: at which the copy ended.
+        crash: the outcome if it counts as a crash in the hunt, else empty.
+        step: the step at which the copy ended.
         disturbed: whether any disturbance had an effect on the copy.
-        disturbances: disturbances of a crash, all that were planned from the start of the trial.
-        within: probability of what this copy represents, given its first onset. It is 1 where later disturbances are
-            drawn as ever. With forced second onsets it is the probability of that onset, or of none.
+        disturbances: if the copy crashed, all disturbances that were planned from the start of the trial.
+        within: conditional probability of this copy, given its first onset. It is 1 if later disturbances are drawn as
+            usual. With forced second onsets, it is the probability of the forced second onset, or of no second onset.
         second: the cell of its forced second onset; empty for none.
     """
 
@@ -115,7 +115,7 @@ class Forced(Serializable):
         masses: masses by cell, the probability that the first onset is of this cell and begins before the root ends.
         copies: copies in the order of their onsets; after each copy its own copies, with a second onset.
         steps: number of steps of the copies.
-        unanswered: how many further copies there were to be, of which nothing is known.
+        unanswered: number of planned copies without a result.
         why_unanswered: the reason for the first of them; empty if there is none.
         may_be_asked_again: whether a reason lies outside of the trial, so that another run may get all answers.
     """
@@ -347,6 +347,6 @@ class TrialResult(Serializable):
 
 
 def in_effect(result: TrialResult, reported: Iterable[Disturbance]) -> TrialResult:
-    """Return a result with those of the reported disturbances that took effect before the end of the trial."""
+    """Return a result without the reported disturbances that had no effect before the end of the trial."""
     found = tuple(one for one in reported if one.vehicle and one.step <= result.steps_begun)
     return replace(result, disturbances=found) if found else result

@@ -69,11 +69,11 @@ class Constant:
         return self.value
 
     def share_of(self, value: Value) -> float:
-        """Return 0.5."""
+        """Return 0.5, because every share gives the same value."""
         return 0.5
 
     def contains(self, value: Value) -> bool:
-        """Whether ``value`` is the value."""
+        """Return whether ``value`` equals the constant."""
         return bool(value == self.value)
 
     def __str__(self) -> str:
@@ -168,7 +168,7 @@ class Range:
 
     @property
     def _logarithms(self) -> tuple[float, float]:
-        """Of the ends, so that of whole numbers each has the same room around it."""
+        """Return the logarithms of both ends; for whole numbers, the range extends by half a number at each end."""
         room = 0.5 if self.integer else 0.0
         return math.log(self.low - room), math.log(self.high + room)
 
@@ -408,7 +408,7 @@ class Signature:
 
         Raises:
             ArgumentError: a distribution cannot be parsed.
-            KeyError, TypeError: the data are not of a signature.
+            KeyError, TypeError: the data do not describe a signature.
         """
         found = [Argument(**{**facts, "distribution": None}) for facts in data["arguments"]]
         texts = [facts["distribution"] for facts in data["arguments"]]
@@ -447,8 +447,8 @@ def signature_of(factory: Callable[..., object]) -> Signature:
     """Return the arguments of a factory, read from its signature.
 
     A parameter may be annotated ``Annotated[float, Argument(...)]`` to say what a hunt should try. Parameters named
-    ``observation_space`` and ``action_space`` are not arguments: they receive the spaces of the vehicle. Nor is
-    ``step_length_s``, which receives that of the simulation.
+    ``observation_space`` and ``action_space`` are not arguments: they receive the spaces of the vehicle.
+    ``step_length_s`` is not an argument either: it receives the step length of the simulation.
     """
     if _takes_nothing(factory):
         return Signature({}, open=False, given=())
@@ -477,13 +477,13 @@ def signature_of(factory: Callable[..., object]) -> Signature:
 
 
 def _takes_nothing(factory: Callable[..., object]) -> bool:
-    """Whether it is a plain class without a constructor, of which `inspect` needs milliseconds to say so."""
+    """Return whether a class has no constructor of its own; `inspect` would need milliseconds for this answer."""
     plain = type(factory) is type and inspect.getattr_static(factory, "__signature__", None) is None
     return plain and all(inspect.getattr_static(factory, name) is vars(object)[name] for name in _CONSTRUCTORS)
 
 
 def _annotation(parameter: inspect.Parameter, names: dict[str, object]) -> object:
-    """The annotation as an object; None if it cannot be had, such as a name imported for type checkers only."""
+    """Return an annotation as an object; None if it cannot be evaluated, such as names imported for type checkers."""
     if not isinstance(parameter.annotation, str):
         return parameter.annotation
     try:

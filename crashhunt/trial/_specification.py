@@ -37,7 +37,7 @@ class Overruled(Serializable):
 
     Args:
         agent: Identifier of the agent.
-        after: The step after which the override begins; the next step is the first with an overridden action.
+        after: The last step without the override; the next step is the first with an overridden action.
         manoeuvre: ``brake``; ``left`` or ``right`` also changes to the lane on that side in the first step.
         keeps: ``lane`` or ``speed``: the agent still acts, but the vehicle keeps its lane or its current speed. Then
             the manoeuvre has no effect.

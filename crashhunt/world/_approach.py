@@ -97,8 +97,8 @@ def approaches(
     Args:
         frames: frames in order.
         agent: the controlled vehicle; scenes without it have no approach.
-        closest: approaches no closer than this in any measure may be skipped.
-        only_best: whether approaches no closer than that of another scene may be skipped too.
+        closest: the closest approach so far; approaches that are not closer in any measure may be skipped.
+        only_best: whether an approach may also be skipped if another scene has a closer one.
 
     Returns:
         Time to collision (s), gap (m), required deceleration (m/s²), each of shape (scenes,). Gaps of more than 50 m
@@ -173,7 +173,7 @@ class _Block(NamedTuple):
     tall: NDArray[np.float64]
 
     def moved(self, step: int, first: int) -> _Block:
-        """Return the same rectangles with step and agent numbers offset."""
+        """Return the same rectangles with an offset added to the numbers of scenes and agents."""
         return self._replace(step=self.step + step, own=self.own + first)
 
 

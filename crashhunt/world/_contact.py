@@ -65,7 +65,7 @@ class Touch:
         time_s: simulation time, in s.
         share: share of the step, from 0 to 1; 1 is the present scene.
         drives_into: whether the first actor drives into the second; otherwise the second drives into the first.
-        x: of the first actor's front bumper, in m.
+        x: x of the first actor's front bumper, in m.
         y: y of the front bumper of the controlled vehicle, in m.
         speed: speed of the first actor, in m/s.
         other_speed: speed of the second actor, in m/s.
@@ -102,11 +102,11 @@ class _Party:
     """An actor at the contact.
 
     Args:
-        rectangle: the part of it that is touched.
-        leads: whether that is its front part.
-        trails: whether that is its back part.
-        velocity: velocity of that part, without a jump, in m/s.
-        jump: sideways, at the contact, in m.
+        rectangle: the part of the actor that is touched.
+        leads: whether this is the front part of the actor.
+        trails: whether this is the back part of the actor.
+        velocity: velocity of this part, without a jump, in m/s.
+        jump: sideways jump of the actor at the contact, in m.
     """
 
     rectangle: Rectangle
@@ -120,7 +120,7 @@ class _Party:
         return math.hypot(*self.velocity) < STANDS_MPS
 
     def face(self, x: float, y: float) -> Face:
-        """Return the side of it that lies in a direction."""
+        """Return the side of the rectangle that faces a direction."""
         c, s = math.cos(self.rectangle[2]), math.sin(self.rectangle[2])
         ahead, left = x * c + y * s, y * c - x * s
         if abs(ahead) > _FRONT and (self.leads if ahead > 0 else self.trails):
@@ -227,7 +227,7 @@ def contact_at(previous: Scene | None, present: Scene, row: int, other: int, *, 
         swept: as in `Scene`. If not, actors move in straight lines and jump nowhere, and the time is an estimate.
 
     Returns:
-        The contact. Where the outlines do not touch, as in some collisions that a simulator reports, the two at the
+        The contact. If the outlines do not touch, as in some collisions that a simulator reports, the positions at the
         end of the step.
     """
     pair = (row, other)
@@ -367,7 +367,7 @@ def lane_jump(previous: Scene, present: Scene, actor: str) -> float:
 
 
 def reachable_m(speed: float, time_s: float) -> float:
-    """Return the distance that an actor of this speed can cover in a step; after a larger one it has been moved."""
+    """Return the greatest distance that an actor of this speed can drive in a step; a larger one is a teleport."""
     return 1.5 * speed * time_s + 1.0
 
 
@@ -396,7 +396,7 @@ def _pieces(scene: Scene, row: int) -> int:
 
 
 def _sideways_excess(dx: float, dy: float, heading: float, turn: float) -> float:
-    """Return how far to the left, in m, a displacement is outside of the ends of all bends by a turn."""
+    """Return how far to the left, in m, a displacement exceeds what a bend with this change of heading can explain."""
     across = dy * math.cos(heading) - dx * math.sin(heading)
     end = heading + turn
     across_end = dy * math.cos(end) - dx * math.sin(end)

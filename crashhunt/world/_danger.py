@@ -159,7 +159,7 @@ def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float
 
 
 def by_step(times: Array, found: Array, count: int, step_length_s: float) -> Array:
-    """Return the criticality of `count` scenes: that of the sample before each, or the greatest one within its step."""
+    """Return the criticality of `count` scenes: of the sample before each scene, or the greatest within its step."""
     steps = np.clip(np.ceil(times / step_length_s - 1e-6).astype(int), 0, max(0, count - 1))
     held = np.zeros(count)
     np.maximum.at(held, steps, found)
@@ -239,7 +239,7 @@ class _Way:
     def first_contacts(self, others: Others) -> tuple[Array, Array]:
         """Return how far ahead of and behind the agent its outline first touches each actor; infinite for no touch.
 
-        Behind it, only actors in other directions count.
+        Behind the agent, only actors that drive in another direction count.
         """
         spacing = float(np.clip(1.6 * self._track.half_length.min(), 1.0, 4.0))
         ahead = self._first(others, spacing, AHEAD_M)
@@ -251,7 +251,7 @@ class _Way:
         return ahead, behind
 
     def reaches_from_behind(self, others: Others) -> tuple[Array, Array]:
-        """Return the same as `first_contacts`, ahead and only for actors that go in the same direction there."""
+        """Return the contacts ahead as `first_contacts` does, but only with actors that drive in the same direction."""
         ahead, _ = self.first_contacts(others)
         there = np.isfinite(ahead)
         heading = np.interp(self.along[others.sample[there]] + ahead[there], self._at, self._heading)
@@ -259,7 +259,7 @@ class _Way:
         return ahead, np.full(len(ahead), np.inf)
 
     def _first(self, others: Others, spacing: float, far: float) -> Array:
-        """Return the first place of a touch with each actor: search places at a spacing, then refine by bisection."""
+        """Return the first place of contact with each actor, by a search at fixed distances and then bisection."""
         found = np.full(len(others.sample), np.inf)
         base = self.along[others.sample]
         reach = (
@@ -298,7 +298,7 @@ class _Way:
     def _apart(self, others: Others, pair: NDArray[np.intp], along: Array, reach: Array | None = None) -> Array:
         """Return the distance between the agent at places along its way and other actors; negative where they overlap.
 
-        Beyond a reach, where one is given, it is infinite.
+        If a reach is given, larger distances are infinite.
         """
         x, y = np.interp(along, self._at, self._x), np.interp(along, self._at, self._y)
         dx, dy = others.x[pair] - x, others.y[pair] - y
@@ -336,7 +336,7 @@ class _Way:
 
 
 def _forwards(track: Track) -> float:
-    """Return 1, or -1 where the agent reversed when it last moved; from lane to lane SUMO's vehicles move sideways."""
+    """Return for each sample 1, or -1 if the agent last moved backwards; lane changes do not count."""
     moved = np.hypot(np.diff(track.x), np.diff(track.y))
     if not len(last := np.flatnonzero(moved > _MOVES_M)[-1:]):
         return 1.0
@@ -389,7 +389,7 @@ _SIDEWAYS_M = 10.0  # from the line through the agent: an actor never within it 
 def followers_danger(frames: Sequence[Frame], agent: str, step_length_s: float) -> tuple[Array, DangerousMoment, float]:
     """Return the rear criticality of an agent: that of the actors that close in on it from behind.
 
-    It is measured after the fact, from a recording. Of long vehicles that bend, the first part counts.
+    It is computed from a recording. Of articulated vehicles, only the first part counts.
 
     Args:
         frames: frames of the whole episode, in order.
@@ -398,7 +398,7 @@ def followers_danger(frames: Sequence[Frame], agent: str, step_length_s: float) 
 
     Returns:
         The rear criticality of each scene, shape (scenes,); the most critical moment; and the value of the trial,
-        from 0 to below 1. The ``other`` of the moment is the actor that closed in.
+        from 0 to below 1. The ``other`` of the most critical moment is the actor that approaches from behind.
     """
     count = sum(len(frame.columns) for frame in frames)
     nothing = DangerousMoment(danger=0.0, step=0, agent=agent, other="")

@@ -56,7 +56,7 @@ class Event(Serializable):
 
 
 def event_counts(counts: Mapping[str, int]) -> str:
-    """Return in words how many of which kinds there were, such as ``2 red lights run, 1 teleport``."""
+    """Return the number of events of each kind in words, such as ``2 red lights run, 1 teleport``."""
     return ", ".join(
         f"{count} {EVENT_WORDS.get(kind, (kind, kind))[count != 1]}" for kind, count in counts.items() if count
     )
@@ -67,14 +67,14 @@ def event_counts(counts: Mapping[str, int]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A way across a junction, from a lane that leads to it to one that leads away.
+    """A path across a junction, from an incoming lane to an outgoing lane.
 
     Args:
-        junction: its name.
-        source: the lane from which it comes.
-        target: the lane to which it leads.
+        junction: name of the junction.
+        source: the incoming lane.
+        target: the outgoing lane.
         inside: the lanes inside the junction.
-        signalised: whether a traffic light says when.
+        signalised: whether a traffic light controls it.
         shape: the centre line inside the junction, as (x, y) pairs in m.
     """
 
@@ -86,7 +86,7 @@ class Link:
     shape: tuple[tuple[float, float], ...]
 
     def distance(self, x: float, y: float) -> float:
-        """How far a point is from it, in m."""
+        """Return the distance of a point from the path, in m."""
         found = math.inf
         for (x0, y0), (x1, y1) in zip(self.shape, self.shape[1:], strict=False):
             dx, dy = x1 - x0, y1 - y0
@@ -98,22 +98,22 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class RightOfWay:
-    """The ways across all junctions of a map.
+    """The paths across all junctions of a map, and which path has to give way.
 
     Args:
-        links: all of them.
-        gives_way: pairs of places in ``links``: the first has to give way to the second.
+        links: all paths.
+        gives_way: pairs of indices of ``links``; the first path has to give way to the second.
     """
 
     links: tuple[Link, ...]
     gives_way: frozenset[tuple[int, int]]
 
     def places(self, lanes: tuple[str, ...], x: float, y: float) -> tuple[int, ...]:
-        """Return the places of the links that an actor may be on, or has just been on.
+        """Return the indices of the links that an actor may be on, or has just left.
 
         Args:
-            lanes: lanes on which it was, in this order; the same lane may come again.
-            x: where it is, in m.
+            lanes: the lanes of the actor in order; a lane may occur again.
+            x: x of the actor's front bumper, in m.
             y: y of the front bumper of the controlled vehicle, in m.
         """
         for back in range(len(lanes) - 1, -1, -1):

@@ -123,7 +123,7 @@ def time_to_contact(
     half_one: NDArray[np.float64],
     half_two: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return when pairs of rectangles first touch, both going on at constant velocity; infinite if never.
+    """Return when pairs of rectangles first touch, both at constant velocity; infinite if never.
 
     On every separating axis the projections overlap during one interval of time; the outlines touch when all four do.
     Source: the swept separating axis test, D. Eberly: Intersection of convex objects, the method of separating axes.
@@ -162,7 +162,7 @@ def time_to_contact(
 
 
 def _outside(x: NDArray[np.float64], y: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The distance of points from rectangles around the origin."""
+    """Return the distance of points from rectangles around the origin."""
     distance: NDArray[np.float64] = np.hypot(
         np.maximum(np.abs(x) - half[:, 0], 0.0), np.maximum(np.abs(y) - half[:, 1], 0.0)
     )
@@ -176,7 +176,7 @@ def _separations(
     half_one: NDArray[np.float64],
     half_two: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """How far apart the projections are on each of the four axes, shape (4, n); positive somewhere: no overlap."""
+    """Return the gaps of the projections on the four axes, shape (4, n); if one is positive, there is no overlap."""
     along, across = np.abs(cosine), np.abs(sine)
     x, y = offset[:, 0], offset[:, 1]
     return np.stack(
@@ -240,16 +240,16 @@ def levels(scene: Scene, row: int, *, parts: int = 0) -> list[Level]:
 
 
 def same_level(one: Rectangle, level: Level, two: Rectangle, other_level: Level, lower_m: float) -> bool:
-    """Whether nothing but distance is between two rectangles; False if one is on a bridge above the other.
+    """Return whether two rectangles are on the same level; False if one is on a bridge above the other.
 
-    Between two that are on one road, it rises about as much as the grades at both of them say.
+    On the same road, the grades at both rectangles explain the difference of their heights.
 
     Args:
         one: a rectangle.
         level: its height.
         two: another.
-        other_level: its height.
-        lower_m: how tall the lower one is, in m.
+        other_level: height of the second rectangle, in m.
+        lower_m: height of the lower actor itself, in m.
     """
     dx, dy = two[0] - one[0], two[1] - one[1]
     ahead = level[1] * (dx * math.cos(one[2]) + dy * math.sin(one[2]))
@@ -270,7 +270,8 @@ def on_one_level(scene: Scene, row: int, other: int) -> bool:
 def corners(scene: Scene, row: int) -> NDArray[np.float64]:
     """Return the outline of an actor: shape (4, 2), counter-clockwise from the front left, in m.
 
-    Of a long vehicle in a bend it is shape (2 n, 2): down its left side, and up its right.
+    For a long vehicle in a bend, the shape is (2 n, 2): along its left side to the back, and along its right side to
+        the front.
     """
     left_side: list[NDArray[np.float64]] = []
     right_side: list[NDArray[np.float64]] = []

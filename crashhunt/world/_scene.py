@@ -1,4 +1,4 @@
-"""The state of the actors at one step, and what touched."""
+"""The state of the actors at one step, and the collisions that the simulator reports."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Actor:
     """The constant properties of an actor.
 
     Args:
-        id: unique within the episode; that of a person is ``person``, a blank and its name.
+        id: identifier, unique within the episode; for a person, ``person``, a blank and the person's name.
         kind: the simulator's class, such as SUMO's ``passenger``, ``truck``, ``pedestrian``.
         length: length in m.
         width: width in m.
@@ -183,7 +183,7 @@ class Frame(NamedTuple):
 
 
 def core_of(frames: Sequence[Frame]) -> Core | None:
-    """Return what computes faster with all of some frames; None if there is no such thing."""
+    """Return the compiled core that all of some frames have; None if a frame has none."""
     core = frames[0].core if frames else None
     if any(frame.core is None or frame.heights is not None or frame.spines is not None for frame in frames):
         return None
@@ -191,7 +191,7 @@ def core_of(frames: Sequence[Frame]) -> Core | None:
 
 
 def part_of(frame: Frame, agent: str, numbers: list[int]) -> Part:
-    """Return a frame as the core takes it, around an agent, with a number for each actor."""
+    """Return a frame around an agent in the form that the compiled core needs, with a number for each actor."""
     roster = frame.roster
     return frame.columns, roster.index.get(agent, -1), roster.lengths, roster.widths, numbers
 
@@ -199,13 +199,13 @@ def part_of(frame: Frame, agent: str, numbers: list[int]) -> Part:
 def joined_frame(
     roster: Roster, columns: NDArray[np.float64], scenes: Sequence[Scene | None], core: Core | None = None
 ) -> Frame:
-    """Return scenes of one roster as a frame.
+    """Return scenes with the same roster as a frame.
 
     Args:
-        roster: roster of all of them.
+        roster: the roster of all scenes.
         columns: as in `Frame`.
         scenes: each one; None if no actor has a height or bends.
-        core: what computes with it faster.
+        core: the compiled core for this frame.
     """
     heights = spines = None
     if any(scene is not None and scene.heights for scene in scenes):
@@ -240,7 +240,8 @@ class Scene:
     Attributes:
         events: traffic events of this step.
         agent_lanes: the lane of each controlled vehicle, if the simulator reports it; not recorded.
-        previous: the scene one step before; None at the start. It has no previous one itself, so that nothing piles up.
+        previous: the scene one step before; None at the start. The previous scene has no previous scene itself, so
+            memory stays bounded.
     """
 
     __slots__ = (

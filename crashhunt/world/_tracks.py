@@ -143,7 +143,7 @@ def ways(
         agent: the controlled vehicle.
         within_m: as for `tracks`.
         step_length_s: step length in s.
-        reach: permits the core to skip irrelevant actors, and then to number none.
+        reach: if given, the core may skip irrelevant actors, and returns no numbers of actors.
     """
     between = _between_steps(step_length_s)
     if between > 1:
@@ -158,15 +158,15 @@ def ways(
 
 
 def tracks(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) -> tuple[Track, Others, list[str]] | None:
-    """Return the way of an agent, the ways of the actors that came within a distance of it, and their names.
+    """Return the path of an agent, the paths of the actors that came within a distance of it, and their names.
 
     Args:
         parts: as `sampled` yields them.
         agent: the controlled vehicle.
-        within_m: within within between centres; actors slightly further away may be included.
+        within_m: greatest distance between centres, in m; actors slightly further away may be included.
 
     Returns:
-        None where the agent is in no scene.
+        None if the agent is in no scene.
     """
     seen = _fronts(parts, agent, within_m)
     return (_track(seen.time, seen.own), _others(seen.theirs), seen.names) if len(seen.time) else None
@@ -284,7 +284,7 @@ def _filled(seen: _Fronts, between: int, step_length_s: float) -> _Fronts:
 
 
 def _between(columns: Array, old: NDArray[np.intp], new: NDArray[np.intp], share: Array, heading: int) -> Array:
-    """Return old columns interpolated to new ones, repeated for each share; one row holds headings."""
+    """Interpolate between two sets of columns, once for each share of the step; headings are interpolated as angles."""
     before, after = columns[:, old, None], columns[:, new, None].copy()
     turned = after[heading] - before[heading]
     after[heading] -= math.tau * np.round(turned / math.tau)  # the short way round
@@ -333,7 +333,7 @@ def _straight(frame: Frame, row: int, names: NDArray[np.intp], within_m: float) 
 
 
 def _bent(frame: Frame, row: int, names: NDArray[np.intp], within_m: float) -> tuple[Array, tuple[Any, ...]]:
-    """Return the same where long vehicles are in bends: each part counts as an actor; of the agent, only the first."""
+    """Return the same for long vehicles in bends: each part counts as an actor, but only the agent's first part."""
     own: list[tuple[float, ...]] = []
     theirs: list[tuple[float, ...]] = []
     for sample in range(len(frame.columns)):
@@ -401,7 +401,7 @@ class Path:
         return self.first + len(self.states) - 1
 
     def at(self, step: int, step_length_s: float) -> State:
-        """Return its state after a step; after its last one, straight on at constant speed."""
+        """Return the state of the actor after a step; after its last one, it continues straight at constant speed."""
         state = self.states[min(step, self.last) - self.first]
         if step <= self.last:
             return state
@@ -409,7 +409,7 @@ class Path:
         return state._replace(x=state.x + away * math.cos(state.heading), y=state.y + away * math.sin(state.heading))
 
     def cut(self, begin: int, end: int) -> Path | None:
-        """Return its part after the steps ``begin`` to ``end``, counted from ``begin``; None if that is empty."""
+        """Return the part of the path from after step ``begin`` to after step ``end``; None if this part is empty."""
         first, last = max(self.first, begin), min(self.last, end)
         if first > last:
             return None
@@ -432,9 +432,9 @@ class Paths(Serializable):
 
     Args:
         time_s: simulation time before the first step, in s.
-        steps: their number; there is one state more, before the first step.
-        agents: agents of the controlled vehicles.
-        others: of all other actors, in order of appearance.
+        steps: number of steps; there is one more state, before the first step.
+        agents: paths of the controlled vehicles.
+        others: paths of all other actors, in order of appearance.
     """
 
     time_s: float
@@ -469,7 +469,7 @@ class Paths(Serializable):
         return replace(self, agents=tuple(starts))
 
     def to_json(self) -> JsonObject:
-        """Return plain data: what a person may want to read, and the rest as compressed JSON; numbers stay exact."""
+        """Return plain data: a readable summary, and the paths as compressed JSON; numbers stay exact."""
         plain = [[_plain(path) for path in some] for some in (self.agents, self.others)]
         text = json.dumps(plain, separators=(",", ":"))
         return {

@@ -125,7 +125,7 @@ def test_todays_code_is_judged(kept):
 
     drive(kept, MENDED)
     done = kept.crashhunt("corpus", "run", "kept crashes")
-    assert done.out.count("may be tightened") == 2
+    assert done.out.count("to be warned if it crashes again") == 2
     expect(kept, 0, "fixed")
     found = kept.crashhunt("corpus", "run", "kept crashes", "--json").json["cases"]
     assert [(case["got"], case["may_be_tightened"]) for case in found] == [("fixed", False), ("fixed", True)]

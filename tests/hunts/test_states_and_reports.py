@@ -135,7 +135,7 @@ def test_hunt_that_fails_before_its_first_trial_has_the_facts_of_a_hunt_that_ran
         )
     found = hunt_state(tmp_path / "h")
     assert (found.state, found.detail, found.kinds) == ("error", "no worker can be started", [])
-    assert found.rate["why_not"] == "no valid trial counts yet"
+    assert found.rate["why_not"] == "no valid trial has finished"
     assert found.to_json()["newest_kind_s"] is None
 
 

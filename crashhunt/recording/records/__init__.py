@@ -1,7 +1,7 @@
 """The types of records: tag, codec, topic of the evidence in the log, reading and comparison of each.
 
-To add a type, define a `RecordType` in one of the modules here, list it in `RECORD_TYPES`, and call
-`BlackBox.append` with its tag where there is something to record.
+To add a type, define a `RecordType` in one of the modules here, list it in `RECORD_TYPES`, and call `BlackBox.append`
+with its tag and the data to record.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ RECORD_TYPES: dict[int, RecordType] = {
 
 
 class Tag(IntEnum):
-    """What a record holds, by the names of those that crashhunt itself writes."""
+    """The tags of the record types that crashhunt writes."""
 
     PROLOGUE = PROLOGUE.tag
     ACTORS = ACTORS.tag

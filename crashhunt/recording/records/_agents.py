@@ -43,7 +43,7 @@ PROLOGUE = RecordType(tag=1, name="prologue", topic="/prologue", form=TextForm()
 
 
 class ArrayForm(Form):
-    """Arrays of the type that the prologue says.
+    """Arrays of the type that the prologue gives.
 
     Args:
         what: the field of the agent's channel that has the type.
@@ -59,12 +59,12 @@ class ArrayForm(Form):
         self._what = what
 
     def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
-        """Return the numbers, in the message that holds those of this type without losing a bit."""
+        """Return the numbers in a message that can represent this type without loss."""
         dtype = getattr(prologue.agents[aux], self._what)
         return message_of(dtype), {"values": np.frombuffer(payload, dtype).tolist()}
 
     def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
-        """Return their bytes."""
+        """Return the bytes of the array."""
         if prologue is None:
             raise ValueError("an array of an agent comes before the first record")
         return np.array(list(message.values), getattr(prologue.agents[aux], self._what)).tobytes()

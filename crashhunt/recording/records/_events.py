@@ -1,4 +1,4 @@
-"""Records of what happens in a step: contacts and vehicles off the road, disturbances, traffic events."""
+"""Records of the events of a step: contacts, vehicles off the road, disturbances, traffic events."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _Events(TypedDict, total=False):
 
 
 def encode_events(scene: Scene) -> bytes:
-    """Return the payload that says what touched and who left the road."""
+    """Return the payload with the contacts and the vehicles that left the road."""
     contacts = [[getattr(contact, name) for name in Contact.__slots__] for contact in scene.contacts]
     return json.dumps({"contacts": contacts, "off_road": list(scene.off_road)}).encode()
 
@@ -57,7 +57,7 @@ EVENTS = RecordType(
 
 
 def encode_notes(events: Iterable[Event]) -> bytes:
-    """Return the payload that says what else happened in the traffic."""
+    """Return the payload with the traffic events."""
     return json.dumps([event.to_json() for event in events]).encode()
 
 
@@ -75,7 +75,7 @@ _DISTURBANCES_NOTHING = "nothing"
 
 
 def encode_disturbance(disturbance: Disturbance) -> bytes:
-    """Return the payload that says what takes place."""
+    """Return the payload of a disturbance that takes place."""
     return json.dumps({"vehicle": "", **disturbance.to_json()}).encode()
 
 

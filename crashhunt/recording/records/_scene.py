@@ -1,4 +1,4 @@
-"""Records of the scene: its actors, which of them are present, where each is, its height, shape and lane."""
+"""Records of the scene: the present actors with their positions, heights, shapes and lanes."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ ACTORS = RecordType(tag=2, name="actors", topic="/scene/actor_definitions", form
 
 
 def encode_roster(numbers: list[int]) -> bytes:
-    """Return the payload that says who is present, by the numbers of the actors."""
+    """Return the payload with the numbers of the present actors."""
     return np.array(numbers, "<u4").tobytes()
 
 
@@ -219,7 +219,7 @@ STEP = RecordType(
 
 
 def encode_heights(scene: Scene) -> bytes:
-    """Return the payload that says how high everybody is, and how steep it is there."""
+    """Return the payload with the height of each actor and the slope of its road."""
     return np.array([*scene.heights, *scene.grades], "<f8").tobytes()
 
 
@@ -255,7 +255,7 @@ _SPINES_HEAD = struct.Struct("<II")
 
 
 def encode_spines(scene: Scene) -> bytes:
-    """Return the payload that says how the long vehicles are bent."""
+    """Return the payload with the centre lines of long vehicles in bends."""
     return _encode_spines(scene.spines)
 
 
@@ -311,7 +311,7 @@ SPINES = RecordType(
 
 
 def encode_lanes(lanes: Iterable[str]) -> bytes:
-    """Return the payload that says where everybody drives."""
+    """Return the payload with the lane of each actor."""
     return "\n".join(lanes).encode()
 
 
@@ -331,7 +331,7 @@ def step_of(payload: bytes) -> int:
 
 
 def points_of(payload: bytes, agents: int) -> NDArray[np.float64]:
-    """Return the positions of the actors of a step, in m, shape (actors, 2), of a recording with so many agents."""
+    """Return the positions of the actors in the payload of a step, in m, shape (actors, 2)."""
     values = np.frombuffer(payload, "<f8", offset=_STEP_HEAD.size)[agents:]
     return values[: len(values) // 2].reshape(-1, 2)
 

@@ -1,4 +1,4 @@
-"""What is said of a type of record: all of it in one place."""
+"""The definition of a type of record."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ Fields: TypeAlias = "Mapping[str, object]"
 
 
 class Form:
-    """How a payload looks as a message of a log. Every bit of the payload must come back.
+    """The conversion of a payload to a message of a log and back, without losing a bit.
 
     Args:
-        messages: the protobuf messages that it may be: name to the type of each field by its name.
+        messages: the possible protobuf messages: name to a mapping from field name to type.
     """
 
     messages: Mapping[str, Mapping[str, str]]
@@ -53,7 +53,7 @@ class Form:
 
 
 class TextForm(Form):
-    """A payload that is text."""
+    """The conversion of a payload that is text."""
 
     messages: Mapping[str, Mapping[str, str]] = {"Text": {"text": "string"}}
 
@@ -62,13 +62,13 @@ class TextForm(Form):
         return "Text", {"text": payload}
 
     def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
-        """Return it again."""
+        """Return the payload of the text."""
         text: str = message.text
         return text.encode()
 
 
 class BytesForm(Form):
-    """Any payload, of which a log does not say what it means."""
+    """The conversion of a payload without a known meaning."""
 
     messages: Mapping[str, Mapping[str, str]] = {"Bytes": {"data": "bytes"}}
 
@@ -77,25 +77,25 @@ class BytesForm(Form):
         return "Bytes", {"data": payload}
 
     def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
-        """Return it as it was."""
+        """Return the payload unchanged."""
         data: bytes = message.data
         return data
 
 
 @dataclass(frozen=True, slots=True)
 class RecordType:
-    """Everything that crashhunt must know of a type of record.
+    """The properties of a type of record.
 
     Args:
-        tag: its number in the black box; from `FIRST_ASIDE` on it is no evidence. Never given twice.
+        tag: unique number of the type in the black box; types from `FIRST_ASIDE` on are no evidence.
         name: name for people, and for the place of a value.
         topic: topic of its messages in a log; ``{agent}`` is replaced by the agent whose number is the record's
             ``aux``.
-        form: how it looks there. A type that came after the first eleven is text or bytes, so that a crashhunt that
-            does not know it can read the record and count it in the digest; what people want to see of it is a view.
-        read: adds a record, given as ``aux`` and payload, to what has been read so far.
-        difference: the first difference between what two equal steps hold of it; of one agent, where ``{agent}`` is in
-            the topic. None if it is never compared, or with another type.
+        form: the conversion to a message. Types after the first eleven are text or bytes. A crashhunt that does not
+            know such a type can therefore read the record and include it in the digest.
+        read: adds a record, given as ``aux`` and payload, to the `Reading`.
+        difference: the first difference between the records of two equal steps; for one agent if the topic has
+            ``{agent}``. None if it is never compared, or with another type.
         value: value of the agent or actor of a divergence, the value at an index, for the steps around.
     """
 
@@ -109,7 +109,7 @@ class RecordType:
 
     @property
     def per_agent(self) -> bool:
-        """Whether every agent has its own records of it."""
+        """Whether every agent has its own records of this type."""
         return "{agent}" in self.topic
 
 
