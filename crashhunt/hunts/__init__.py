@@ -1,4 +1,4 @@
-"""Hunts: the loop, its directory and ledger, and everything that can be asked of them afterwards."""
+"""Hunts: the loop, the directory, and the results that can be read afterwards."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Whether what lies on disk is what was written: hunts, suites, single crashes and exported ones."""
+"""Checks that the files of hunts, suites, crashes and exported crashes are complete and unchanged."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ _SCRATCH = ".scratch"  # of a hunt, which does not run where its leftovers are l
 
 @dataclass(frozen=True, slots=True)
 class Finding(Serializable):
-    """Something that is not as it should be.
+    """A problem that the check has found.
 
     Args:
         where: the file or folder.
-        what: is wrong with it.
-        lost: what cannot be had from it any more; empty if nothing is lost.
-        fix: what gets the rest.
-        damaged: whether it is damage; else it is worth knowing, and harmless.
+        what: the problem.
+        lost: the data that are lost; empty if nothing is lost.
+        fix: how to recover the rest.
+        damaged: whether the problem is damage; otherwise it is harmless.
     """
 
     where: str
@@ -55,18 +55,18 @@ class Finding(Serializable):
 
 @dataclass(slots=True)
 class Checked:
-    """A hunt, a crash or an exported crash that has been looked at.
+    """The result of the check of a hunt, a crash or an exported crash.
 
     Args:
-        dir: where it is.
+        dir: path of the hunt or crash.
         kind: ``hunt``, ``crash`` or ``file``.
         protected: whether every trial has a digest; the ledgers of early versions have none.
         trials: the numbers of the trials whose rows are as they were written.
         damaged_trials: reason for each damaged trial.
         crashes: the names of the bundles that are as they were written.
         damaged_crashes: reason for each damaged crash.
-        findings: what is wrong.
-        dropped: the trials of which the bundles were given up, as shorter crashes of their kind were kept.
+        findings: the problems.
+        dropped: the trials whose bundles were deleted, because shorter crashes of their type were kept.
     """
 
     dir: Path
@@ -100,7 +100,7 @@ class Checked:
 
 
 def check(directory: Path) -> list[Checked]:
-    """Look at everything that a directory has: a hunt, the hunts of a suite, one crash, or an exported file.
+    """Check a hunt, the hunts of a suite, a crash, or an exported file.
 
     Raises:
         HuntDirectoryError: it is none of these.
@@ -174,7 +174,7 @@ def _ledger(hunt: Path) -> Path:
 
 
 def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> dict[int, TrialResult] | None:
-    """The crashes in the ledger, where it can be read at all."""
+    """Check the rows of the ledger; return its crashes, or nothing if the ledger cannot be read."""
     path = _ledger(hunt)
     if not has_begun(path):
         if (hunt / layout.CRASHES).is_dir() and not (hunt / layout.CASE).is_file():
@@ -237,7 +237,7 @@ def _count_rows(found: Checked, ledger: Ledger, settings: HuntSettings | None, e
 
 
 def _check_parts(found: Checked, hunt: Path) -> dict[str, Bundle]:
-    """Bundles, snapshots and kept trials; returns the bundles that are whole."""
+    """Check bundles, snapshots and kept trials; return the intact bundles."""
     bundles = {}
     for folder in sorted((hunt / layout.CRASHES).glob(layout.SHOWN)):
         bundle = _check_bundle(found, folder)
@@ -334,7 +334,7 @@ def _check_snapshot(found: Checked, path: Path, crash: str) -> None:
 def _compare(
     found: Checked, rows: dict[int, TrialResult], bundles: dict[str, Bundle], settings: HuntSettings | None
 ) -> None:
-    """What the ledger and the bundles say about each other."""
+    """Compare the crashes of the ledger with the bundles."""
     # One that was made smaller is another trial, of which the ledger knows nothing.
     own = (bundle for name, bundle in bundles.items() if not name.endswith(layout.SMALL))
     by_trial = {bundle.result.spec.number: bundle for bundle in own}
@@ -392,11 +392,11 @@ def salvage(found: Checked, to: Path) -> dict[str, int]:
 
     Args:
         found: the hunt, as it was found.
-        to: a new or an empty directory. It gets its name when everything is in it. Where it has exactly what would be
-            copied, because an earlier call was killed at its end, nothing is done.
+        to: a new or an empty directory. It gets its name when everything is in it. If it already has exactly the copied
+            data, because an earlier call was killed at its end, nothing is done.
 
     Raises:
-        HuntDirectoryError: it has something else or cannot be written, or nothing says what the hunt was asked.
+        HuntDirectoryError: the directory has other content or cannot be written, or the settings of the hunt are lost.
     """
     if found.kind != "hunt":
         raise HuntDirectoryError(
@@ -420,7 +420,7 @@ def salvage(found: Checked, to: Path) -> dict[str, int]:
 
 
 def _copy(found: Checked, settings: HuntSettings, building: Path, to: Path) -> int:
-    """Copy everything into a folder that gets the name of the directory later; return how many trials it has."""
+    """Copy everything into a temporary folder, which is renamed later; return the number of trials in it."""
     for snapshot in intact_snapshots(found.dir):
         shutil.copytree(snapshot.path, building / layout.SNAPSHOTS / snapshot.digest)
     for name in found.crashes:
@@ -439,7 +439,7 @@ def _copy(found: Checked, settings: HuntSettings, building: Path, to: Path) -> i
 
 
 def _is_same(found: Checked, settings: HuntSettings, to: Path) -> bool:
-    """Return whether a directory has what would be copied, and no hunt has resumed there."""
+    """Return whether a directory already has the data to copy, and no hunt has resumed there."""
     with suppress(HuntDirectoryError), closing(Ledger(to / layout.LEDGER)) as ledger:
         facts = ledger.facts()
         return (
@@ -465,7 +465,7 @@ def _settings(hunt: Path) -> HuntSettings:
 
 
 def _copy_rows(found: Checked, settings: HuntSettings, to: Path) -> int:
-    """Copy the rows of trials that are whole, but those of crashes without a bundle."""
+    """Copy the intact rows of trials, except those of crashes without a bundle."""
     with closing(Ledger(to / layout.LEDGER, writable=True)) as ledger:
         count = 0
         source = found.dir / layout.LEDGER

@@ -231,14 +231,14 @@ class Judged:
 
 
 class Kinds:
-    """The kinds of the crashes that a hunt has saved.
+    """The crash types of a hunt, and the crashes to keep, to judge and to show.
 
     Args:
         wanted: number of crash types that ends the hunt; 0 for no limit.
-        crashes: that were saved before.
-        newest: when the last new kind came, in s since the epoch; None if that is unknown.
+        crashes: the crashes that earlier runs of the hunt have saved.
+        newest: time of the last new crash type, in s since the epoch; None if unknown.
         only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
-        dropped: for each crash type, in words, the trials whose bundles were given up before.
+        dropped: for each crash type, in words, the trials whose bundles were deleted before.
         dropped_at_fault: of these trials, the ones whose crashes are the agent's own fault.
         by_cause: number of crashes of each type to judge, so that each cause of a type counts; 0: types count.
     """
@@ -276,7 +276,7 @@ class Kinds:
             self._sign(bundle)
 
     def add(self, bundle: Bundle, ended: int) -> None:
-        """Take in a crash that has been saved.
+        """Add a saved crash.
 
         Args:
             bundle: the crash.
@@ -286,11 +286,11 @@ class Kinds:
             self.newest, self.newest_trial = time.time(), ended
 
     def groups(self, *, running: bool = False) -> tuple[Group, ...]:
-        """Return what there is, the most frequent kind first, each with its crashes in the order of their trials.
+        """Return the crash types, the most frequent first, each with its crashes in the order of their trials.
 
         Args:
-            running: for a screen, which asks ten times a second: the groups of some moments ago, where new ones
-                would take too much of the time, as with 10,000 crashes.
+            running: whether the groups of some moments ago are good enough, as for a screen that is refreshed ten times
+                a second. With 10,000 crashes, new groups would take too long.
         """
         began = time.monotonic()
         if running and self._groups is None and began < self._due:
@@ -333,7 +333,7 @@ class Kinds:
         return found
 
     def _parts(self, group: Group, *, final: bool) -> list[list[Bundle]]:
-        """Return the crashes of a type by cause; none where that is not known yet."""
+        """Return the crashes of a type by cause; a crash whose cause is still unknown is omitted."""
         division = self._divisions.get(group.signature)
         if division is None:
             return [list(group.bundles)]
@@ -357,7 +357,7 @@ class Kinds:
         return sum(division.left for division in self._divisions.values())
 
     def settle(self, judged: Judged) -> None:
-        """Take in the cause of a crash."""
+        """Add the cause of a crash."""
         number = judged.bundle.result.spec.number
         if judged.is_stopped:
             self._divisions[self._signed[number][0]].postpone(number)
@@ -371,7 +371,7 @@ class Kinds:
 
     @property
     def types_by_cause(self) -> int | None:
-        """How many causes there are, each type on its own; None if types count."""
+        """The number of causes, counted for each type separately; None if types count."""
         return len(self._counted()) if self._by_cause else None
 
     def _count(self, number: int, signature: Signature, cause: Cause | None) -> None:
@@ -380,35 +380,35 @@ class Kinds:
             self._first[signature, known] = min(number, self._first.get((signature, known), number))
 
     def _counted(self) -> list[int]:
-        """Return the first trials of what counts: a type without a known cause counts once."""
+        """Return the first trial of each counted type or cause; a type without a known cause counts once."""
         caused = {signature for signature, cause in self._first if cause is not None}
         return sorted(
             number for (signature, cause), number in self._first.items() if cause is not None or signature not in caused
         )
 
     def _worth(self, bundle: Bundle) -> tuple[bool, int, int]:
-        """What is kept first: what was hunted for, and of that the shortest."""
+        """Return the sort key of crashes to keep: wanted crashes first, and among them the shortest."""
         result = bundle.result
         return self._only_at_fault and result.spec.number not in self._at_fault, result.steps, result.spec.number
 
     @property
     def until(self) -> int | None:
-        """The least number of a trial up to which there are enough kinds; None if there are not."""
+        """The least number of a trial up to which there are enough crash types; None if there are not enough."""
         firsts = self._counted()
         return firsts[self._wanted - 1] if 0 < self._wanted <= len(firsts) else None
 
     @property
     def at_fault(self) -> tuple[int, ...] | None:
-        """The trials whose crashes are the agent's own fault, also without a bundle; None if that was not asked."""
+        """The trials whose crashes are the agent's fault, also without a bundle; None without ``--only-at-fault``."""
         return tuple(sorted(self._at_fault | self._dropped_at_fault)) if self._only_at_fault else None
 
     @property
     def dropped_at_fault(self) -> list[int]:
-        """Of the trials whose bundles were deleted, those whose crashes are the agent's own fault."""
+        """The trials whose bundles were deleted and whose crashes are the agent's fault."""
         return sorted(self._dropped_at_fault)
 
     def refresh(self, crashes: Sequence[Bundle]) -> None:
-        """Take the crashes as they are now: they have been confirmed."""
+        """Replace the crashes by their confirmed versions."""
         for bundle in crashes:
             number = bundle.result.spec.number
             if number in self._signed:
@@ -416,7 +416,7 @@ class Kinds:
         self._groups = None
 
     def _sign(self, bundle: Bundle) -> bool:
-        """Take in a crash; return whether it is of a kind that has not been there."""
+        """Add a crash; return whether its crash type is new."""
         number = bundle.result.spec.number
         collided = bundle.result.collision is not None
         try:
@@ -451,7 +451,7 @@ class Kinds:
 def prune_bundles(
     ledger: Ledger, kinds: Kinds | None, crashes: list[Bundle], keep: int, *, final: bool = False
 ) -> list[Bundle]:
-    """Remove the bundles of crashes of which there are enough that are shorter; return the crashes that stay.
+    """Delete bundles beyond the `keep` shortest of each crash type; return the remaining crashes.
 
     Args:
         ledger: ledger of the hunt.
@@ -474,7 +474,7 @@ def prune_bundles(
 
 
 def dropped_crashes(hunts: Iterable[Path]) -> dict[str, int]:
-    """Return of each kind of crash, in words, how many are in the ledgers of some hunts only."""
+    """Return for each crash type, in words, the number of crashes that have no bundle, only a row in a ledger."""
     found: Counter[str] = Counter()
     for hunt in hunts:
         if not (hunt / layout.LEDGER).is_file():

@@ -1,7 +1,7 @@
 """Runs from the start after the last trial: crashes of copies, and the most dangerous trials without a crash.
 
-The branches and probes of all trials are summed up. A copy shows what may happen. Only a run from the start is a
-crash, because a bundle of it replays.
+The branches and probes of all trials are summed up. A copy only shows a possible crash. A run from the start confirms
+it, because its bundle can be replayed.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def verify_branches(copies: VerificationRuns) -> BranchReport | None:
 
 
 def likeliest(result: TrialResult) -> Found | None:
-    """Return the likeliest branch of a trial that crashed, as it is from the start; None if none did."""
+    """Return the likeliest crashed branch of a trial, as a specification from the start; None if no branch crashed."""
     if result.branches is None or not result.branches.crashes:
         return None
     return _specification(result, max(result.branches.crashes, key=_likely))
@@ -173,7 +173,7 @@ def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
 
 
 def _as_it_took_place(stress: Stress | None, result: TrialResult) -> Disturbance:
-    """What a trial was probed with, as it took place when it was run from the start."""
+    """Return the disturbance of a probe as it took place in the run from the start."""
     assert stress is not None
     planned = stress.disturbance
     assert planned is not None
@@ -182,7 +182,7 @@ def _as_it_took_place(stress: Stress | None, result: TrialResult) -> Disturbance
 
 
 def mildest(result: TrialResult) -> Found | None:
-    """Return a trial from the start, with the mildest that made a copy of it crash; None if nothing did."""
+    """Return a trial with the mildest disturbance that made a probe crash, from the start; None if no probe crashed."""
     stress = result.stress
     if stress is None or stress.disturbance is None:
         return None
@@ -194,15 +194,15 @@ def mildest(result: TrialResult) -> Found | None:
 
 
 class CopiedCrashes:
-    """Runs from the start what copies of trials have crashed with, where a crash of that kind would end the hunt.
+    """Runs crashes of copies from the start, if such a crash may end the hunt.
 
-    That is one by disturbances of the kinds that the hunt has. A probe asks for all others as well, and with the worst
-    that is plausible nearly every trial ends in a crash: that measures a trial, and is no crash that the hunt is after.
-    Where kinds of crashes are counted, or those that are the agent's own fault, trials alone end the hunt.
+    Only crashes by the hunt's own kinds of disturbances may end it. Probes also try all other kinds, and with the
+    strongest plausible disturbance nearly every trial crashes. Such a crash measures the trial, but is not one that the
+    hunt searches. If the hunt counts crash types or crashes at fault, only trials end it.
 
     Args:
-        copies: runs from the start what they have found.
-        progress: progress of the hunt, which gets what has crashed there as well.
+        copies: runs crashes of copies from the start.
+        progress: progress of the hunt, which receives these crashes.
         trials: trials of the hunt that are still to run.
     """
 
@@ -215,7 +215,7 @@ class CopiedCrashes:
         self._waiting: list[TrialResult] = []
 
     def resume(self) -> None:
-        """Look at trials that ended in earlier runs of the hunt, which may have been killed before it had."""
+        """Add trials of earlier runs of the hunt, which may have been killed before it examined them."""
         ledger = self._copies.again.ledger
         if not self._ends or self._progress.is_done:
             return
@@ -229,15 +229,15 @@ class CopiedCrashes:
         self.look()
 
     def add(self, result: TrialResult) -> None:
-        """Take in a trial that has ended without a crash."""
+        """Add a trial that has ended without a crash."""
         if self._ends and self._found(result):
             self._waiting.append(result)
 
     def look(self, tell: Callable[[], None] = lambda: None) -> bool:
-        """Run from the start what has been found of the trials that were taken in; return whether one ends the hunt.
+        """Run the crashes of copies of the added trials from the start; return whether one ends the hunt.
 
         Args:
-            tell: called before that, where there is any.
+            tell: called before the first run.
         """
         waiting = sorted(self._waiting, key=lambda result: result.spec.number)
         self._waiting = [result for result in waiting if self._comes_later(result.spec.number)]
@@ -256,12 +256,12 @@ class CopiedCrashes:
         return ends
 
     def _comes_later(self, number: int) -> bool:
-        """Whether trials of lower numbers have not begun: it had ended when the hunt was killed, and they had not."""
+        """Return whether a trial with a lower number has not begun, as after a kill of the hunt."""
         upcoming = self._trials.upcoming
         return self._deterministic and upcoming is not None and upcoming < number
 
     def _found(self, result: TrialResult) -> list[tuple[str, Found]]:
-        """What copies of a trial have crashed with, of the kinds that its hunt has; of its branches the likeliest."""
+        """Return the crash of a copy by the hunt's own kinds of disturbances: the likeliest branch, or a probe."""
         every = ((layout.BRANCHES, likeliest(result)), (layout.PROBES, mildest(result)))
         return [(folder, one) for folder, one in every if one is not None and self._is_of_the_hunt(one)]
 
@@ -275,10 +275,10 @@ class CopiedCrashes:
 
 
 def verify_fork_results(copies: VerificationRuns) -> tuple[ProbeReport | None, BranchReport | None]:
-    """Run what copies have found from the start, and write down how much of it is confirmed.
+    """Run crashes of copies from the start, and record how many are confirmed.
 
     Args:
-        copies: runs that.
+        copies: runs crashes of copies from the start.
     """
     probes, branches = verify_probes(copies), verify_branches(copies)
     found = {PROBES: probes, BRANCHES: branches}
@@ -337,11 +337,11 @@ def _crash_of_copy(result: TrialResult, copy: ForcedCopy) -> Found:
 
 
 def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
-    """See that the most dangerous trials of a hunt are there as bundles, and no others; return them in that order.
+    """Save bundles of the most critical trials of a hunt, and delete others; return the bundles in that order.
 
     Args:
-        again: runs trials of the hunt again. Its settings say how many; where that is none, those that are there stay.
-            Its notes get a line for each trial that could not be kept, and why.
+        again: runs trials of the hunt again. Its settings have the number of bundles; with 0, existing bundles stay.
+            Its notes get a line for each trial that could not be kept, with the reason.
     """
     directory, ledger, keep = again.place.path, again.ledger, again.settings.run.near_misses
     if not keep or len(again.stops):

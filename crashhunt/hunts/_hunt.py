@@ -138,7 +138,7 @@ class Hunt:
                 remove_scratch(self._place.scratch)  # while requests to stop are only collected
 
     def _fail(self, ledger: Ledger, why: str) -> None:
-        """Write down why the hunt ends, where that can still be written."""
+        """Record why the hunt ends, if the ledger can still be written."""
         remove_scratch(self._place.scratch)  # on a disk that is full, this makes room for a line
         with suppress(CrashhuntError):
             last: Noted = self._progress.noted(now=True) if self._progress is not None else {}
@@ -307,7 +307,7 @@ class Hunt:
     def _show_phase(
         self, ledger: Ledger, progress: Progress, watch: Callable[[HuntStatus], None]
     ) -> Callable[[PhaseStatus], None]:
-        """Return what shows the progress after the last trial, on the screen and, every second, in the ledger."""
+        """Return a function that shows the progress after the last trial, on the screen and in the ledger."""
         noted = -math.inf
 
         def show(phase: PhaseStatus) -> None:
@@ -323,7 +323,7 @@ class Hunt:
         return show
 
     def _resume_counts(self, ledger: Ledger, progress: Progress, before: Facts, settings: HuntSettings) -> None:
-        """Take over what the screen counts from the trials of earlier runs."""
+        """Add the trials of earlier runs to the counts of the screen."""
         if before.get("origins"):
             progress.searching.resume(sum(progress.outcomes.values()), ledger.tried_by_origin(settings.crash_on))
         branches, probes = sums_of_branches(ledger, before), sums_of_probes(ledger, before)
@@ -435,13 +435,13 @@ class Hunt:
         progress.ends_at = time.time() + found if self.settings.trials and math.isfinite(found) else None
 
     def _cancelled(self, executor: Executor, in_flight: set[int], wanted: int) -> set[int]:
-        """Cancel trials that are not waited for, as one is what the hunt is after; return those under way that are."""
+        """Cancel trials that a wanted crash makes unnecessary; return the running trials that are still needed."""
         above = wanted if self.settings.run.deterministic else -1
         executor.cancel(above=above)
         return {number for number in in_flight if number <= above}
 
     def _lag(self, before: Facts) -> tuple[int, bool]:
-        """Return by how many trials the results of trials are delayed for a sampler, and whether by fewer at first."""
+        """Return the delay of results for the sampler, in trials, and whether the delay is smaller at first."""
         under_way = _under_way(self.settings.run.parallel or self._parallel_here)
         if not self.settings.run.deterministic:
             return under_way, False
@@ -452,7 +452,7 @@ class Hunt:
     def _listen(
         self, executor: Executor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0
     ) -> None:
-        """Write down what people should know about how the trials were run, and whether they are the same again."""
+        """Record notices about how the trials were run, and the results of the audit."""
         for note in self._heard.take(executor):
             ledger.remark(note)
             progress.notes.append(note)
@@ -465,7 +465,7 @@ class Hunt:
     def _finish_audit(
         self, phases: PhaseClock, executor: Executor, audit: Audit, ledger: Ledger, progress: Progress
     ) -> None:
-        """Run the trials again that still wait for it after the last trial."""
+        """Run the remaining trials of the audit after the last trial."""
         audit.parallel = self._parallel_here
         if (total := audit.waiting) and not self._stops:
             phases.begin("auditing", total)
@@ -522,7 +522,7 @@ class Hunt:
 
     @property
     def _parallel_here(self) -> int:
-        """How many trials at a time this machine runs again, whatever else the executor has."""
+        """Return the number of trials that this machine runs again at a time, independent of the executor."""
         return parallel_here(self.settings.run.executor, self.settings.run.parallel)
 
     def _status(
@@ -558,7 +558,7 @@ class Hunt:
 
 
 def _rate_of(directory: Path, watch: BarWatch | None, stopped: StoppedBecause) -> CrashRate | None:
-    """Return the rate that a hunt with a bar ends with."""
+    """Return the final rate of a hunt with a bar."""
     if watch is None:
         return None
     why_not = "" if stopped in ("rate", "all_trials") else "the number of trials was not fixed ahead"
@@ -573,5 +573,5 @@ def _rate_of(directory: Path, watch: BarWatch | None, stopped: StoppedBecause) -
 
 
 def _under_way(parallel: int) -> int:
-    """How many trials are handed over, of which so many run."""
+    """Return the number of submitted trials for a number of running ones."""
     return parallel * (1 + _QUEUED_PER_WORKER)

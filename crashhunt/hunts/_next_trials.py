@@ -72,15 +72,15 @@ class Trials:
 
     Args:
         settings: settings of the hunt.
-        sampler: who proposes.
+        sampler: the sampler.
         ledger: ledger of the hunt.
         finished: the numbers of the trials that have ended.
-        unanswered: those of them that run again, in order of their numbers: something outside of them kept answers from
-            it. The sampler receives the result in the ledger, and not that of the second run, so that a resumed hunt
+        unanswered: the ended trials that run again, in order of their numbers, because an outside cause prevented some
+            results. The sampler receives the result in the ledger, not that of the second run, so a resumed hunt
             proposes the same trials.
         lag: number of trials that run at a time; in a deterministic hunt, the maximum number.
         lag_grows: whether the first trials of a deterministic hunt have a smaller lag (`growing_lag`).
-        disturber: what draws their disturbances; None if they have none.
+        disturber: draws the disturbances of trials; None if trials have none.
         forcings: the forcing of each root, in rare mode; None in any other hunt.
 
         begun_with: the version of the sampler's proposals in the hunt so far; None if the hunt has none.
@@ -125,7 +125,7 @@ class Trials:
 
     @property
     def upcoming(self) -> int | None:
-        """The number of the next one; all of lower numbers have ended or are under way. None if there is none."""
+        """The number of the next trial; all lower ones are running or have ended. None if there is none."""
         upcoming = [one.number for one in list(self._unanswered)[:1]] + [
             one for one in (self._next,) if one is not None
         ]
@@ -133,11 +133,11 @@ class Trials:
 
     @property
     def exhausted(self) -> bool:
-        """Whether there are no more."""
+        """Whether all trials were handed out."""
         return self._next is None and not self._unanswered
 
     def take(self, room: int) -> list[TrialSpec]:
-        """Return the next trials, at most so many; fewer where there are no more, or a result is waited for first.
+        """Return at most a number of next trials; fewer if there are no more, or if the sampler needs a result first.
 
         Raises:
             CrashhuntError: the sampler fails, or the ledger cannot be written.
@@ -174,7 +174,7 @@ class Trials:
         return found
 
     def ended(self, result: TrialResult) -> None:
-        """Take note of how a trial ended, which is in the ledger already, or will be before anything else happens."""
+        """Register the result of a trial, which is already in the ledger or is written next."""
         number = result.spec.number
         if number in self._running_again:
             self._running_again.discard(number)
@@ -273,7 +273,7 @@ def spec_of(
 
 
 def _drawn(disturber: DisturbanceSampler, seed: int, steps: int, forcing: Forcing | None) -> tuple[Disturbance, ...]:
-    """Return the disturbances of a trial; of a root those of the steps before a first onset can be forced."""
+    """Return the disturbances of a trial; for a root, only those before the first step with a forced onset."""
     return disturber.draw(seed, steps if forcing is None else min(steps, FIRST_STEP - 1))
 
 
@@ -304,7 +304,7 @@ def settings_again(settings: HuntSettings, snapshot: Snapshot, scratch: Path) ->
 
 
 def _settings(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
-    """What both have in common: all that a trial is."""
+    """Return the settings that `settings_of_workers` and `settings_again` have in common."""
     return WorkerSettings(
         scenario=with_settings(snapshot.scenario(), settings),
         oracles=settings.oracles,
@@ -327,14 +327,14 @@ def find_unanswered(ledger: Ledger) -> list[TrialResult]:
     """Return the trials that are to run again, as the ledger of a hunt has them.
 
     Raises:
-        HuntDirectoryError: one of them is not as it was written.
+        HuntDirectoryError: a row of the ledger has changed.
     """
     where = _KILLED if not ledger.facts().get("copies") else f"{_KILLED} OR {_UNASKED}"  # the latter reads every row
     return [result for result in ledger.results_where(where) if result.is_to_be_run_again]
 
 
 class Unanswered:
-    """The trials of a hunt that run again. Their rows stay in the ledger until what comes of it replaces them.
+    """The trials of a hunt that run again. Their rows stay in the ledger until the new results replace them.
 
     Args:
         ledger: ledger of the hunt.
@@ -346,16 +346,16 @@ class Unanswered:
         self._open: set[int] = set()  # of this run of the hunt
 
     def __len__(self) -> int:
-        """How many are still to run again, in this run of the hunt or the next."""
+        """Return the number of trials that are still to run again."""
         return len(self._open | self._before.keys())
 
     @property
     def specs(self) -> list[TrialSpec]:
-        """Which trials run again, in order of their numbers."""
+        """Return the trials that run again, in order of their numbers."""
         return [result.spec for result in self._before.values()]
 
     def account(self, result: TrialResult, progress: Progress) -> bool:
-        """Take note of any trial that has ended; return whether its result is to be recorded.
+        """Register an ended trial; return whether its result is to be recorded.
 
         Args:
             result: result of the trial.

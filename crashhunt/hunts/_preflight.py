@@ -46,15 +46,15 @@ _ENOUGH = 4
 class Preflight:
     """Holds back the first results of a hunt while all of them are the same failure of an agent to start.
 
-    It costs no time: these are the hunt's own first trials. Where an argument of the agent varies, another value of it
-    may well do, and nothing is held back.
+    This takes no time, because these are the hunt's own first trials. If an argument of the agent varies, another value
+    may work, so no result is held back.
 
     Args:
         settings: settings of the hunt.
         planned: number of planned trials.
         files: files of arguments that name files, to where the snapshot has them.
         code: folders of the snapshot from which agents are imported.
-        listen: called before the first result is accounted for, as it may be refused why there are none.
+        listen: called before the first result is accounted for; it may refuse the hunt.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Preflight:
         self._listen = listen
 
     def filter_setup_failures(self, result: TrialResult) -> list[TrialResult]:
-        """Return what is to be accounted for now: nothing yet, or this result with those that were held back.
+        """Return the results to account for now: none yet, or this result and those that were held back.
 
         Raises:
             ArgumentError: the agent does not start, whatever the trial.
@@ -121,14 +121,14 @@ class Preflight:
         )
 
     def _as_asked(self, text: str) -> str:
-        """The same with the names of files as they were given, instead of where the snapshot has them."""
+        """Return the result with the file names that the user gave, instead of the files in the snapshot."""
         for there, here in self._names.items():
             text = text.replace(there, here)
         return text
 
 
 class Heard:
-    """What workers have to say, until it is written down; it is heard before that, as it may refuse the hunt.
+    """Notices of workers; they are read before the first result is recorded, because they may refuse the hunt.
 
     Args:
         settings: settings of the hunt.
@@ -141,7 +141,7 @@ class Heard:
         self._notes: list[str] = []
 
     def hear(self, executor: Executor) -> None:
-        """Ask the workers of an executor.
+        """Read the notices of an executor's workers.
 
         Raises:
             UsageError: trials cannot be copied, as the first ones have shown after their first step. Once any has
@@ -154,7 +154,7 @@ class Heard:
             self._notes.append(note)
 
     def take(self, executor: Executor) -> list[str]:
-        """Return what has been said and was not taken before.
+        """Return the notices that were not returned before.
 
         Raises:
             UsageError: as of `hear`.
@@ -176,7 +176,7 @@ class Heard:
 
 
 def is_hopeless(settings: HuntSettings, outcomes: Mapping[str, int]) -> bool:
-    """Whether so many trials could not be set up, and none could, that no other will be.
+    """Return whether so many trials have failed in their setup, and none succeeded, that the hunt should end.
 
     Args:
         settings: settings of the hunt.
@@ -188,7 +188,7 @@ def is_hopeless(settings: HuntSettings, outcomes: Mapping[str, int]) -> bool:
 
 
 def why_invalid(result: TrialResult, scenario: Scenario) -> str:
-    """Return why a trial could not be set up, with what the simulator said about it last."""
+    """Return why a trial could not be set up, with the last message of the simulator."""
     explained = scenario.backend.explained
     if explained is not None and result.failure is not None:
         error = explained(result.summary, result.failure.last_output, scenario)
@@ -216,10 +216,10 @@ OUTPUT = "output.log"
 
 
 class TrafficSurveyor:
-    """Replaces the candidates that route files promise with the vehicles that do enter.
+    """Replaces the candidates from the route files by the vehicles that really enter.
 
     Args:
-        directory: directory of the hunt. A hunt that is there keeps its candidates.
+        directory: directory of the hunt. An existing hunt keeps its candidates.
         overwrite: whether that hunt is to be removed.
     """
 
@@ -228,12 +228,12 @@ class TrafficSurveyor:
         self._overwrite = overwrite
 
     def __call__(self, scenario: Scenario, request: Request, settings: HuntSettings) -> Scenario:
-        """Return the scenario with its candidates, or the same scenario where there is nothing to find out.
+        """Return the scenario with the surveyed candidates, or the same scenario if it needs no survey.
 
         Args:
-            scenario: as it was loaded.
-            request: what was asked.
-            settings: what follows from it without a survey.
+            scenario: the loaded scenario.
+            request: the request of the user.
+            settings: the settings without a survey.
 
         Raises:
             ScenarioError: no trial can be valid.
@@ -262,7 +262,7 @@ class TrafficSurveyor:
         return refined
 
     def _has_begun_with(self, settings: HuntSettings) -> bool:
-        """Return whether the hunt that is there has the candidates of the route files, because its survey failed."""
+        """Return whether the existing hunt has the candidates of the route files, because its survey failed."""
         if self._overwrite:
             return False
         with suppress(CrashhuntError, OSError):

@@ -1,4 +1,4 @@
-"""How a hunt is going: the figures of the status screen, of ``status`` and of the page; phases and the time left."""
+"""Progress of a hunt: the numbers for the status screen, ``status`` and the page; phases and the time left."""
 
 from __future__ import annotations
 
@@ -54,13 +54,13 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class StrategyStatus:
-    """One of the origins of trials.
+    """The trials of one strategy of the sampler.
 
     Args:
         name: name of the strategy.
-        trials: that it proposed and that have ended.
-        share: share of all that have ended, 0 to 1.
-        danger: mean of its trials, 0 to 1, a crash counting as 1; None if none of them has one.
+        trials: number of ended trials that the strategy proposed.
+        share: share of all ended trials, 0 to 1.
+        danger: mean criticality of its trials, 0 to 1, where a crash counts as 1; None if it is unknown.
         crashes: crashes among its trials.
     """
 
@@ -73,12 +73,12 @@ class StrategyStatus:
 
 @dataclass(frozen=True, slots=True)
 class SearchStatus:
-    """How a search is going, for people who watch.
+    """Progress of a search, for the status screen.
 
     Args:
-        strategies: those that have had trials, the most frequent first; empty if a sampler names none.
+        strategies: the strategies with trials, the most frequent first; empty if the sampler names none.
         grown_trials: number of trials since the last rise of the greatest danger; None without a rise in this run.
-        grown_s: how long ago that was, in s of wall time; None likewise.
+        grown_s: time since this rise, in s of wall time; None likewise.
     """
 
     strategies: tuple[StrategyStatus, ...] = ()
@@ -96,7 +96,7 @@ class _Tally:
 
 @dataclass(slots=True)
 class Searching:
-    """Keeps account of the trials of a hunt, also those of its earlier runs."""
+    """Counts the trials of each strategy, also those of earlier runs of the hunt."""
 
     ended: int = 0
     _tallies: dict[str, _Tally] = field(default_factory=dict)
@@ -127,11 +127,11 @@ class Searching:
             tally.danger += danger
 
     def grow(self) -> None:
-        """Take note that the trial which was counted last is the most dangerous one without a crash."""
+        """Record that the last counted trial is the most critical trial without a crash."""
         self._grown = self.ended, time.monotonic()
 
     def status(self) -> SearchStatus:
-        """Return how it is going."""
+        """Return the progress of the search."""
         strategies = [
             StrategyStatus(
                 name=name,
@@ -150,30 +150,30 @@ class Searching:
 
 @dataclass(frozen=True, slots=True)
 class HuntStatus:
-    """How a hunt is going, for people who watch.
+    """The progress of a hunt, for the status screen.
 
     Args:
         phase: ``hunting``, ``saving``, ``auditing``, ``done``, or a name of `PhaseStatus`.
         planned: trials in all; 0 if only the time is limited.
         done: trials that have ended, in earlier runs of the hunt too.
-        outcomes: how they ended.
+        outcomes: number of trials with each outcome.
         rate_per_s: trials a second in this run.
         elapsed_s: wall time of this run.
-        nearest: the trial that came nearest to a crash without one.
-        workers: trial number to where it is.
+        nearest: the trial without a crash that came nearest to one.
+        workers: trial number to the progress of the trial.
         crashes: found so far, with or without a bundle.
-        nodes: the machines that take part now; None if there is this one only.
+        nodes: the machines that run trials now; None if it is only this machine.
         kinds: kinds of crashes, the most frequent first; None if the first crash ends the hunt.
-        newest_kind_s: how long ago the last new one came, in s; None if that is unknown.
+        newest_kind_s: time since the last new crash type, in s; None if unknown.
         newest_kind_trials: number of trials since the last new crash type; None if an earlier run of the hunt found it.
         types_by_cause: number of causes, each type on its own; None if types count.
         time_left_s: time until no more trials begin, in s of wall time; infinite without a limit.
         disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
         stressed: the trial with the least stress margin; None if no copy was asked, or if no copy crashed.
         branched: number of branches that have crashed.
-        not_fully_asked: number of trials with a question to their copies that has no answer.
-        search: which strategies have had trials, and when the greatest danger grew in this run.
-        rate: the crash rate so far; None if the trials bound none.
+        not_fully_asked: number of trials in which a probe or branch has no result.
+        search: trials of each strategy, and the last rise of the greatest danger in this run.
+        rate: the crash rate so far; None if there is none.
         trials_left_s: time until the last trial ends, in s of wall time; None for an estimate by the mean rate.
         progress: progress of the work after the last trial; None before.
     """
@@ -204,7 +204,7 @@ class HuntStatus:
 
     @property
     def seconds_left(self) -> float:
-        """Time until the last trial, or until the limit, whichever comes first; infinite if neither is known."""
+        """Time until the last trial or the time limit, whichever is first; infinite if both are unknown."""
         if not self.planned:
             return self.time_left_s
         if self.trials_left_s is not None:
@@ -214,7 +214,7 @@ class HuntStatus:
 
     @property
     def share_done(self) -> float:
-        """Which share of the hunt is done, from 0 to 1, by trials or by the clock, whichever is nearer to its end."""
+        """The completed share of the hunt, from 0 to 1: the larger one of trials and time."""
         by_count = self.done / self.planned if self.planned else 0.0
         whole_s = self.elapsed_s + self.time_left_s
         return max(by_count, self.elapsed_s / whole_s if whole_s > 0 else 1.0)
@@ -222,7 +222,7 @@ class HuntStatus:
 
 @dataclass(slots=True)
 class Progress:
-    """What the hunt has seen, in this run of it and before."""
+    """The progress of a hunt in this run and in earlier runs."""
 
     began: float = field(default_factory=time.monotonic)
     until: float = math.inf  # no trial begins
@@ -255,7 +255,7 @@ class Progress:
     rare: RareWatch | None = None
 
     def resume(self, crashes: list[Bundle], run: RunSettings, before: Facts) -> None:
-        """Take in what was saved before."""
+        """Add the crashes that earlier runs have saved."""
         self.crashes = crashes
         self.failed_steps = before.get("failed_steps", 0)
         if run.keep_going or run.only_at_fault:
@@ -293,7 +293,7 @@ class Progress:
             self.found[result.spec.number] = result
 
     def _compare(self, result: TrialResult) -> None:
-        """Compare a trial without a crash with those before: the nearest miss and the least stress margin are kept."""
+        """Update the nearest miss and the least stress margin with a trial that has not crashed."""
         if result.collision is None and result.failure is None:
             before = self.nearest
             self.nearest = max(before or result, result, key=lambda one: one.nearness)
@@ -321,7 +321,7 @@ class Progress:
 
     @property
     def last_wanted(self) -> int | None:
-        """The number of the trial with which the hunt has found what it is after; None if the hunt continues."""
+        """The number of the trial whose crash ends the hunt; None if the hunt continues."""
         if self.rate is not None and self.rate.decided_at is not None:
             return self.rate.decided_at
         found = self.found.keys() | self.copied.keys()
@@ -329,18 +329,18 @@ class Progress:
 
     @property
     def ended_by_copy(self) -> Bundle | None:
-        """What a copy has found that ends the hunt; None if it is a trial that does, or nothing."""
+        """The crash of a copy that ends the hunt; None if there is none, or if a trial ends the hunt."""
         return self.copied.get(self.last_wanted) if self.last_wanted is not None else None
 
     @property
     def is_done(self) -> bool:
-        """Whether the hunt had found what it is after before it began."""
+        """Whether earlier runs of the hunt have already found the wanted crashes."""
         if self.rate is not None:
             return self.rate.decided_at is not None
         return bool(self.crashes or self.copied) if self.kinds is None else self.kinds.until is not None
 
     def why_stopped(self, *, keep_going: bool) -> StoppedBecause:
-        """Why a hunt stops that has found what it is after."""
+        """The reason why a hunt ends after it has found the wanted crashes."""
         if self.rate is not None:
             return "rate"
         return "distinct" if keep_going else "crash"
@@ -355,38 +355,38 @@ class Progress:
 
     @property
     def disturbed(self) -> int:
-        """How many of the crashes had disturbances."""
+        """The number of crashes with disturbances."""
         unsaved = self.unsaved
         return self.tally.disturbed + (unsaved is not None and unsaved.disturbed)
 
     @property
     def crash_count(self) -> int:
-        """How many crashes there are, with or without a bundle."""
+        """The number of crashes, with or without a bundle."""
         return self.tally.found + (self.unsaved is not None)
 
     @property
     def time_left_s(self) -> float:
-        """Until no more trials begin; infinite without a limit."""
+        """Time until no more trials begin, in s; infinite without a limit."""
         return max(0.0, self.until - time.monotonic())
 
     def look_at(self, executor: Executor) -> None:
-        """Take note of where trials run."""
+        """Update the progress of the running trials."""
         self.nodes = tuple(executor.nodes()) if supports(executor, HasNodes) else None
 
     def running_rate(self, *, now: bool = False) -> RunningRate | None:
         """Return the crash rate so far; None if the trials bound none.
 
         Args:
-            now: whether that of some moments ago will not do.
+            now: whether the rate must be new; otherwise a rate of some moments ago is returned.
         """
         watch = self.rare or self.counted
         return None if watch is None else watch.running(now=now)
 
     def noted(self, *, now: bool = False) -> Noted:
-        """Return what the ledger is to say about now.
+        """Return the facts about the present progress for the ledger.
 
         Args:
-            now: whether a rate of some moments ago will not do.
+            now: whether the rate must be new; otherwise it may be some moments old.
         """
         nodes: Noted = {} if self.nodes is None else {"nodes": [asdict(node) for node in self.nodes]}
         kinds: Noted = {}
@@ -501,7 +501,7 @@ class PhaseStatus(Serializable):
 
 
 class PhaseClock:
-    """Reports the progress of what a hunt does after its last trial.
+    """Reports the progress of the work after the last trial of a hunt.
 
     Args:
         show: receives the progress about ten times a second, in the thread of the hunt.

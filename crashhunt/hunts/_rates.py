@@ -1,4 +1,4 @@
-"""Which trials of a hunt count for its crash rate, the rate of a running hunt, and rare mode.
+"""The trials that count for the crash rate of a hunt, the rate of a running hunt, and rare mode.
 
 Cost: constant for each trial. A resumed hunt reads the number and the outcome of each earlier trial once.
 """
@@ -85,7 +85,7 @@ def refuse_training_traffic(settings: HuntSettings, held_out: HeldOutTraffics) -
 
 
 def why_no_interval(settings: HuntSettings, facts: Facts) -> str:
-    """Return why the trials of a hunt say nothing about a rate; empty if they do."""
+    """Return why the trials of a hunt give no rate; empty if they give one."""
     if settings.rare:
         return "in rare mode, one of five trials runs without disturbances; crashhunt status reports the rate"
     if settings.seeds:
@@ -100,7 +100,7 @@ def why_no_interval(settings: HuntSettings, facts: Facts) -> str:
 
 
 def bar_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics) -> BarWatch | None:
-    """Return what watches the rate, with the trials that ended in earlier runs; None if there is no bar."""
+    """Return the object that compares the rate with the bar, with the trials of earlier runs; None without a bar."""
     if not settings.run.until_rate:
         return None
     bar, per = rate_of(settings.run.until_rate)
@@ -117,7 +117,7 @@ def bar_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics)
 
 
 def rate_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics) -> RateWatch | None:
-    """Return what counts the trials per trial, with those of earlier runs; None if they bound no rate."""
+    """Return the object that computes the rate per trial, with the trials of earlier runs; None if there is no rate."""
     facts = ledger.facts()
     if why_no_interval(settings, facts):
         return None
@@ -168,13 +168,13 @@ class Forcings:
 
     @staticmethod
     def needed(number: int) -> int:
-        """Return how many trials, from number 0 on, have to have ended before a trial begins."""
+        """Return the number of first trials that must have ended before a trial begins."""
         if not is_root(number):
             return 0
         return max(0, number // TRIALS_PER_ROOT // BLOCK - 1) * BLOCK * TRIALS_PER_ROOT
 
     def of(self, number: int) -> Forcing | None:
-        """Return the forcing of a root, None of a plain trial; numbers have to be asked in order."""
+        """Return the forcing of a root; None for a plain trial. Call it in the order of trial numbers."""
         if not is_root(number):
             return None
         needed = self.needed(number)
@@ -216,14 +216,14 @@ class RareWatch:
 
     @property
     def roots(self) -> int:
-        """How many roots were read with their plain trials."""
+        """The number of roots that were read together with their plain trials."""
         return self._counter.roots + self._counter.excluded
 
     def read(self, finished: int | None = None) -> None:
         """Read the trials that have ended, up to the first one that has not.
 
         Args:
-            finished: how many trials, from number 0 on, have ended; None to look.
+            finished: number of first trials that have ended; None to read it from the ledger.
         """
         while not self.is_met and (finished is None or self._read < finished):
             result = self._ledger.result(self._read)
@@ -258,7 +258,7 @@ class RareWatch:
         """Return the rate so far.
 
         Args:
-            now: whether that of some moments ago will not do, where a new one takes too much of the time.
+            now: whether the rate must be new; otherwise it may be some moments old.
         """
         return self._paced(self.roots, now=now)
 

@@ -1,4 +1,4 @@
-"""What a hunt reports: the report itself, and those of its audit, its probes and its branches."""
+"""The report of a hunt, with the reports of its audit, probes and branches."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Difference(Serializable):
-    """Where a trial differs when it is run again in a new process.
+    """The first difference between a trial and its run in a new process.
 
     Args:
         trial: number of the trial.
@@ -175,13 +175,13 @@ class BranchReport:
 
 @dataclass(frozen=True, slots=True)
 class RareReport:
-    """What came of a hunt in rare mode.
+    """The result of a hunt in rare mode.
 
     Args:
         estimate: estimate of the crash probability per trial.
         verified: number of the weightiest crashes of copies that were run from the start.
         not_finished: number of these runs that did not finish.
-        crashes: those of them that crashed in the same way at the same step, and once more bit-identically.
+        crashes: the runs that crashed in the same way at the same step, and again bit-identically.
     """
 
     estimate: RareEstimate
@@ -191,7 +191,7 @@ class RareReport:
 
     @property
     def is_verified(self) -> bool:
-        """Whether every crash that was run to its end from the start came again."""
+        """Whether every completed run from the start has crashed again."""
         return len(self.crashes) == self.verified - self.not_finished
 
     def to_json(self) -> JsonObject:
@@ -206,7 +206,7 @@ class RareReport:
 
     @property
     def lines(self) -> list[str]:
-        """The answer, its evidence and what is missing, for the user."""
+        """The estimate, its evidence and its limits, as lines for the user."""
         found = self.estimate
         if found.estimate is None:
             return [f"rare: no estimate: {found.why_not or 'no root has ended'}"]

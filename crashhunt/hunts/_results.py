@@ -1,4 +1,4 @@
-"""What hunts have left on disk, as objects: ``crashhunt.load(directory)``."""
+"""The results of hunts on disk, as objects: ``crashhunt.load(directory)``."""
 
 from __future__ import annotations
 
@@ -85,10 +85,10 @@ Cell: TypeAlias = "Value | None"
 
 @dataclass(frozen=True, slots=True)
 class TrialRow:
-    """One trial of many.
+    """One trial of a table.
 
-    What an earlier version did not write is missing here. It is made of plain data, as ledgers yield them: a table has
-    a million trials, and a `TrialResult` takes three times as long.
+    Values that an earlier version did not write are missing. It is made of plain data, as ledgers yield them: a table
+    has a million trials, and a `TrialResult` takes three times as long.
 
     Args:
         data: data of the trial.
@@ -98,17 +98,17 @@ class TrialRow:
 
     @property
     def number(self) -> int:
-        """Its place in the hunt."""
+        """The number of the trial in the hunt."""
         return int(self.data["spec"]["number"])
 
     @property
     def outcome(self) -> Outcome:
-        """How it ended."""
+        """The outcome of the trial."""
         return outcome_of(self.data)
 
     @property
     def time_to_collision_s(self) -> float | None:
-        """The least; None if no course ever crossed."""
+        """The least time to collision, in s; None if no courses crossed."""
         return _closest(self.data).get("time_to_collision_s")
 
     @property
@@ -118,41 +118,41 @@ class TrialRow:
 
     @property
     def origin(self) -> str:
-        """Which strategy of a sampler proposed it; empty if none did."""
+        """The strategy of the sampler that proposed the trial; empty if there is none."""
         return str(self.data["spec"].get("origin", ""))
 
     @property
     def parent(self) -> int | None:
-        """The number of the trial that it was made from; None if there is none."""
+        """The number of the trial from which the sampler derived this trial; None if there is none."""
         found: int | None = self.data["spec"].get("parent")
         return found
 
     @property
     def stress_margin(self) -> float | None:
-        """How little it would have taken, 0 to 1; None if that was not asked, or not fully."""
+        """The stress margin, 0 to 1; None if it was not measured, or not completely."""
         stress = self.data.get("stress")
         return stress.get("margin") if stress else None
 
     @property
     def is_fully_asked(self) -> bool:
-        """Whether every question to its copies has an answer; also where there were to be none."""
+        """Whether all planned probes and branches have a result; true if none were planned."""
         stress, branches = self.data.get("stress"), self.data.get("branches")
         return not (stress and stress.get("margin") is None) and not (branches and branches.get("unanswered"))
 
     @property
     def arguments(self) -> Mapping[str, Mapping[str, Value]]:
-        """What its agents were given, by agent and name."""
+        """The arguments of the agents, by agent and name."""
         found: Mapping[str, Mapping[str, Value]] = self.data["spec"].get("arguments", {})
         return found
 
     @property
     def scenario_arguments(self) -> Mapping[str, Value]:
-        """What its scenario was given, by name."""
+        """The arguments of the scenario, by name."""
         found: Mapping[str, Value] = self.data["spec"].get("scenario_arguments", {})
         return found
 
     def cells(self, columns: Sequence[str]) -> dict[str, Cell]:
-        """Return it as a row of a table that has some columns.
+        """Return the trial as a row of a table with some columns.
 
         Args:
             columns: some of `FACTS`, `DISTURBANCES`, `STRESS`, `BRANCHES` and `ORIGINS`, ``AGENT.ARGUMENT`` and
@@ -205,7 +205,7 @@ def _closest(data: JsonObject) -> JsonObject:
 
 
 class UnfinishedWarning(UserWarning):
-    """What was loaded is not, or not yet, what was asked for."""
+    """The loaded hunt or suite has not finished."""
 
 
 class HuntResults:
@@ -231,10 +231,9 @@ class HuntResults:
 
     @cached_property
     def settings(self) -> HuntSettings:
-        """What was asked.
+        """The settings of the hunt.
 
-        Raises:
-            HuntDirectoryError: hunt.toml is missing or damaged, or the ledger is that of another hunt.
+        Raises: HuntDirectoryError: hunt.toml is missing or damaged, or the ledger is that of another hunt.
         """
         settings = read_settings(self.directory / layout.HUNT)
         if not has_begun(self.directory / layout.LEDGER):
@@ -257,7 +256,7 @@ class HuntResults:
 
     @cached_property
     def plain_origin(self) -> str:
-        """The origin of the trials that were drawn independently of all others, where not all were; else empty."""
+        """The origin of the independently drawn trials, if not all trials are independent; else empty."""
         with closing(self._ledger()) as ledger:
             return ledger.facts().get("plain_origin") or ""
 
@@ -265,8 +264,8 @@ class HuntResults:
     def columns(self) -> tuple[str, ...]:
         """The columns of a table of the trials, with ``parent`` and ``origin`` if the sampler reports them.
 
-        Likewise ``disturbances`` and ``log_likelihood``, where it has any disturbances, those of `STRESS`, where
-        it has probes, and those of `BRANCHES`, where it has branches.
+        If the hunt has disturbances, also ``disturbances`` and ``log_likelihood``; with probes, those of `STRESS`; with
+        branches, those of `BRANCHES`.
         """
         with closing(self._ledger()) as ledger:
             origins = ORIGINS if ledger.facts().get("origins") else ()
@@ -319,8 +318,8 @@ class HuntResults:
     def trials(self) -> NDArray[np.generic]:
         """Return a row per trial, as a structured array, shape (trials,).
 
-        Its fields are those of ``crashhunt trials``; times in s, distances in m, decelerations in m/s². A number that
-        there is none of is NaN.
+        Its fields are those of ``crashhunt trials``; times in s, distances in m, decelerations in m/s². A missing
+        number is NaN.
         """
         names = self.columns
         columns: dict[str, list[Cell]] = {name: [] for name in names}
@@ -351,7 +350,7 @@ class HuntResults:
         Args:
             trial: number of the trial.
             agent: id of the vehicle; may be empty if the hunt has a single controlled vehicle.
-            trust: import what the hunt names even if the hunt is neither made here nor trusted.
+            trust: import the modules that the hunt names, even if the hunt is neither made here nor trusted.
 
         Raises:
             UsageError: there is no such vehicle or trial.
@@ -441,8 +440,8 @@ def write_text(hunt: HuntResults, out: IO[str], form: str, *, outcomes: Sequence
     """Write the trials of a hunt as text; return how many.
 
     Args:
-        hunt: whose.
-        out: where.
+        hunt: the hunt.
+        out: the text file to write to.
         form: ``csv``, ``json`` (one array) or ``jsonl`` (an object per line).
         outcomes: only those; empty for all.
     """
@@ -489,7 +488,7 @@ def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()
 
 
 def _kinds(hunt: HuntResults, batch: list[dict[str, Cell]]) -> dict[str, str]:
-    """The type of each column, which a row group cannot find out by itself."""
+    """Return the type of each column, because a single row group may not show it."""
     settings = hunt.settings
     specs = {f"scenario.{name}": spec for name, spec in settings.scenario_arguments.items()}
     for agent, chosen in settings.agents.items():

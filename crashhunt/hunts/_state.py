@@ -1,4 +1,4 @@
-"""What state a hunt is in, read from its directory by any process at any time."""
+"""The state of a hunt, which any process can read from its directory at any time."""
 
 from __future__ import annotations
 
@@ -62,16 +62,16 @@ PROBES, BRANCHES, RARE = "probes", "branches", "rare"
 
 
 class ProbeSums(TypedDict):
-    """What ``status --json`` says of the probes of a hunt.
+    """The probes of a hunt in ``status --json``.
 
     Args:
-        trials: number of trials whose copies were asked everything that was to be asked.
-        not_fully_asked: number of further trials with a question that has no answer.
-        least: the least stress margin of the former; None if there is none.
+        trials: number of trials in which all probes have a result.
+        not_fully_asked: number of further trials in which a probe has no result.
+        least: the least stress margin of the trials with all results; None if there is none.
         trial: the number of the trial that has it.
         probes: number of probes.
         steps: number of steps of the copies.
-        left_out: number of skipped questions, because copies had used their share of steps.
+        left_out: number of probes that were skipped because copies had used their budget of steps.
         crashed_trials: number of trials without a crash of their own that a probe made crash.
         run_again: number of the mildest disturbances that were run from the start; None before these runs.
         confirmed: number of these runs that crashed.
@@ -90,7 +90,7 @@ class ProbeSums(TypedDict):
 
 
 class BranchSums(TypedDict):
-    """What ``status --json`` says of the branches of a hunt, as `ProbeSums`.
+    """The branches of a hunt in ``status --json``, as in `ProbeSums`.
 
     Args:
         trials: number of trials that may have had some.
@@ -100,7 +100,7 @@ class BranchSums(TypedDict):
         left_out: number of skipped branches, because branches had used their share of steps.
         crashed: number of branches that crashed.
         crashed_trials: number of trials whose copies crashed.
-        not_fully_asked: number of trials with a branch that has no answer.
+        not_fully_asked: number of trials in which a branch has no result.
         run_again: number of the likeliest crashes that were run from the start; None before these runs.
         confirmed: number of these runs that crashed.
     """
@@ -118,13 +118,13 @@ class BranchSums(TypedDict):
 
 
 def copies_to_come(settings: HuntSettings) -> list[str] | None:
-    """Return which copies a hunt has of its trials; None if it has none."""
+    """Return whether the trials of a hunt have probes, branches or both; None for neither."""
     every = ((PROBES, settings.probe), (BRANCHES, settings.branch), (RARE, settings.rare))
     return [name for name, wanted in every if wanted] or None
 
 
 def sums_of_probes(ledger: Ledger, facts: Facts) -> ProbeSums | None:
-    """Return what came of the probes of a hunt so far; None if it has none."""
+    """Return the results of the probes of a hunt so far; None if it has no probes."""
     if PROBES not in (facts.get("copies") or ()):
         return None
     (row,) = ledger.summed(
@@ -144,7 +144,7 @@ def sums_of_probes(ledger: Ledger, facts: Facts) -> ProbeSums | None:
 
 
 def sums_of_branches(ledger: Ledger, facts: Facts) -> BranchSums | None:
-    """Return what came of the branches of a hunt so far; None if it has none."""
+    """Return the results of the branches of a hunt so far; None if it has no branches."""
     if BRANCHES not in (facts.get("copies") or ()):
         return None
     (row,) = ledger.summed(
@@ -164,7 +164,7 @@ def sums_of_branches(ledger: Ledger, facts: Facts) -> BranchSums | None:
 
 
 def _confirmed(facts: Facts, name: str) -> tuple[int | None, int | None]:
-    """How many were run from the start, and how many of them crashed there as well."""
+    """Return the number of runs from the start, and how many of them crashed."""
     found = None if facts.get("state") == "running" else (facts.get("confirmed") or {}).get(name)  # of an earlier run
     return (found[0], found[1]) if found else (None, None)
 
@@ -184,32 +184,32 @@ _ENDED: dict[str, State] = {
 
 @dataclass(frozen=True, slots=True)
 class HuntState(Serializable):
-    """Where a hunt stands.
+    """The state of a hunt.
 
     Args:
-        dir: its directory.
+        dir: directory of the hunt.
         state: ``queued``, ``running``, ``finished`` (no crash), ``crashed`` (found one), ``error``, ``interrupted``
             or ``killed`` (its process is gone and did not say why).
-        detail: why, where it is an error.
+        detail: the reason of an error.
         trials_planned: number of planned trials; 0 if only the time is limited.
         trials_run: number of ended trials.
-        outcomes: how.
+        outcomes: number of trials with each outcome.
         crashes: number of crashes, with or without a bundle.
         crashes_saved: number of crashes with a bundle, if there are fewer (``--keep``); else None.
         errors: number of trials that could not be set up, or ended in a software fault.
-        rate_per_s: trials a second, in its last run.
+        rate_per_s: trials per second in the last run of the hunt.
         seconds_left: expected time to the last trial, to the time limit, or to the end of the phase, in s; None if
             unknown.
-        owner_alive: whether its process is there.
+        owner_alive: whether the process of the hunt is running.
         damaged: whether its ledger cannot be read, so that the counts say nothing.
         phase: what it does after its last trial: fields of `PhaseStatus` but the time; None before, and where it does
             not run.
         disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
-        probes: what came of them so far; None if it has none.
+        probes: results of the probes so far; None if the hunt has no probes.
         branches: likewise.
         rate: the crash rate, as it was at its last heartbeat: fields of `RunningRate`; None if none is known.
         core: whether the simulator's compiled core is used; None if it has none.
-        nodes: the machines on which it runs, or ran last: fields of `NodeFigures`; None if it was this one only.
+        nodes: the machines of its last run: fields of `NodeFigures`; None if it was only this machine.
         kinds: kinds of crashes, the most frequent first: fields of `KindData`; None if the first crash ends the hunt.
         newest_kind_s: how long ago the last new one came, in s; None if that is unknown.
         types_by_cause: number of causes, each type on its own; None without ``--by-cause``.
@@ -241,7 +241,7 @@ class HuntState(Serializable):
 
     @property
     def failed(self) -> bool:
-        """Whether it ended without having done what was asked."""
+        """Whether the hunt ended without completing its work."""
         return self.state in ("error", "interrupted", "killed")
 
 
@@ -310,7 +310,7 @@ def hunt_state(directory: Path) -> HuntState:
 
 
 def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last: float | None) -> HuntState:
-    """Return the state of a hunt from what its ledger says, without its crashes and the sums over its copies.
+    """Return the state of a hunt from the facts of its ledger, without its crashes and the sums over its copies.
 
     Args:
         directory: directory of the hunt.
@@ -349,13 +349,13 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
 
 
 def _phase(facts: Facts) -> dict[str, Any] | None:
-    """Return what a running hunt does after its last trial."""
+    """Return the phase of a running hunt after its last trial."""
     phase = facts.get("phase")
     return {name: phase[name] for name in ("name", "done", "total")} if phase else None
 
 
 def _seconds_left(facts: Facts, trials: int, rate: float) -> float | None:
-    """Until the last trial, or until the time is up, whichever is first; after that, to the end of the phase."""
+    """Return the time until the last trial or the time limit; after that, the time until the end of the phase."""
     if phase := facts.get("phase"):
         left: float | None = phase["seconds_left"]
         return None if left is None else max(0.0, left - (time.time() - facts.get("heartbeat", time.time())))
@@ -393,7 +393,7 @@ def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
 
     Args:
         facts: facts of its ledger.
-        settings: settings of the hunt; before samplers said it, of ours the random one did.
+        settings: settings of the hunt; in early ledgers without this fact, the sampler `random` is independent.
     """
     return bool(facts.get("independent", settings.sampler == "random")) and not settings.seeds
 
@@ -417,7 +417,7 @@ def _is_alive(owner: Owner, heartbeat: float) -> bool:
 
 
 def _started(pid: int) -> int:
-    """When a process began, in ticks since the machine did; 0 if it is not there, -1 where that is unknown."""
+    """Return when a process started, in clock ticks since boot; 0 if it does not exist, -1 if unknown."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
     except OSError:
@@ -434,7 +434,7 @@ def _started(pid: int) -> int:
 
 
 def _in_order(path: Path) -> tuple[tuple[int, int, str], ...]:
-    """Runs by number: 2 before 10."""
+    """Return the sort key of runs by number: 2 before 10."""
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in path.parts)
 
 
@@ -457,10 +457,10 @@ _BEFORE = (".lock", _SCRATCH, ".hunt.")  # what may be there before: of a hunt t
 
 
 class HuntDirectory:
-    """A directory to hunt in.
+    """The directory of a hunt.
 
     Args:
-        path: path of it; it is made where it does not exist, its parents are not.
+        path: path of the directory; the directory itself is created if it does not exist.
 
     Attributes:
         has_begun: whether the hunt runs. Until then, an error removes a directory that was made for it.
@@ -472,15 +472,15 @@ class HuntDirectory:
 
     @property
     def scratch(self) -> Path:
-        """Where running trials write, wherever their process goes meanwhile.
+        """The folder in which running trials write.
 
-        A hunt that resumes has another folder: processes of one that was killed may still be writing for a moment.
+        A resumed hunt has another folder, because processes of a killed hunt may still write for a moment.
         """
         return self.path.absolute() / f"{_SCRATCH}-{this_process().token}"
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other hunts out, by a lock that dies with this process.
+        """Lock the directory against other hunts; the lock ends with this process.
 
         Raises:
             HuntDirectoryError: the directory is busy, foreign or unwritable.
@@ -533,7 +533,7 @@ class HuntDirectory:
                 (self.path / name).unlink(missing_ok=True)
 
     def claim(self, settings: HuntSettings, command: list[str], *, overwrite: bool, seed_given: bool) -> HuntSettings:
-        """Make the directory this hunt's, or see that it is already; return the settings that hold.
+        """Claim the directory for this hunt, or check that it already has this hunt; return the valid settings.
 
         Args:
             settings: settings of the hunt.
@@ -601,12 +601,12 @@ _MOST = 1_000_000  # bytes of one file, from its end
 
 
 class LogReader:
-    """Reads the logs of a hunt and its trials, each time what is new.
+    """Reads the new lines of the logs of a hunt and its trials.
 
     Args:
-        hunt: its directory.
-        kinds: what of it.
-        trial: only of this one.
+        hunt: directory of the hunt.
+        kinds: the kinds of logs to read.
+        trial: number of the only trial to read; None for all.
     """
 
     def __init__(self, hunt: Path, kinds: tuple[LogKind, ...], *, trial: int | None = None) -> None:
@@ -618,7 +618,7 @@ class LogReader:
         self._told = 0
 
     def fresh(self) -> Iterator[tuple[str, str]]:
-        """Yield title and text of what has come since the last time."""
+        """Yield title and text of the lines that are new since the last call."""
         if self._trial is None:
             if "state" in self._kinds:
                 yield from self._states()
@@ -666,7 +666,10 @@ class LogReader:
                 yield f"{title}{kind}{changed}", text
 
     def _as_written(self, path: Path) -> bool:
-        """Whether a file has the digest that its crash records. Files of hunts and of early crashes have none."""
+        """Return whether a file has the digest that its crash records.
+
+        Files of hunts and of early crashes have no digest.
+        """
         if path.parent not in self._files:
             self._files[path.parent] = files_of(path.parent)
         entry = self._files[path.parent].get(path.name)

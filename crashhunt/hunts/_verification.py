@@ -65,7 +65,7 @@ class Confirmation:
     the hunt are confirmed and judged then.
 
     Args:
-        again: runs them.
+        again: runs crashes again.
         executor: executor of the hunt.
     """
 
@@ -82,7 +82,7 @@ class Confirmation:
         self._is_judging = False
 
     def look(self, progress: Progress) -> None:
-        """Ask for crashes that are new, and take in those that have been confirmed or judged."""
+        """Start with new crashes, and collect those that have been confirmed or judged."""
         if progress.kinds is None:
             return  # the first crash ends the hunt, and is confirmed then
         for bundle in progress.crashes:
@@ -155,13 +155,13 @@ class TrialReruns:
 
     Args:
         place: place of the hunt.
-        ledger: ledger of the hunt, which knows the code of each trial.
+        ledger: ledger of the hunt, which has the snapshot of each trial.
         settings: settings of the hunt.
         parallel: number of runs at a time.
-        notes: gets a line for whatever went wrong.
-        failed: gets what was to confirm something, and ended otherwise.
+        notes: receives a line for each problem.
+        failed: receives runs that should have confirmed a crash, and ended otherwise.
         stops: non-empty as soon as a stop is requested.
-        executors: which run crashes again.
+        executors: the executors that run crashes again.
         phases: receive the progress of these runs.
         taken: the digest of the snapshot that this process has taken; without it, each snapshot has to be trusted.
     """
@@ -181,7 +181,7 @@ class TrialReruns:
         """Yield each trial as it ends, until a stop is requested.
 
         Args:
-            specs: specs of different trials of the hunt; what else they say may have been changed.
+            specs: specifications of different trials of the hunt; their other fields may have been changed.
             folder: folder of the hunt, into which bundles of them are written.
 
         Raises:
@@ -210,7 +210,7 @@ class TrialReruns:
                 remove_scratch(scratch)
 
     def confirm(self, crashes: Sequence[Bundle]) -> list[Bundle]:
-        """Run every crash that is not fully confirmed yet once more, and return them all, in their order."""
+        """Run every crash again that is not fully confirmed; return all crashes in their order."""
         left = [bundle for bundle in crashes if not is_settled(bundle)]
         if not left:
             return list(crashes)
@@ -224,7 +224,7 @@ class TrialReruns:
         return bool(len(self.stops))
 
     def confirm_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Bundle:
-        """Run a crash that is not fully confirmed yet once more; return it as it is then.
+        """Run a crash again that is not fully confirmed; return the updated crash.
 
         Args:
             bundle: the crash.
@@ -251,7 +251,7 @@ class TrialReruns:
         return found
 
     def judge_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Judged:
-        """Find the cause of a crash by runs, and write them into its bundle.
+        """Find the cause of a crash by runs, and write the result into its bundle.
 
         Args:
             bundle: the crash.
@@ -286,12 +286,12 @@ class TrialReruns:
             progress.replace([judged.bundle if judged.bundle.id == one.id else one for one in progress.crashes])
 
     def _is_made_now(self, bundle: Bundle) -> bool | None:
-        """Whether a bundle ran what this process has just taken a snapshot of, whose files need no second look."""
+        """Return whether a bundle has the snapshot that this process has just made, so that its files need no check."""
         return True if bundle.snapshot == self.taken and is_bundle_made_here(bundle) else None
 
 
 def is_settled(bundle: Bundle) -> bool:
-    """Whether a crash is fully confirmed, so that it is not run again."""
+    """Return whether a crash is fully confirmed, so that it is not run again."""
     return bundle.confirmed is not None and not bundle.result.why_no_escape
 
 
@@ -301,8 +301,8 @@ class Again:
 
     Args:
         result: the result.
-        runs: which ran it.
-        snapshot: the digest of its code.
+        runs: the object that ran the trial.
+        snapshot: digest of the snapshot.
         scratch: the folder of the workers.
         folder: folder of the hunt, for its bundle.
     """
@@ -314,7 +314,7 @@ class Again:
     folder: str
 
     def write(self, result: TrialResult, *, confirmed: bool | None = None) -> Bundle:
-        """Write the bundle: what it has left behind, with a result; return it."""
+        """Write the bundle of the trial with a result; return the bundle."""
         trial = scratch_of(self.scratch, result.spec.number)
         return write_bundle(
             self.runs.place.path, result, trial, hunt_seed=self.runs.settings.seed, snapshot=self.snapshot,
@@ -327,12 +327,12 @@ class Again:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """How a copy of a trial crashed.
+    """A crash of a copy of a trial.
 
     Args:
-        spec: the same from the start.
+        spec: specification of the crash from the start.
         outcome: outcome of the copy.
-        step: at which it ended.
+        step: step at which the copy ended.
     """
 
     spec: TrialSpec
@@ -342,12 +342,12 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class VerificationRuns:
-    """Runs from the start what copies have found.
+    """Runs crashes of copies from the start.
 
     Args:
         again: runs trials of the hunt again.
-        disturber: knows how likely disturbances are; None if the hunt has no models.
-        kept: by folder and trial, what has been run already, and is not run again.
+        disturber: computes the likelihood of disturbances; None if the hunt has no models.
+        kept: the crashes that were already run, by folder and trial; they are not run again.
     """
 
     again: TrialReruns
@@ -360,12 +360,12 @@ class VerificationRuns:
         return bool(len(self.again.stops))
 
     def crashes(self, found: Sequence[Found], folder: str, name: PhaseName) -> tuple[tuple[Bundle, ...], int]:
-        """Return those that reproduce at the same step, and once more bit-identically, in their order.
+        """Return the crashes that reproduce at the same step, and again bit-identically, in their order.
 
-        The second value is how many could not be run to their end, so that nothing is known about them.
+        The second value is the number of runs that did not finish.
 
         Args:
-            found: of different trials.
+            found: crashes of copies of different trials.
             folder: folder of the hunt, for the bundles; what it had before is gone, but for what is kept. If a stop is
                 requested, it stays.
             name: name of the phase.
@@ -397,7 +397,7 @@ class VerificationRuns:
         return crashed.get(found.spec.number)
 
     def _run(self, found: Sequence[Found], folder: str) -> tuple[dict[int, Bundle], set[int]]:
-        """Return the bundles of those that crashed as their copies did, and the numbers of those without an answer."""
+        """Return the bundles of runs that crashed like their copies, and the numbers of trials without a result."""
         wanted = {one.spec.number: one for one in found}
         unanswered = set(wanted)
         bundles: dict[int, Bundle] = {}
@@ -439,11 +439,11 @@ class VerificationRuns:
 
 
 class Audit:
-    """Runs the sample again during the hunt, one trial at a time.
+    """Runs the sampled trials again during the hunt, one at a time.
 
     Args:
         settings: settings of the hunt; they say which trials.
-        failed: gets those that were not the same.
+        failed: receives the trials that differed.
     """
 
     def __init__(self, settings: WorkerSettings, failed: list[TrialResult]) -> None:
@@ -460,17 +460,17 @@ class Audit:
 
     @property
     def left(self) -> list[int]:
-        """The numbers of the trials that were to be run again, and have not been run to the end yet."""
+        """The numbers of the sampled trials whose second run has not finished."""
         return sorted(self._killed | self._waiting.keys())
 
     @property
     def waiting(self) -> int:
-        """How many trials have not been run again yet."""
+        """The number of trials that still wait for their second run."""
         return len(self._waiting)
 
     @property
     def report(self) -> AuditReport:
-        """What has come of it so far."""
+        """The results so far."""
         return AuditReport(self._done, tuple(self._differences), len(self.left))
 
     @property
@@ -498,7 +498,7 @@ class Audit:
         return replace(result, kept=False)
 
     def look(self, timeout_s: float = 0.0) -> list[Difference]:
-        """Return what has been found since the last call, waiting so long for a trial to end, if one runs."""
+        """Return the results since the last call; wait at most this long for a running trial."""
         if not self._waiting:
             return []
         found = []
@@ -567,7 +567,7 @@ _FOLDER = "audits"  # of the scratch folder
 
 
 class AuditsLeft:
-    """The trials that earlier runs of a hunt were to run again, and did not.
+    """The sampled trials that earlier runs of a hunt have not run again.
 
     Args:
         ledger: ledger of the hunt.
@@ -587,12 +587,12 @@ class AuditsLeft:
         self.numbers = sorted(left)
 
     def note(self, audit: Audit, progress: Progress) -> None:
-        """Have the progress of the hunt say the results audit, and what is left of all audits."""
+        """Add the result of the audit, and the trials left of all audits, to the progress of the hunt."""
         progress.audit = audit.report
         progress.audits_left = sorted({*audit.left, *self.numbers})
 
     def finish(self, again: TrialReruns, progress: Progress) -> None:
-        """Run them again, and add what comes of it to the progress of the hunt."""
+        """Run these trials again, and add the results to the progress of the hunt."""
         left_now = set(progress.audits_left) - set(self.numbers)
         now, (late, left) = progress.audit or AuditReport(), _finish(again, self.numbers)
         progress.audit = AuditReport(
