@@ -315,11 +315,13 @@ def test_it_is_what_a_search_over_time_shifts_finds(bend, speed, ways):
         return  # they touch in earnest, or all but
     measured, _ = level(ego, *theirs)
     whole = searched(ego, theirs, LENGTH, WIDTH, same_way=math.pi / 6 - 2 * abs(bend))
-    # Behind the agent, 30 m of its way are examined at places 4 m apart, none of which may lie in the first 4 m of the
-    # way or the last 4 m of the 30 m. An actor that goes the agent's way is excluded by the place where whole cars
-    # touch, within 12 m of where their inner parts do.
-    behind, first = int(26 / (speed * 0.1)), math.ceil(4 / (speed * 0.1))
-    inner = searched(ego, theirs, 1.0, 0.8, behind=behind, first=first, same_way=math.pi / 6 + 12 * abs(bend))
+    # Behind the agent, its way is examined at places 4 m apart, from the agent to 28 m or to the last of them on the
+    # known way. An actor that goes the agent's way is excluded by the place where whole cars touch, within 12 m of
+    # where their inner parts do.
+    driven = speed * 0.1 * np.arange(steps)
+    last = driven - 4.0 * np.minimum(np.floor(driven / 4.0 - 1e-9), 7)
+    first = np.ceil(last / (speed * 0.1)).astype(int)
+    inner = searched(ego, theirs, 1.0, 0.8, first=first, same_way=math.pi / 6 + 12 * abs(bend))
     found = -1.2 * np.log(np.maximum(measured, 1e-9))
     sampled = np.arange(0, steps, 3)
     # The way ends; nobody knows what is beyond.
@@ -328,11 +330,11 @@ def test_it_is_what_a_search_over_time_shifts_finds(bend, speed, ways):
     assert np.all(found[sampled] < inner[sampled] + 0.15)
 
 
-def searched(ego, theirs, length, width, behind=None, first=0, *, same_way):
+def searched(ego, theirs, length, width, first=None, *, same_way):
     """The least shift in time, in s, with which an overlap comes about at each step.
 
-    Back, the search covers at most ``behind`` steps, and none before the first. It skips actors that go the same way,
-    up to some rad.
+    Back, the search ends at the step that ``first`` has for each step. It skips actors that go the same way, up to some
+    rad.
     """
     steps = len(ego)
     nearest = np.full(steps, np.inf)
@@ -345,7 +347,7 @@ def searched(ego, theirs, length, width, behind=None, first=0, *, same_way):
     for other in theirs:
         apart = np.hypot(*(ego[:, None] - other[None])[..., :2].T).T
         for step in range(0, steps, 3):
-            earliest = min(step, max(first, step - (behind or step)))
+            earliest = 0 if first is None else min(step, int(first[step]))
             for at in sorted(range(earliest, steps), key=lambda at: abs(at - step)):
                 if 0.1 * abs(at - step) >= nearest[step]:
                     break
