@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import urllib.request
 from contextlib import suppress
 
@@ -116,20 +117,20 @@ def test_a_missing_extra_names_the_command_that_installs_it(shell):
 def test_a_hunt_with_crashes_ends_with_the_command_on_a_terminal_only(toy, terminal):
     words = ["run", "my hunt", "1", "1", "99", "--scenario", "toy", "--arg", "speed=20", "--seed", "1"]
     reader, writer = pty.openpty() if terminal else os.pipe()
-    environment = {**toy.environment, "TERM": "xterm", "COLUMNS": "100"}
-    with subprocess.Popen(
-        [sys.executable, "-m", "crashhunt", *words],
-        cwd=toy.folder,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=writer,
-        stderr=subprocess.STDOUT,
-    ):
-        os.close(writer)
-        shown = b""
+    toy.environment |= {"TERM": "xterm", "COLUMNS": "100"}
+    shown = []
+
+    def read():
         with suppress(OSError), open(reader, "rb", buffering=0) as screen:  # EIO when a terminal is closed
             while part := screen.read(65_536):
-                shown += part
+                shown.append(part)
+
+    reading = threading.Thread(target=read)
+    reading.start()
+    toy.crashhunt(*words, terminal=writer, streams=(1, 2))
+    os.close(writer)
+    reading.join(60)
+    shown = b"".join(shown)
     assert b"000000-collision" in shown
     assert (b"Look at it: crashhunt dashboard 'my hunt'" in shown) is terminal
 

@@ -561,7 +561,7 @@ def test_fault_of_crashhunt_ends_the_hunt_with_a_line_to_report_it(shell):
     prepare(shell)
     with (shell.folder / "place_environment.py").open("a") as file:
         file.write(FAULT)
-    done = shell.process("run", "h", "1", "3", "4", "--scenario", "s.toml", "--seed", "1", "--json", expect=2)
+    done = shell.crashhunt("run", "h", "1", "3", "4", "--scenario", "s.toml", "--seed", "1", "--json", expect=2)
     assert "crashhunt itself failed in trial 0 after 0 steps: KeyError: 'ours'" in done.err
     assert "report it with the output of the same command with CRASHHUNT_TRACEBACK=1" in done.err
     assert "Traceback" not in done.err

@@ -8,7 +8,8 @@ from contextlib import closing, suppress
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, strategies as st
+from conftest import examples
+from hypothesis import given, settings, strategies as st
 
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.hunts import TrialRow
@@ -193,6 +194,7 @@ def test_the_nearest_miss_is_no_crash_and_no_void(tmp_path):
 NAMES = st.text().filter(lambda name: name not in ("seal", "reader"))
 
 
+@settings(max_examples=examples(20))  # each is a ledger of its own
 @given(st.dictionaries(NAMES, st.none() | st.integers() | st.text() | st.lists(st.floats(allow_nan=False))))
 def test_facts_are_kept_and_none_removes_one(tmp_path_factory, facts):
     ledger = Ledger(tmp_path_factory.mktemp("ledger") / "ledger.sqlite", writable=True)
