@@ -40,8 +40,11 @@ class Traffic(Protocol):
     def step(self, dt: float, /) -> bool:
         """Do what `Road.step` does; return False before the search for lanes if a number is no longer finite."""
 
-    def run(self, count: int, dt: float, /) -> tuple[int, bool]:
-        """Do several sub-steps; return the number of complete ones, and whether `step` would have returned False."""
+    def run(self, count: int, dt: float, stops: bool, /) -> tuple[int, bool]:
+        """Do several sub-steps; return the number of complete ones, and whether `step` would have returned False.
+
+        If it stops at crashes, the sub-step in which a vehicle crashes is the last one.
+        """
 
     def collide(self, dt: float, /) -> None:
         """Do what `Road.step` does after the movement: check all pairs for collisions."""
@@ -54,6 +57,9 @@ class Traffic(Protocol):
 
     def fill_times(self, *given: object) -> None:
         """Fill the grid of `compute_ttc_grid`."""
+
+    def observe(self, *given: object) -> int | None:
+        """Fill the rows of a `KinematicObservation`; return their number, or None if highway-env must observe."""
 
     def completed(self) -> int:
         """Return the number of complete sub-steps of the last `run`, which may have raised an error."""

@@ -34,7 +34,16 @@ if TYPE_CHECKING:
     from crashhunt.accelerator._roads import State
 
 
-__all__ = ["close_objects", "fill_lanes", "fill_times", "observe", "observe_exit", "observe_goal", "observe_grid"]
+__all__ = [
+    "close_objects",
+    "fill_lanes",
+    "fill_times",
+    "observe",
+    "observe_exit",
+    "observe_goal",
+    "observe_grid",
+    "observe_in_kernel",
+]
 
 
 _BASIC = frozenset(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))
@@ -43,6 +52,8 @@ _OF_DESTINATIONS = ("cos_d", "sin_d")
 _LATE = frozenset((*_OF_LANES, *_OF_DESTINATIONS))  # highway-env's own code computes them, if they are shown
 _KNOWN = _BASIC | _LATE
 _ALL = sorted(_BASIC)
+_CODES = {name: code for code, name in enumerate(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))}
+"""The features in the order of the kernel."""
 _OF_OBJECTS = _BASIC - {"heading"}
 
 
@@ -80,6 +91,46 @@ def close_objects(
     if count:
         found = found[:count]
     return [frame.things[number] for _, number in found]
+
+
+def observe_in_kernel(kinematic: KinematicObservation, state: State) -> NDArray[np.generic] | None:
+    """Return the result of `KinematicObservation.observe`; None if the kernel does not know a part of it."""
+    features, rows, env = kinematic.features, kinematic.vehicles_count, kinematic.env
+    if not _are_known(features) or not _BASIC.issuperset(features) or not state.roster.describes:
+        return None
+    if type(rows) is not int or rows < 2 or not are_numbers((env.PERCEPTION_DISTANCE,)):
+        return None
+    ranges = kinematic.features_range
+    if kinematic.normalize:
+        ranges = ranges or _default_ranges(kinematic)
+        if type(ranges) is not dict:
+            return None
+    scales = np.zeros((len(features), 2))
+    for name, limits in ranges.items() if kinematic.normalize else ():
+        if name in features:
+            low, high = limits[0], limits[1]
+            if not are_numbers((low, high)) or not np.isfinite(high - low) or high == low:
+                return None
+            scales[features.index(name)] = low, high - low
+    shown = np.zeros((rows, len(features)))
+    found = state.traffic.observe(
+        shown,
+        kinematic.observer_vehicle,
+        bytes(map(_CODES.__getitem__, features)),
+        scales,
+        env.PERCEPTION_DISTANCE,
+        kinematic.see_behind,
+        kinematic.order == "sorted",
+        kinematic.include_obstacles,
+        kinematic.absolute,
+        kinematic.clip,
+    )
+    if found is None:
+        return None
+    kinematic.features_range = ranges
+    if kinematic.order == "shuffled":
+        env.np_random.shuffle(shown[1:])
+    return shown.astype(np.float32)
 
 
 def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.generic] | None:
@@ -353,16 +404,20 @@ def _values(thing: RoadObject, late: Iterable[str] = ()) -> dict[str, float]:
     return values
 
 
+def _default_ranges(kinematic: KinematicObservation) -> dict[str, list[float]]:
+    side = kinematic.env.road.network.all_side_lanes(kinematic.observer_vehicle.lane_index)
+    width = AbstractLane.DEFAULT_WIDTH * len(side)
+    return {
+        "x": [-5.0 * Vehicle.MAX_SPEED, 5.0 * Vehicle.MAX_SPEED],
+        "y": [-width, width],
+        "vx": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
+        "vy": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
+    }
+
+
 def _normalize(kinematic: KinematicObservation, shown: NDArray[np.float64], rows: int) -> None:
     if not kinematic.features_range:
-        side = kinematic.env.road.network.all_side_lanes(kinematic.observer_vehicle.lane_index)
-        width = AbstractLane.DEFAULT_WIDTH * len(side)
-        kinematic.features_range = {
-            "x": [-5.0 * Vehicle.MAX_SPEED, 5.0 * Vehicle.MAX_SPEED],
-            "y": [-width, width],
-            "vx": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
-            "vy": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
-        }
+        kinematic.features_range = _default_ranges(kinematic)
     for name, limits in kinematic.features_range.items():
         if name in kinematic.features:
             column = kinematic.features.index(name)

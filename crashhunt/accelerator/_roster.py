@@ -61,6 +61,7 @@ class Roster:
         decides: Whether the kernel knows how all vehicles decide.
         moves: Whether the kernel knows how all vehicles move.
         predicts: Whether all vehicles predict their paths as highway-env's do.
+        describes: Whether all vehicles and objects describe themselves as highway-env's do.
         kinds: The properties of the class of each vehicle and object.
     """
 
@@ -76,6 +77,7 @@ class Roster:
         self._is_shared = all(map(_is_disjoint, self._fixed, map(vars, things)))
         #: one thing of each class, for the parameters of the class
         self._examples = [things[kinds.index(kind)] for kind in dict.fromkeys(kinds)]
+        self.describes = all(kind.describes for kind in kinds)
         self._thinking = [thing for thing, kind in zip(things, kinds, strict=True) if kind.times]
         self.traffic = self._in_kernel(road, things, network)
         if self.traffic is not None:

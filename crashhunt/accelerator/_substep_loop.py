@@ -51,6 +51,9 @@ class Onlooker:
         after: Called after each sub-step.
         interferes: Returns whether the two observers may change the road; called before and after each sub-step. By
             default they never do.
+        waits: Returns whether the observers do nothing until a vehicle crashes, apart from the sub-steps in which a
+            vehicle crashes. Then ``after`` is called only after these, and ``before`` is not called. By default they
+            are always called.
     """
 
     def __init__(
@@ -60,11 +63,18 @@ class Onlooker:
         before: Callable[[float], None] | None = None,
         after: Callable[[], None] | None = None,
         interferes: Callable[[], bool] = bool,
+        waits: Callable[[], bool] = bool,
     ) -> None:
         self._advance = advance
         self._before = before
         self._after = after
         self.interferes = interferes
+        self.waits = waits
+
+    def look(self) -> None:
+        """Call the observer after a sub-step."""
+        if self._after is not None:
+            self._after()
 
     def __deepcopy__(self, memo: dict[int, object]) -> Onlooker:
         """Return the same object for a copy of the road, as for a function."""
@@ -75,8 +85,7 @@ class Onlooker:
         if self._before is not None:
             self._before(dt)
         self._advance(dt)
-        if self._after is not None:
-            self._after()
+        self.look()
 
 
 _CALLED = ("_simulate", "_automatic_rendering")
@@ -105,7 +114,7 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[object, 
         originals["AbstractEnv._simulate"](env, action)
         return
     frames = _frames(env)
-    can_fuse = type(road) is Road and "step" not in vars(road)
+    can_fuse = type(road) is Road
     found.alone = True
     frame = -1
     try:
@@ -114,7 +123,7 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[object, 
                 found.distrust()
                 env.action_type.act(action)
                 found.distrust()
-            if can_fuse:
+            if can_fuse and _waits(road):
                 due = frames if action is None else _frames(env) - env.steps % _frames(env)
                 done = _run(env, found, min(frames - frame, due))
                 if done:
@@ -145,7 +154,7 @@ def _run(env: AbstractEnv, found: Prepared, count: int) -> int:
     if not state.roster.decides or not state.roster.moves:
         return 0
     try:
-        done, unfinished = state.traffic.run(count, dt)
+        done, unfinished = state.traffic.run(count, dt, "step" in vars(road))
     except BaseException:
         env.steps += state.traffic.completed()
         raise
@@ -153,6 +162,8 @@ def _run(env: AbstractEnv, found: Prepared, count: int) -> int:
         finish(road, dt)
         done += 1
     env.steps += done
+    if done and "step" in vars(road):
+        vars(road)["step"].look()
     return done
 
 
@@ -183,6 +194,12 @@ def _are_in_place(replaced: Iterable[tuple[object, str, object]]) -> bool:
     return rendering is originals["AbstractEnv._automatic_rendering"] and all(
         vars(owner).get(name) is faster for owner, name, faster in replaced
     )
+
+
+def _waits(road: Road) -> bool:
+    """Whether the observers of a road's sub-steps may be called at a crash only."""
+    onlooker = vars(road).get("step")
+    return onlooker is None or (type(onlooker) is Onlooker and onlooker.waits())
 
 
 def _interferes(road: Road) -> bool:

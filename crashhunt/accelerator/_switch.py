@@ -27,6 +27,7 @@ from crashhunt.accelerator._observe import (
     observe_exit,
     observe_goal,
     observe_grid,
+    observe_in_kernel,
 )
 from crashhunt.accelerator._roads import (
     forget,
@@ -198,7 +199,11 @@ def _enforce_road_rules(self: RegulatedRoad) -> None:
 
 def _observe(self: KinematicObservation) -> object:
     if _is_plain(self, KinematicObservation):
-        found = observe(self, frame_of(self.env.road))
+        road = self.env.road
+        state = look(road) if type(road).close_objects_to is _close_objects_to else None
+        found = observe_in_kernel(self, state) if state is not None else None
+        if found is None:
+            found = observe(self, frame_of(road))
         if found is not None:
             return found
     return originals["KinematicObservation.observe"](self)

@@ -10,10 +10,10 @@
 //   not finite.
 //
 // Its parts are kernel_numbers.hpp (arithmetic), kernel_lanes.hpp, kernel_actors.hpp (state), kernel_policies.hpp
-// (decisions), kernel_movement.hpp, kernel_collisions.hpp, kernel_predictions.hpp, and kernel_snapshots.hpp (what must
-// stay the same). This file has what Python calls.
+// (decisions), kernel_movement.hpp, kernel_collisions.hpp, kernel_predictions.hpp, kernel_observations.hpp, and
+// kernel_snapshots.hpp (what must stay the same). This file has what Python calls.
 
-#include "kernel_predictions.hpp"
+#include "kernel_observations.hpp"
 #include "kernel_snapshots.hpp"
 
 namespace {
@@ -70,16 +70,22 @@ PyObject *traffic_collide(Traffic *self, PyObject *dt) {
     Py_RETURN_NONE;
 }
 
+std::ptrdiff_t count_crashed(const Traffic *self) {
+    return std::count_if(self->actors->begin(), self->actors->end(), [](const Actor &actor) { return actor.moves && actor.crashed; });
+}
+
+// run(count, dt, stops): several sub-steps; where it stops at crashes, the sub-step in which a vehicle crashes is the last.
 PyObject *traffic_run(Traffic *self, PyObject *args) {
-    int count;
+    int count, stops;
     PyObject *dt;
-    if (!PyArg_ParseTuple(args, "iO!", &count, &PyFloat_Type, &dt)) {
+    if (!PyArg_ParseTuple(args, "iO!p", &count, &PyFloat_Type, &dt, &stops)) {
         return nullptr;
     }
     double length = PyFloat_AS_DOUBLE(dt);
     Moved moved = FINITE;
+    const std::ptrdiff_t crashed = count_crashed(self);
     int &done = self->completed;
-    for (done = 0; done < count; done++) {
+    for (done = 0; done < count && !(stops && count_crashed(self) > crashed); done++) {
         if (!act_all(self)) {
             return fail(self, done > 0);
         }
@@ -232,6 +238,60 @@ PyObject *traffic_fill_times(Traffic *self, PyObject *args) {
     Py_RETURN_NONE;
 }
 
+// observe(cells, observer, features, scales, distance, sees_behind, is_sorted, includes_objects, is_absolute, clips): the
+// number of rows that it writes into the cells, of which there are enough; None if highway-env must observe. A feature is
+// a byte, and its scale two floats: the lower end, and the length of the interval, which is 0 for no scale.
+PyObject *traffic_observe(Traffic *self, PyObject *args) {
+    Py_buffer cells, features, numbers;
+    PyObject *object;
+    Search search;
+    int sees_behind, is_sorted, includes_objects, is_absolute, clips;
+    if (!PyArg_ParseTuple(args, "w*Oy*y*dppppp", &cells, &object, &features, &numbers, &search.distance, &sees_behind,
+                          &is_sorted, &includes_objects, &is_absolute, &clips)) {
+        return nullptr;
+    }
+    const size_t columns = static_cast<size_t>(features.len), line = columns * sizeof(double);
+    const size_t lines = columns ? static_cast<size_t>(cells.len) / line : 0;
+    const char *codes = static_cast<const char *>(features.buf);
+    std::vector<Scale> scales(columns);
+    bool fits = lines > 1 && static_cast<size_t>(numbers.len) == 2 * line;
+    for (size_t column = 0; fits && column < columns; column++) {
+        double given[2];
+        std::memcpy(given, static_cast<const char *>(numbers.buf) + column * sizeof(given), sizeof(given));
+        scales[column] = {given[0], given[1], given[1] != 0};
+        fits = codes[column] >= 0 && codes[column] < FEATURES;
+    }
+    PyObject *found = nullptr;
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "the cells have another size than their parts");
+    } else {
+        const std::vector<Actor> &actors = *self->actors;
+        const auto which = std::find_if(actors.begin(), actors.end(), [object](const Actor &actor) { return actor.object == object; });
+        const size_t row = static_cast<size_t>(which - actors.begin());
+        search.sees_behind = sees_behind;
+        search.is_sorted = is_sorted;
+        search.includes_objects = includes_objects;
+        search.most = lines - 1;
+        if (row < self->vehicles) {
+            std::vector<size_t> close = close_objects_to(self, row, search);
+            bool all = arrives(self->network, actors[row]);
+            for (size_t other : close) {
+                // highway-env does not describe the heading of an object that is no vehicle.
+                all = all && (actors[other].moves ? arrives(self->network, actors[other]) : !std::memchr(codes, HEADING, columns));
+            }
+            if (all) {
+                show(self, row, close, codes, scales.data(), columns, is_absolute, clips, static_cast<double *>(cells.buf));
+                found = PyLong_FromSize_t(close.size() + 1);
+            }
+        }
+        found = found || PyErr_Occurred() ? found : Py_NewRef(Py_None);
+    }
+    PyBuffer_Release(&cells);
+    PyBuffer_Release(&features);
+    PyBuffer_Release(&numbers);
+    return found;
+}
+
 PyObject *traffic_completed(Traffic *self, PyObject *) { return PyLong_FromLong(self->completed); }
 
 PyMethodDef traffic_methods[] = {
@@ -242,6 +302,7 @@ PyMethodDef traffic_methods[] = {
     {"completed", reinterpret_cast<PyCFunction>(traffic_completed), METH_NOARGS, nullptr},
     {"run", reinterpret_cast<PyCFunction>(traffic_run), METH_VARARGS, nullptr},
     {"conflicts", reinterpret_cast<PyCFunction>(traffic_conflicts), METH_NOARGS, nullptr},
+    {"observe", reinterpret_cast<PyCFunction>(traffic_observe), METH_VARARGS, nullptr},
     {"fill_times", reinterpret_cast<PyCFunction>(traffic_fill_times), METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };

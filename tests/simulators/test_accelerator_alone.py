@@ -1,4 +1,4 @@
-"""The accelerator looks at everybody once in a step, unless somebody else's code runs between two sub-steps."""
+"""The accelerator looks at everybody once for a step and once for its observation, unless foreign code runs between."""
 
 from __future__ import annotations
 
@@ -92,8 +92,8 @@ def passer_by(env):
     env.road.step = lambda dt: advance(dt)
 
 
-@pytest.mark.parametrize(("change", "times"), [(lambda env: None, 2), (onlooker, 2), (passer_by, 32)])
-def test_everybody_is_looked_at_once_in_a_step_unless_an_actor_might_do_anything(change, times, monkeypatch):
+@pytest.mark.parametrize(("change", "times"), [(lambda env: None, 4), (onlooker, 4), (passer_by, 34)])
+def test_everybody_is_looked_at_twice_in_a_step_unless_an_actor_might_do_anything(change, times, monkeypatch):
     slow, fast = both(made, driven(change, steps=2))
     assert slow == fast
     env = made()
@@ -357,3 +357,28 @@ def test_an_environment_whose_vehicle_moves_by_the_dynamic_model():
 
     slow, fast = both(make, drive)
     assert slow == fast
+
+
+def test_observers_that_wait_for_a_crash_are_called_after_its_sub_step():
+    """Otherwise the sub-steps run without them."""
+
+    def drive(env, waits=bool):
+        found = []
+        env.road.vehicles[3].position = env.road.vehicles[0].position + np.array([16.0, 0.0])
+        env.road.vehicles[3].speed = 0.0
+        env.road.step = Onlooker(
+            env.road.step,
+            before=lambda _: found.append(state(env.road)),
+            after=lambda: found.append((env.road.vehicles[0].crashed, state(env.road))),
+            waits=waits,
+        )
+        for _ in range(3):
+            env.step(1)
+        return found
+
+    assert switch_on() == ""
+    every, few = drive(made()), drive(made(), lambda: True)
+    first = next(number for number, (crashed, _) in enumerate(every[1::2]) if crashed)
+    assert 0 < first < 7  # within the first step, and not in its last sub-step
+    # The sub-steps up to the crash, those left of the step, and those of the next two.
+    assert few == [every[1::2][number] for number in (first, 7, 15, 23)]

@@ -33,7 +33,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle, RoadObject
 from hypothesis import given, settings, strategies as st
 
-from crashhunt.accelerator import _kernel, _roads, switch_off, switch_on
+from crashhunt.accelerator import _kernel, _roads, _switch, switch_off, switch_on
 from crashhunt.scenario import load_scenario
 from crashhunt.scenario.backends import highway
 from crashhunt.scenario.backends.highway import BACKEND
@@ -516,3 +516,60 @@ def test_what_is_unusual_is_refused_at_once(change):
     assert _roads.prepared(road).roster() is not None
     change(road)
     assert _roads.prepared(road).roster() is None
+
+
+def kinematic(rng):
+    """A random observation of this kind, without its road."""
+    features = list(
+        rng.permutation(["presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"])[: rng.integers(1, 9)]
+    )
+    truths = ("absolute", "normalize", "clip", "see_behind", "include_obstacles", "observe_intentions")
+    given = {name: bool(rng.random() < 0.5) for name in truths}
+    if rng.random() < 0.5:
+        given["features_range"] = {"x": [-100, 80], "vy": [-9.5, 9.5], "heading": [-np.pi, np.pi], "other": [0, 1]}
+    return {**given, "features": list(map(str, features)), "vehicles_count": int(rng.integers(1, 9)),
+            "order": str(rng.choice(["sorted", "shuffled"]))}  # fmt: skip
+
+
+def observed(seed):
+    """What every vehicle of a road sees."""
+    road, rng = crowded(seed), np.random.default_rng(seed)
+    for vehicle in road.vehicles[::3]:
+        if isinstance(vehicle, ControlledVehicle):
+            vehicle.route = [[], [("a", "b", 0), ("b", "c", None)]][rng.integers(2)]
+    if seed == 3:
+        road.vehicles[-1].route = [("a", "nowhere", 0)]
+    found = []
+    for vehicle in road.vehicles[:6]:
+        env = SimpleNamespace(road=road, vehicle=vehicle, PERCEPTION_DISTANCE=200, np_random=np.random.default_rng(1))
+        seen = observation.KinematicObservation(env, **kinematic(rng))
+        try:
+            found.append((exact(seen.observe()), seen.features_range))
+        except Exception as error:
+            found.append(repr(error))
+    return found
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_observations_of_the_kernel_have_the_bits_of_highway_env(monkeypatch):
+    slow = [observed(seed) for seed in range(4)]
+    assert not switch_on()
+    others = []
+    close = _switch.close_objects
+    monkeypatch.setattr(
+        _switch, "close_objects", lambda *given, **options: others.append(1) or close(*given, **options)
+    )
+    assert [observed(seed) for seed in range(4)] == slow
+    assert len(others) < sum(map(len, slow)) / 2  # seen by highway-env, or without the kernel
+
+
+def test_search_for_close_objects_of_a_users_road_is_called():
+    class Blind(Road):
+        def close_objects_to(self, *given, **options):
+            return []
+
+    assert not switch_on()
+    road = Blind(RoadNetwork.straight_road_network(2), np_random=np.random.default_rng(1))
+    road.vehicles += [IDMVehicle(road, [12.0 * number, 0.0], 0.0, 20.0) for number in range(3)]
+    env = SimpleNamespace(road=road, vehicle=road.vehicles[0], PERCEPTION_DISTANCE=200)
+    assert not observation.KinematicObservation(env).observe()[1:].any()

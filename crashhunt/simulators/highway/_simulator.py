@@ -348,8 +348,12 @@ class HighwaySimulator:
 
         road = self._env.road
         road.step = Onlooker(
-            road.step, before=disturbances.before_moving, after=after, interferes=lambda: disturbances.is_active
-        )  # fmt: skip
+            road.step,
+            before=disturbances.before_moving,
+            after=after,
+            interferes=lambda: disturbances.is_active,
+            waits=lambda: not disturbances.is_active,
+        )
 
     def _objects(self) -> list[RoadObject]:
         """Return all vehicles and obstacles that can be hit."""
