@@ -120,7 +120,7 @@ class _Network(ABC):
             self._try(path, observation_space)
 
     def _try(self, path: str, shown: Space[object]) -> None:
-        """Ask once, to find out whether observations go in and actions come out."""
+        """Call the policy once, to check that it accepts the observations and returns valid actions."""
         blank = np.zeros(shown.shape or (), np.float32)
         batch = blank.reshape(1, -1) if self._flatten else blank[None]
         try:
@@ -148,7 +148,7 @@ class _Network(ABC):
         """Return a value for each discrete action, or the continuous action, of each observation of a batch."""
 
     def act(self, observation: object) -> object:
-        """Return the action of the network's answer."""
+        """Return the action for the network's output."""
         seen = np.array(observation, np.float32)
         values = self._answer(seen.reshape(1, -1) if self._flatten else seen[None])[0]
         from gymnasium.spaces import Box, Discrete
@@ -249,7 +249,7 @@ def _line(error: BaseException) -> str:
 
 
 def _choices(space: Space[object]) -> object:
-    """Return the properties of an action space that a policy's answers depend on: kind, shape and number."""
+    """Return the properties of an action space on which a policy's output depends: kind, shape and number."""
     from gymnasium.spaces import Discrete, MultiDiscrete
 
     sizes = (
@@ -259,7 +259,7 @@ def _choices(space: Space[object]) -> object:
 
 
 def _count(space: Space[object] | None) -> int:
-    """How many numbers a network answers with: one for each discrete action, or the continuous action itself."""
+    """Return the size of the network's output: one number for each discrete action, or the continuous action."""
     from gymnasium.spaces import Discrete
 
     return int(space.n) if isinstance(space, Discrete) else math.prod(space.shape or () if space is not None else ())

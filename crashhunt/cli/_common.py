@@ -1,4 +1,4 @@
-"""What several commands share."""
+"""Functions that several commands share."""
 
 from __future__ import annotations
 
@@ -238,7 +238,7 @@ def run_trusted(
     *,
     path: Path | None = None,
 ) -> T:
-    """Run what runs the code of a crash; where that is not trusted, ask the user at the terminal, once per origin.
+    """Call a function that runs the code of a crash; if the code is not trusted, ask the user once per origin.
 
     Args:
         run: called with True if the code is trusted; else with None, to find out. It raises `UntrustedError` before
@@ -304,7 +304,7 @@ def shown_progress(what: str, *, as_json: bool) -> Iterator[Watch | None]:
     """Yield a function that shows progress in one line; the line is removed at the end, also after Ctrl-C.
 
     Args:
-        what: is done, such as ``writing crash.mp4``.
+        what: the work, such as ``writing crash.mp4``.
         as_json: whether the output is JSON; then no progress is shown.
     """
     from rich.console import Console
@@ -386,7 +386,7 @@ def _options(names: Collection[str]) -> list[HuntOption]:
 
 
 def add_options_of_machine(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say where all the hunts of a command run, whatever each of them says."""
+    """Add the options for all hunts of a command, such as ``--executor``, which override the options of each hunt."""
     for option in hunt_options():
         if option.about.anywhere:
             _add(parser, option, help_text=option.help_with("as in each hunt"))
@@ -394,7 +394,7 @@ def add_options_of_machine(parser: argparse.ArgumentParser) -> None:
 
 
 def chosen_of_machine(given: argparse.Namespace) -> Given:
-    """Return those of them that were given."""
+    """Return the given options of `add_options_of_machine`."""
     found = {option.name: getattr(given, option.name) for option in hunt_options() if option.about.anywhere}
     return {name: value for name, value in found.items() if value is not None}
 

@@ -138,7 +138,7 @@ def _runs(parsed_args: argparse.Namespace, **_: object) -> list[str]:
 
 
 def _arguments(parsed_args: argparse.Namespace, *, of_agents: bool) -> list[str]:
-    """What the scenario says of arguments; it is only read, as a shell does not wait."""
+    """Return the arguments of the scenario, from its file alone, because a shell does not wait."""
     from crashhunt.scenario import configurations, shipped_folder
 
     name = vars(parsed_args).get("scenario") or "loop"

@@ -65,5 +65,5 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _unwound(text: str) -> str:
-    """A progress bar that has written over its own line, as the lines that there were."""
+    """Return the lines of a progress bar that has overwritten its own line."""
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -388,7 +388,7 @@ def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptio
 
 
 def _look(options: argparse.Namespace, bundle: Bundle) -> Look | None:
-    """Return what to look at; None for nothing."""
+    """Return the options of a debugged replay; None for a plain replay."""
     from crashhunt.replays import Look
 
     if options.json and options.pdb:
@@ -412,7 +412,7 @@ def _look(options: argparse.Namespace, bundle: Bundle) -> Look | None:
 
 
 def _last_step(options: argparse.Namespace, bundle: Bundle) -> int:
-    """Where to stop; 0 if that was not asked for."""
+    """Return the step at which to stop; 0 without ``--until`` or ``--before``."""
     crash, what = bundle.result.steps, "the crash is"
     if bundle.is_near_miss and (options.before is not None or options.pdb):
         from crashhunt.crashes import most_dangerous

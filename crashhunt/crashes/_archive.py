@@ -1,4 +1,4 @@
-"""A crash as one file: everything that its replay needs, for another machine."""
+"""Archives: a crash in one file with everything that its replay needs on another machine."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Archive:
     Args:
         directory: where its hunt is now.
         made_by: name of the tool that made it, according to the file.
-        made_at: when, as it says itself.
+        made_at: time of the export, as recorded in the archive.
         made_here: whether this user made it on this machine, which its signature proves.
     """
 
@@ -58,7 +58,7 @@ class Archive:
 
 
 def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) -> int:
-    """Write a crash, its hunt's settings and its snapshot into one zip file, all of it or nothing.
+    """Write a crash, its hunt's settings and its snapshot into one zip file; the file is never incomplete.
 
     Args:
         bundle: the crash.
@@ -105,7 +105,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
 def open_archive(path: Path) -> Iterator[Archive]:
     """Unpack an archive into a folder that is removed afterwards.
 
-    Nothing is believed: names, sizes and hashes are checked, and nothing is run.
+    The archive is not trusted: names, sizes and hashes are checked, and no code runs.
 
     Raises:
         BundleError: it is not one, or it has something that it should not have.

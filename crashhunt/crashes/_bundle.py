@@ -1,4 +1,4 @@
-"""Crash bundles: the folder with all that replaying one crash needs, and what its log says of itself."""
+"""Crash bundles: the folder with everything that the replay of one crash needs, and the metadata of its log."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def refuse_damaged(data: Protected) -> None:
 
 
 def files_of(folder: Path) -> dict[str, FileEntry]:
-    """Return size and digest of what a crash or a kept trial came with, where that was written down and can be read."""
+    """Return the recorded size and digest of each file of a crash or kept trial; empty if they cannot be read."""
     for name in (layout.CRASH, layout.PARAMS):
         with suppress(OSError, ValueError):
             data = read_object(folder / name, Protected)
@@ -359,7 +359,7 @@ class Bundle:
         return found
 
     def write(self, into: Path | None = None) -> None:
-        """Write ``crash.json``, all of it or nothing; into another folder where the bundle is still being built."""
+        """Write ``crash.json`` atomically; into another folder if the bundle is still being built."""
         folder = into or self.path
         result = self.result
         plain = result.to_json()
@@ -510,7 +510,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
 
 
 def _added(data: CrashData) -> dict[str, object]:
-    """What a later version says, of the crash and inside its parts."""
+    """Return the keys that a later version has added to the crash and its parts."""
     added: dict[str, object] = {name: value for name, value in data.items() if name not in _KEYS}
     for name, kind in _PARTS.items():
         _, rest = known_part(kind, data.get(name))
@@ -589,9 +589,9 @@ def write_bundle(
         hunt_seed: seed of the hunt.
         snapshot: the digest of the code that ran.
         lanes: The lanes of the map, for viewers of the log.
-        name: name of its folder, where that is not made of the trial's number and the outcome.
-        place: the folder of the directory that it goes into.
-        confirmed: whether a fresh process did the same, where that is known already.
+        name: name of its folder, if it differs from the number and the outcome of the trial.
+        place: the folder of the hunt's directory in which the bundle is written.
+        confirmed: whether a replay in a new process was bit-identical; None if unknown.
         authenticate: whether to write down the proof that this user made it; only where the snapshot is this user's.
     """
     from crashhunt.recording import foxglove_layout, write_log
@@ -652,7 +652,7 @@ def list_near_misses(directory: Path) -> list[Bundle]:
 
 
 def crash_folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
-    """Return the folders of crashes, also of one that has lost its ``crash.json``; not of those that were made smaller.
+    """Return the folders of crashes, also without a ``crash.json``, but not the folders of minimized crashes.
 
     Args:
         directory: directory of the hunt.

@@ -25,14 +25,14 @@ _SCALES = {"speed": 5.0, "gap": 5.0, "length": 4.0}  # m/s, m, m: a difference t
 
 @dataclass(frozen=True, slots=True, order=True)
 class Cause(Serializable):
-    """What a crash hangs on, according to runs. No speeds, identifiers and times: they differ from trial to trial.
+    """The cause of a crash, as determined by runs. No speeds, identifiers and times: they differ from trial to trial.
 
     Args:
         kind: ``omission``, ``decision``, ``disturbance``, ``argument``, ``traffic``, ``software fault`` or ``unknown``.
         what: of an omission, what was disregarded, as in `Omission`. For a lane change into a gap that is not safe it
             is ``gap left`` or ``gap right``. Of a decision it is what the agent did, of a disturbance its type, of an
             argument its name.
-        instead: what the agent did instead of what it omitted.
+        instead: the action of the agent in place of the omitted one.
         actor: ``long`` where the disregarded actor is longer than a car, else empty.
     """
 
@@ -61,7 +61,7 @@ class CauseGroup:
     Args:
         cause: cause of all of them.
         members: the crashes, the first one found first.
-        judged: those of them whose cause was found by runs; the others have the cause of the nearest of all such.
+        judged: the crashes whose cause was found by runs; the other crashes have the cause of the most similar one.
     """
 
     cause: Cause
@@ -102,7 +102,7 @@ def cause_of(bundle: Bundle, judgement: Judgement | None) -> Cause:
 
 
 def _of_omission(bundle: Bundle, omission: Omission) -> Cause:
-    """Of a lane change only the side counts: whether a vehicle is ahead, behind or alongside is chance."""
+    """For a lane change only the side counts, because it is chance whether a vehicle is ahead, behind or alongside."""
     relation, _, side = omission.kind.rpartition(" ")
     if omission.instead == "changed lanes" and relation != "no lane":
         return Cause("omission", f"gap {side}", omission.instead)
@@ -143,7 +143,7 @@ def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[flo
 
     Args:
         bundle: the crash.
-        recording: recording of it, where it has been read already.
+        recording: recording of the crash, if it has already been read.
 
     Raises:
         BundleError: its log is missing or damaged.
@@ -228,7 +228,7 @@ class Division:
 
     @property
     def left(self) -> int:
-        """How many crashes `choose` would still return."""
+        """The number of crashes that `choose` would still return."""
         return max(0, min(self._most, len(self._features)) - len(self._chosen))
 
     @property
@@ -238,7 +238,7 @@ class Division:
 
     @property
     def is_complete(self) -> bool:
-        """Whether as many crashes have been judged as should be."""
+        """Whether enough crashes have been judged."""
         return not self._open and len(self._chosen) >= self._most
 
     def causes(self) -> dict[int, Cause]:

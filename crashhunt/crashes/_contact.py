@@ -86,7 +86,7 @@ class ContactRecord:
         began_s: when the episode began.
         lanes: lanes around the place.
         events: events of the last seconds, each with its simulation time.
-        right_of_way: right of way of the map, where it says.
+        right_of_way: right of way of the map; None if the map has none.
         lane: The lane of the agent at the contact; empty if it is unknown.
         swept: whether actors drive from scene to scene, and change lanes in an instant, as in `Scene`.
         reported: The collision in the result of the trial; None if it is unknown.
@@ -106,7 +106,7 @@ class ContactRecord:
 
     @cached_property
     def before(self) -> list[Scene]:
-        """The last scenes before the contact in which both were there, over at least 4 s where there are as many.
+        """The last scenes before the contact with both actors, over at least 4 s if the recording is that long.
 
         The first scene is the last one that is 4 s or more before the contact. Otherwise the part of a long step in
         which they touch would decide how long the rules can look back.
@@ -127,17 +127,17 @@ class ContactRecord:
 
     @cached_property
     def through(self) -> list[Scene]:
-        """The same and the scene after the contact."""
+        """The scenes before the contact and the scene after it."""
         last = self.scenes[-1]
         there = self.agent in last.roster.index and self.other in last.roster.index
         return [*self.before, last] if there and last is not self.before[-1] else self.before
 
     @cached_property
     def times(self) -> NDArray[np.float64]:
-        """When the movement before the contact is sampled, in s before the contact; the first one is the longest ago.
+        """The times at which the movement before the contact is sampled, in s before the contact, the earliest first.
 
-        The samples are relative to the contact, and not those of the scenes. Otherwise the answers of the rules would
-        depend on the part of a long step in which the actors touch.
+        The times are relative to the contact, not to the scenes. Otherwise the results of the rules would depend on the
+        part of a long step in which the actors touch.
         """
         first, last = (self.time_s - self.before[place].time_s for place in (0, -1))
         first = min(first, max(_WINDOW_S, last))
@@ -203,7 +203,7 @@ class ContactRecord:
         return found
 
     def partner(self, actor: str) -> str:
-        """Return the other actor of the two."""
+        """Return the other actor of the contact."""
         return self.other if actor == self.agent else self.agent
 
     @cached_property
@@ -274,7 +274,7 @@ class ContactRecord:
 
     @property
     def same_way(self) -> bool:
-        """Whether they drove in the same direction at the contact."""
+        """Whether both actors drove in the same direction at the contact."""
         return self.turn < SAME_WAY
 
     def turned(self, since_s: float) -> float:
@@ -290,7 +290,7 @@ class ContactRecord:
         return float(dx * math.cos(other.headings[back]) + dy * math.sin(other.headings[back]))
 
     def gap_m(self, actor: str, back: int = -1) -> float:
-        """How far an actor's rear is ahead of the other's front, along the other's heading, in m; at that scene."""
+        """Return how far an actor's rear is ahead of the other's front in a scene, along the other's heading, in m."""
         own, other = self.way(actor), self.way(self.partner(actor))
         return self.ahead_m(actor, back) - (own.length + other.length) / 2
 
@@ -313,7 +313,7 @@ class ContactRecord:
         return self.agent if faces == ("front", "rear") else self.other if faces == ("rear", "front") else ""
 
     def in_its_way_s(self, leader: str) -> float:
-        """For how long a leader had been in the follower's way, in s: the follower drove over where it had been."""
+        """Return for how long a leader had been in the follower's path, in s."""
         lead, follow = self.way(leader), self.way(self.partner(leader))
         # The leader is the last point: where the road bends, the follower would not have gone straight on.
         ends = [self._at_contact(actor)[0] for actor in (follow.id, leader)]
@@ -327,7 +327,7 @@ class ContactRecord:
         return found
 
     def turns_off_s(self, leader: str) -> float | None:
-        """How long before the contact a leader left the way of a follower that drove straight on; None if it did not.
+        """Return when a leader left the path of a straight follower, in s before the contact; None if never.
 
         The actor had been in the way in all recorded steps before.
         """
@@ -343,7 +343,7 @@ class ContactRecord:
         return float(self.times[left - 1]) if left > 0 and parting else None
 
     def changed_s(self, actor: str) -> float | None:
-        """How long before the contact an actor last came from one lane into the next, or was about to; None if not."""
+        """Return how long before the contact an actor last changed lanes or began to; None if it did not."""
         return self._changes[actor]
 
     @cached_property
@@ -384,7 +384,7 @@ class ContactRecord:
         return tuple(found)
 
     def drifted(self, actor: str) -> bool:
-        """Whether an actor was moving over the side of its lane when they touched, or had done so before."""
+        """Return whether an actor was crossing the side of its lane at the contact, or had crossed it before."""
         return self.changed_s(actor) is not None
 
     def meets_sideways(self, actor: str) -> bool:
@@ -407,7 +407,7 @@ class ContactRecord:
         )
 
     def is_between_junctions(self, *actors: str) -> bool:
-        """Whether all of them were on roads of SUMO's, in none of its junctions, in the last seconds."""
+        """Return whether all given actors were on roads of SUMO in the last seconds, and not in junctions."""
         lanes = {
             actor: [
                 scene.lanes[scene.roster.index[actor]]

@@ -55,7 +55,7 @@ Manner = Literal["ahead", "behind", "oncoming", "crossing from the left", "cross
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """How the other actor stands to the agent after one step.
+    """The position and speed of the other actor relative to the agent after one step.
 
     Args:
         step: step of the episode.
@@ -80,7 +80,7 @@ class Moment:
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where the other actor is, as seen from the agent.
+    """The position of the other actor relative to the agent.
 
     Args:
         place: place on which side of it.
@@ -92,7 +92,7 @@ class Position:
 
     @property
     def faces(self) -> Literal["same", "other", "left", "right"]:
-        """Where it heads: the same way, the other way, or to the agent's left or right."""
+        """The direction of the other actor: same, opposite, or to the agent's left or right."""
         if abs(self.turn) > math.radians(135):
             return "other"
         if abs(self.turn) > math.radians(45):
@@ -120,7 +120,7 @@ class Encounter:
         self.moments = self._measure()
 
     def position(self, step: int) -> Position | None:
-        """Where the other actor was after a step, as seen from the agent; None if one of them was not there."""
+        """Return the position of the other actor relative to the agent after a step; None if one of them was absent."""
         scene = next((scene for number, scene in self._scenes if number == step), None)
         if scene is None:
             return None
@@ -141,7 +141,7 @@ class Encounter:
         return Position("ahead" if ahead > 0 else "behind", turn)
 
     def manner(self, step: int) -> Manner | None:
-        """How they came together, as of a step; None if one of them was not there."""
+        """Return the kind of encounter, as seen at a step; None if one of the actors was absent."""
         found = self.position(step)
         if found is None:
             return None
@@ -218,8 +218,7 @@ def last_escape(recording: Recording, agent: str, other: str, *, braking: float)
         braking: deceleration, in m/s².
 
     Returns:
-        None if there was no such step, or where the calculation does not collide without braking either, so that
-        it says nothing.
+        None if there was no such step, or if the calculation has no collision even without braking.
     """
     model = _Model(recording, agent, other)
     if not model.collides_without_braking():
@@ -230,7 +229,7 @@ def last_escape(recording: Recording, agent: str, other: str, *, braking: float)
 
 
 class _Model:
-    """The two of a crash, the other actor moving as it did, the agent along the path that it drove."""
+    """A model of a crash: the other actor moves as recorded, and the agent follows its recorded path."""
 
     def __init__(self, recording: Recording, agent: str, other: str) -> None:
         found = Encounter(recording, agent, other)._scenes
@@ -251,7 +250,7 @@ class _Model:
         ] if scenes else []  # fmt: skip
 
     def collides_without_braking(self) -> bool:
-        """Whether what was recorded touches in its last step or on the way there, or would by the next."""
+        """Return whether the recorded actors touch up to the last step, or would touch in the next step."""
         last = len(self.steps) - 1
         if last < 1:
             return False
@@ -260,7 +259,7 @@ class _Model:
         return self._touch_on_the_way(last - 1, before, end) or self._touch_on_the_way(last, end, beyond)
 
     def avoids(self, start: int, braking: float) -> bool:
-        """Whether braking from a scene on avoids any touch until the agent stands."""
+        """Return whether braking from a scene on avoids every contact until the agent stands."""
         speed, driven, index = max(0.0, self._speeds[start]), self._path.distances[start], start
         if self._touch(driven, float(index)):
             return False
@@ -346,7 +345,7 @@ class DangerCourse:
 
     Args:
         agent: whose.
-        steps: that have a scene.
+        steps: the steps that have a scene.
         own: The criticality in each of them towards actors ahead of the agent or crossing its path.
         behind: The rear criticality in each of them: by actors that approach the agent from behind.
         greatest: the moment of the greatest own danger.
@@ -368,7 +367,7 @@ class DangerCourse:
     nearest: tuple[str, float, int] | None = None
 
     def of_step(self, step: int) -> tuple[float, float] | None:
-        """The own danger of a step and that by those behind; None if it has no scene."""
+        """Return the agent's own criticality of a step and the rear criticality; None if the step has no scene."""
         if step not in self.steps:
             return None
         place = self.steps.index(step)
@@ -410,8 +409,8 @@ def _with_lane_changes(
     """Return the criticality with that of lane changes towards the vehicles behind in the target lane.
 
     The way of an agent after a lane change does not lead through the vehicles behind it, so `dangers` does not count
-    them. Here the post-encroachment time is that from the step in which the agent comes into their way until the
-    vehicle behind is where the agent is.
+    them. Here the post-encroachment time is the time from the lane change until the vehicle behind reaches the agent's
+    position.
     """
     own = own.copy()
     for number, (before, after) in enumerate(pairwise(scenes), 1):
@@ -452,7 +451,7 @@ def _behind_in_its_way(scene: Scene, row: int) -> list[int]:
 
 
 def _moved_into_its_way(scenes: Sequence[Scene], agent: str, after: Scene, other: int) -> bool:
-    """Whether an agent came into the way of another actor by its own sideways motion, on a straight road.
+    """Return whether an agent moved sideways into the path of another actor on a straight road.
 
     In a bend, the paths of two lanes do not show which of the two vehicles changed lanes.
     """
@@ -498,8 +497,8 @@ def closest_actors(recording: Recording, agent: str) -> list[tuple[str, str]]:
         agent: the controlled vehicle.
 
     Returns:
-        Two identifiers for each scene. An identifier is empty if `approaches` finds no such actor, or where several
-        are equally close.
+        Two identifiers for each scene. An identifier is empty if `approaches` finds no such actor, or if several are
+        equally close.
     """
     scenes = recording.scenes()
     times, gaps, _ = approaches([scene.frame for scene in scenes], agent)

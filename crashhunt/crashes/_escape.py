@@ -61,15 +61,16 @@ def find_escape(
     """Return until when braking would have avoided a collision of two actors, or why that is unknown.
 
     Only runs count, no calculation: the same trial once more, in which the agent brakes as hard as it can after some
-    step, and the others react as they then do. Two runs, a step apart, are the answer: the first ends without a crash,
-    the second in the same one. Where another vehicle drove into the agent from behind, nothing is run.
+    step, and the others react as they then do. The result rests on two runs, one step apart: the first ends without a
+        crash, the second in the same crash. If another vehicle drove into the agent from behind, there are no runs.
 
     Args:
         result: result of the trial.
         recording: recording of it.
         braking: how the vehicle brakes; None if it is unknown.
         run: runs a trial in the same way.
-        borders: returns those of the map's lanes, as `LaneMap` takes them; by them a run shows what else it changes.
+        borders: returns the borders of the map's lanes, as `LaneMap` needs them, to describe further differences of a
+            run.
 
     Returns:
         None if it was no collision of two actors.
@@ -150,7 +151,7 @@ class _Search:
         return None
 
     def how(self, deceleration: float) -> str:
-        """What is said about the braking: no number that the vehicle has not done when it was run."""
+        """A description of the braking, which contains only decelerations that the vehicle reached in a run."""
         said = self.braking.deceleration
         if said is None:
             return self.braking.how
@@ -255,7 +256,7 @@ def ending_of(
 
 
 def _is_over(recording: Recording, agent: str, other: str) -> bool:
-    """Whether the danger has passed, and is not put off only: one of them has left, stands, or goes elsewhere."""
+    """Return whether the danger is over: one of the actors has left, stands, or drives elsewhere."""
     scene = recording.scenes()[-1]
     row = scene.roster.index.get(agent)
     if row is None or other not in scene.roster.index or scene.speeds[row] < _STANDS:

@@ -56,7 +56,7 @@ _RED_S = 8.0  # after a red light, a junction is left by then
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What a rule says.
+    """The verdict of a rule.
 
     Args:
         rule: its name.
@@ -153,7 +153,7 @@ def _lane_change(case: ContactRecord) -> Finding | None:
 
 
 def _into_who_had_changed(case: ContactRecord, changer: str, source: str) -> Finding | None:
-    """Blame the actor that moves sideways into one that completed its own lane change a response time ago."""
+    """Return the fault of an actor that moves sideways into one that completed its lane change a response time ago."""
     other = case.partner(changer)
     since = case.changed_s(other)
     if since is None or since < _RESPONSE_S - 1e-6 or case.turned(since) > SAME_WAY:
@@ -322,7 +322,7 @@ class Fault:
 
     @property
     def is_egos(self) -> bool:
-        """Whether it was the agent's fault, or both's."""
+        """Return whether the agent, or both actors, were at fault."""
         return self.verdict in ("ego", "both")
 
     def to_json(self) -> JsonObject:
@@ -341,8 +341,8 @@ def fault_of(bundle: Bundle, recording: Recording | None = None, record: Contact
 
     Args:
         bundle: the crash.
-        recording: recording of it, where it has been read already.
-        record: record of its contact, where that has been made already.
+        recording: recording of the crash, if it has already been read.
+        record: record of the contact, if it has already been made.
 
     Raises:
         BundleError: its log is missing or damaged.

@@ -1,4 +1,4 @@
-"""What running a collision again with its agent overruled has shown: until when it could have been avoided, and how."""
+"""Results of runs of a collision with its agent overridden: until when and how the collision could be avoided."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class LeftOut(Serializable):
         given: The other value of an argument or seed; for every other cause, the step after which it was suppressed.
         ending: The result of the run.
         into: The actor into which a vehicle with held speed drove itself; empty if there was none.
-        changed: What else the agent does otherwise in the run, such as ``ego does not change lanes``.
+        changed: Further differences of the agent in the run, such as ``ego does not change lanes``.
     """
 
     given: Value
@@ -81,7 +81,7 @@ class Factor(Serializable):
 
     @property
     def clear(self) -> int:
-        """How many runs say something."""
+        """The number of runs with a clear result."""
         return sum(run.ending != "unclear" for run in self.runs)
 
     @property
@@ -96,14 +96,14 @@ class Factor(Serializable):
 
     @property
     def needed(self) -> bool | None:
-        """True if no run crashed without it, False if all did; None if that differs, or none says it."""
+        """True if no run without the factor crashed, False if all crashed; None if runs differ or are unclear."""
         if not self.clear:
             return None
         return True if self.crashed == 0 else False if self.crashed == self.clear else None
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """Between which shares of such runs crash, with 95 % confidence (Wilson's)."""
+        """The interval of the share of such runs that crash, with 95 % confidence (Wilson's)."""
         return wilson(self.crashed, self.clear) if self.clear else None
 
 
@@ -113,7 +113,7 @@ class Why(Serializable):
 
     Args:
         factors: factors in the order in which they were looked at.
-        steps: number of steps after which a run ended that did not crash; of those with other arguments or seeds.
+        steps: number of steps after which a run with other arguments or seeds ended if it did not crash.
         left: number of further runs that the limit prevented.
         why_not: why there is no answer, or not a whole one; empty if there is.
     """
@@ -132,7 +132,7 @@ class Why(Serializable):
 
 
 def why_from(data: Any) -> Why | None:
-    """Rebuild what `Why.to_json` returned; None of what is none.
+    """Return the `Why` of the data of `Why.to_json`; None for no data.
 
     Raises:
         ValueError, KeyError, TypeError: it is damaged.
@@ -212,7 +212,7 @@ class Attempt:
 
     @property
     def too_late_step(self) -> int | None:
-        """The step after the last one, where that was run and ended in a crash; without a last one, the first such."""
+        """The step after the last avoidable step, if its run crashed; else the first crashed one."""
         last = self.last_step
         crashed = [step for step, ending in self.endings.items() if ending in ("hit", "other")]
         if last is None:
@@ -221,11 +221,11 @@ class Attempt:
 
     @property
     def all_later_run(self) -> bool:
-        """Whether every step after the last one was run, up to the one before the crash, and ended in a crash."""
+        """Whether a run from every later step up to the crash was made, and crashed."""
         return self.in_vain_from(0 if self.last_step is None else self.last_step + 1)
 
     def in_vain_from(self, step: int) -> bool:
-        """Whether it was run from every step from this one on, up to the one before the crash, and each crashed."""
+        """The step from which on every run up to the crash was made, and crashed; None if there is none."""
         return all(self.endings.get(each) in ("hit", "other") for each in range(step, self.end))
 
     def to_json(self) -> JsonObject:
@@ -243,7 +243,7 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What all manoeuvres have shown. Nothing is in it that was not run.
+    """The results of all manoeuvres; every result is from a run.
 
     Args:
         attempts: a manoeuvre each.
@@ -261,7 +261,7 @@ class Judgement:
 
     @property
     def verdict(self) -> JudgementVerdict:
-        """Whether it could be avoided, as far as the agent could see what was coming."""
+        """The verdict: whether the agent could avoid the crash after it could observe the other vehicle."""
         best, visible = self.best, self.visible_step
         if self.avoidable is False and self.attempts[0].endings[0] == "hit":
             return "invalid"
@@ -318,7 +318,7 @@ class Judgement:
 
 
 def judgement_of(bundle: Bundle) -> Judgement | None:
-    """Return what `judge` has written into a bundle; None if there is nothing, or nothing that can be read."""
+    """Return the result of `judge` in a bundle; None if there is none, or if it cannot be read."""
     data: Any = bundle.added.get(_KEY)
     try:
         attempts = []

@@ -34,7 +34,7 @@ _END_M = 0.5  # who is nearer to the end of a lane leaves it ahead, not sideways
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Where a point is, as seen from a lane."""
+    """The position of a point relative to a lane."""
 
     aside_m: float  # to the left of the centre line
     along_m: float  # from the beginning
@@ -203,7 +203,7 @@ class LaneMap:
 
 
 def _poses(scenes: Sequence[Scene], actor: str) -> list[tuple[int, tuple[NDArray[np.float64], float]]]:
-    """Where an actor was and how it was turned, each with the place of its scene."""
+    """Return the positions and headings of an actor, each with the index of its scene."""
     return [
         (place, (np.array(scene.points[row]), scene.headings[row]))
         for place, scene in enumerate(scenes)

@@ -1,4 +1,4 @@
-"""What runs with a reference driver have shown: what the agent omitted, since when, and for which actor."""
+"""Results of runs with a reference driver: what the agent omitted, since when, and for which actor."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ReferenceRun(Serializable):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Omission(Serializable):
-    """What an agent omitted. Without the omission there is no crash, in every run.
+    """An omission of an agent. Without the omission there is no crash, in every run.
 
     Args:
         faculty: faculty with which a reference driver avoids the crash: ``longitudinal``, ``lateral`` or ``both``.
@@ -62,12 +62,12 @@ class Omission(Serializable):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reference(Serializable):
-    """What the runs with a reference driver have shown.
+    """The results of the runs with a reference driver.
 
     Args:
         omission: the cause; None if no run says so.
         runs: all runs with a reference driver that acts.
-        why_not: why there is no answer, or not a whole one; empty if there is.
+        why_not: why the result is missing or incomplete; empty if it is complete.
     """
 
     omission: Omission | None = None

@@ -55,7 +55,7 @@ class Frame:
 
 
 def own_frames(failure: Failure) -> list[Frame]:
-    """Return the calls that are the agent's own, the innermost first; those of libraries where it has none there."""
+    """Return the calls in the agent's own code, the innermost first; without any, the calls in libraries."""
     frames = _frames(failure.traceback) or _frames(failure.last_output)
     ours = [
         number
@@ -89,7 +89,7 @@ _NUMBERS = re.compile(r"0x[0-9a-fA-F]+|-?\d+(\.\d+)?")
 
 @dataclass(frozen=True, slots=True, order=True)
 class Signature(Serializable):
-    """What makes two crashes the same one. No speeds, ids and times: they differ from trial to trial.
+    """The properties that define a crash type. No speeds, ids and times: they differ from trial to trial.
 
     Args:
         outcome: how the trial ended.
@@ -127,8 +127,8 @@ def signature_of(bundle: Bundle, recording: Recording | None = None, record: Con
 
     Args:
         bundle: the crash.
-        recording: recording of it, where it has been read already.
-        record: record of its contact, where that has been made already.
+        recording: recording of the crash, if it has already been read.
+        record: record of the contact, if it has already been made.
 
     Raises:
         BundleError: its log is missing or damaged.
@@ -185,7 +185,7 @@ def _kind(failure: Failure) -> str:
 
 
 def _where(failure: Failure) -> str:
-    """The innermost functions that are the agent's own, or what was said, without its numbers."""
+    """Return the innermost functions of the agent, or without any, the message without its numbers."""
     chosen = own_frames(failure)
     if chosen:
         return " < ".join(f"{frame.file.name}:{frame.function}" for frame in chosen[:_FRAMES])

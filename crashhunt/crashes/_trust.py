@@ -1,4 +1,4 @@
-"""Whether the code of a crash may run here without asking: it was made here, is trusted, or is of this repository."""
+"""Decides whether the code of a crash may run: it was made here, is trusted, or is in this repository."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ class TrustedOrigin:
     """Code that this user trusts.
 
     Args:
-        fingerprint: SHA-256 of everything that says what would run, in hexadecimal.
-        path: where it was when the user trusted it.
+        fingerprint: SHA-256 of everything that determines the code that would run, in hexadecimal.
+        path: its path when the user trusted it.
         runs: what would run, in words.
         trusted_at: when, as UTC.
     """
@@ -87,7 +87,7 @@ def add_trusted(fingerprint: str, *, path: str, runs: str) -> TrustedOrigin:
 
     Args:
         fingerprint: fingerprint of the code.
-        path: where it is now.
+        path: its present path.
         runs: what would run, in words.
 
     Raises:
@@ -137,7 +137,7 @@ def remove_trusted(names: Sequence[str]) -> list[TrustedOrigin]:
         names: for each, the beginning of its fingerprint, or the path that it was trusted at.
 
     Raises:
-        UsageError: a name is none of a trusted origin, or may be several; then nothing is removed.
+        UsageError: a name matches no trusted origin, or several; then none is removed.
         HuntDirectoryError: an entry cannot be removed.
     """
     known = list_trusted()
@@ -172,7 +172,7 @@ def is_bundle_trusted(bundle: Bundle, *, faults: Sequence[str] | None = None) ->
 
     Args:
         bundle: the crash.
-        faults: those of its snapshot, where they are known already.
+        faults: the faults of its snapshot, if they are already known.
     """
     try:
         snapshot = snapshot_of(bundle)
@@ -255,7 +255,7 @@ def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> U
 
     Args:
         bundle: the crash.
-        where: what the user named; the folder of the crash where it is empty.
+        where: the path that the user gave; empty for the folder of the crash.
         made_by: name of the tool that made it, according to the file.
     """
     place = where or str(bundle.path)
@@ -286,7 +286,7 @@ def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> U
 
 
 def _first_change(settings: HuntSettings, snapshot: Snapshot) -> str:
-    """What of a bundle is not as the snapshot says, in words; empty if everything is."""
+    """Return the first difference between a bundle and its snapshot, in words; empty if there is none."""
     faults = snapshot.faults()
     if faults:
         return f"the snapshot is damaged: {faults[0]}"
@@ -299,7 +299,7 @@ def _first_change(settings: HuntSettings, snapshot: Snapshot) -> str:
 
 
 def _has_known_texts(spec: TrialSpec, settings: HuntSettings, snapshot: Snapshot) -> bool:
-    """Whether every text among the arguments of a trial is one that its hunt or its scenario names."""
+    """Return whether its hunt or its scenario names every text among the arguments of a trial."""
     scenario = with_settings(snapshot.scenario(), settings)
     arguments = [*scenario.scenario_arguments().values()]
     for agent in scenario.agents:
@@ -311,7 +311,7 @@ def _has_known_texts(spec: TrialSpec, settings: HuntSettings, snapshot: Snapshot
 
 
 def _unknown_names(settings: HuntSettings, snapshot: Snapshot) -> list[str]:
-    """What settings name that may be imported or opened, and that those in a snapshot do not name.
+    """Return the names in settings that may be imported or opened, and that the settings in a snapshot lack.
 
     Numbers may differ, so that the user can edit them and replay the crash.
     """
@@ -359,13 +359,13 @@ def _is_of_this_repository(files: Iterable[Path]) -> bool:
 
 
 def is_made_here(index: ArchiveIndex) -> bool:
-    """Whether the signature of an archive is this user's."""
+    """Return whether this user has signed an archive on this machine."""
     said = index.get("signature")
     return isinstance(said, str) and said.isascii() and hmac.compare_digest(said, signature(index))
 
 
 def signature(index: ArchiveIndex) -> str:
-    """What only this user on this machine can know of an archive."""
+    """Return the signature of an archive, which only this user on this machine can compute."""
     content = {name: value for name, value in index.items() if name != "signature"}
     text = json.dumps(content, sort_keys=True, default=str).encode()
     return hmac.new(user_key(), text, "sha256").hexdigest()

@@ -41,7 +41,7 @@ class Group:
 
     @property
     def count(self) -> int:
-        """How many crashes there were."""
+        """The number of crashes."""
         return len(self.bundles) + self.dropped
 
     @property
@@ -52,7 +52,7 @@ class Group:
 
     @property
     def avoidable(self) -> bool | None:
-        """Whether runs have avoided all of them, or none; None if that differs, or is not known of all."""
+        """Whether runs have avoided all crashes (True) or none (False); None if they differ or are not all judged."""
         if self.dropped:
             return None
         said = {_avoidable(bundle) for bundle in self.bundles}

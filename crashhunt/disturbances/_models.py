@@ -1,4 +1,4 @@
-"""The models that come with crashhunt: a few places, strengths and lengths each, drawn independently."""
+"""The included models; each draws place, strength and duration independently from a few values."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _AROUND = {"left": 1.0, "right": 1.0, "left ahead": 2.0, "right ahead": 2.0}
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """A model that chooses place, strength and length independently of each other.
+    """A model that draws place, strength and duration independently of each other.
 
     Args:
         what: the kind.
@@ -153,7 +153,7 @@ def unseen() -> Choices:
 
 
 def late_action() -> Choices:
-    """What the agent decides takes effect late."""
+    """The actions of the agent take effect late."""
     return Choices(
         what="late_action",
         who={"itself": 1.0},

@@ -7,16 +7,16 @@ is drawn as in any trial.
 
 Let S be the probability that no onset is effective so far, and c the chance of a model per step. Let a be the
 probability that its draw finds a vehicle. The first onset is of this model with probability S * c * a, and then S is
-multiplied by 1 - c * a. Draws without a vehicle have no effect, so they neither begin nor end anything. Which draws
-find a vehicle is known one step ahead, since the root is undisturbed up to there.
+multiplied by 1 - c * a. Draws without a vehicle have no effect, so they neither begin nor end anything. The draws that
+find a vehicle are known one step ahead, since the root is undisturbed so far.
 
 The proposal multiplies the law of each cell (a model with one strength) by a ratio. The proposed probability
 accumulates along the root. Each interval of `Forcing.spacing` of it gets one onset, at a uniform point. The weight of
 an onset is spacing / ratio.
 
 Invariant: the expected sum of weights over any set of first onsets is the probability of that set, given the root.
-The estimate is the weighted crashes of all copies, plus S at the end where the root itself crashes. So it has no bias,
-for all ratios above 0 and for any spacing.
+The estimate is the weighted crashes of all copies, plus S at the end where the root itself crashes. The estimate is
+therefore unbiased, for all ratios above 0 and for any spacing.
 
 Why intervals of fixed length, and not eight equal parts of each root: the total is known only at the end of the root.
 A second run would cost its steps again. The spacing is learned, so that a root has eight copies on average.
@@ -113,7 +113,7 @@ class _Cell:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """One model around one agent, with its cells by the disturbance that is asked for a target."""
+    """One model around one agent, with its cells by disturbance."""
 
     order: int  # within a step
     agent: str
@@ -201,7 +201,7 @@ class FirstOnsets:
 
         Args:
             step: the step that is complete.
-            has_target: answers for disturbances that begin in the next step.
+            has_target: returns whether a disturbance that begins in the next step has a target vehicle.
         """
         found: list[Onset] = []
         begins = step + 1

@@ -15,7 +15,7 @@ __all__ = ["Closes", "DisturbanceModel", "Drawn", "Enumerates"]
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What a model has drawn.
+    """A disturbance that a model has drawn.
 
     Args:
         who: the place in the grid around the agent, one of `crashhunt.trial.CELLS`.
@@ -36,24 +36,24 @@ class DisturbanceModel(Protocol):
         [project.entry-points."crashhunt.disturbances"]
         truck_cut_in = "mypackage.disturbances:TruckCutIn"
 
-    Contract: `draw` draws from its argument alone, and two models that were made alike draw alike. What is drawn is one
-    of countably many possibilities, of which `log_likelihood` knows the probability. A model keeps no state.
+    Contract: `draw` draws from its argument alone, and two models that were made alike draw alike. The model draws one
+        of countably many possibilities; `log_likelihood` returns the probability of each. A model keeps no state.
     """
 
     @property
     def what(self) -> str:
-        """The kind: what the simulator is asked to do, such as ``brake``."""
+        """The kind of disturbance, such as ``brake``."""
 
     def draw(self, rng: np.random.Generator) -> Drawn:
-        """Return one, drawn by its own generator."""
+        """Draw a disturbance with the given generator."""
 
     def log_likelihood(self, drawn: Drawn) -> float:
-        """Return the natural logarithm of the probability that one that happens is this; -inf where it never is."""
+        """Return the natural logarithm of the probability of a draw; -inf if the model never draws it."""
 
 
 @runtime_checkable
 class Enumerates(Protocol):
-    """A model that can list what it draws, so that draws without a vehicle to disturb are skipped in closed form."""
+    """A model that can list all its draws, so that draws without a target vehicle can be skipped in closed form."""
 
     def possibilities(self) -> Iterable[tuple[Drawn, float]]:
         """Return everything that `DisturbanceModel.draw` can return, each with its probability; the sum is 1."""

@@ -48,7 +48,7 @@ _FIX = f"write {FORM}, such as brake@124=ahead:4:2 for 4 m/s² and 2 s from step
 
 
 def is_fixed(word: str) -> bool:
-    """Whether a word is about a disturbance in its own step, and says no rate."""
+    """Return whether a word gives a disturbance at a given step, not a rate."""
     return "@" in word
 
 
@@ -61,7 +61,7 @@ def parse_fixed(words: Iterable[str], agents: Sequence[str], *, shown: str = "--
         shown: the option or key that has the words, for the error.
 
     Raises:
-        UsageError: a word is not valid, or a kind comes twice in one step around one agent.
+        UsageError: a word is not valid, or a kind begins twice in one step around one agent.
     """
     found: dict[tuple[int, str, str], Disturbance] = {}
     for word in filter(is_fixed, words):
@@ -129,10 +129,11 @@ def parse_rates(words: Iterable[str]) -> dict[str, float]:
     """Return the rate of each disturbance in 1/s, from ``NAME=RATE``; rates of 0 are excluded.
 
     Args:
-        words: the words of the option; ``none`` for no disturbances. Those that fix a disturbance are left aside.
+        words: the words of the option; ``none`` for no disturbances. Words that give a disturbance at a given step are
+            ignored.
 
     Raises:
-        UsageError: a word says no rate, or a name comes twice.
+        UsageError: a word has no rate, or a name occurs twice.
     """
     given = tuple(words)
     rates: dict[str, float] = {}
@@ -286,7 +287,7 @@ class DisturbanceSampler:
     fixed: tuple[Disturbance, ...] = ()
 
     def draw(self, seed: int, max_steps: int) -> tuple[Disturbance, ...]:
-        """Return the disturbances of a trial, in order; those of a longer one begin with these.
+        """Return the disturbances of a trial in order; a longer trial with the same seed begins with the same ones.
 
         Args:
             seed: seed of the trial.
@@ -340,7 +341,7 @@ class DisturbanceSampler:
         return tuple(found)
 
     def _with_fixed(self, drawn: Iterable[Disturbance], after: int, last: int) -> tuple[Disturbance, ...]:
-        """What is drawn, and what is there anyway; in its step and of its kind, that alone."""
+        """Return the drawn and the given disturbances; a given disturbance replaces drawn ones of its kind and step."""
         given = [one for one in self.fixed if after < one.step <= last]
         taken = {_key(one) for one in given}
         return in_turn([*(one for one in drawn if _key(one) not in taken), *given])
@@ -400,8 +401,8 @@ class DisturbanceSampler:
     def log_likelihood_of(self, result: TrialResult) -> float | None:
         """Return the logarithm of the probability that just what took place in a trial begins in its steps.
 
-        A draw without an actor to disturb has no effect: a trial without it is the same, and likelier. None
-        if nothing is drawn at all.
+        A draw without a target vehicle has no effect, so it does not lower the likelihood. None if nothing is drawn at
+        all.
         """
         if not self.models:
             return None

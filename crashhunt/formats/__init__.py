@@ -1,4 +1,4 @@
-"""A crash in formats of others: what was recorded, as a scenario that tools of other people run.
+"""Export of a recorded crash as a scenario for other tools.
 
 Written as plain XML with what Python brings along. ``scripts/readers`` tests that the libraries of the formats read
 back what was recorded. Writing does not need them.

@@ -30,24 +30,25 @@ _NOWHERE = {"geoNameId": "-999", "gpsLatitude": "999", "gpsLongitude": "999"}  #
 
 
 def write_commonroad(bundle: Bundle, target: Path, *, with_agents: bool = False) -> dict[str, list[int]]:
-    """Write a crash as a CommonRoad scenario of version 2020a, all of it or nothing.
+    """Write a crash as a CommonRoad scenario of version 2020a; the file is never incomplete.
 
     Lengths are in m, angles in rad, speeds in m/s, times in steps of ``timeStepSize`` s; step 0 is before the first.
     A position is the middle of a vehicle. Each lane that the agent came near is a lanelet; the order of lanelets
     follows from the shapes. Every other actor is a dynamic obstacle from the step in which it was first seen. Each
     agent is a planning problem: its start, with the goal of still driving at the end of the recording.
-    A planner that avoids the crash solves it. Its yaw rate is that of the first step, its slip angle unknown and 0.
+    A planner that avoids the crash solves the planning problem. Its yaw rate is that of the first step, its slip angle
+    unknown and 0.
 
     Args:
         bundle: the crash.
         target: the file; an existing one is replaced.
-        with_agents: whether the ways that the agents drove are there as obstacles, too.
+        with_agents: whether the recorded paths of the agents are obstacles, too.
 
     Returns:
-        The numbers under which each actor is in the file, those of planning problems included.
+        The number of each actor in the file, including planning problems.
 
     Raises:
-        BundleError: there is nothing that could be written, or it is damaged.
+        BundleError: the crash has no recorded actors or lanes, or its log is damaged.
         HuntDirectoryError: the file cannot be written.
     """
     recorded = recorded_of(bundle)

@@ -103,7 +103,7 @@ def write_openscenario(bundle: Bundle, target: Path, *, with_agents: bool = Fals
 
     Args:
         bundle: the crash.
-        target: the scenario, ``….xosc``; the roads are in ``….xodr``. What is there is replaced.
+        target: the scenario, ``….xosc``; the roads are in ``….xodr``. Existing files are replaced.
         with_agents: whether the agents follow their recorded ways, too; else they are placed where they began, with the
             speed that they had, for whatever is to drive them.
 
@@ -111,7 +111,7 @@ def write_openscenario(bundle: Bundle, target: Path, *, with_agents: bool = Fals
         The names under which each actor is in the file.
 
     Raises:
-        BundleError: there is nothing that could be written, or it is damaged.
+        BundleError: the crash has no recorded actors or lanes, or its log is damaged.
         HuntDirectoryError: a file cannot be written.
     """
     recorded = recorded_of(bundle)
@@ -228,7 +228,7 @@ def _add_way(action: ET.Element, name: str, poses: list[Pose], dt: float) -> Non
 
 
 def _add_event(maneuver: ET.Element, name: str, time_s: float) -> ET.Element:
-    """Add what happens at a time, half a step before which it is set off; return its action, which comes first."""
+    """Add an event at a time, with a trigger half a step earlier; return its first action."""
     event = add(maneuver, "Event", name=name, priority="parallel", maximumExecutionCount="1")
     action = add(event, "Action", name=name)
     _add_trigger(event, "StartTrigger", time_s)

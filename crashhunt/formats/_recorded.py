@@ -1,4 +1,4 @@
-"""What of a crash is handed on: who drove where, on which lanes."""
+"""The exported part of a crash: the paths of all actors, and the lanes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SAME_WAY_RAD = math.pi / 3  # and in about its direction; a lane that only cros
 
 
 class Pose(NamedTuple):
-    """Where the middle of an actor is after a step.
+    """The position of the centre of an actor after a step.
 
     Args:
         step: 0 is before the first.
@@ -84,7 +84,7 @@ class Road:
         right: its right border, shape (n, 2), in m.
         left: its left one, with as many points.
         after: numbers of the lanes that begin where it ends, derived from shapes, because recordings lack them.
-        before: which ones end where it begins.
+        before: numbers of the lanes that end where it begins.
     """
 
     right: NDArray[np.float64]
@@ -105,15 +105,15 @@ class Road:
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A crash as it is handed on.
+    """A crash for the export.
 
     Args:
-        title: what it is, in one line.
+        title: description of the crash, in one line.
         number: number of its trial.
         step_length_s: step length in s.
         steps: number of recorded steps.
         agents: the ways of the controlled vehicles.
-        others: those of everybody else.
+        others: the paths of all other actors.
         roads: the lanes that an agent came near.
     """
 
@@ -130,7 +130,7 @@ def recorded_of(bundle: Bundle) -> Recorded:
     """Return what of a crash can be handed on.
 
     Raises:
-        BundleError: nothing: it has no scenes, its agent is in none, or no map was recorded; or its log is damaged.
+        BundleError: the crash has no scenes with its agent, no map was recorded, or its log is damaged.
     """
     recording = bundle.recording()
     paths = paths_of(recording.scenes(), recording.agents)

@@ -39,7 +39,7 @@ def plain_text(text: str) -> str:
 
 
 def write_xml(root: ET.Element, target: Path) -> None:
-    """Write a document, all of it or nothing.
+    """Write a document; the file is never incomplete.
 
     Raises:
         HuntDirectoryError: it cannot be written.

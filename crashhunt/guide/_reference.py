@@ -103,12 +103,12 @@ def _type(annotation: object) -> str:
 
 
 def _value(value: object) -> str:
-    """A default as one would write it: members of an enumeration by their values."""
+    """Return a default value as source text; members of an enumeration become their values."""
     return re.sub(r"<\w+\.\w+: ('\w+')>", r"\1", repr(value))
 
 
 def _attributes(found: ast.ClassDef) -> Iterator[str]:
-    """Those of a protocol, each with the string below it."""
+    """Return the attributes of a protocol, each with the string below it."""
     for item, after in zip(found.body, [*found.body[1:], ast.Pass()], strict=True):
         if isinstance(item, ast.AnnAssign):
             yield f"**`{ast.unparse(item.target)}: {ast.unparse(item.annotation)}`**\n"
@@ -129,7 +129,7 @@ def _methods(found: ast.ClassDef) -> Iterator[str]:
 
 
 def _made_with(found: ast.ClassDef) -> str:
-    """How an instance is made; empty for protocols, errors and enumerations."""
+    """Return the signature of the constructor; empty for protocols, errors and enumerations."""
     for method in found.body:
         if isinstance(method, ast.FunctionDef) and method.name == "__init__":
             return _signature(method, bound=True).removesuffix(" -> None")
@@ -221,7 +221,7 @@ def _prose(line: str) -> str:
 
 
 def _door(module: str) -> dict[str, tuple[str, str]]:
-    """What a module offers, and where each is defined: the module and the name there."""
+    """Return the public names of a module, each with the module and the name of its definition."""
     stub = _file(module).with_suffix(".pyi")
     tree = ast.parse(stub.read_text(encoding="utf-8")) if stub.is_file() else _parsed(module)
     found: dict[str, tuple[str, str]] = {}
@@ -374,7 +374,7 @@ def _expanded(command: argparse.ArgumentParser, action: argparse.Action) -> str:
 
 
 def _plain(text: str | None) -> str:
-    """Text in which nothing is Markdown by accident, such as the name of a placeholder between angle brackets."""
+    """Return a text in which characters with a meaning in Markdown are escaped."""
     said = " ".join((text or "").split())
     return "".join(f"\\{letter}" if letter in "*<[`" else letter for letter in said)
 

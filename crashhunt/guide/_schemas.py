@@ -49,7 +49,7 @@ class EventCount(TypedDict):
 
 
 class Exposure(TypedDict):
-    """What the agents drove."""
+    """The distance and time that the agents drove."""
 
     trials: int
     hours: float
@@ -68,7 +68,7 @@ class RatePartData(TypedDict):
 
 
 class CountedTrials(TypedDict):
-    """Which trials do not count for a rate: reason to number."""
+    """The trials that do not count for a rate: reason to number."""
 
     left_out: dict[str, int]
 
@@ -217,7 +217,7 @@ class CheckedHunt(TypedDict):
 
 
 class Salvaged(TypedDict):
-    """What ``--salvage`` copied."""
+    """The result of ``--salvage``."""
 
     trials: int
     crashes: int

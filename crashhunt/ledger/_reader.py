@@ -30,7 +30,7 @@ __all__ = ["Facts", "KindData", "LedgerReader", "Noted", "Owner", "Seal", "Turn"
 
 
 class KindData(TypedDict):
-    """A kind of crashes in few words, as the ledger and ``--json`` have it."""
+    """A crash type as in the ledger and in ``--json``."""
 
     words: str
     count: int
@@ -47,7 +47,7 @@ class Owner(TypedDict):
 
 
 class UntilRate(TypedDict):
-    """Where a hunt with ``--until-rate`` stands; ``decided_at`` is the number of a trial, or None."""
+    """The progress of a hunt with ``--until-rate``; ``decided_at`` is the number of a trial, or None."""
 
     bar: str
     decided_at: int | None
@@ -59,7 +59,7 @@ class Bounds(TypedDict):
 
     Args:
         low: the least rate.
-        high: the greatest; None if nothing bounds it.
+        high: the upper bound; None if there is none.
     """
 
     low: float
@@ -104,12 +104,12 @@ class RunningRate(TypedDict):
 
 
 class Noted(TypedDict, total=False):
-    """What is noted of a hunt besides its state; None if something no longer holds.
+    """The recorded facts about a hunt in addition to its state; None removes a fact.
 
     Args:
         owner: the process that runs it, while it runs.
         began: when it was begun or resumed, in s since the epoch.
-        heartbeat: when it was there last, likewise.
+        heartbeat: time of the last sign of life of the hunt, in s since the epoch.
         done_before: number of trials that had ended at the start of this run.
         planned: number of planned trials; 0 if only the time is limited.
         until: when its time is up, in s since the epoch; None if it has all the time.
@@ -193,7 +193,7 @@ class Facts(Noted, total=False):
 
 
 class Seal(TypedDict):
-    """What a ledger held when it was closed; earlier versions said less."""
+    """The content of a ledger when it was closed; earlier versions recorded less."""
 
     outcomes: Mapping[str, int]
     steps: int
@@ -228,7 +228,7 @@ class Turn:
 
 
 class LedgerReader:
-    """Answers what a ledger says.
+    """Reads a ledger.
 
     Args:
         database: that is open.
@@ -266,10 +266,10 @@ class LedgerReader:
         return [self._result(json.loads(self._checked(row, "a trial that ran again")[2])) for row in rows]
 
     def turns(self) -> Iterator[Turn]:
-        """Yield what a sampler that learns has proposed, in order; nothing for any other.
+        """Yield the proposals of a sampler that learns, in order; nothing for other samplers.
 
         Raises:
-            HuntDirectoryError: something of it is not as it was written, or missing; what was before was yielded.
+            HuntDirectoryError: a proposal is damaged or missing; earlier ones have been yielded.
         """
         if not self._proposing:
             return
@@ -280,7 +280,7 @@ class LedgerReader:
         self._compare_seal(seal, "proposals", count)
 
     def intact_turns(self) -> list[Turn]:
-        """Return those that are as they were written, whatever has become of the others."""
+        """Return the intact proposals, also if others are damaged."""
         found: list[Turn] = []
         try:
             for row in self._select(f"{self._shape.select('proposals')} ORDER BY turn") if self._proposing else ():
@@ -394,7 +394,7 @@ class LedgerReader:
         """Yield the same as plain data, which takes a third of the time.
 
         Raises:
-            HuntDirectoryError: a trial is not as it was written, or one is missing; those before were yielded.
+            HuntDirectoryError: a trial is damaged or missing; earlier ones have been yielded.
         """
         where = f"WHERE outcome IN ({','.join('?' * len(outcomes))})" if outcomes else ""
         seal, count = self._seal(), 0
@@ -660,7 +660,7 @@ class LedgerReader:
         return seal
 
     def _fits(self, seal: Seal) -> bool:
-        """Whether what is there is what was sealed, by a version that knew less or more, too."""
+        """Return whether the content equals the sealed content, also if another version has sealed it."""
         found: Plain = self._make_seal()
         said: Plain = seal
         return all(found[name] == said[name] for name in found.keys() & said.keys())

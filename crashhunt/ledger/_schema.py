@@ -122,12 +122,12 @@ _LATER = {"proposals": ("turn", "number", "told", "spec")}
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What the tables of a ledger have.
+    """The columns of the tables of a ledger.
 
     Args:
         version: version of the tables.
         columns: table to its columns but the digest, which is made over them in this order. A table of a newer version
-            may have more than is known here, after those that are; what an older version lacks is not there.
+            may have further columns at its end; a table of an older version may lack columns.
     """
 
     version: int
@@ -158,7 +158,7 @@ def create(path: Path) -> None:
 
 
 def note_reader(database: sqlite3.Connection) -> None:
-    """Write down which crashhunt is needed to read the ledger, for those that are older than what wrote it."""
+    """Record the oldest crashhunt that can read the ledger."""
     row = (_READER_FACT, json.dumps(_READER))
     database.execute("INSERT OR REPLACE INTO hunt VALUES (?, ?, ?)", (*row, digest_of_row(row)))
 
@@ -167,7 +167,7 @@ def shape_of(database: sqlite3.Connection, path: Path) -> Shape:
     """Return what the tables have.
 
     Raises:
-        HuntDirectoryError: they cannot be read, or are not those of their version.
+        HuntDirectoryError: the tables cannot be read, or do not belong to their version.
         sqlite3.Error: it is no database.
     """
     version = int(database.execute("PRAGMA user_version").fetchone()[0])
@@ -223,7 +223,7 @@ def _refuse_unreadable(database: sqlite3.Connection, path: Path, version: int) -
 
 
 def _add_digests(database: sqlite3.Connection) -> None:
-    """What is there now is what digests will vouch for."""
+    """The digests are computed from the present content."""
     database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
     for table, columns in FIRST.items():
         database.execute(f"ALTER TABLE {table} ADD COLUMN digest INTEGER NOT NULL DEFAULT 0")
@@ -246,7 +246,7 @@ def _add_danger(database: sqlite3.Connection) -> None:
 
 
 def _add_other_steps(database: sqlite3.Connection) -> None:
-    """Of what is there, copies said how many steps they took; the steps of warm-ups are unknown."""
+    """The steps of copies are in the existing data; the steps of warm-ups are unknown."""
     database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
     database.execute("ALTER TABLE trials ADD COLUMN other_steps INTEGER")
     was = ", ".join((*FIRST["trials"], "danger"))
@@ -330,7 +330,7 @@ def damaged(path: Path, message: str) -> HuntDirectoryError:
 
 
 def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
-    """Return the error that says in our words what SQLite says."""
+    """Return the error of crashhunt for an error of SQLite."""
     where, text = str(path), " ".join(str(error).split())  # which may quote what is damaged
     if "full" in text or "disk I/O" in text:
         return HuntDirectoryError(
@@ -362,7 +362,7 @@ _untouched: ContextVar[bool] = ContextVar("untouched", default=False)
 
 @contextmanager
 def leave_untouched() -> Iterator[None]:
-    """Open every ledger that is only read as `opened` does with `read_only`, in whatever is called meanwhile."""
+    """Inside the context, open every ledger read-only, as `opened` does with `read_only`."""
     before = _untouched.set(True)
     try:
         yield

@@ -51,12 +51,12 @@ _TOGETHER_S = 0.5  # a kill loses no more than this of what was recorded togethe
 
 
 def has_begun(path: Path) -> bool:
-    """Whether there is a ledger; an empty file, which SQLite creates on opening, is none."""
+    """Return whether a ledger exists; an empty file, which SQLite creates on opening, does not count."""
     return path.exists() and path.stat().st_size > 0
 
 
 class Ledger(LedgerReader):
-    """What happened in a hunt.
+    """Writes the trials and the facts of a hunt.
 
     Args:
         path: path of ``ledger.sqlite``.
@@ -114,7 +114,7 @@ class Ledger(LedgerReader):
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Write what is recorded meanwhile at once: thousands of trials a second can be recorded so.
+        """Write all records inside the context together, so that thousands of trials can be recorded per second.
 
         What was recorded is written half a second later at the latest, with the next trial: the caller may wait
         for trials in between. Other processes do not see it before, and a kill loses it: those trials run again.
@@ -178,7 +178,7 @@ class Ledger(LedgerReader):
         self._event(state, detail)
 
     def remark(self, detail: str) -> None:
-        """Write down something that happened on the way; the state of the hunt stays what it is."""
+        """Record an event; the state of the hunt does not change."""
         self._event("remark", detail)
 
     def _event(self, state: str, detail: str) -> None:
@@ -250,7 +250,7 @@ class Ledger(LedgerReader):
 
     @contextmanager
     def _lasting(self) -> Iterator[None]:
-        """Have one commit wait for the disk, which takes along all those before that did not."""
+        """Make one commit wait for the disk; this also makes all earlier commits durable."""
         self._database.execute("PRAGMA synchronous = FULL")
         try:
             with self._database:
@@ -260,7 +260,7 @@ class Ledger(LedgerReader):
             self._database.execute("PRAGMA synchronous = NORMAL")
 
     def _begin_to_write(self) -> None:
-        """See that what is there is as it was written before anything is added to it, and bring it to this version.
+        """Check that the existing content is intact before anything is added, and migrate it to this version.
 
         Raises:
             HuntDirectoryError: it is not, or it is of a newer version.

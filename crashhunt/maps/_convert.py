@@ -42,7 +42,7 @@ _IGNORING = ("--ignore-errors", "--ignore-errors.connections")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConvertOptions:
-    """What a network is made with.
+    """The options of the conversion of a map to a network.
 
     Args:
         bbox: the part of the map, in degrees; None for all of it.
@@ -62,7 +62,7 @@ class Converted:
     """A network.
 
     Args:
-        network: what it holds.
+        network: the content of the network.
         notes: what the user should know of how it was made.
     """
 

@@ -118,7 +118,7 @@ def scenario_toml(
     """Return ``scenario.toml``.
 
     Args:
-        title: one line, for people.
+        title: description in one line.
         arguments: arguments of the scenario.
         warmup_s: warmup in s.
         speed_limit_mps: usual on the routes, in m/s; agents want to drive about as fast.
@@ -284,7 +284,7 @@ def readme(
 
     Args:
         title: title of the place.
-        place: what it is, in lines.
+        place: description of the place, in lines.
         demand: its traffic.
         steps: a bound on a trial.
         run_s: how long the plain traffic ran, in s.

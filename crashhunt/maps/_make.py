@@ -52,7 +52,7 @@ _KMH = 3.6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapOptions:
-    """What a scenario is made with.
+    """The options of a scenario that is made from a map.
 
     Args:
         bbox: the part of the map, in degrees; None for all of it.
@@ -77,7 +77,7 @@ class MapOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlainTrial:
-    """What came of one trial in the new scenario.
+    """The result of one trial in the new scenario.
 
     Args:
         outcome: how it ended.
@@ -92,7 +92,7 @@ class PlainTrial:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeScenario:
-    """A scenario that has been made and tried.
+    """A scenario that has been made and checked.
 
     Args:
         folder: folder of the scenario.
@@ -103,7 +103,7 @@ class MadeScenario:
         busy: what it did at the largest.
         steps: a bound on trials, from the longest route.
         notes: what the user should know.
-        trial: what came of one trial; None if none ran.
+        trial: the result of one trial; None if none ran.
     """
 
     folder: Path
@@ -157,7 +157,7 @@ def make_scenario(
     try_out: Callable[[Path, int], PlainTrial] | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> MadeScenario:
-    """Make the folder of a scenario from a map, and try what it made.
+    """Make the folder of a scenario from a map, and check the scenario.
 
     Args:
         source: the map.

@@ -1,4 +1,4 @@
-"""What a network of SUMO holds: roads, lanes, who may use them, junctions."""
+"""The content of a SUMO network: roads, lanes, permitted vehicle classes, junctions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Lane:
         length_m: length in m.
         speed_mps: the speed limit, in m/s.
         allowed: the vehicle classes that may use it; None for all.
-        disallowed: those that may not.
+        disallowed: the vehicle classes that may not use the lane.
         shape: its centre line, in m.
     """
 

@@ -38,7 +38,7 @@ def draw_map(
     """Write a PNG: roads in the colour of their traffic, the names of the busiest, a scale.
 
     Args:
-        network: what is drawn.
+        network: the network to draw.
         vehicles: vehicles on each edge, in the time that was simulated.
         path: path of the PNG.
         title: above the map.

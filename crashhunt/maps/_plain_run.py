@@ -40,14 +40,14 @@ _MAX_PROBE_DELAY_S = 10.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlainRun:
-    """What the plain traffic did in `RUN_S` seconds.
+    """The result of a simulation of the traffic without an agent for `RUN_S` seconds.
 
     Args:
         demand: the factor on the traffic.
         wanted: vehicles that were to enter.
-        entered: those that did.
-        arrived: those that reached their destination.
-        running: those on the road at the end.
+        entered: number of vehicles that entered.
+        arrived: number of vehicles that reached their destination.
+        running: number of vehicles on the road at the end.
         halting: number of these vehicles that stood.
         teleports: vehicles that SUMO moved on after they had stood for 300 s.
         collisions: number of collisions between vehicles of the traffic.
@@ -73,7 +73,7 @@ class PlainRun:
 
     @property
     def jam(self) -> str:
-        """Why the traffic does not flow, in words; empty if it does."""
+        """The reason why the traffic does not flow, in words; empty if it flows."""
         if not self.entered:
             return "no vehicle enters"
         if self.wanted - self.entered > max(5, _MAX_WAITING_SHARE * self.wanted):

@@ -1,4 +1,4 @@
-"""What a scenario is made from: a file that holds a map, or the shape of a map to be generated."""
+"""The source of a scenario: a map file, or the shape of a generated map."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _CHUNK_BYTES = 1 << 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapSource:
-    """Where a map comes from.
+    """The source of a map: a file or a shape.
 
     Args:
         kind: kind of the map.
@@ -56,7 +56,7 @@ class MapSource:
 
     @property
     def title(self) -> str:
-        """What people call it."""
+        """The name of the map format."""
         if self.path is not None:
             return self.path.name
         first, second = self.shape

@@ -32,7 +32,7 @@ _LEAST_FREE_BYTES = 1 << 16
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a program did.
+    """The exit code and the output of a program.
 
     Args:
         code: its exit code; 0 means success.

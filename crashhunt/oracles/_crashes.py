@@ -69,7 +69,7 @@ class Overlap:
     """Sees a collision where the outlines of a controlled vehicle and another actor overlap, or did within the step.
 
     Simulators miss some: SUMO compares vehicles of one lane only. The collider is the vehicle that moves into the
-    other's lane, or that has the other in front of it at the first touch. A vehicle that stands is no collider.
+    other's lane, or that has the other in front of it at the first touch. A standing vehicle is never the collider.
     """
 
     name = "overlap"
@@ -125,8 +125,8 @@ class OffRoad:
 def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
     """Return the rows of actors that may have touched an actor since the previous scene, nearest first; mostly none.
 
-    Who is further away than the two have got relative to each other has not been there. This looks at every vehicle
-    nearby in every step, and so spares what it can.
+    An actor that is further away than both could have moved relative to each other cannot have touched the agent. This
+    function examines every near vehicle in every step, so it avoids all unnecessary work.
     """
     roster, further = scene.roster, 0.0
     if previous is not None:
@@ -163,15 +163,14 @@ def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
 
 
 def _may_touch(scene: Scene, previous: Scene | None, row: int, other: int, margin: float) -> bool:
-    """Whether two outlines overlap, or both scenes leave room for that within the step.
+    """Return whether two outlines overlap, or may have overlapped between the two scenes.
 
     Args:
         scene: the present one.
         previous: the one before.
         row: one actor.
         other: another.
-        margin: what they have moved relative to each other, in m: they cannot have been further apart than this before
-            and after taken together.
+        margin: distance that the two actors have moved relative to each other, in m.
     """
     if scene.spines or (previous is not None and previous.spines):
         return True
@@ -194,7 +193,7 @@ def _were_near(previous: Scene, scene: Scene, row: int, other: int, margin: floa
 
 
 def _moved(previous: Scene, scene: Scene, row: int) -> tuple[float, float, float]:
-    """How far an actor moved (x, y), and how much further one of its corners may have been from there on the way."""
+    """Return the displacement of an actor (x, y), and how much further one of its corners may have moved on the way."""
     was = row
     if previous.roster is not scene.roster:
         found = previous.roster.index.get(scene.roster.actors[row].id)

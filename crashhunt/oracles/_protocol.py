@@ -38,12 +38,12 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A traffic crash or a traffic event that an oracle saw.
+    """A traffic crash or a traffic event that an oracle has detected.
 
     Args:
         outcome: ``collision``, ``off_road``, the kind of an event, or an outcome of the oracle's own.
         collision: the evidence of a crash.
-        event: the evidence of anything else; its ``what`` says in words what happened.
+        event: the evidence of a traffic event; its ``what`` describes the event in words.
     """
 
     outcome: Outcome
@@ -85,7 +85,7 @@ class BringsOutcomes(Protocol):
 
 
 def merge_findings(findings: Sequence[Finding]) -> Finding | None:
-    """Return the first finding, credited to every oracle that saw the same; None if there is none."""
+    """Return the first finding, with the names of all oracles that detected the same; None if there is none."""
     if not findings:
         return None
     first = findings[0]
@@ -155,13 +155,13 @@ class OracleChoice:
 
 
 def oracle_name(text: str) -> str:
-    """Return the name in a choice; nothing is imported."""
+    """Return the name of the oracle in an ``--oracle`` value, without importing the oracle."""
     match = _CHOICE.fullmatch(text)
     return match["name"] if match else text
 
 
 def modules_of(oracles: Iterable[str]) -> list[str]:
-    """Return the modules of the oracles that are chosen as ``module:attribute``; nothing is imported."""
+    """Return the modules of the oracles that are given as ``module:attribute``, without importing them."""
     return [name.partition(":")[0] for text in oracles if ":" in (name := oracle_name(text))]
 
 
@@ -169,7 +169,7 @@ def parse_oracle(text: str) -> OracleChoice:
     """Read a choice.
 
     Raises:
-        CrashhuntError: there is no such oracle, it takes no such argument, or a value is none of the right type.
+        CrashhuntError: the oracle does not exist, has no such argument, or a value has the wrong type.
     """
     match = _CHOICE.fullmatch(text)
     if match is None:
@@ -207,7 +207,7 @@ def chosen_oracles(asked: Sequence[str], described: Collection[str] = ()) -> tup
     """Return the oracles of a hunt in the order of their checks: the default ones, then the chosen ones.
 
     Args:
-        asked: what ``--oracle`` was given, as often as it was; ``none`` drops the default ones.
+        asked: the values of all ``--oracle`` options; ``none`` removes the default oracles.
         described: those that another process has made, so that they are not made here.
 
     Raises:
@@ -233,7 +233,7 @@ def outcomes_brought(
         described: the outcomes of those that another process has made, with their categories.
 
     Raises:
-        CrashhuntError: one of them cannot be had.
+        CrashhuntError: an oracle cannot be created.
     """
     brought: dict[Outcome, None] = {}
     for text in oracles:

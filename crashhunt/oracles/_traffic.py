@@ -23,11 +23,12 @@ __all__ = ["OffRoute", "RedLight", "Teleport", "TooClose", "TrafficEvents", "Wro
 
 
 class TooClose:
-    """Sees a near miss: an agent that moves comes nearer to another actor than a gap, without touching it.
+    """Detects a near miss: a moving agent comes closer to another actor than a gap, without touching it.
 
     Args:
         gap_m: gap between the outlines.
-        speed: speed of the agent relative to the other, at least; 0 includes an agent that creeps up in a queue.
+        speed: least speed of the agent relative to the other actor, in m/s; 0 includes an agent that creeps forward in
+            a queue.
     """
 
     name = "too-close"
@@ -59,7 +60,7 @@ class TooClose:
         return findings
 
     def _others(self, scene: Scene, row: int) -> list[tuple[Scene, int, int]]:
-        """Who may be near enough; the circles around the outlines bound the gap from below."""
+        """Yield the actors that may be near enough; circles around the outlines give a lower bound of the gap."""
         found = []
         reaches = scene.roster.reaches
         for squared, other in scene.neighbors(row):
@@ -98,7 +99,8 @@ class TooClose:
 class TrafficEvents:
     """Reports the simulator's own traffic events, such as red lights, standstills and teleports.
 
-    An episode asks it last, and only where ``--crash-on`` names one of them: a collision in the same step comes first.
+    An episode uses it as the last oracle, and only if ``--crash-on`` names a traffic event, so that a collision in the
+    same step comes first.
     """
 
     name = "traffic-events"
@@ -142,7 +144,7 @@ class OffRoute(_ReportedEvent):
 
 
 class Teleport(_ReportedEvent):
-    """Sees the simulator move an agent that was stuck, where it reports it."""
+    """Detects that the simulator teleports an agent that was stuck, if the simulator reports this."""
 
     name = "teleport"
     outcomes: Mapping[str, Category] = {"teleport": "traffic event"}

@@ -1,4 +1,4 @@
-"""Plans: what was asked of a hunt, resolved and kept in ``hunt.toml``, and the trials that follow from it."""
+"""Plans: the request of a hunt, its resolved settings in ``hunt.toml``, and the options."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""How an option of a hunt is declared, and what follows from it: its form, its help, and which values it refuses."""
+"""The declaration of an option of hunts: its name, type, default, help and checks."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ _ABOUT = "crashhunt"  # the key of a field's metadata
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class About:
-    """What the list says of an option besides its name, type and default.
+    """The declaration of an option in addition to its name, type and default.
 
     Args:
         meaning: meaning of its value, in words.
-        help: the same on the command line, where it has to be said otherwise.
-        unset: what holds where it is not given, in words; empty if that is the default itself.
+        help: text for the command line, if it differs.
+        unset: the effect if the option is not given, in words; empty for the default value.
         flag: option on the command line; empty if it is not there.
         metavar: placeholder of its value in the help.
         group: group of the help of ``crashhunt run``: what is tested, search, faults and probes, what is kept, how it
             runs, output.
         brief: the same in one line, for the short help of ``crashhunt run``; empty for options that it only names.
-        check: says what to give instead of a value that is none.
+        check: returns the fix for an invalid value; empty for a valid one.
         separator: separator of a list that is one word on the command line; empty if its flag may be repeated.
         named: of a table, whether every value has a name.
         anywhere: whether ``suite run`` and ``rerun`` have the flag as well, for all their hunts: it belongs to the
@@ -90,7 +90,7 @@ def option(default: T, meaning: str, **about: Any) -> T:
 
 
 def at_least(least: int, *, zero: str = "") -> Check:
-    """Return the check of a number; ``zero`` says what nought means, where it may be given."""
+    """Return the check of a number; ``zero`` is the meaning of 0, if 0 is allowed."""
     fix = f"give at least {least}{f' (0: {zero})' if zero else ''}"
     return lambda value: fix if value < least else ""
 
@@ -112,7 +112,7 @@ class HuntOption:
     Args:
         name: name in Python and in files.
         form: form of its values.
-        default: what holds where it is not given.
+        default: the value if the option is not given.
         about: everything else.
     """
 
@@ -123,28 +123,28 @@ class HuntOption:
 
     @property
     def shown(self) -> str:
-        """How errors call it."""
+        """The name of the option in errors."""
         return self.about.flag or self.name
 
     @property
     def line(self) -> str:
-        """What the documentation of a function says of it."""
+        """The line about the option in the documentation of a function."""
         return f"{self.name}: {self.about.meaning}{f'; by default {self.about.unset}' if self.about.unset else ''}."
 
     @property
     def help(self) -> str:
-        """What the command line says of it."""
+        """The help text of the option on the command line."""
         said = self.about.unset
         if self.form in ("integer", "number", "text") and self.default not in ("", None):
             said = f"{self.default:g}" if self.form == "number" else str(self.default)
         return self.help_with(said)
 
     def help_with(self, default: str) -> str:
-        """What the command line says of it, with another default."""
+        """Return the help text of the option with another default."""
         return f"{self.about.help or self.about.meaning}{f'; default: {default}' if default else ''}"
 
     def checked(self, value: object) -> object:
-        """Return a value of this option, plain where it was NumPy's.
+        """Return a checked value of this option; a NumPy number becomes a Python number.
 
         Raises:
             UsageError: it is none.
@@ -225,7 +225,7 @@ def seconds_of(text: str) -> float:
     5400.0
 
     Raises:
-        ValueError: it is no such time, or none at all.
+        ValueError: the text is not a time.
     """
     if not text:
         return math.inf
@@ -262,7 +262,7 @@ def share_of(text: str) -> float:
 
 
 def check_share(text: str) -> str:
-    """Return what to give instead of a text that is no share; empty if it is a share, or nothing."""
+    """Return the fix for a text that is not a share; empty for a share or an empty text."""
     try:
         share_of(text or "1")
     except ValueError:
@@ -271,7 +271,7 @@ def check_share(text: str) -> str:
 
 
 def check_probe(text: str) -> str:
-    """Return what to give instead of how often copies are asked; empty if that is fine."""
+    """Return the fix for an invalid interval of probes; empty if the interval is valid."""
     if check_duration(text):
         return "give a time above 0, such as 4s, or omit the option"
     return "" if not text or sys.platform == "linux" else "omit the option: forks need Linux"

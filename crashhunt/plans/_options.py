@@ -62,7 +62,7 @@ class _Options:
 
 @dataclass(frozen=True, kw_only=True)
 class Subject(_Options):
-    """What is hunted."""
+    """The scenario, agents and arguments of a hunt."""
 
     scenario: Path | str = option(
         "loop", "name of an included scenario, or a path",
@@ -112,7 +112,7 @@ class Subject(_Options):
 
 @dataclass(frozen=True, kw_only=True)
 class TrialOptions(_Options):
-    """What a trial is; `HuntSettings` has them too."""
+    """The options that determine trials; `HuntSettings` has them, too."""
 
     sampler: str = option(
         "random", "name of the sampler",
@@ -179,7 +179,7 @@ class TrialOptions(_Options):
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(_Options):
-    """How trials are run; `RunSettings` has them too."""
+    """The options that determine how trials run; `RunSettings` has them, too."""
 
     duration: str = option(
         "", "time limit of the hunt: ``90s``, ``30m``, ``1h30m``; TRIALS may then be 0",
@@ -317,7 +317,7 @@ class RunOptions(_Options):
 
 @dataclass(frozen=True, kw_only=True)
 class SnapshotChoices(_Options):
-    """What the snapshot of the code takes in."""
+    """The options of the snapshot of the code."""
 
     snapshot_roots: Sequence[str | Path] = option(
         (), "files and folders to add to the snapshot, in addition to the agents' projects",
@@ -343,7 +343,7 @@ class HuntOptions(SnapshotChoices, RunOptions, TrialOptions, Subject):
 
 
 def hunt_options(kind: type = HuntOptions) -> tuple[HuntOption, ...]:
-    """Return the options of the list, or those of them that a dataclass has which is made of it."""
+    """Return all options of hunts, or the options that a given dataclass has."""
     names = declared(kind)
     return tuple(known for known in _all_options() if known.name in names)
 

@@ -127,7 +127,7 @@ json.dump([names, is_open, defaults], answer)
 
 @dataclass(frozen=True, slots=True)
 class Takes:
-    """Which arguments an agent takes.
+    """The arguments that an agent accepts.
 
     Args:
         names: names of those that it declares.
@@ -231,7 +231,7 @@ def agent_of(word: str, agents: Collection[str]) -> str:
 
 
 def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None) -> Takes:
-    """Ask the code of an agent what it takes, in its own process, as that code may be of a snapshot.
+    """Read the arguments of an agent from its code, in a separate process, because the code may come from a snapshot.
 
     Args:
         locator: locator of the agent.
@@ -266,12 +266,12 @@ def plan_with_code(request: Request, *, survey: Surveyor | None = None) -> tuple
     """Resolve a request, and return what was found out about the code that it names.
 
     Args:
-        request: what was asked.
+        request: the request of the user.
         survey: returns the scenario with the vehicles that an agent can replace. It is called last, as it may take
             long: what cannot be meant is refused sooner.
 
     Raises:
-        CrashhuntError: with what is wrong with it.
+        CrashhuntError: the request is invalid.
     """
     request = request.checked()
     loaded = load_scenario(request.scenario, ego=request.ego)
@@ -373,7 +373,7 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
 
 
 def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
-    """Return the scenario with the forms of action that are asked for; an empty one is as the scenario says."""
+    """Return the scenario with the requested forms of action; an empty form keeps that of the scenario."""
     for agent, action in actions.items():
         if action and not scenario.backend.actions:
             meant, fix = titles(lambda backend: bool(backend.actions)), "omit the option; the environment has its own"
@@ -390,7 +390,7 @@ def disturber(
     *,
     find: Callable[[str], DisturbanceModel] | None = None,
 ) -> DisturbanceSampler | None:
-    """Return what draws the disturbances of trials; None if there are none.
+    """Return the object that draws the disturbances of trials; None if there are none.
 
     Args:
         scenario: scenario in which they take place.
@@ -399,7 +399,7 @@ def disturber(
         find: returns the model of a name; by default it is imported in this process.
 
     Raises:
-        CrashhuntError: there is no such disturbance, or the simulator cannot do it.
+        CrashhuntError: the disturbance does not exist, or the simulator does not support it.
     """
     rates, fixed = parse_rates(disturb), parse_fixed(disturb, tuple(agents))
     if not rates and not fixed:
@@ -446,7 +446,7 @@ def sampler_of(settings: HuntSettings) -> NamedSampler:
 
 @contextmanager
 def _said_by(request: Request, scenario: Scenario) -> Iterator[None]:
-    """Name the scenario in errors of disturbances that come from it, and not from the command line."""
+    """Name the scenario in errors of disturbances that the scenario defines."""
     try:
         yield
     except CrashhuntError as error:
@@ -457,7 +457,7 @@ def _said_by(request: Request, scenario: Scenario) -> Iterator[None]:
 
 
 def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
-    """What is asked for, or else what the scenario says."""
+    """Return the requested disturbances, or else those of the scenario."""
     words = request.disturb or tuple(f"{name}={rate}" for name, rate in scenario.disturbances.items())
     agents = tuple(scenario.agents)
     fixed = parse_fixed(words, agents)
@@ -537,11 +537,11 @@ def parse_crash_on(
     """Return the outcomes that ``--crash-on`` names, and the limits that it gives.
 
     Args:
-        words: what it was given.
+        words: the values of ``--crash-on``.
         brought: the outcomes of the oracles that were chosen, which may be named as well.
 
     Raises:
-        UsageError: there is no such outcome or limit.
+        UsageError: the outcome does not exist, or the limit is invalid.
     """
     known = tuple(dict.fromkeys((*CRASHES, *EVENTS, *brought)))
     crashes = [str(outcome) for outcome in known]
@@ -620,7 +620,7 @@ def _agents(
 
 
 def _owner(name: str, scenario: Scenario, signatures: Mapping[str, Signature]) -> tuple[str, str]:
-    """Which agent an ``--arg`` is for."""
+    """Return the agent to which an ``--arg`` belongs."""
     takes = {agent: Takes(signature.arguments, signature.open) for agent, signature in signatures.items()}
     owner = Owners(takes).of(name, option="--arg")
     if owner is not None:

@@ -61,7 +61,7 @@ _RUN_KEYS = (
 
 @dataclass(frozen=True, kw_only=True)
 class ArgumentSpec:
-    """What is tried for one argument.
+    """The values that a hunt tries for one argument.
 
     Args:
         spec: as in ``--arg NAME=SPEC``.
@@ -73,13 +73,13 @@ class ArgumentSpec:
 
     @property
     def distribution(self) -> Distribution:
-        """What the specification says."""
+        """The distribution of the specification."""
         return parse_spec(self.spec, self.kind)
 
 
 @dataclass(frozen=True, kw_only=True)
 class AgentSettings:
-    """``[agents.ID]``: who drives a vehicle, and what is tried for its arguments; how it acts, where that was asked."""
+    """``[agents.ID]``: the agent of a vehicle, the values of its arguments, and its form of action if requested."""
 
     agent: str
     arguments: dict[str, ArgumentSpec] = field(default_factory=dict)
@@ -89,7 +89,7 @@ class AgentSettings:
 @clear_constructor
 @dataclass(frozen=True, kw_only=True)
 class RunSettings(RunOptions):
-    """``[run]``: how the hunt is run. None of it changes what a trial is, so a resumed hunt may have other values.
+    """``[run]``: how the hunt is run. These options do not change trials, so a resumed hunt may have other values.
 
     Args:
         parallel: trials at a time.
@@ -106,7 +106,7 @@ class RunSettings(RunOptions):
 @clear_constructor
 @dataclass(frozen=True, kw_only=True)
 class HuntSettings(TrialOptions):
-    """``hunt.toml``, with those options of the list that decide what a trial is.
+    """The content of ``hunt.toml``: all options that determine trials.
 
     Args:
         scenario: the name or path that was given.
@@ -117,7 +117,7 @@ class HuntSettings(TrialOptions):
         crash_on: the outcomes that count as a crash.
         oracles: the oracles that detect crashes, each as in ``--oracle``.
         agents: agent id to who drives it.
-        scenario_arguments: what is tried for the scenario's arguments.
+        scenario_arguments: the values that the hunt tries for the scenario's arguments.
         events: limits of traffic events that were asked for, such as ``not_moving`` in s.
         run: how it is run.
         schema: schema of the file format.
@@ -138,17 +138,17 @@ class HuntSettings(TrialOptions):
 
     @property
     def probe_s(self) -> float:
-        """How often copies of trials are asked, in s of simulation time; 0 for never."""
+        """Time between two probes, in s of simulation time; 0 for no probes."""
         return seconds_of(self.probe) if self.probe else 0.0
 
     @property
     def most_trials(self) -> int:
-        """How many trials it may have; where there is no limit, more than anybody runs."""
+        """The maximum number of trials; without a limit, a number that no hunt reaches."""
         return self.trials or sys.maxsize
 
     @property
     def crash_on_words(self) -> tuple[str, ...]:
-        """What ``--crash-on`` was given, limits included."""
+        """The values of ``--crash-on``, including limits."""
         return tuple(f"{kind}:{self.events[kind]:g}" if kind in self.events else str(kind) for kind in self.crash_on)
 
     @property
@@ -185,11 +185,11 @@ def _flat(data: object, prefix: str = "") -> dict[str, str]:
 
 
 def write_settings(path: Path, settings: HuntSettings, command: list[str], *, like: Path | None = None) -> None:
-    """Write ``hunt.toml``, with the command line as a comment on top; all of it or nothing.
+    """Write ``hunt.toml``, with the command line as a comment on top; the file is never incomplete.
 
     Args:
-        path: path of the file. What a later version has added to one that is there is kept.
-        settings: what it says.
+        path: path of the file. Keys that a later version has added to an existing file are kept.
+        settings: the settings to write.
         command: the command line.
         like: another file from which that is taken over instead.
     """
@@ -247,7 +247,7 @@ def read_settings(path: Path) -> HuntSettings:
 
 
 def _added_to(path: Path) -> Plain:
-    """What a later version has added to a file, where one is there and can be read."""
+    """Return the keys that a later version has added to an existing file."""
     try:
         later: Plain = known_part(HuntSettings, tomllib.loads(path.read_text(encoding="utf-8")))[1]
     except (OSError, ValueError, RecursionError):
@@ -285,7 +285,7 @@ class SizesItself(Protocol):
 
 
 def executor_of(word: str) -> Callable[..., Any]:
-    """Return what makes the executor that is meant, with its argument where it has one.
+    """Return the factory of the named executor, with its argument if there is one.
 
     Args:
         word: a registered name or ``module:attribute``, and perhaps ``:ARG``, in which there may be colons.

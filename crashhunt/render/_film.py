@@ -61,7 +61,7 @@ _WITHOUT_SCENE = ("reward", "action")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilmOptions:
-    """What a film looks like.
+    """The options of a film.
 
     Args:
         fps: pictures a second; as many as there are steps by default, so that it runs in real time.
@@ -235,7 +235,7 @@ def _frame_rate(shots: Sequence[Shot], options: FilmOptions) -> float:
 
 
 def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:
-    """Write an MP4 file, all of it or nothing; return how many pictures it has.
+    """Write an MP4 file, which is never incomplete; return the number of pictures.
 
     Raises:
         HuntDirectoryError: the file cannot be written.
@@ -313,7 +313,7 @@ def _builtin_labels(shot: Shot) -> tuple[str, ...]:
 
 
 class _Builtin:
-    """The panels that every agent has: how near it came, and what it decided."""
+    """The panels that every film has: time to collision, gap, speed and action of the agent."""
 
     def __init__(self, shot: Shot) -> None:
         recording, agent = shot.recording, shot.agent
@@ -381,7 +381,7 @@ def shown_steps(recording: Recording, last_s: float, nearest: int) -> tuple[int,
 
 
 def _steps(shot: Shot, options: FilmOptions) -> list[int]:
-    """Which step each picture shows."""
+    """Return the step that each picture shows."""
     dt = shot.recording.prologue.step_length_s
     first, last = shown_steps(shot.recording, options.last_s, shot.nearest)
     fps = options.fps or 1.0 / dt
@@ -397,7 +397,7 @@ _LINE = 34  # characters that fit
 
 
 def explanation(error: Exception) -> Text:
-    """Return what stands where a panel cannot be."""
+    """Return the panel that replaces a panel that cannot be drawn."""
     return Text("\n".join(textwrap.wrap(f"cannot be drawn: {type(error).__name__}: {error}", _LINE)[:9]))
 
 

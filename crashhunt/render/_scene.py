@@ -99,7 +99,7 @@ class SceneView:
         return as_array(smooth)
 
     def _marked(self, step: int) -> str:
-        """What is written above a step that is marked; empty if none is."""
+        """Return the text above a marked step; empty if the step is not marked."""
         if step == self._crash_step:
             return "CRASH"
         # One picture alone would be gone before anybody has seen it.

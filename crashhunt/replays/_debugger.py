@@ -1,4 +1,4 @@
-"""A replay to look into: pdb inside the agent, the window (``--gui``), panels; up to a step."""
+"""Debugging of a replay up to a step: pdb inside the agent, the window (``--gui``), and panels."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ _TARGET = "back"
 
 
 class Backwards(Observer):
-    """Leaves a copy behind before each of the last steps before the debugger stops; it comes before what stops.
+    """Observer that keeps a copy of the process before each of the last steps; it must come before the debugger.
 
     Args:
         stop: what stops.
@@ -83,7 +83,7 @@ class Backwards(Observer):
             self._leave_behind(step + 1)
 
     def go(self, step: int) -> str:
-        """Go back to a step; return why not, where that cannot be."""
+        """Go back to a step; return the reason if that is impossible."""
         if not self._first or step < self._first:
             how = f"to step {self._first} at most" if self._first else "nowhere from here"
             return f"it goes back {how}"
@@ -134,7 +134,7 @@ class OneLine:
 
 
 def _places() -> dict[int, int]:
-    """Where this process is in the files that it reads."""
+    """Return the positions of this process in the files that it reads."""
     found = {}
     for name in os.listdir("/proc/self/fd") if sys.platform == "linux" else ():  # noqa: PTH208 - names are enough
         with suppress(OSError):
@@ -305,7 +305,7 @@ class _Stopped:
 
 
 class _Panels(Observer):
-    """Draws the agents' panels after every answer.
+    """Draws the agents' panels after every action.
 
     Args:
         first: the first step to draw.
@@ -342,10 +342,10 @@ class _Done(TypedDict):
 
 
 class _Job(TypedDict):
-    """What the process of a look is to do.
+    """The job of the process of a debugged replay.
 
     Args:
-        settings: where it runs.
+        settings: settings of the worker.
         spec: the trial, to the step up to which it runs.
         stop_at: the step in which the debugger stops; 0 for none.
         agent: who is looked at.
@@ -366,10 +366,10 @@ class _Job(TypedDict):
 
 
 class _Window(Observer):
-    """Slows a simulator down that shows what happens in its own window, and follows who crashes.
+    """Slows down a simulator with its own window, and lets the window follow the crashing vehicle.
 
     Args:
-        simulator: what is simulated.
+        simulator: the simulator.
         job: who is followed, how long a step takes, and before which step to pause.
     """
 

@@ -1,4 +1,4 @@
-"""A recorded trial with something changed on purpose: by hand in ``hunt.toml``, or on the command line."""
+"""Changes of a recorded trial by the user: in ``hunt.toml`` or on the command line."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def is_about_disturbances(name: str) -> bool:
 def edited_disturbances(
     planned: Sequence[Disturbance], name: str, text: str, agents: Sequence[str] = ()
 ) -> tuple[tuple[Disturbance, ...], list[str]]:
-    """Return the disturbances with one change, and what is not as it was, in words.
+    """Return the disturbances with one change, and a description of the change.
 
     Args:
         planned: plan of the trial.
@@ -92,8 +92,8 @@ def with_other_words(
 ) -> tuple[tuple[Disturbance, ...], list[str], list[str]]:
     """Return the disturbances of a trial where ``disturb`` of its ``hunt.toml`` has been edited.
 
-    What was fixed there is what is fixed now. Of what was drawn, that of kinds which have no rate any more is gone; it
-    cannot be drawn again with another rate.
+    Disturbances at given steps are those of the new words. Drawn disturbances are removed if their kind no longer has a
+    rate. They are not drawn again with another rate.
 
     Args:
         planned: plan of the trial.
@@ -102,7 +102,7 @@ def with_other_words(
         agents: the controlled vehicles.
 
     Returns:
-        The disturbances, what is not as it was, and what makes no difference, in words.
+        The disturbances, the changes, and the edits without an effect, in words.
 
     Raises:
         UsageError: a word cannot be meant.
@@ -202,12 +202,12 @@ Values = dict[tuple[str, str], Value]  # (agent, or empty for the scenario; name
 
 @dataclass(frozen=True, slots=True)
 class Edits:
-    """What is not as it was recorded, in words.
+    """The differences from the recorded trial, in words.
 
     Args:
         agents: who drives, and with which arguments.
-        others: everything else: traffic, length, what counts. If a crash does not come again, that may be why.
-        ignored: what is written otherwise in ``hunt.toml`` and makes no difference to a replay.
+        others: everything else: traffic, length, what counts. They may explain why a crash does not reproduce.
+        ignored: edits in ``hunt.toml`` that have no effect on a replay.
     """
 
     agents: tuple[str, ...] = ()
@@ -216,7 +216,7 @@ class Edits:
 
     @property
     def all(self) -> tuple[str, ...]:
-        """What makes it another trial."""
+        """All edits that change the trial."""
         return (*self.agents, *self.others)
 
 
@@ -228,7 +228,7 @@ def edited_spec(
     *,
     code: Sequence[str] | None = None,
 ) -> tuple[TrialSpec, Edits]:
-    """Return the trial as it is to be replayed, and what is not as it was recorded.
+    """Return the trial to replay, and its differences from the recorded trial.
 
     Args:
         recorded: the trial.

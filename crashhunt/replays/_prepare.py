@@ -1,4 +1,4 @@
-"""What a crash needs to be run again: its recording, the trial with all edits, who drives; what differs since."""
+"""Prepares a replay: the recording, the trial with all edits, the code that drives, and the differences since."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Code = Literal["snapshot", "current", "log"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Look:
-    """What to look at in a replay.
+    """The options of a debugged replay.
 
     Args:
         until: number of steps to run.
@@ -64,7 +64,7 @@ class Look:
 @clear_constructor
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayOptions:
-    """How to replay.
+    """The options of a replay.
 
     Args:
         code: which code drives: that of the snapshot, today's, or the recorded actions.
@@ -90,7 +90,7 @@ class ReplayOptions:
 
 @dataclass(frozen=True, slots=True)
 class Rerun:
-    """A crash, ready to be run again.
+    """A crash that is prepared for a replay.
 
     Args:
         bundle: the crash.
@@ -99,7 +99,7 @@ class Rerun:
         worker: where and how it runs; its scratch folder is not set yet.
         code: who drives.
         snapshot: snapshot of the bundle.
-        edits: what is not as it was recorded, in words.
+        edits: the differences from the recorded trial, in words.
         warnings: what may make a difference, in words.
         other_traffic: those edits that are not about who drives: without the crash, they may be why.
         elsewhere: whether it is in another scenario, so that steps cannot be compared.
@@ -219,7 +219,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
 
 
 def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s: float) -> tuple[Scenario, TrialSpec]:
-    """The same agents, arguments, seed and simulation time elsewhere; the traffic is its own but for what both have."""
+    """Return the trial in another scenario: same agents, arguments, seed and simulation time."""
     other = load_scenario(name)
     if len(other.agents) != len(settings.agents):
         counts = f"{len(other.agents)} controlled vehicles, and the crash has {len(settings.agents)}"
@@ -248,7 +248,7 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
 
 
 def _kind_it_cannot_do(scenario: Scenario, spec: TrialSpec) -> str:
-    """The first kind of disturbance of a trial that a scenario's simulator cannot do; empty if there is none."""
+    """Return the first kind of disturbance that the scenario's simulator does not support; empty if there is none."""
     able = scenario.backend.disturbances
     odd = (one.what for one in spec.disturbances if able is not None and one.what not in (*able, *OF_AGENT))
     return next(odd, "")

@@ -104,7 +104,7 @@ def judged(
         rerun: description of the run.
         recorded: the recording, or its beginning.
         replayed: number of steps that were replayed.
-        result: what came of the replay.
+        result: the result of the replay.
         whole: whether the replay was to end where the crash did.
     """
     if rerun.elsewhere:
@@ -203,7 +203,10 @@ def _end_divergence(was: TrialResult, now: TrialResult, code: Code) -> Divergenc
 
 
 def up_to(recording: Recording, step: int) -> Recording:
-    """Return a recording to the end of a step. What recorded actions can bring back ends with its last whole one."""
+    """Return a recording to the end of a step.
+
+    Recorded actions can repeat the episode only up to the last complete step.
+    """
     ends = [number for number, record in enumerate(recording.records) if record.tag == Tag.STEP]
     return recording if step >= len(ends) else recording.beginning(ends[step] + 1)
 
@@ -211,8 +214,8 @@ def up_to(recording: Recording, step: int) -> Recording:
 def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport:
     """Run a crash again from its bundle alone, and compare every step with the log.
 
-    The scenario comes from the snapshot, whatever has become of the original; so does the agent's code, unless the
-    options say otherwise. With recorded actions at the wheel, nothing of the bundle's code is run.
+    The scenario comes from the snapshot, even if the original has changed, and so does the agent's code unless the
+    options say otherwise. With recorded actions, no code of the bundle runs.
 
     Raises:
         BundleError: the bundle is damaged.
@@ -243,7 +246,7 @@ def confirm(
         bundle: the crash.
         stopped: Returns whether to stop; called repeatedly. A replay that fails afterwards does not count.
         failed: receives the result of the replay, if it is not the crash.
-        executors: which run it; a new Python process where there are none.
+        executors: the executors that run the trial; None for a new Python process.
         trusted: whether its code may run; None to find out.
 
     Returns:

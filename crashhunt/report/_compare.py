@@ -118,7 +118,7 @@ def comparison_page(found: Comparison, path: Path) -> None:
 
 
 def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
-    """A bar per hunt, and its interval; in percent of the width, so that a telephone shows it as well."""
+    """Return a bar with its interval for each hunt, in percent of the width, so that it also fits small screens."""
     most = max([hunt.interval[1] if hunt.interval else _drawn_rate(hunt) for hunt in hunts] or [1.0])
     scale, parts = 100 / max(most, 1e-9), []
     for hunt in hunts:

@@ -23,7 +23,7 @@ _ICONS = {"better": "✅", "no_difference": "✅", "worse": "❌", "undecided": 
 
 
 def describe_gate(found: GateReport) -> str:
-    """Return a verdict for people: the answer first, then what it rests on, then the next command."""
+    """Return a verdict as text: the answer first, then the evidence, then the next command."""
     lines = [_answer(found)]
     if found.why:
         lines.append(f"  {found.why}")

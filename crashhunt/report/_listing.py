@@ -45,7 +45,7 @@ class ArgumentEntry(TypedDict):
 
 
 class ListingEntry(TypedDict):
-    """What ``agents``, ``oracles`` and ``scenarios`` print of one, under ``--json``; the last two are a scenario's."""
+    """An entry of ``agents``, ``oracles`` and ``scenarios`` with ``--json``; only scenarios have the last two keys."""
 
     name: str
     locator: str
@@ -62,12 +62,12 @@ def list_agents() -> list[ListingEntry]:
 
 
 def list_disturbances() -> list[ListingEntry]:
-    """Return the registered models of disturbances, likewise."""
+    """Return the registered models of disturbances."""
     return _list("disturbances")
 
 
 def list_oracles() -> list[ListingEntry]:
-    """Return the registered oracles, likewise."""
+    """Return the registered oracles with their arguments."""
     return _list("oracles")
 
 

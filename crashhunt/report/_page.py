@@ -75,7 +75,7 @@ _GENERATIONS = 50  # of a lineage; more are unreadable
 
 
 class Importance(TypedDict):
-    """How much of the differences in danger one argument explains alone, from 0 to 1, with an interval of 90 %."""
+    """The share of the variation of criticality that one argument explains alone, 0 to 1, with a 90 % interval."""
 
     name: str
     share: float
@@ -182,7 +182,7 @@ def write_report(
     name: str = "",
     watch: Watch | None = None,
 ) -> int:
-    """Write the report of a hunt, all of it or nothing.
+    """Write the report of a hunt; the file is never incomplete.
 
     Args:
         directory: directory of the hunt; its ledger may be missing, as in an exported crash.
@@ -242,11 +242,11 @@ def _read(name: str) -> str:
 
 
 def player_data(bundle: Bundle, story: Story | None = None) -> dict[str, object]:
-    """Return a crash or near miss for the player, with what is said of it.
+    """Return the data of a crash or near miss for the player, with its texts.
 
     Args:
         bundle: the crash; its log is read.
-        story: story of it, where there is one already.
+        story: the story of the crash, if it has already been made.
 
     Raises:
         BundleError: it is damaged.
@@ -287,7 +287,7 @@ def report_data(
 
 
 def _lineages(directory: Path, bundles: Sequence[Bundle]) -> dict[str, list[list[object]]]:
-    """Id of a crash to the trials that it was made from, where it was made from any: number, origin and danger."""
+    """Return for each crash the trials from which the sampler derived it: number, origin and danger."""
     path = directory / layout.LEDGER
     if not bundles or not has_begun(path):
         return {}
@@ -338,7 +338,7 @@ def _category(crash: str) -> str:
 
 
 def _shown_name(agent: str, name: str, settings: HuntSettings) -> str:
-    """How the page calls an argument: with its agent where there are several."""
+    """Return the name of an argument on the page; with several agents, it includes the agent."""
     return f"{agent}.{name}" if agent and len(settings.agents) > 1 else name
 
 
@@ -403,7 +403,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
 
 
 def _rate(rate: RunningRate | None) -> dict[str, object] | None:
-    """Return the crash rate as the hunt has left it; None if it has none, as those of earlier versions."""
+    """Return the crash rate that the hunt has recorded; None if there is none, as in hunts of earlier versions."""
     if rate is None:
         return None
     words = f"The bounds have {rate['confidence']:g} % confidence, valid whenever you look."
@@ -426,7 +426,7 @@ def _drawn(trials: Sequence[Mapping[str, object]], total: int, crashes: int, set
 def _is_drawn(number: int, share: float) -> bool:
     """Whether a trial is among a share of all, evenly over the hunt.
 
-    Not every fifth, say: what comes in turns, as plain random trials do in a guided hunt, would be all or none.
+    The choice is not periodic: every fifth trial of a guided hunt is random, so a periodic choice would be biased.
     """
     return number * _GOLDEN % 1.0 < share
 
@@ -493,13 +493,13 @@ def _badges(story: Story) -> list[str]:
 
 
 def _danger(story: Story) -> dict[str, object]:
-    """The agent's own danger over time, and that by those behind it."""
+    """Return the agent's own criticality and the rear criticality over time."""
     course = story.danger
     return {"danger": _packed(course.own), "behind": _packed(course.behind)} if course is not None else {}
 
 
 def _disturbances(result: TrialResult) -> dict[str, str]:
-    """What the page says of disturbances, which the words tell one by one."""
+    """Return the summary of the disturbances for the page."""
     if not may_be_disturbed(result):
         return {}
     said = f"{len(result.disturbances)} took place" if result.disturbed else "none: in undisturbed traffic"
@@ -557,7 +557,7 @@ def _scenes(recording: Recording, agent: str) -> dict[str, object]:
 
 
 def _to_other(encounter: Encounter, recording: Recording) -> dict[str, str]:
-    """Return gap and time to collision to the actor that the text is about, instead of those to the nearest."""
+    """Return gap and time to collision to the actor of the text, not to the nearest actor."""
     moments = {moment.step: moment for moment in encounter.moments}
     steps = [step.step for step in recording.all_steps if step.scene is not None]
     found = {"gap": "gap_m", "ttc": "time_to_collision_s"}

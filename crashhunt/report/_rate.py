@@ -76,7 +76,7 @@ def format_interval(interval: Interval) -> str:
 
 
 def describe_running(rate: RunningRate) -> str:
-    """Return the rate of a running hunt in a line: the answer, then what it rests on."""
+    """Return the rate of a running hunt in one line: the answer, then the evidence."""
     if rate["method"] == "rare":
         return _describe_rare(rate)
     bar = f"; bar {format_rate(rate['bar'])} {_PER[rate['per']]}: {rate['verdict']}" if rate["bar"] is not None else ""
@@ -109,7 +109,7 @@ def _certain(bounds: Bounds) -> str:
 
 
 def describe_rates(rates: Sequence[CrashRate]) -> str:
-    """Return rates for people: the answer first, then what it rests on."""
+    """Return rates as text: the answer first, then the evidence."""
     lines: list[str] = []
     for _, group in groupby(rates, key=lambda rate: rate.dir):
         lines += _of_hunt(list(group))

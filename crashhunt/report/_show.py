@@ -258,7 +258,7 @@ class Story:
         return [f"At fault: {who}, {rules}."]
 
     def _about_escape(self) -> list[str]:
-        """Return until when braking would have avoided the crash; an empty list where that is unknown."""
+        """Return sentences on the last step from which braking avoids the crash; empty if that step is unknown."""
         tried = self.bundle.result.escape
         if self._braking is not None:
             return [self._calculated(self._braking)]
@@ -366,7 +366,7 @@ class Story:
         return "" if array is None else describe_value(array, _MAX_ACTION_CHARACTERS)
 
     def _action(self, step: int) -> list[float] | None:
-        """What the agent decided in a step."""
+        """Return the action of the agent in a step as text."""
         if not 0 <= step < len(self.recording.all_steps):
             return None
         array = self.recording.all_steps[step].actions.get(self.agent)

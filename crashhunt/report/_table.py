@@ -187,7 +187,7 @@ def _format(value: TableCell) -> str:
 def argument_units(directory: Path, settings: HuntSettings) -> dict[tuple[str, str], str]:
     """Return the units that are known: (agent, or empty for the scenario; name of the argument) to unit.
 
-    The scenario of the snapshot says them, and the signatures of our own agents; no code of a bundle is run.
+    The units come from the scenario of the snapshot and the signatures of crashhunt's agents; no code of a bundle runs.
     """
     try:
         found = latest_snapshot(directory)

@@ -33,7 +33,7 @@ _MANOEUVRES = {
 
 
 class CrashFacts(Protocol):
-    """What a verdict is built from; a `Story` has it.
+    """The facts of a crash from which a verdict is made; a `Story` has these.
 
     Attributes:
         bundle: the crash or near miss.
@@ -94,7 +94,7 @@ def describe_contact(contact: ContactRecord, omission: Omission | None = None) -
 
     Args:
         contact: contact of the agent with the other actor.
-        omission: the lane change that runs have shown to be the cause, where there is one.
+        omission: the lane change that is the cause according to runs; None if there is none.
     """
     changers = contact.lane_changers(_CHANGE_S) if contact.same_way else ()
     if len(changers) != 1:
@@ -192,7 +192,7 @@ def _gap_words(gap_m: float, speed_mps: float) -> str:
 
 
 def _omission(story: CrashFacts) -> Omission | None:
-    """Return the omission that runs have shown, where it is about the collision partner or about no actor."""
+    """Return the omission found by runs, if it concerns the collision partner or no actor."""
     reference = story.judgement.reference if story.judgement is not None else None
     found = reference.omission if reference is not None else None
     return found if found is not None and found.actor in ("", story.other) else None

@@ -1,4 +1,4 @@
-"""The danger of a crash or near miss in words and figures: the agent's own, and that by those behind it."""
+"""The criticality of a crash or near miss in words and numbers: the agent's own and the rear criticality."""
 
 from __future__ import annotations
 
@@ -234,7 +234,7 @@ def list_disturbances(result: TrialResult) -> list[str]:
 
 
 def describe_disturbances(report: HuntReport) -> list[str]:
-    """Return how many crashes of a hunt with disturbances had any, and which of those is the likeliest."""
+    """Return the number of crashes with disturbances in a hunt, and the likeliest of them."""
     found = report.tally
     if not (report.settings.disturb and found.found):
         return []
@@ -268,7 +268,7 @@ def by_likelihood(crashes: Sequence[Bundle]) -> list[Bundle]:
 
 
 def may_be_disturbed(result: TrialResult) -> bool:
-    """Whether its hunt has disturbances, whatever of them took place."""
+    """Return whether the hunt of a crash has disturbances, even if none took place."""
     return result.log_likelihood is not None or bool(result.spec.disturbances)
 
 
@@ -417,7 +417,7 @@ def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
 
 
 def about_changes(changed: Sequence[str]) -> str:
-    """Return what else the agent does otherwise in a run, as a sentence with a leading space; empty for nothing."""
+    """Return the further differences of the agent in a run, as a sentence with a leading space; empty for none."""
     return f" In addition, {' and '.join(changed)} in that run." if changed else ""
 
 

@@ -183,7 +183,7 @@ def copy_shipped_scenario(name: str, to: Path) -> None:
         to: The folder to make; it may exist if it is empty.
 
     Raises:
-        ScenarioError: There is no such scenario.
+        ScenarioError: The scenario does not exist.
         HuntDirectoryError: The folder is not empty or cannot be written.
     """
     if name not in shipped_scenarios():
@@ -241,7 +241,7 @@ def endings() -> tuple[str, ...]:
 
 
 def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool = False) -> Scenario:
-    """Validate what a ``scenario.toml`` says, without looking at the files that it names.
+    """Validate the content of a ``scenario.toml``, without reading the files that it names.
 
     Args:
         data: content of the file.
@@ -287,7 +287,7 @@ def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool 
 
 
 def _known(data: Plain) -> tuple[dict[str, object], dict[str, object]]:
-    """What this version has fields for, and what a later one has added."""
+    """Return the keys that this version knows, and those that a later version has added."""
     tables = {name: kind for name in data if (kind := _table_kind(name)) is not None}
     rest = {name: value for name, value in data.items() if name not in tables}
     known: dict[str, object]

@@ -83,10 +83,10 @@ class ArgumentSetup:
     """``[arguments.NAME]`` or ``[agents.ID.arguments.NAME]``.
 
     Args:
-        range: what a hunt tries, as a specification such as ``5:40``; empty if it stays at the default.
+        range: the values that a hunt tries, as a specification such as ``5:40``; empty for only the default.
         default: the value without a request for another one.
-        unit: unit for people.
-        help: description for people.
+        unit: unit of the values, such as ``m/s``.
+        help: description in one line.
         option: option of a scenario argument, its target: an option of SUMO such as ``scale``, or a dotted entry of an
             environment's configuration or keywords such as ``observation.vehicles_count``. Without an option, it
             fills ``${NAME}`` in SUMO's route and additional files, or sets the entry of its own name.
@@ -99,7 +99,7 @@ class ArgumentSetup:
     option: str = ""
 
     def argument(self, name: str, where: str) -> Argument:
-        """Return what this says about the argument ``name``."""
+        """Return the argument with the given name."""
         kind: Kind | None = kind_of(self.default) if self.default is not None else None
         distribution = parse_spec(self.range, kind, where=f"{where}.{name}.range") if self.range else None
         return Argument(
@@ -127,7 +127,7 @@ class AgentSetup:
         action: ``continuous`` is (target speed, lane change); ``meta`` is highway-env's DiscreteMetaAction.
         target_speeds: the speeds that FASTER and SLOWER of ``meta`` step through, in m/s.
         speed_mode: SUMO's speed mode bits; 6 keeps physical limits and ignores the safe speed.
-        arguments: what is known about the agent's arguments here.
+        arguments: the arguments of the agent that the scenario describes.
     """
 
     agent: str = DEFAULT_AGENT
@@ -179,7 +179,7 @@ class Scenario:
     """The setting of a trial: network, traffic, controlled vehicles and their arguments.
 
     Args:
-        title: one line, for people.
+        title: description in one line.
         simulator: the name of a registered simulator, or ``module:attribute``.
         step_length_s: the control step, in s; that of some simulators follows from their own configuration.
         warmup_s: simulation time before the controlled vehicles enter, in s.
@@ -195,9 +195,9 @@ class Scenario:
         schema: schema of the file format.
         name: name for users; by default the name of the folder.
         folder: folder of its files; not part of the file.
-        file: what was read, relative to the folder; not part of it, and not of what crosses to a worker.
+        file: path of the file that was read, relative to the folder; it is not sent to workers.
         notes: decisions of crashhunt, as texts for the user; not part of the file.
-        added: what a later version has written into the file, for a worker of that version; nothing here reads it.
+        added: keys that a later version has written into the file; only a worker of that version reads them.
     """
 
     title: str = ""
@@ -225,7 +225,7 @@ class Scenario:
 
     @property
     def backends(self) -> dict[str, Backend]:
-        """The descriptor of its simulator, by name; for a simulator that has none, those of its tables.
+        """The descriptor of the scenario's simulator, by name; without one, the descriptors of its tables.
 
         So a class of your own that drives a simulator which is known may be given as ``module:attribute``.
         """
@@ -234,7 +234,7 @@ class Scenario:
 
     @property
     def backend(self) -> Backend:
-        """The descriptor of its simulator; one that says nothing if there is none."""
+        """The descriptor of the scenario's simulator; an empty descriptor if there is none."""
         return next(iter(self.backends.values()), Backend())
 
     def table(self, kind: type[T]) -> T:
@@ -265,7 +265,7 @@ class Scenario:
             yield from backend.files(self)
 
     def texts(self) -> Iterator[str]:
-        """Yield those of the files that may say ``${NAME}``.
+        """Yield the files that may contain ``${NAME}``.
 
         Raises:
             ScenarioError: one of them names a file that is not there.
@@ -302,7 +302,7 @@ def with_action(scenario: Scenario, agent: str, action: str) -> Scenario:
     """Return the scenario with another form of action for one agent.
 
     Raises:
-        ScenarioError: there is no such form.
+        ScenarioError: the form of action does not exist.
     """
     if action not in ("continuous", "meta"):
         raise ScenarioError(f"{action!r} is not a form of action", fix="give continuous or meta")
@@ -376,14 +376,14 @@ def as_plain_data(scenario: Scenario) -> dict[str, object]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Configuration:
-    """A file of the simulator's own, which is run as it is, without a ``scenario.toml``.
+    """A file format of the simulator that can be run without a ``scenario.toml``.
 
     Args:
         endings: endings of its name, such as ``.sumocfg``; messages name the first one.
         load: returns it as a scenario, from its path and from what ``--ego`` says, which may be empty.
         arguments: the scenario arguments that every such scenario has, for completion in the shell.
         takes_ego: whether ``--ego`` chooses its controlled vehicle.
-        waiting: what takes its time when one is loaded, in words; empty if nothing does.
+        waiting: a slow step of loading, in words; empty if there is none.
     """
 
     endings: tuple[str, ...]
@@ -408,7 +408,7 @@ class Accelerator:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompiledCore:
-    """A compiled part that may be missing, and changes no bit of what is computed.
+    """An optional compiled part, with bit-identical results.
 
     Args:
         switched_off: returns a scenario without it, as ``--no-native`` asks for.
@@ -481,10 +481,10 @@ class Backend:
         reported_events: the types of traffic events that it reports; None if that is unknown.
         disturbances: the types of disturbances of the traffic that it supports; None if that is unknown.
         actions: the forms of action (``continuous``, ``meta``) that ``--action`` may choose.
-        accelerator: where it has one.
-        core: its compiled part, where it has one.
-        load_order: the order at load on which its results depend, where there is one.
-        configurations: files of its own that are run as they are.
+        accelerator: the accelerator of the simulator; None if it has none.
+        core: the compiled part; None if there is none.
+        load_order: the order at load on which its results depend; None if there is none.
+        configurations: file formats that can be run without a ``scenario.toml``.
         explained: returns the mistake in the scenario after a failed setup, from the message of the failure and from
             printed output; None if the scenario is not the cause.
         side_effect: of a stranger's scenario, returns what it would do besides simulating, in words that

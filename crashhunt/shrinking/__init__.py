@@ -1,4 +1,4 @@
-"""A crash made smaller while it stays the same kind of crash: fewer others, plainer arguments, fewer disturbances."""
+"""Minimization: fewer actors, simpler arguments and fewer disturbances, with the same crash type."""
 
 import lazy_loader
 

@@ -168,7 +168,7 @@ class Runs:
         return replace(spec, max_steps=min(spec.max_steps, self.most_steps))
 
     def _judged(self, ended: Ended) -> Ran:
-        """Return whether a candidate crashed in the same manner; its signature takes a while, so only where it may."""
+        """Return whether a candidate crashed with the same type; the slow signature is computed last."""
         was, result = self._rerun.bundle.result, ended.result
         same = result.outcome is was.outcome
         if was.collision is not None and result.collision is not None:
@@ -206,7 +206,7 @@ class Runs:
 
 
 def is_same(found: Signature | None, wanted: Signature, spec: TrialSpec) -> bool:
-    """Whether a trial crashed in the same manner; what disturbed scripted others is in their ways."""
+    """Return whether a trial crashed with the same type; the paths of scripted actors include their disturbances."""
     if found is not None and spec.script is not None:
         found = replace(found, disturbed=wanted.disturbed)
     return found == wanted

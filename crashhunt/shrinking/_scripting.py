@@ -38,7 +38,7 @@ class Part:
 
     @property
     def count(self) -> int:
-        """How many take part."""
+        """The number of actors that take part."""
         return len(self.agents) + len(self.others)
 
 
@@ -61,7 +61,7 @@ class Scripting:
 
     @property
     def steps(self) -> int:
-        """How many were recorded."""
+        """The number of recorded steps."""
         return self._paths.steps
 
     def spec(self, part: Part) -> TrialSpec:
@@ -80,7 +80,7 @@ class Scripting:
         )
 
     def begins(self, agents: Sequence[str]) -> list[int]:
-        """Return with which later steps it could begin, the last one first: none after which braking helps no more."""
+        """Return the possible later starts, the latest first; none is later than the last avoidable step."""
         known = [{step for step, _ in path.lanes} for path in self._paths.agents if path.actor.id in agents]
         steps = sorted(set.intersection(*known)) if known else []
         found = []
@@ -91,7 +91,7 @@ class Scripting:
 
 
 def can_be_scripted(rerun: Rerun) -> bool:
-    """Whether simulator and the crashhunt that runs it can move others along recorded ways."""
+    """Return whether the simulator, and the crashhunt that runs it, can move other actors along recorded paths."""
     if not rerun.worker.scenario.backend.plays_paths:
         return False
     scenario = rerun.worker.scenario

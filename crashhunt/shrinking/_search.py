@@ -1,4 +1,6 @@
-"""Delta debugging of a set, simpler values of an argument: the order of candidates. Nothing here knows what a trial is.
+"""Delta debugging of a set, simpler values of an argument: the order of candidates.
+
+The search is independent of trials: it works on any items.
 
 Delta debugging (Zeller and Hildebrandt, *Simplifying and Isolating Failure-Inducing Input*, 2002) for what there are
 several of; for a value, the plainest first, as Hypothesis does it. The search is deterministic: the next candidate
@@ -27,7 +29,7 @@ _DIGITS = (1, 2, 3, 4)
 
 
 def fewest(items: Sequence[T], tried: Tried[tuple[T, ...]], likely: Sequence[Sequence[T]] = ()) -> tuple[T, ...]:
-    """Return as few of some items as still do it: without any one of those that are left, it does not.
+    """Return a minimal part of some items that still passes the test: without any single one of them, it fails.
 
     Args:
         items: all of them, with which it is known to do it.

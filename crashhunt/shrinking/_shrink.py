@@ -40,7 +40,7 @@ class Shrunk:
 
     Args:
         bundle: the crash.
-        verdict: whether it is smaller, or cannot be made so, or did not come again.
+        verdict: whether the crash was minimized, cannot be minimized, or did not reproduce.
         ended: why it was ended.
         small: the minimized crash; None if nothing was removed.
         why: reason for the end, in words.
@@ -212,7 +212,7 @@ def shrink(
 
 
 def _constructor_defaults(rerun: Rerun) -> dict[tuple[str, str], Value]:
-    """Return the defaults in the constructors of the agents, by agent and name; those that are no plain values miss."""
+    """Return the default arguments of the agents' constructors, by agent and name, if they are plain values."""
     found: dict[tuple[str, str], Value] = {}
     for agent, setup in rerun.worker.scenario.agents.items():
         defaults = takes_of(setup.agent, rerun.worker.code).defaults
@@ -223,7 +223,7 @@ def _constructor_defaults(rerun: Rerun) -> dict[tuple[str, str], Value]:
 def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | None:
     """Run the smallest in a fresh process, and write its bundle; another process confirms it, as of every crash.
 
-    Of what does not do the same there, the next larger one is taken; None if none does.
+    If a result does not reproduce, the next larger one is tried; None if none reproduces.
     """
     bundle = rerun.bundle
     tries = _TRIES if bundle.confirmed is False else 1

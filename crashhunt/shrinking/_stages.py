@@ -72,7 +72,7 @@ class Search:
         self._scripting = Scripting(rerun) if form != "traffic" and can_be_scripted(rerun) else None
 
     def run(self, stopped: Callable[[], bool]) -> tuple[Ended, str]:
-        """Make it smaller until nothing helps any more; returns why it ended."""
+        """Minimize until no stage helps; return why the search ended."""
         tries = _FLAKY_TRIES if self._rerun.bundle.confirmed is False else _TRIES
         try:
             for _ in range(tries):
@@ -230,7 +230,7 @@ class Search:
             self._runs.most_steps = before
 
     def _is_smaller(self, than: TrialSpec) -> bool:
-        """Whether the best has fewer actors, agents or steps than one in which the others drive."""
+        """Return whether the best result is smaller than the best one without scripted actors."""
         script = self.best.script
         if self._form == "scripted" or script is None or than.only is None:
             return True
@@ -346,13 +346,13 @@ class Search:
     # What came of it
 
     def actors(self, after: Recording | None) -> tuple[int, int]:
-        """How many were seen before and after."""
+        """The number of actors before and after."""
         before = _actors(self._rerun.recorded)
         return before, before if after is None else _actors(after)
 
     @property
     def steps_cut(self) -> int:
-        """How many steps of the beginning were cut off."""
+        """The number of steps that were removed from the beginning."""
         script = self.best.script
         if script is None:
             return 0
@@ -377,7 +377,7 @@ class Search:
         return (*others, *(one.words for one in gone))
 
     def _has(self, disturbance: Disturbance) -> bool:
-        """Whether what is left has a disturbance; where the beginning was cut off, it comes earlier in it."""
+        """Return whether the remaining trial has a disturbance, whose step is earlier if the beginning was removed."""
         shifted = replace(disturbance, step=disturbance.step - self.steps_cut)
         return shifted in self.best.disturbances
 

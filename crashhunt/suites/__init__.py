@@ -1,4 +1,4 @@
-"""Suites: many hunts, each in its own process, and running them again."""
+"""Suites: many hunts, each in its own process; reruns and gates."""
 
 import lazy_loader
 

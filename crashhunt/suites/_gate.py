@@ -80,7 +80,7 @@ class GateVersion:
 
     @classmethod
     def of(cls, word: str, folder: Path) -> GateVersion:
-        """Return what a word means: an agent where it names one, else a commit of the repository of a folder.
+        """Return the version that a word names: an agent, or else a commit of the repository of a folder.
 
         Raises:
             UsageError: it is neither.
@@ -126,7 +126,7 @@ class GateProgress:
 
 @dataclass(frozen=True, kw_only=True)
 class Gate:
-    """What a gate compares, and when it ends.
+    """The versions that a gate compares, and its limits.
 
     Args:
         base: the version before the change.
@@ -135,14 +135,14 @@ class Gate:
         folder: folder from which the user imports agents.
         most: maximum number of pairs of trials, of all hunts together.
         duration_s: the most wall time, in s; infinite for no limit.
-        margin: the greatest difference in crashes per trial that counts as none; 0 for no such verdict.
+        margin: the greatest difference in crashes per trial that counts as no difference; 0 for no such verdict.
         confidence: confidence of the verdict, in percent.
         corpus: corpus of HEAD, as a path from the folder; where it is None, ``crashes``, if HEAD is a commit that has
             it.
         parallel: trials at a time, of both versions together; 0 for one per core.
         is_suite: whether there may be several hunts; then only *worse* ends the gate before the last of them.
         trusted: whether hunts that are there already, and the corpus, may run in any case.
-        machine: options such as ``executor`` that hold for all hunts.
+        machine: options such as ``executor`` that apply to all hunts.
     """
 
     base: GateVersion
@@ -163,7 +163,7 @@ class Gate:
         """Compare the two until the verdict is certain, the last pair, the end of the time, or an interrupt.
 
         Args:
-            directory: where the hunts are kept; what has ended there is not run again. None for a temporary folder.
+            directory: folder of the hunts; ended trials in it are not run again. None for a temporary folder.
             watch: called about once a second.
 
         Raises:
@@ -282,7 +282,7 @@ class _Run:
     # What is compared.
 
     def _begin(self) -> int:
-        """Write what the folder is, or see that it is the same already; return the seed of the hunts."""
+        """Write the description of the gate, or check that the folder has the same gate; return its seed."""
         gate, file = self._gate, self._place / GATE
         given = next(iter(gate.hunts.values())).request.seed
         asked = {
@@ -364,7 +364,7 @@ class _Run:
             ) from error
 
     def _check_origins(self) -> None:
-        """See that what drives comes from the work trees.
+        """Check that the agents are imported from the work trees.
 
         Raises:
             UsageError: it does not, so that both versions would be the same.
@@ -565,7 +565,7 @@ class _Run:
         return base, head
 
     def _write(self, report: GateReport) -> None:
-        """Add the report to the file that says what the folder is."""
+        """Add the report to the description of the gate."""
         file = self._place / GATE
         known = json.loads(file.read_text(encoding="utf-8"))
         with whole_file(file) as temporary:

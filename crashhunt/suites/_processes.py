@@ -72,12 +72,12 @@ _PR_SET_PDEATHSIG = 1
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
-    """What a run of a suite will be: `request.json` in its folder.
+    """The request of a run of a suite: `request.json` in its folder.
 
     Args:
         request: request of the hunt.
         folder: folder from where agents are imported.
-        snapshot: what the snapshot takes in.
+        snapshot: options of the snapshot.
     """
 
     request: Request
@@ -110,7 +110,7 @@ class RunRequest:
 
 
 def write_request(folder: Path, request: RunRequest) -> None:
-    """Write ``request.json``, all of it or nothing."""
+    """Write ``request.json``; the file is never incomplete."""
     data = json.loads(json.dumps(request.to_json(), default=str))
     data["authentication_code"] = authentication_code(PURPOSE_OF_REQUEST, data)
     with whole_file(folder / REQUEST) as temporary:
@@ -133,7 +133,7 @@ def check_machine(parallel: int, machine: Given | None) -> None:
 
     Raises:
         UsageError: ``parallel`` is negative, or an option is none.
-        PluginError: there is no such executor.
+        PluginError: the executor does not exist.
     """
     slots_of(parallel)
     executor_of(RunSettings(**(machine or {})).checked().executor)
@@ -148,14 +148,14 @@ def run_all(
     is_enough: Callable[[], bool] = lambda: False,
     environments: Mapping[Path, Mapping[str, str]] | None = None,
 ) -> None:
-    """Run hunts, each in its own process, until the last has ended, is not needed any more, or is interrupted.
+    """Run hunts, each in its own process, until all have ended, are no longer needed, or are interrupted.
 
     Args:
         folders: folders of the runs, each with its ``request.json``.
         parallel: trials at a time, of all hunts together; 0 for one per core.
         watch: called about once a second, and at the end.
         machine: options that hold for all of them, whatever each says.
-        is_enough: asked after each `watch`; where it is true, the hunts stop as after an interrupt.
+        is_enough: called after each `watch`; if it returns true, the hunts stop as after an interrupt.
         environments: folder to the environment variables of its process; that of this process where there is none.
 
     Raises:

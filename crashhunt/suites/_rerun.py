@@ -140,7 +140,7 @@ def _request(hunt: Path) -> RunRequest:
 
 
 def _moved(asked: RunRequest, hunt: Path, aside: Path) -> RunRequest:
-    """The same, where the scenario is that of the snapshot, which has been set aside with everything else."""
+    """Return the settings with the scenario of the snapshot, which has been moved with all replaced files."""
     scenario = Path(asked.request.scenario)
     if not scenario.is_relative_to(hunt.resolve()):
         return asked

@@ -41,7 +41,7 @@ _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]*")
 @clear_constructor
 @dataclass(frozen=True, kw_only=True)
 class SuiteEntry(HuntOptions):
-    """``[[hunts]]``: one hunt of a suite; ``[defaults]`` has the same keys. Options are those of the list.
+    """``[[hunts]]``: one hunt of a suite; ``[defaults]`` has the same keys. The fields are the options of hunts.
 
     Args:
         id: names its folder; unique in the suite.
@@ -268,7 +268,7 @@ def default_suite() -> str:
 
 
 def _merged(defaults: Given, given: Given) -> Given:
-    """A hunt over the defaults; tables are merged, and its own agent is instead of all default ones."""
+    """Return an entry merged with the defaults; the entry's agent replaces all default agents."""
     found = dict(defaults)
     if "agent" in given or "agents" in given:
         found.pop("agent", None)

@@ -24,7 +24,7 @@ class CrashRule:
 
     Args:
         info: a key of the info that is true.
-        termination: the environment terminates; what it truncates is no crash.
+        termination: whether the termination of the environment is a crash; truncation is no crash.
         reward_below: the reward of the step is below this.
         function: ``module:function``, called with observation, reward, terminated, truncated, info; what it returns is
             taken as true or false, and a text as what happened.

@@ -1,4 +1,4 @@
-"""What a scenario for SUMO must be: files and arguments that go together, and options with which a trial is a trial."""
+"""Checks a scenario for SUMO: its files, its arguments, and the options that trials need."""
 
 from __future__ import annotations
 

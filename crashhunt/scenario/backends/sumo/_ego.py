@@ -50,13 +50,13 @@ _NO_ROAD = {"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway"
 
 @dataclass(frozen=True, slots=True)
 class Ego:
-    """Who is controlled.
+    """The controlled vehicle.
 
     Args:
         agent: its id.
         setup: how it gets there.
         note: what to tell the user.
-        arguments: those of the scenario that it needs.
+        arguments: the scenario arguments that the controlled vehicle needs.
     """
 
     agent: str
@@ -141,7 +141,7 @@ def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
 
 
 def _anybody(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
-    """Draw the vehicle in each trial, of those that depart when there is traffic; where none departs, add one."""
+    """Draw a vehicle in each trial from those that depart amid traffic; if none departs, add one."""
     why = "" if ego else NOT_GIVEN
     # Who would have departed before the simulation begins never does.
     known = [one for one in _departures(files) if one.depart_s >= begin and not one.off_road]
@@ -214,7 +214,7 @@ def _on_any_route(files: list[Path], path: Path) -> Ego:
 
 
 def _departures(files: list[Path]) -> list[Departure]:
-    """The vehicles that can be named before the simulation has run; of a flow, those that soon depart."""
+    """Return the vehicles whose names are known before the simulation; of a flow, only those that depart soon."""
     found = []
     elements = _elements(files, "vehicle", "trip", "flow", "vType")
     elsewhere = {one.get("id") for one in elements if one.tag == "vType" and one.get("vClass") in _NO_ROAD}
@@ -247,7 +247,7 @@ def _of_flow(flow: ET.Element, name: str, begin: float, off_road: bool) -> list[
 
 
 def _departure_of(vehicle: str, files: list[Path]) -> float:
-    """When a vehicle departs, as far as its files tell; SUMO calls the vehicles of a flow ``FLOW.0``, ``FLOW.1``."""
+    """Return the departure of a vehicle in the files; SUMO names the vehicles of a flow ``FLOW.0``, ``FLOW.1``."""
     flow, _, place = vehicle.rpartition(".")
     for element in _elements(files, "flow"):
         if element.get("id") == flow and place.isdecimal():

@@ -84,7 +84,7 @@ class Reference:
     offset: int
 
     def __str__(self) -> str:
-        """How it stands in the file."""
+        """Return the reference as written in the file."""
         return f'<{self.tag} {self.attribute}="{self.value}">'
 
 
@@ -111,7 +111,7 @@ def read_xml(path: Path) -> bytes:
 
 
 def references(content: bytes, where: str) -> list[Reference]:
-    """Return what an XML file says about other files.
+    """Return the references to other files in an XML file.
 
     Raises:
         ScenarioError: it is no valid XML.
@@ -162,7 +162,7 @@ def rewritten(content: bytes, found: list[Reference], name: Callable[[Reference]
     Args:
         content: content of the file.
         found: what `references` has found in it.
-        name: what each is to name; what it does already changes nothing.
+        name: returns the new name for each reference; an equal name changes nothing.
     """
     from xml.sax.saxutils import quoteattr  # which imports urllib and ssl
 
@@ -203,7 +203,7 @@ def movable(path: Path) -> bytes | None:
 
 
 def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) -> tuple[str, ...]:
-    """Return the files that some files have SUMO read, and those that these do, relative to the folder.
+    """Return all files that SUMO reads because of some files, directly or indirectly, relative to the folder.
 
     Args:
         folder: folder of the scenario.
@@ -228,7 +228,7 @@ def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) 
 
 
 def written_by(folder: Path, names: tuple[str, ...]) -> list[str]:
-    """Return what files would have SUMO write, in words; nothing if they would not."""
+    """Return the output that SUMO would write because of some files, in words; empty for none."""
     found = [
         f"{name}: {reference}"
         for name in dict.fromkeys((*names, *nested_files(folder, names)))
@@ -390,7 +390,7 @@ def filled_in(content: bytes, values: Mapping[str, Value]) -> bytes:
 
     Raises:
         KeyError: it asks for an argument that is not there.
-        ValueError: it is no text, or has a dollar sign that means nothing.
+        ValueError: the file is no text, or contains an invalid dollar sign.
     """
     return _substitute(string.Template(content.decode()), values).encode() if b"${" in content else content
 

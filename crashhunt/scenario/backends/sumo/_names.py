@@ -1,8 +1,8 @@
 """What SUMO's files define: the vehicles, types, routes and edges that a scenario may name.
 
-SUMO itself finds out that there is no such thing only when a trial begins, and of a vehicle of the traffic never: it
-waits for it in vain. So names are looked up before a hunt, wherever the files can tell. They are searched and not
-parsed, as a network may have hundreds of megabytes.
+SUMO itself reports a missing name only when a trial begins, and never reports a missing vehicle of the traffic. Names
+are therefore checked before a hunt, as far as the files show them. They are searched and not parsed, as a network may
+have hundreds of megabytes.
 """
 
 from __future__ import annotations

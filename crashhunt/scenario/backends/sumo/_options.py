@@ -1,4 +1,4 @@
-"""SUMO's options: those that it always gets, what they are called, and which of them read, write or listen."""
+"""SUMO's options: those of every trial, their names, and which of them read, write or open a port."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ def writes(name: str) -> bool:
 
 
 def is_output(name: str) -> bool:
-    """Whether an option says what SUMO writes, or how."""
+    """Return whether an option concerns SUMO's output."""
     family, dot, _ = name.partition(".")
     return writes(name) or (bool(dot) and writes(family))
 
@@ -241,9 +241,8 @@ class SumoSetup:
         net: the network.
         routes: route files.
         additional: additional files.
-        options: further options of SUMO without their dashes, such as ``lateral-resolution``. Where there is no
-            ``time-to-teleport``, it is -1: no vehicle is removed, and a jam stays one. SUMO writes none of their output
-            files.
+        options: further options of SUMO without their dashes, such as ``lateral-resolution``. The default of
+            ``time-to-teleport`` is -1, so SUMO removes no vehicle from a jam. SUMO writes none of their output files.
         native: whether the compiled core may be used; it changes no bit.
         fix_link_order: whether SUMO processes the links of the network in the order of their construction.
             Otherwise it uses the order of their memory addresses, which differs between processes.

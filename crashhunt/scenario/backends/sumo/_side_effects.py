@@ -105,7 +105,7 @@ class _SideEffectError(Exception):
 
 
 def side_effect(scenario: Scenario, values: Mapping[str, Value], _specifications: Iterable[str]) -> str:
-    """Return what else SUMO would do with the options and files of a scenario; empty if that is nothing."""
+    """Return the side effect that SUMO would have with the options and files of a scenario; empty for none."""
     sumo = scenario.table(SumoSetup)
     options = [*sumo.options, *(setup.option for setup in scenario.arguments.values() if setup.option)]
     for option in options:
