@@ -22,7 +22,7 @@ from starlette.routing import Route
 
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.base.version import __version__
-from crashhunt.crashes import export_crash, read_bundle
+from crashhunt.crashes import export_crash
 from crashhunt.dashboard._control import Jobs, stop_hunt
 from crashhunt.dashboard._crashes import CrashList
 from crashhunt.dashboard._details import Compared, detail_of, importance_of_points
@@ -127,7 +127,7 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
             return _gone()
         view.refresh(points=True)
         units: dict[str, str] = {}
-        if view.settings is not None:
+        if view.settings is not None and view.sample is not None:  # else the hunt is damaged or has no trial
             several = len(view.settings.agents) > 1
             with suppress(CrashhuntError, OSError):
                 found = argument_units(view.path, view.settings)
@@ -163,13 +163,13 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
     def export(request: Request) -> Response:
         name = request.path_params["crash"]
         found = shown.crashes(request.path_params["hunt"])
-        folder = found.folder(name) if found is not None else None
-        if found is None or folder is None or found.log(name) is None:
+        bundle = found.bundle(name) if found is not None else None
+        if bundle is None:
             return _error(404, "there is no such crash in this hunt")
         place = tempfile.TemporaryDirectory(prefix="crashhunt-export-")
         target = Path(place.name) / f"{name}.zip"
         try:
-            export_crash(read_bundle(folder), target)
+            export_crash(bundle, target)
         except BaseException:
             place.cleanup()
             raise
@@ -197,10 +197,10 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
     def job_add(request: Request) -> Response:
         identifier, name = request.path_params["hunt"], request.path_params["crash"]
         found = shown.crashes(identifier)
-        folder = found.folder(name) if found is not None else None
-        if found is None or folder is None or found.log(name) is None:
+        bundle = found.bundle(name) if found is not None else None
+        if bundle is None:
             return _error(404, "there is no such crash in this hunt")
-        return _answer(request, jobs.add(identifier, folder.parent.parent, name, request.path_params["job"]))
+        return _answer(request, jobs.add(identifier, bundle.hunt, name, request.path_params["job"]))
 
     routes = [
         Route("/", page("list")),

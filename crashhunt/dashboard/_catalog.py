@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import threading
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.hunts import is_hunt
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
+    from collections.abc import Iterable, Iterator, Sequence
 
-__all__ = ["Catalog", "Found", "is_inside", "outside_link"]
+__all__ = ["Catalog", "Found", "is_inside", "unreadable", "unreadable_below"]
 
 _DEPTH = 4  # of hunts below a named folder: a folder of suites has DIR/SUITE/ID/RUN
 _MAX_FOLDERS = 20_000  # looked into; a home folder may have millions
@@ -31,6 +32,8 @@ _OWN_FILES = (
     layout.HUNT, layout.LEDGER, f"{layout.LEDGER}-wal", f"{layout.LEDGER}-shm", layout.REQUEST, layout.CRASHES,
     *layout.BESIDE, layout.SNAPSHOTS, layout.RUN_LOG, layout.ERROR_LOG,
 )  # fmt: skip
+_MAX_BYTES = {layout.HUNT: 4 << 20, layout.CRASH: 16 << 20}
+"""The largest size of files that are read as a whole. Usual ones have some KB, and 1 MB takes 20 ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,18 +135,53 @@ def is_inside(path: Path, roots: Sequence[Path]) -> bool:
     return any(path == root or root in path.parents for root in roots)
 
 
-def outside_link(folder: Path, root: Path, names: Sequence[str] = _OWN_FILES) -> str:
-    """Return the name of a file of a folder that is a symbolic link out of another folder; empty for none.
+def unreadable(folder: Path, root: Path, names: Iterable[str] = _OWN_FILES) -> str:
+    """Return why a file of a folder must not be opened; empty if all may be.
+
+    The folder of a stranger may have links that lead out of it, pipes at which a reader waits for ever, and files that
+    fill the memory.
 
     Args:
         folder: whose files are checked.
         root: that they must lie in.
-        names: names of the files; those of a hunt by default.
+        names: names of the files and folders; those of a hunt by default.
     """
     for name in names:
         path = folder / name
-        if path.is_symlink() and not is_inside(path.resolve(), [root]):
-            return name
+        try:
+            found = path.lstat()
+            if stat.S_ISLNK(found.st_mode):
+                if not is_inside(path.resolve(), [root]):
+                    return f"{name} is a symbolic link to a place outside {root}"
+                found = path.stat()
+        except (OSError, RuntimeError):  # a reader reports a missing file, or a link to itself
+            continue
+        if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+            return f"{name} is neither a file nor a folder"
+        if (most := _MAX_BYTES.get(name)) is not None and found.st_size > most:
+            return f"{name} has {found.st_size:,} bytes (allowed: {most:,})"
+    return ""
+
+
+def unreadable_below(folder: Path, root: Path) -> str:
+    """Return why a file in a folder, or in one below, must not be opened; empty if all may be.
+
+    Args:
+        folder: which may be missing.
+        root: that the files must lie in.
+    """
+    folders = [folder]
+    while folders:
+        inside = folders.pop()
+        try:
+            with os.scandir(inside) as found:
+                entries = list(found)
+        except OSError:
+            continue
+        odd = [one.name for one in entries if one.is_symlink() or not (one.is_file() or one.is_dir())]
+        if why := unreadable(inside, root, odd):
+            return f"in {inside.relative_to(root)}, {why}"
+        folders += [Path(one.path) for one in entries if one.is_dir(follow_symlinks=False)]
     return ""
 
 

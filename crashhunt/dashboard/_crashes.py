@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
-from crashhunt.crashes import crash_folders, fault_of, read_bundle, signature_of
-from crashhunt.dashboard._catalog import is_inside, outside_link
+from crashhunt.crashes import crash_folders, fault_of, most_dangerous, read_bundle, signature_of
+from crashhunt.dashboard._catalog import is_inside, unreadable, unreadable_below
 from crashhunt.dashboard._hunt import read_tail
 from crashhunt.hunts import TrialRow
 from crashhunt.ledger import Ledger, has_begun
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 __all__ = ["CrashList"]
 
 _PLACES = (layout.CRASHES, layout.NEAR_MISSES)
-_FILES = (layout.CRASH, layout.LOG, layout.RUN_LOG, layout.ERROR_LOG)
 _MAX_LISTED = 2_000
 _MAX_LANES = 4_000
 _MAP_LOGS = 40  # that lanes are read from
@@ -90,7 +89,7 @@ class CrashList:
             self._entries = {name: entry for name, entry in self._entries.items() if name in folders}
             for name, folder in sorted(folders.items())[:_MAX_LISTED]:
                 row = self._row(name, folder)
-                if not row["damaged"] and not row["near_miss"] and self._is_unknown(name):
+                if not row["damaged"] and self._is_unknown(name):
                     unknown.append((name, folder))
                 analysed = self._analysed.get(name)
                 rows.append({**row, **(analysed[1] if analysed else {"type": None, "fault": None})})
@@ -115,15 +114,27 @@ class CrashList:
         """Read a bundle.
 
         Raises:
-            BundleError: it is damaged, or has links out of the hunt.
+            BundleError: it is damaged, or a file of it or of the hunt must not be opened.
         """
         root = self._found.path
-        if not is_inside(folder.resolve(), [root]) or (name := outside_link(folder, root, _FILES)):
-            what = name if is_inside(folder.resolve(), [root]) else folder.name
-            raise BundleError(
-                f"{what} is a symbolic link to a file outside the directory of the hunt", where=str(folder)
-            )
+        why = (
+            unreadable(folder.parent, root, [folder.name])
+            or unreadable(folder, root, [path.name for path in folder.iterdir()])
+            or unreadable(root, root)
+            or unreadable_below(root / layout.SNAPSHOTS, root)
+        )
+        if why:
+            raise BundleError(why, fix="do not trust this crash", where=str(folder))
         return read_bundle(folder)
+
+    def bundle(self, crash: str) -> Bundle | None:
+        """Return a crash by its identifier; None if it is missing.
+
+        Raises:
+            BundleError: it is damaged, or a file of it must not be opened.
+        """
+        folder = self.folder(crash)
+        return None if folder is None else self._read(folder)
 
     def _is_unknown(self, name: str) -> bool:
         analysed = self._analysed.get(name)
@@ -134,12 +145,7 @@ class CrashList:
             written = _written(folder / layout.CRASH)
             said: JsonObject = {"type": None, "fault": None}
             try:
-                bundle = self._read(folder)
-                recording = bundle.recording() if bundle.result.collision is not None else None
-                said = {
-                    "type": str(signature_of(bundle, recording)),
-                    "fault": fault_of(bundle, recording).verdict,
-                }
+                said |= _analysis(self._read(folder))
             except (CrashhuntError, OSError) as error:
                 said["damaged"] = str(error)
             with self._lock:
@@ -264,6 +270,20 @@ def _summary(bundle: Bundle) -> JsonObject:
         "x": round(x, 2) if known else None,
         "y": round(y, 2) if known else None,
     }
+
+
+def _analysis(bundle: Bundle) -> JsonObject:
+    """Return keys of the row of a crash or near miss that need its log: type and fault, or the most critical place."""
+    if not bundle.is_near_miss:
+        recording = bundle.recording() if bundle.result.collision is not None else None
+        return {"type": str(signature_of(bundle, recording)), "fault": fault_of(bundle, recording).verdict}
+    recording = bundle.recording()
+    most = most_dangerous(recording)
+    if most is None:
+        return {}
+    scene = recording.scene(most.step)
+    x, y = scene.points[scene.roster.index[most.agent]]
+    return {"x": round(x, 2), "y": round(y, 2)}
 
 
 def _commands(hunt: Path, crash: str, bundle: Bundle) -> list[list[str]]:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.crashes import crash_folders
+from crashhunt.dashboard._catalog import unreadable
 from crashhunt.dashboard._hunt import read_tail
 from crashhunt.estimation import compare
 from crashhunt.ledger import leave_untouched
@@ -44,10 +46,12 @@ def detail_of(view: HuntView) -> JsonObject:
     """Return a hunt as ``/api/hunts/ID`` does: its row, and what its page shows."""
     row = view.row()
     settings, counts = view.settings, view.counts
+    is_readable = not view.unreadable()
+    log_name, log = _log(view) if is_readable else ("", "")
     return {
         **row,
         "path": str(view.path),
-        "command": _command(view.path / layout.HUNT),
+        "command": _command(view.path / layout.HUNT) if is_readable else "",
         "settings": _settings(settings) if settings is not None else {},
         "columns": _columns(settings) if settings is not None else [],
         "scenario_columns": list(settings.scenario_arguments) if settings is not None else [],
@@ -58,9 +62,19 @@ def detail_of(view: HuntView) -> JsonObject:
         "dropped": {words: len(numbers) for words, numbers in (view.facts.get("dropped") or {}).items()},
         "until_rate": view.facts.get("until_rate"),
         "workers": _workers(view) if row["state"] == "running" else [],
-        "run_log": read_tail(view.path / layout.RUN_LOG, view.path),
+        "run_log": log,
+        "run_log_of": log_name,
         "problems": view.sample.problems if view.sample is not None else [],
     }
+
+
+def _log(view: HuntView) -> tuple[str, str]:
+    """Return what wrote the end of a log, and the end: the hunt of a suite, else the crash of the last trial."""
+    if text := read_tail(view.path / layout.RUN_LOG, view.path):
+        return "", text
+    for folder in crash_folders(view.path)[-1:]:
+        return folder.name, "".join(read_tail(folder / name, view.path) for name in (layout.RUN_LOG, layout.ERROR_LOG))
+    return "", ""
 
 
 def _settings(settings: HuntSettings) -> JsonObject:
@@ -79,6 +93,7 @@ def _settings(settings: HuntSettings) -> JsonObject:
         "branch": settings.branch,
         "seeds": settings.seeds,
         "keep going": settings.run.keep_going,
+        "near misses kept": settings.run.near_misses,
         f"crash types{' by cause' if settings.run.by_cause else ''} wanted": settings.run.distinct,
     }
     return {name: value for name, value in found.items() if value not in ("", None, False, 0)}
@@ -109,7 +124,7 @@ def _workers(view: HuntView) -> list[JsonObject]:
     is_here = owner is not None and owner["host"] == socket.gethostname()
     now, found = time.monotonic(), {}  # the clock of black boxes, which counts from the start of a machine
     for path in sorted(view.path.glob(f".scratch-*/trial-*/{layout.BLACK_BOX}"))[:_MAX_WORKERS]:
-        header = read_header(path)
+        header = None if unreadable(path.parent, view.path, [path.name]) else read_header(path)
         if header is None or header.phase is Phase.DONE or not re.fullmatch(r"trial-\d+", path.parent.name):
             continue
         found[header.trial] = {
@@ -179,6 +194,8 @@ class Compared:
         if trials > _MAX_TRIALS:
             why = f"a comparison reads all trials, of which there are more than {_MAX_TRIALS:,}"
             return {"hunts": {}, "pairs": [], "problem": f"{why}; run: crashhunt compare"}
+        if why := next(filter(None, (view.unreadable() for view in views)), ""):
+            return {"hunts": {}, "pairs": [], "problem": why}
         try:
             with leave_untouched():
                 found = _plain(compare(*(view.path for view in views)), rows)

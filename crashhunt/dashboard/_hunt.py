@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.crashes import crash_folders
-from crashhunt.dashboard._catalog import outside_link
+from crashhunt.dashboard._catalog import unreadable, unreadable_below
 from crashhunt.dashboard._trials import Sample, TrialCounts
 from crashhunt.estimation import counts_suffice, rate_of_counts, rate_of_trials
 from crashhunt.hunts import HuntState, hunt_state, state_of_facts, sums_of_branches, sums_of_probes
@@ -56,6 +56,8 @@ class HuntView:
         self._replaced = 0
         self._file: tuple[int, int] = (0, 0)
         self._settings_key: tuple[int, int] = (0, 0)
+        self._snapshots_key: tuple[int, int, int] | None = None
+        self._why_unreadable = ""
         self.settings: HuntSettings | None = None
         self.facts: Facts = {}
         self.events: list[tuple[float, str, str]] = []
@@ -100,8 +102,8 @@ class HuntView:
         self._key, self.counts, self.sample = (), None, None
 
     def _refresh(self, *, points: bool) -> HuntState:
-        if name := outside_link(self.path, self.found.root):
-            raise HuntDirectoryError(f"{name} is a symbolic link to a place outside the folders of the dashboard")
+        if why := self.unreadable():
+            raise HuntDirectoryError(why, fix=f"do not trust this hunt, or see crashhunt check {self.path}")
         self._read_settings()
         ledger = self.path / layout.LEDGER
         if not has_begun(ledger):
@@ -127,6 +129,15 @@ class HuntView:
             crashes_saved=saved if saved < found else None,
             **self._copies,
         )
+
+    def unreadable(self) -> str:
+        """Return why a file of the hunt must not be opened; empty if all may be. Snapshots are examined once."""
+        snapshots = self.path / layout.SNAPSHOTS
+        if why := unreadable(self.path, self.found.root):
+            return why
+        if (key := _sign(snapshots)) != self._snapshots_key:
+            self._why_unreadable, self._snapshots_key = unreadable_below(snapshots, self.found.root), key
+        return self._why_unreadable
 
     def _read_settings(self) -> None:
         path = self.path / layout.HUNT

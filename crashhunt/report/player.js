@@ -248,7 +248,8 @@ function drawPlot() {
   if (!crash.speeds) crash.speeds = Array.from({ length: crash.steps }, (_, step) => (view.agent >= 0 && state(step, view.agent) ? state(step, view.agent)[3] : NaN));
   copied("plot", crash, context, width, height, (context) => {
     const speeds = crash.speeds, fastest = speeds.reduce((most, speed) => Math.max(most, Math.ceil(speed) || 0), 10);
-    const curves = [["--crash", crash.ttcs, 10], ["--accent", speeds, fastest]];
+    const widest = [10, 20, 50, 100].find((limit) => crash.gaps.every((gap) => !(gap > limit))) ?? 100;
+    const curves = [["--s3", crash.gaps, widest], ["--crash", crash.ttcs, 10], ["--accent", speeds, fastest]];
     context.strokeStyle = css("--line");
     context.strokeRect(left + 0.5, top + 0.5, right - left, bottom - top);
     context.font = "11px system-ui";
@@ -270,8 +271,10 @@ function drawPlot() {
     context.fillText("10 s", left - 4, top + 9);
     context.fillText("TTC", left - 4, bottom);
     context.textAlign = "left";
-    context.fillText(crash.other ? `time to collision with ${crash.other}` : "least time to collision with any actor", left, top - 5, right - left);
+    context.fillText(crash.other ? `time to collision with ${crash.other}` : "least time to collision with any actor", left, top - 5, right - left - 90);
+    context.fillStyle = css("--s3");
     context.textAlign = "right";
+    context.fillText(`gap, 0 to ${widest} m`, right, top - 5, 86);
     context.fillStyle = css("--accent");
     context.textAlign = "left";
     context.fillText(`${fastest} m/s`, right + 4, top + 9);
@@ -338,6 +341,7 @@ function drawDanger() {
     context.fillText("0", left - 4, bottom);
     context.textAlign = "left";
     context.fillText("criticality (all actors)", left, top - 5);
+    const free = left + context.measureText("criticality (all actors)").width + 8;
     context.fillStyle = css("--ego");
     context.fillText("own", right + 4, top + 9);
     context.fillStyle = css("--accent");
@@ -351,7 +355,7 @@ function drawDanger() {
       context.lineTo(x(at), bottom);
       context.stroke();
       context.textAlign = x(at) > (left + right) / 2 ? "right" : "left";
-      context.fillText(crash.nearest === null ? "crash" : "nearest", x(at), top - 5);
+      context.fillText(crash.nearest === null ? "crash" : "nearest", Math.max(free, x(at)), top - 5);
     }
   });
   drawCursor(context, x(view.step), top, bottom);

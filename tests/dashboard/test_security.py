@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import socket
 import sqlite3
 import threading
 from contextlib import ExitStack, closing, suppress
@@ -12,6 +13,8 @@ from contextlib import ExitStack, closing, suppress
 import pytest
 from dashboard_hunts import hunted, written
 from served import served
+
+from crashhunt.dashboard import _serving
 
 TOKEN = "a-token-of-a-test-1234"
 
@@ -148,11 +151,53 @@ def test_links_out_of_the_folders_are_not_followed(hunt, tmp_path):
         one = f"/api/hunts/{rows['one']['id']}"
         listed = {row["id"]: row for row in dashboard.get(f"{one}/crashes")["crashes"]}
         for name in (crash.name, "999999-collision"):
-            assert "is a symbolic link to a file outside" in listed[name]["damaged"]
+            assert "is a symbolic link to a place outside" in listed[name]["damaged"]
             for what in ("", "/log", "/export"):
                 reply = dashboard.ask(f"{one}/crashes/{name}{what}")
                 assert reply.status in (404, 422)
                 assert b"a secret" not in reply.body
+
+
+@pytest.mark.parametrize("name", ["hunt.toml", "run.log", "ledger.sqlite", "manifest.json", "crash.json", "huge"])
+def test_files_without_an_end_are_not_opened(hunt, name):
+    crash = sorted((hunt / "one" / "crashes").iterdir())[0]
+    folders = {"manifest.json": next((hunt / "one" / "snapshots").iterdir()), "crash.json": crash}
+    path = folders.get(name, hunt / "one") / name
+    if name == "huge":
+        path = hunt / "one" / "hunt.toml"
+        os.truncate(path, 1 << 33)
+    else:
+        path.unlink(missing_ok=True)
+        os.mkfifo(path)
+    with served(hunt) as dashboard:
+        try:
+            row = dashboard.hunts()["one"]
+            one = f"/api/hunts/{row['id']}"
+            for target in ("", "/trials", "/importance", "/crashes", "/map"):
+                assert dashboard.ask(one + target).status == 200
+            refused = [dashboard.ask(f"{one}/crashes/{crash.name}{what}") for what in ("", "/export")]
+            assert {reply.status for reply in refused} == {422}
+            said = refused[0].json["error"]["message"] if name == "crash.json" else row["detail"]
+            assert ("(allowed: 4,194,304)" if name == "huge" else f"{name} is neither a file nor a folder") in said
+        finally:  # a thread that waits for the other end would outlive the test
+            with suppress(OSError):
+                os.close(os.open(path, os.O_WRONLY | os.O_NONBLOCK))
+
+
+def test_a_request_that_does_not_end_loses_its_connection(hunt, monkeypatch):
+    monkeypatch.setattr(_serving, "_REQUEST_S", 0.2)
+    with served(hunt) as dashboard:
+        for begun in (
+            b"",
+            b"GET /api HTTP/1.1\r\nHost: local",
+            b"GET /api HTTP/1.1\r\nHost: localhost\r\n\r\nGET /api",
+        ):
+            with socket.create_connection(("127.0.0.1", dashboard.port), timeout=30) as connection:
+                connection.sendall(begun)
+                received = b""
+                while part := connection.recv(65536):  # it ends, although this side goes on
+                    received += part
+                assert received.count(b"HTTP/1.1 200") == (b"\r\n\r\n" in begun)
 
 
 def test_requests_that_are_too_large_are_refused(hunt):

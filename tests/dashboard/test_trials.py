@@ -12,8 +12,10 @@ import pytest
 from dashboard_hunts import hunted
 from hypothesis import given, settings, strategies as st
 
+from crashhunt.crashes import list_near_misses, most_dangerous
 from crashhunt.dashboard import _trials
 from crashhunt.dashboard._catalog import Catalog
+from crashhunt.dashboard._crashes import CrashList
 from crashhunt.dashboard._hunt import HuntView
 from crashhunt.dashboard._trials import Sample, TrialCounts
 from crashhunt.estimation import counts_suffice, measure_rates, rate_of_counts
@@ -227,3 +229,17 @@ def test_crash_type_came_with_its_first_trial_though_that_bundle_was_deleted():
         "dropped": {"rear end": [9, 1], "side swipe": [0]},
     }
     assert view.kind_firsts() == [1, 4]
+
+
+def test_near_misses_are_on_the_map_where_they_were_most_critical(shell, made_once):
+    hunt = made_once(hunted, shell).folder / "runs" / "one"
+    (found,) = Catalog([hunt]).hunts().values()
+    crashes = CrashList(found)
+    crashes.rows()  # begins the analysis of logs
+    crashes._thread.join(60)
+    (bundle,) = list_near_misses(hunt)
+    most = most_dangerous(bundle.recording())
+    scene = bundle.recording().scene(most.step)
+    (point,) = [one for one in crashes.map()["points"] if one["near_miss"]]
+    assert (point["x"], point["y"]) == pytest.approx(scene.points[scene.roster.index["ego"]], abs=0.01)
+    assert all(one["x"] is not None and one["type"] for one in crashes.map()["points"] if not one["near_miss"])

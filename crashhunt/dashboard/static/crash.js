@@ -27,6 +27,7 @@ async function begin() {
   }
   document.title = `${crash.id} - crashhunt`;
   setText($("title"), crash.id);
+  setText($("hunt"), `Hunt ${crash.path.split("/").at(-3)}`);
   for (const id of ["player", "more"]) $(id).hidden = false;
   await window.load(crash);
   $("commands").replaceChildren(...crash.commands.flatMap(([name, command]) => [make("span", name), make("code", command), copyButton(command, name)]));
@@ -45,6 +46,8 @@ async function begin() {
 async function control() {
   if (!(await mayControl())) return;
   $("control").hidden = false;
+  const names = [...$("commands").querySelectorAll("span")].map((node) => node.textContent);
+  for (const button of document.querySelectorAll("[data-job]")) button.hidden = !names.includes(button.textContent.toLowerCase());
   let ended = 0;
   const refresh = async () => {
     const found = await get(`${API}/jobs`);

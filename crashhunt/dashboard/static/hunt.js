@@ -1,7 +1,8 @@
 /* The page of one hunt. */
-import { $, PALETTE, Refused, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, interval, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, spelled, tell } from "/static/common.js";
+import { $, PALETTE, Refused, between, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, spelled, tell } from "/static/common.js";
 
 const ID = location.pathname.split("/")[2], API = `/api/hunts/${ID}`;
+const NOT_DECIDED = "nobody can tell"; // the verdict of the API
 const COLORS = { "traffic crash": "--crash", "traffic event": "--crash", "software fault": "--fault", "no crash": "--fine" };
 let hunt = null, crashes = [], points = [], cursor = "", units = {}, road = null, shares = { share: 1, crash_share: 1 };
 const byNumber = new Map(), brushes = new Map();
@@ -44,6 +45,8 @@ function renew(id, data, fill) {
   if (within) [...$(id).querySelectorAll("a, button")].find((node) => (node.getAttribute("href") ?? node.textContent) === key)?.focus();
 }
 
+const faultOf = (one) => (one.fault === NOT_DECIDED ? "not decided" : one.fault ?? "");
+
 function link(crash, text) { return make("a", text ?? crash, "", { href: `/hunts/${ID}/crashes/${encodeURIComponent(crash)}` }); }
 
 function showHunt() {
@@ -66,8 +69,8 @@ function showHunt() {
     ...(newest ? [["since the last new type", seconds(Math.max(0, now() - newest))]] : []),
     ["trials/s", hunt.rate_per_s ? hunt.rate_per_s.toFixed(1) : "-"],
     ...(hunt.seconds_left === null ? [] : [["time left", seconds(hunt.seconds_left)]]),
-    ...(rate?.certain ? [["crash rate per trial, certain", interval(rate)]] : []),
-    ...(rate && rate.estimate !== null && rate.estimate !== undefined ? [["crash rate per trial, estimated", rateOf(rate.estimate)]] : []),
+    ...(rate?.certain ? [["crash rate per trial, certain interval", between(rate)]] : []),
+    ...(rate && rate.estimate !== null && rate.estimate !== undefined ? [["crash rate per trial, estimate", rateOf(rate.estimate)]] : []),
     ...(hunt.until_rate ? [[`bar ${hunt.until_rate.bar}`, hunt.until_rate.verdict]] : []),
   ];
   renew("tiles", tiles, () => $("tiles").replaceChildren(...tiles.map(([name, value]) => {
@@ -78,21 +81,22 @@ function showHunt() {
   if (rate?.why_not) $("tiles").title = `No estimate: ${rate.why_not}`;
   renew("settings", hunt.settings, () => $("settings").replaceChildren(...Object.entries(hunt.settings).flatMap(([name, value]) => [make("dt", name), make("dd", value === true ? "yes" : value, "mono")])));
   renew("command", hunt.command, () => $("command").replaceChildren(...(hunt.command ? [make("span", "command"), make("code", hunt.command), copyButton(hunt.command, "repeat this hunt")] : [make("span", "No command is known.")])));
-  $("workers-card").hidden = !hunt.workers.length && !(hunt.nodes ?? []).length;
-  renew("workers", hunt.workers, () => $("workers").replaceChildren(...(hunt.workers.length ? [table([["Trial", "number"], ["Step", "number"], ["Doing"], ["Since", "number"]], hunt.workers.map((one) => [count(one.trial), count(one.step), one.doing, seconds(one.since_s)]), "Running trials")] : [])));
+  $("workers-card").hidden = hunt.state !== "running" && !(hunt.nodes ?? []).length;
+  renew("workers", hunt.workers, () => $("workers").replaceChildren(...(hunt.workers.length ? [table([["Trial", "number"], ["Step", "number"], ["Doing"], ["Since", "number"]], hunt.workers.map((one) => [count(one.trial), count(one.step), one.doing, seconds(one.since_s)]), "Running trials")] : [make("p", hunt.state === "running" ? "Between two trials." : "No trial is running.", "faint")])));
   renew("nodes", hunt.nodes, () => $("nodes").replaceChildren(...(hunt.nodes?.length ? [table([["Node"], ["Trials at a time", "number"], ["Trials", "number"], ["Trials/s", "number"]], hunt.nodes.map((one) => [one.name, one.parallel, count(one.trials), (one.rate_per_s ?? 0).toFixed(1)]), "Nodes")] : [])));
   const copies = [["probes", hunt.probes], ["branches", hunt.branches]].flatMap(([name, sums]) => (sums ? Object.entries(sums).map(([key, value]) => [`${name}: ${key.replaceAll("_", " ")}`, value]) : []));
   $("copies-card").hidden = !copies.length;
   renew("copies", copies, () => $("copies").replaceChildren(...copies.flatMap(([name, value]) => [make("dt", name), make("dd", value ?? "-", "mono")])));
-  renew("events", hunt.events, () => $("events").replaceChildren(table([["At"], ["State"], ["Detail"]], [...hunt.events].reverse().map(([at, state, why]) => [new Date(at * 1000).toLocaleString("en-GB"), state, why]), "Events")));
+  renew("events", hunt.events, () => $("events").replaceChildren(table([["At"], ["State"], ["Detail"]], [...hunt.events].reverse().map(([at, state, why]) => [new Date(at * 1000).toLocaleString("sv-SE"), state.replaceAll("_", " "), why]), "Events")));
   showControl();
   $("run-log-box").hidden = !hunt.run_log;
+  setText($("run-log-title"), hunt.run_log_of);
   setText($("run-log"), hunt.run_log);
 }
 
 function showKinds() {
   const kinds = hunt.kinds ?? [...Map.groupBy(crashes.filter((one) => one.type), (one) => one.type)].map(([type, members]) => ({ words: type, count: members.length, first: members[0].id, shortest: [...members].sort((a, b) => a.steps - b.steps)[0].id }));
-  const faults = new Map([...Map.groupBy(crashes.filter((one) => one.type), (one) => one.type)].map(([type, members]) => [type, [...new Set(members.map((one) => one.fault))].join(", ")]));
+  const faults = new Map([...Map.groupBy(crashes.filter((one) => one.type), (one) => one.type)].map(([type, members]) => [type, [...new Set(members.map((one) => faultOf(one)))].join(", ")]));
   const kept = new Set(crashes.map((one) => one.id));
   $("kinds-section").hidden = !kinds.length;
   const lines = kinds.map((kind) => [kind.words, kind.count, kind.first, kind.shortest, faults.get(kind.words) ?? ""]);
@@ -117,7 +121,7 @@ function showCrashes() {
   const filter = $("crash-filter").value;
   const lines = crashes.filter((one) => !filter || (filter === "near misses" ? one.near_miss : one.type === filter));
   renew("crashes", lines, () => $("crashes").replaceChildren(table([["Crash"], ["What happened"], ["Type"], ["At fault"], ["Steps", "number"], ["Confirmed"]], lines.map((one) => [
-    one.damaged && !one.summary ? one.id : link(one.id), one.damaged || one.summary, one.near_miss ? (one.disturbed ? "near miss, disturbed" : "near miss") : one.type ?? "", one.fault ?? "", one.steps === undefined ? "" : count(one.steps),
+    one.damaged && !one.summary ? one.id : link(one.id), one.damaged || one.summary, one.near_miss ? (one.disturbed ? "near miss, disturbed" : "near miss") : one.type ?? "", faultOf(one), one.steps === undefined ? "" : count(one.steps),
     one.near_miss ? "" : one.confirmed === true ? "yes" : one.confirmed === false ? "no: flaky" : one.why_unconfirmed || "not yet",
   ]), "Crashes")));
 }
@@ -151,13 +155,14 @@ function drawProgress() {
   const outcomes = [...new Set(hunt.parts.flatMap((part) => Object.keys(part.outcomes)))].sort();
   const plain = ["survived", "finished", "invalid"];
   outcomes.sort((a, b) => plain.includes(b) - plain.includes(a));
-  const size = Math.max(1, Math.ceil(hunt.parts.length / 48)), groups = [];
+  const size = Math.max(1, Math.ceil(hunt.parts.length / 30)), groups = [];
   for (let place = 0; place < hunt.parts.length; place += size) groups.push(hunt.parts.slice(place, place + size));
-  const tones = { survived: "--fine", finished: "--s0", invalid: "--line", collision: "--crash", off_road: "--ego" };
+  const most = Math.max(...groups.map((group) => group.reduce((sum, part) => sum + Object.values(part.outcomes).reduce((all, one) => all + one, 0), 0)));
+  const tones = { survived: "--fine", finished: "--done", invalid: "--line", collision: "--crash", off_road: "--ego" };
   draw($("outcomes"), outcomes.map((outcome, place) => ({
     type: "bar", name: spelled(outcome), x: groups.map((group) => group[0].first), width: groups.map((group) => group[group.length - 1].last - group[0].first + 1), offset: 0,
     y: groups.map((group) => group.reduce((sum, part) => sum + (part.outcomes[outcome] ?? 0), 0)), marker: { color: css(tones[outcome] ?? PALETTE[place % PALETTE.length]) },
-  })), { barmode: "stack", bargap: 0, xaxis: { title: "trial" }, yaxis: { title: "trials" } }, `Outcomes over the hunt: ${Object.entries(hunt.outcomes).map(([name, number]) => `${name} ${number}`).join(", ")}`);
+  })), { barmode: "stack", bargap: 0, xaxis: { title: "trial" }, yaxis: { title: "trials", ...(most < 6 ? { dtick: 1 } : { tickformat: ",d", nticks: 6 }) } }, `Outcomes over the hunt: ${Object.entries(hunt.outcomes).map(([name, number]) => `${name} ${number}`).join(", ")}`);
 }
 
 /* The trials that charts draw as dots: all crashes, and of the others an even share. Each dot costs 0.1 ms and more of
@@ -230,8 +235,11 @@ function drawParallel(names) {
   const canvas = $("parallel"), ratio = devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
   canvas.width = Math.round(width * ratio);
   canvas.height = Math.round(height * ratio);
-  const context = canvas.getContext("2d"), top = 34, bottom = height - 22, left = 34, right = width - 34;
+  const context = canvas.getContext("2d"), bottom = height - 22, left = 34, right = width - 34, apart = (right - left) / (names.length - 1);
   context.scale(ratio, ratio);
+  context.font = "12px system-ui";
+  /* Names that are too long for one row are written in two rows in turns. */
+  const rows = names.every((name) => context.measureText(name).width < apart - 6) ? 1 : 2, top = 20 + 14 * rows;
   parallel.names = names;
   parallel.axes = new Map(names.map((name, place) => {
     const values = points.map((one) => one.values[name]).filter((value) => value !== undefined), numeric = values.every((value) => typeof value === "number");
@@ -266,7 +274,6 @@ function drawParallel(names) {
   stroke(calm.filter((_, place) => place % every === 0), css("--fine"), calm.length > 300 ? 0.25 : 0.5, 1);
   stroke(inside.filter((one) => one.crash), css("--crash"), 0.8, 1.3);
   context.globalAlpha = 1;
-  context.font = "12px system-ui";
   for (const [name, axis] of parallel.axes) {
     context.strokeStyle = css("--faint");
     context.lineWidth = 1;
@@ -278,7 +285,7 @@ function drawParallel(names) {
     context.textAlign = axis.x < left + 20 ? "left" : axis.x > right - 20 ? "right" : "center";
     const at = context.textAlign === "left" ? 4 : context.textAlign === "right" ? width - 4 : axis.x;
     const place = names.indexOf(name);
-    context.fillText(name, at, place % 2 ? 12 : 12, (right - left) / Math.max(1, names.length - 1) - 6);
+    context.fillText(name, at, 12 + 14 * (place % rows), rows * apart - 6);
     context.fillStyle = css("--faint");
     context.fillText(axis.numeric ? short(axis.high) : axis.known[axis.known.length - 1], at, top - 6);
     context.fillText(axis.numeric ? short(axis.low) : axis.known[0], at, height - 6);
@@ -355,6 +362,22 @@ function pick(number) {
 function pickOf([one]) { if (one?.customdata !== undefined) pick(one.customdata); }
 
 /* Where the crashes were */
+/* The density of crashes on a grid around them: each adds a bell of a fiftieth of their extent, from 4 m to 25 m. */
+function densityOf(crashed) {
+  const around = (values, margin) => [values.reduce((a, b) => Math.min(a, b)) - margin, values.reduce((a, b) => Math.max(a, b)) + margin];
+  const xs = crashed.map((one) => one.x), ys = crashed.map((one) => one.y), [w, e] = around(xs, 0), [s, n] = around(ys, 0);
+  const bell = Math.min(25, Math.max(4, Math.max(e - w, n - s) / 50)), [west, east] = around(xs, 3 * bell), [south, north] = around(ys, 3 * bell);
+  const cell = Math.max(bell / 3, Math.max(east - west, north - south) / 400), reach = Math.ceil((3 * bell) / cell);
+  const places = (from, to) => Array.from({ length: Math.ceil((to - from) / cell) + 1 }, (_, place) => from + place * cell);
+  const x = places(west, east), y = places(south, north), z = y.map(() => new Array(x.length).fill(0));
+  for (const one of crashed) {
+    const column = Math.round((one.x - west) / cell), row = Math.round((one.y - south) / cell);
+    for (let j = Math.max(0, row - reach); j <= Math.min(y.length - 1, row + reach); j++) {
+      for (let i = Math.max(0, column - reach); i <= Math.min(x.length - 1, column + reach); i++) z[j][i] += Math.exp(-((x[i] - one.x) ** 2 + (y[j] - one.y) ** 2) / (2 * bell ** 2));
+    }
+  }
+  return { x, y, z };
+}
 function drawMap() {
   $("where-section").hidden = !road || !road.points.length;
   if ($("where-section").hidden) return;
@@ -366,10 +389,14 @@ function drawMap() {
   }
   const crashed = road.points.filter((one) => !one.near_miss), near = road.points.filter((one) => one.near_miss), types = [...new Set(crashed.map((one) => one.type ?? one.outcome))].sort();
   $("near-box").hidden = !near.length;
-  const traces = [{ type: "scatter", mode: "lines", x, y, fill: "toself", fillcolor: css("--road"), line: { color: css("--mark"), width: 1 }, hoverinfo: "skip", showlegend: false }];
-  if ($("density").checked && crashed.length > 1) traces.push({ type: "histogram2dcontour", x: crashed.map((one) => one.x), y: crashed.map((one) => one.y), colorscale: [[0, "rgba(0,0,0,0)"], [1, css("--crash")]], opacity: 0.5, showscale: false, hoverinfo: "skip", ncontours: 8, line: { width: 0 } });
+  /* Plotly cuts a legend that is wider than the chart. */
+  const wrapped = (text) => ($("map").clientWidth < 600 ? text.replace(/(.{20,34})\s/g, "$1<br>") : text);
+  /* Plotly draws a density below the roads, so they are translucent then. */
+  const isDense = $("density").checked && crashed.length > 1;
+  const traces = [{ type: "scatter", mode: "lines", x, y, fill: "toself", fillcolor: css("--road") + (isDense ? "55" : ""), line: { color: css("--mark"), width: 1 }, hoverinfo: "skip", showlegend: false }];
+  if (isDense) traces.push({ type: "heatmap", ...densityOf(crashed), colorscale: [[0, "rgba(0,0,0,0)"], [1, css("--crash")]], opacity: 0.7, showscale: false, hoverinfo: "skip", zsmooth: "best" });
   const dots = (own, more) => ({ type: "scatter", mode: "markers", x: own.map((one) => one.x), y: own.map((one) => one.y), customdata: own.map((one) => one.id), text: own.map((one) => spelled(`${one.id}: ${one.type ?? one.outcome}`)), hovertemplate: "%{text}<extra></extra>", ...more });
-  types.forEach((type, place) => traces.push(dots(crashed.filter((one) => (one.type ?? one.outcome) === type), { name: spelled(type), marker: { color: place ? css(PALETTE[place % PALETTE.length]) : css("--crash"), size: 10, symbol: ["circle", "square", "diamond", "triangle-up", "cross"][place % 5], line: { color: css("--card"), width: 1 } } })));
+  types.forEach((type, place) => traces.push(dots(crashed.filter((one) => (one.type ?? one.outcome) === type), { name: wrapped(spelled(type)), marker: { color: place ? css(PALETTE[place % PALETTE.length]) : css("--crash"), size: 10, symbol: ["circle", "square", "diamond", "triangle-up", "cross"][place % 5], line: { color: css("--card"), width: 1 } } })));
   if ($("near").checked && near.length) traces.push(dots(near, { name: "near misses", marker: { color: css("--faint"), size: 8, symbol: "circle-open" } }));
   draw($("map"), traces, { xaxis: { title: "x in m", showgrid: false, zeroline: false }, yaxis: { title: "y in m", scaleanchor: "x", showgrid: false, zeroline: false }, dragmode: "pan" }, `Map of ${plural(crashed.length, "crash", "crashes")}`, (clicked) => {
     const crash = clicked.find((one) => one.customdata)?.customdata;
@@ -468,7 +495,7 @@ async function refresh() {
       showKinds();
       changed = true;
     } else crashesSeen = key;
-    const saved = crashes.map((one) => `${one.id} ${one.type}`).join();
+    const saved = crashes.map((one) => `${one.id} ${one.type} ${one.x}`).join();
     if (saved && saved !== mapSeen) {
       road = (await get(`${API}/map`)) ?? road;
       mapSeen = saved;

@@ -93,7 +93,9 @@ function fill(row) {
   const node = nodeOf(row), { cells } = node;
   setText(node.link, row.name);
   const agents = Object.entries(row.agents), several = agents.length > 1;
-  setText(node.sub, agents.map(([id, agent]) => (several ? `${id}: ${agent}` : agent)).join(", "));
+  const spelled = (shorten) => agents.map(([id, agent]) => (several ? `${id}: ` : "") + (shorten ? agent.split(":").pop() : agent)).join(", ");
+  setText(node.sub, spelled(true));
+  node.sub.title = spelled(false);
   node.box.setAttribute("aria-label", `Select ${row.name} to compare`);
   setText(node.state, row.exported ? "exported" : row.state);
   node.state.className = `state ${row.state}`;
