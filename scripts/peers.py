@@ -2,11 +2,12 @@
 
 Optuna as its own documentation drives it; ``--sampler optuna:NAME`` gives it a random trial in five besides. VerifAI is
 installed by whoever measures: ``pip install verifai``, best into an environment of its own, as it brings Scenic, and an
-attrs of 2022. So is SMAC: ``pip install smac``.
+attrs of 2022. So are SMAC (``pip install smac``) and BoTorch (``pip install botorch``).
 """
 
 from __future__ import annotations
 
+import importlib
 import tempfile
 from bisect import insort
 from pathlib import Path
@@ -21,7 +22,16 @@ if TYPE_CHECKING:
     from crashhunt.samplers import Key, Space
     from crashhunt.trial import TrialResult, Value
 
-__all__ = ["PEERS", "OptunaCmaEs", "OptunaTpe", "PlainMutation", "Smac", "VerifaiBandit", "VerifaiCrossEntropy"]
+__all__ = [
+    "PEERS",
+    "OptunaCmaEs",
+    "OptunaTpe",
+    "PlainMutation",
+    "Smac",
+    "Turbo",
+    "VerifaiBandit",
+    "VerifaiCrossEntropy",
+]
 
 PEERS = {
     "optuna-tpe": "peers:OptunaTpe",
@@ -30,6 +40,7 @@ PEERS = {
     "verifai-ce": "peers:VerifaiCrossEntropy",
     "verifai-mab": "peers:VerifaiBandit",
     "smac": "peers:Smac",
+    "turbo": "peers:Turbo",
 }
 """Name in tables to what stands for it."""
 
@@ -178,6 +189,98 @@ class Smac:
         crashed = result.outcome.category != "no crash"
         cost = 0.0 if crashed else 1.0 - (result.danger or 0.0)
         self._smac.tell(self._asked.pop(result.spec.number), TrialValue(cost=cost), save=False)
+
+
+class Turbo:
+    """TuRBO-1 (Eriksson et al. 2019) as the tutorial of BoTorch runs it, in batches of four, for numbers only.
+
+    A Gaussian process with a Matérn kernel of 5/2, Thompson draws in a trust region around the best trial, and a new
+    start where the region has shrunk to its minimum. The process is fitted for every fourth proposal, so that a
+    proposal follows from the results that a batch of the tutorial has.
+    """
+
+    learns = True
+    batch = 4
+
+    def __init__(self, space: Space, *, points: int = 10) -> None:
+        self._cube = Cube(space)
+        self._last: dict[int, Any] = {}
+        self._begin()
+
+    def _begin(self) -> None:
+        self._points: list[Any] = []
+        self._scores: list[float] = []
+        self._length, self._successes, self._failures, self._best = 0.8, 0, 0, -1.0
+        self._batch: list[Any] = []
+        self._gained: list[bool] = []
+
+    def ask(self, number: int, rng: np.random.Generator) -> Proposal:
+        """Return a Sobol point, or the next of four draws of the process."""
+        size = self._cube.dimensions
+        if len(self._points) < 2 * size:
+            torch = importlib.import_module("torch")
+            point = torch.quasirandom.SobolEngine(size, scramble=True, seed=int(rng.integers(2**31))).draw(1)[0].numpy()
+        else:
+            if not self._batch:
+                self._batch = self._drawn(int(rng.integers(2**31)))
+            point = self._batch.pop()
+        return Proposal(self._cube.arguments(np.asarray(point, dtype=float)), origin="turbo")
+
+    def tell(self, result: TrialResult) -> None:
+        """Add a result; four of them change the region as a batch does."""
+        score = 1.0 if result.outcome.category != "no crash" else result.danger or 0.0
+        self._points.append(self._cube.point(result.spec))
+        self._scores.append(score)
+        size = self._cube.dimensions
+        if len(self._points) <= 2 * size:
+            self._best = max(self._best, score)
+            return
+        self._gained.append(score > self._best + 1e-3 * abs(self._best))
+        self._best = max(self._best, score)
+        if len(self._gained) < self.batch:
+            return
+        gained = any(self._gained)
+        self._gained = []
+        self._successes, self._failures = (self._successes + 1, 0) if gained else (0, self._failures + 1)
+        if self._successes == 10:
+            self._length, self._successes = min(2.0 * self._length, 1.6), 0
+        elif self._failures == max(1, -(-size // self.batch)):
+            self._length, self._failures = self._length / 2.0, 0
+        if self._length < 0.5**7:
+            self._begin()
+
+    def _drawn(self, seed: int) -> list[Any]:
+        torch, botorch, gpytorch = (importlib.import_module(name) for name in ("torch", "botorch", "gpytorch"))
+        interval = gpytorch.constraints.Interval
+        torch.manual_seed(seed)
+        points = torch.tensor(np.array(self._points), dtype=torch.double)
+        scores = torch.tensor(self._scores, dtype=torch.double)
+        scores = ((scores - scores.mean()) / scores.std().clamp_min(1e-9)).unsqueeze(-1)
+        size = points.shape[1]
+        kernel = gpytorch.kernels.ScaleKernel(
+            gpytorch.kernels.MaternKernel(nu=2.5, ard_num_dims=size, lengthscale_constraint=interval(0.005, 4.0))
+        )
+        model = botorch.models.SingleTaskGP(
+            points, scores, covar_module=kernel, outcome_transform=None,
+            likelihood=gpytorch.likelihoods.GaussianLikelihood(noise_constraint=interval(1e-8, 1e-3)),
+        )  # fmt: skip
+        botorch.fit_gpytorch_mll(gpytorch.mlls.ExactMarginalLogLikelihood(model.likelihood, model))
+        center = points[scores.argmax(), :].clone()
+        weights = kernel.base_kernel.lengthscale.squeeze(0).detach()
+        weights = weights / weights.mean()
+        weights = weights / torch.prod(weights.pow(1.0 / size))
+        low = torch.clamp(center - weights * self._length / 2.0, 0.0, 1.0)
+        high = torch.clamp(center + weights * self._length / 2.0, 0.0, 1.0)
+        many = min(5000, max(2000, 200 * size))
+        drawn = low + (high - low) * torch.quasirandom.SobolEngine(size, scramble=True, seed=seed).draw(many).double()
+        touched = torch.rand(many, size) <= min(20.0 / size, 1.0)
+        bare = torch.where(touched.sum(dim=1) == 0)[0]
+        touched[bare, torch.randint(0, size, (len(bare),))] = True
+        candidates = torch.where(touched, drawn, center.expand(many, size))
+        with torch.no_grad():
+            draws = botorch.generation.MaxPosteriorSampling(model=model, replacement=False)
+            chosen = draws(candidates, num_samples=self.batch)
+        return list(chosen.numpy())
 
 
 class PlainMutation:
