@@ -43,8 +43,10 @@ CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 IMPORTED = ("cli", "api", "crashes", "executors", "hunts", "plans", "recording", "replays", "report", "snapshots")
 # What these import while they run, and whoever writes, reads and packs hunts; and what one command does that is rare.
 _WHILE_RUNNING = (
-    "crashhunt.agents._protocol", "crashhunt.dashboard._server", "crashhunt.scenario.backends.sumo._check",
-    "crashhunt.scenario.backends.sumo._files", "encodings.cp437", "gzip", "numpy.ma", "numpy.random",
+    "crashhunt.agents._protocol", "crashhunt.corpus._cases", "crashhunt.corpus._run", "crashhunt.dashboard._server",
+    "crashhunt.samplers._space_filling", "crashhunt.scenario.backends.sumo._check",
+    "crashhunt.scenario.backends.sumo._files", "crashhunt.suites._gate", "crashhunt.suites._suite",
+    "crashhunt.whatif._engine", "encodings.ascii", "encodings.cp437", "gzip", "numpy.ma", "numpy.random",
     "rich._emoji_codes", "rich.progress", "tomli_w", "urllib.request", "xml.etree.ElementTree", "xml.sax",
 )  # fmt: skip
 _FOR_COMMAND = {"compare": ("crashhunt.estimation", "scipy.stats")}  # the latter takes 0.8 s

@@ -40,7 +40,7 @@ def test_a_hunt_is_running_until_its_process_is_gone(toy):
     found = state(toy)
     assert (found["state"], found["owner_alive"], found["trials_planned"]) == ("running", True, 50000)
     assert found["rate_per_s"] > 0
-    assert 0 < found["seconds_left"] < 50000
+    assert 0 < found["seconds_left"] < 50000 * 10  # s: of a trial each, on a loaded machine too
     # Nobody else's business: the workers are stopped first, so that nothing is left to end by itself.
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
