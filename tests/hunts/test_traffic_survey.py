@@ -257,7 +257,7 @@ def test_hunt_of_a_suite_that_was_killed_before_its_snapshot_keeps_its_candidate
     begun, settings = surveyed(town.folder, seed=1)
     (town.folder / "h").mkdir()
     write_settings(town.folder / "h" / "hunt.toml", settings, ["crashhunt", "suite", "run"])
-    resumed, again = _planned(town.folder / "h", request, {})
+    resumed, again, _ = _planned(town.folder / "h", request, {})
     assert again == settings
     assert as_plain_data(resumed) == as_plain_data(begun)
 
