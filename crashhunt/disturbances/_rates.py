@@ -257,6 +257,8 @@ def draw_checked(name: str, model: DisturbanceModel, rng: np.random.Generator) -
     try:
         drawn = model.draw(rng)
         fine = drawn.who in CELLS and math.isfinite(drawn.how_strong) and 0 < drawn.how_long < math.inf
+    except CrashhuntError:  # of a model in its own process, which has been blamed there
+        raise
     except Exception as error:  # of user code
         raise blamed(f"the disturbance {name!r} cannot be drawn", error) from error
     if not fine:

@@ -258,6 +258,18 @@ def test_the_strongest_that_a_model_may_draw_comes_first_and_is_as_likely_as_any
         assert found == draws.draw_strongest(3, number, 10, 5) != draws.draw_strongest(4, number, 10, 5)
 
 
+class Gone:
+    """A model that cannot draw."""
+
+    what = "brake"
+
+    def draw(self, rng):
+        return 1 / 0
+
+    def log_likelihood(self, drawn):
+        return 0.0
+
+
 def test_foreign_model_draws_in_its_own_process_as_it_would_here():
     own, apart = brake(), ModelApart("brake", timeout_s=60)
     one, other = np.random.default_rng(5), np.random.default_rng(5)
@@ -268,3 +280,10 @@ def test_foreign_model_draws_in_its_own_process_as_it_would_here():
     assert apart.log_likelihood(Drawn("ahead", 1e9, 1.0)) == -math.inf
     assert apart.what == own.what
     apart.close()
+    gone = ModelApart(f"{__name__}:Gone", timeout_s=60)
+    sampler = DisturbanceSampler(models={"gone": gone}, rates={"gone": 1.0}, agents=("ego",), step_length_s=1.0)
+    with pytest.raises(PluginError) as caught:
+        sampler.draw(1, 10)
+    assert caught.value.message.endswith(":Gone' cannot be drawn: ZeroDivisionError: division by zero")
+    assert caught.value.message.count("cannot be drawn") == 1
+    gone.close()
