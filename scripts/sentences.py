@@ -27,9 +27,9 @@ NOT_READ = (*GENERATED, "changelog.md")
 Sentence = tuple[str, str]  # place, text
 
 
-def sentences(text: str) -> Iterator[str]:
+def sentences(text: str, *, python: bool = False) -> Iterator[str]:
     """Yield the sentences of prose, each in one line, from `MIN_WORDS` words on."""
-    for _, paragraph in paragraphs(text, 1):
+    for _, paragraph in paragraphs(text, 1, python=python):
         flat = " ".join(re.sub(r"\]\([^)]*\)", "]", paragraph).split())
         for sentence in re.split(r"(?<=[.!?])\s+(?=[^a-z]|crashhunt\b|highway-env\b)", flat):
             if len(sentence.split()) >= MIN_WORDS:
@@ -37,11 +37,17 @@ def sentences(text: str) -> Iterator[str]:
 
 
 def in_guide() -> Iterator[Sentence]:
-    """Yield the sentences of all pages and of the README."""
+    """Yield the sentences of all pages and of the README, with the titles of their page and section."""
     for page in sorted([*ROOT.glob("crashhunt/guide/**/*.md"), ROOT / "README.md"]):
-        if not page.as_posix().endswith(NOT_READ):
-            text = re.sub(r"<!--.*?-->", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-            yield from ((page.relative_to(ROOT).as_posix(), sentence) for sentence in sentences(text))
+        if page.as_posix().endswith(NOT_READ):
+            continue
+        text = re.sub(r"<!--.*?-->", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        code = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
+        parts = re.split(r"^#+ (.*)$", code.sub("", text), flags=re.MULTILINE)
+        titles = parts[1::2]
+        for title, section in zip(titles, parts[2::2], strict=True):
+            place = titles[0] if title == titles[0] else f"{titles[0]} > {title}"
+            yield from ((f"{page.relative_to(ROOT).as_posix()} ({place})", sentence) for sentence in sentences(section))
 
 
 def in_help(parser: argparse.ArgumentParser) -> Iterator[Sentence]:
@@ -89,13 +95,22 @@ def shown_value(node: ast.expr) -> str:
 
 
 def in_docstrings() -> Iterator[Sentence]:
-    """Yield the sentences of all docstrings."""
+    """Yield the sentences of all docstrings, with the signature of their function."""
     for file in sorted(ROOT.glob("crashhunt/**/*.py")):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 found = inspect.cleandoc(ast.get_docstring(node) or "")
-                place = f"{file.relative_to(ROOT).as_posix()} {getattr(node, 'name', '')}"
-                yield from ((place, sentence) for sentence in sentences(found))
+                place = f"{file.relative_to(ROOT).as_posix()} {signature(node)}"
+                yield from ((place, sentence) for sentence in sentences(found, python=True))
+
+
+def signature(node: ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> str:
+    """Return the first line of a definition; empty for a module."""
+    if isinstance(node, ast.Module):
+        return ""
+    if isinstance(node, ast.ClassDef):
+        return f"class {node.name}"
+    return f"def {node.name}({ast.unparse(node.args)})"
 
 
 def draw(seed: int) -> Iterator[tuple[str, Sentence]]:

@@ -48,6 +48,9 @@ NAMES = re.compile(
     r"|goes_on|go_on|comes_to|stands_for|to_the_bit|so_far)(?:_|$)|^_what$"
 )
 
+MARKDOWN_ITEM = r"\s*(?:[-*#>|]\s|[#>|]|\d+\.\s)"
+ITEM = MARKDOWN_ITEM + r"|\s*\w[\w*, .]*:(?:\s|$)"
+
 Finding = tuple[int, str, str]  # line, text found, what to write in its place
 
 
@@ -59,13 +62,16 @@ def banned_phrases(text: str, line: int) -> Iterator[Finding]:
             yield line + text.count("\n", 0, match.start()), match[0], words
 
 
-def paragraphs(text: str, line: int) -> Iterator[tuple[int, str]]:
-    """Yield the paragraphs of prose with their lines: no code, no tables, no headings; an item of a list is one."""
+def paragraphs(text: str, line: int, *, python: bool = False) -> Iterator[tuple[int, str]]:
+    """Yield the paragraphs of prose with their lines: no code, no tables, no headings; an item of a list is one.
+
+    In docstrings of Python, a line such as ``name: meaning`` is an item as well.
+    """
     lines: list[str] = []
     fenced = literal = False
     for number, row in enumerate([*text.split("\n"), ""], line):
         fence = row.lstrip().startswith(("```", ":::"))
-        item = re.match(r"\s*(?:[-*#>|]|\d+\.|\w[\w*, .]*:(?:\s|$))", row)
+        item = re.match(ITEM if python else MARKDOWN_ITEM, row)
         if (fence or fenced or not row.strip() or item) and lines:
             yield number - len(lines), "\n".join(lines)
             lines = []
@@ -77,7 +83,7 @@ def paragraphs(text: str, line: int) -> Iterator[tuple[int, str]]:
 
 def heavy_sentences(text: str, line: int, semicolons: bool) -> Iterator[Finding]:
     """Yield sentences of more than `MAX_WORDS` words, and semicolons between sentences where those are banned."""
-    for start, paragraph in paragraphs(text, line):
+    for start, paragraph in paragraphs(text, line, python=not semicolons):
         prose = re.sub(r"`[^`]*`", lambda code: "C" + "\n" * code[0].count("\n"), paragraph)
         prose = re.sub(r"\]\([^)]*\)", "]", prose)
         position = 0
