@@ -4,10 +4,11 @@ Agents with two or three planted bugs are hunted. The label of a crash is the se
 trial has no crash with the same two actors until 5 s after it. A crash with an empty set does not count: the agent
 without any bug has it, too, or each of several bugs suffices. The adjusted Rand index (Hubert and Arabie 1985) compares
 types with the labels of the crashes that need a single bug: 1 is equal, 0 chance. A crash that needs several bugs has
-no single label: removing either one is a fix. Its cause is consistent if it is also the cause of crashes that need one
-of these bugs alone, and of no crash that needs another bug alone.
+no single label: removing either one is a fix. The bug of them that acted last is compared as well. Its cause is
+consistent if it is also the cause of crashes that need one of these bugs alone, and of no crash that needs another bug
+alone.
 
-    scripts/causes --folder DIR [--trials N] [--judge N] [SCENARIO:BUGS…]     goes on where it was
+    scripts/causes --folder DIR [--trials N] [--judge N] [SCENARIO|FILE.sumocfg:BUGS…]     goes on where it was
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base import layout
 from crashhunt.crashes import group_crashes, list_bundles
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Outcome
@@ -44,7 +46,8 @@ AGENTS = (
 )  # fmt: skip
 _TITLES = (
     "scenario", "bugs", "crashes", "need no bug, with an omission", "need one bug", "of bugs", "ARI types",
-    "ARI types and causes", "ARI causes alone", "need several", "consistent", "contradictory", "hidden by --keep 3",
+    "ARI types and causes", "ARI causes alone", "ARI of all, the bug that acted last (crashes)", "need several",
+    "consistent", "contradictory", "hidden by --keep 3",
 )  # fmt: skip
 _AFTER_S = 5.0
 _KEEP = 3
@@ -75,9 +78,9 @@ def main() -> int:
     shutil.copy(Path(__file__).with_name("planted_bugs.py"), given.folder)
     print(f"| {' | '.join(_TITLES)} |")
     print(f"{'| --- ' * len(_TITLES)}|", flush=True)
-    chosen = [tuple(one.split(":", 1)) for one in given.only] or AGENTS
+    chosen = [tuple(one.rsplit(":", 1)) for one in given.only] or AGENTS
     for scenario, bugs in chosen:
-        store = given.folder / f"{scenario}-{bugs}.json"
+        store = given.folder / f"{Path(scenario).stem}-{bugs}.json"
         if not store.is_file():
             store.write_text(json.dumps(_studied(scenario, bugs, given)), encoding="utf-8")
         print(_line(json.loads(store.read_text(encoding="utf-8"))), flush=True)
@@ -85,10 +88,11 @@ def main() -> int:
 
 
 def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, Any]:
-    hunt = given.folder / f"{scenario}-{bugs}"
+    hunt = given.folder / f"{Path(scenario).stem}-{bugs}"
+    named = str(Path(scenario).resolve()) if Path(scenario).is_file() else scenario
     if not (hunt / "ledger.sqlite").is_file():
         command = [sys.executable, "-m", "crashhunt", "run", str(hunt), str(len(os.sched_getaffinity(0)))]
-        command += [str(given.trials), str(given.steps), "--scenario", scenario, "--agent", "planted_bugs:Planted"]
+        command += [str(given.trials), str(given.steps), "--scenario", named, "--agent", "planted_bugs:Planted"]
         command += ["--arg", f"bugs={bugs}", "--arg", "desired_speed=18:28", "--seed", str(given.seed)]
         command += ["--keep-going"]
         command += ["--action", "continuous"] if scenario == "motorway" else []
@@ -102,6 +106,7 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
                 {
                     "crash": bundle.id,
                     "needs": [name for name in labels[bundle.id] if name] if "" in labels[bundle.id] else [],
+                    "last": _last_bug(bundle, labels[bundle.id]),
                     "has_no_bug": "" not in labels[bundle.id],
                     "type": str(group.signature),
                     "cause": str(part.cause),
@@ -110,7 +115,7 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
                 }
                 for bundle in part.members
             ]
-    return {"scenario": scenario, "bugs": bugs, "rows": rows}
+    return {"scenario": Path(scenario).stem, "bugs": bugs, "rows": rows}
 
 
 def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, list[str]]:
@@ -134,6 +139,13 @@ def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, list[st
                 found[bundle.id].append(bug)
         runs.close()
     return found
+
+
+def _last_bug(bundle: Bundle, needs: Sequence[str]) -> str:
+    """Return the needed bug that changed an action last, as the agent has printed it; empty if there is none."""
+    lines = (bundle.path / layout.RUN_LOG).read_text(encoding="utf-8").splitlines()
+    acted = [line.split()[1] for line in lines if line.startswith("PLANTED ")]
+    return next((bug for bug in reversed(acted) if bug in needs), "")
 
 
 def _is_same(rerun: TrialResult, result: TrialResult) -> bool:
@@ -162,6 +174,8 @@ def _line(study: dict[str, Any]) -> str:
     consistent = sum(bool(bugs) and bugs <= needs for bugs, needs in several)
     contradictory = sum(not bugs <= needs for bugs, needs in several)
     indices = [f"{adjusted_rand_index(labels, found):.2f}" for found in (types, causes, merged)]
+    last = [(row["last"], row["cause"]) for row in rows if row["last"]]
+    indices.append(f"{adjusted_rand_index(*zip(*last, strict=True)):.2f} ({len(last)})" if last else "-")
     hidden = [", ".join(sorted({*labels} - _kept(rows, key))) or "none" for key in ("type", "cause")]
     none = [row for row in study["rows"] if row["has_no_bug"]]
     claimed = sum(row["judged"] and row["cause"].startswith("omission") for row in none)

@@ -86,6 +86,8 @@ def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGrou
             shortest = part.shortest
             cells = [f"  {part.cause}", str(len(part.judged)), shortest.id, str(shortest.result.steps)]
             rows.append([str(len(part.members)), *cells])
+        if group.dropped:
+            rows.append([str(group.dropped), "  not judged: their bundles were deleted (--keep)", "", "", ""])
     count = len({part.cause for parts in causes for part in parts})
     of_types = sum(map(len, causes))
     words = f"{count} {'cause' if count == 1 else 'causes'}"
