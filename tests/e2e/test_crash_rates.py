@@ -49,8 +49,8 @@ HUNT = ("60", "--scenario", "toy", "--seed", "4", "--arg", "speed=8:14", "--set"
 
 
 def hunted(shell):
-    """Hunt 40 trials of which some crash, in ``h``; of each type, one crash is confirmed."""
-    shell.crashhunt("run", "h", "2", "40", *HUNT, "--keep-going", "--keep", "1")
+    """Hunt 24 trials of which some crash, in ``h``; of each type, one crash is confirmed."""
+    shell.crashhunt("run", "h", "2", "24", *HUNT, "--keep-going", "--keep", "1")
 
 
 @pytest.fixture
@@ -63,14 +63,14 @@ def test_rate_counts_trials_and_divides_them_by_an_argument(hunt):
     crashes = sum(trial["outcome"] == "collision" for trial in results(toy.folder / "h"))
     assert crashes > 2
     by_trial, by_hour, by_km = rates(toy, "h")
-    assert (by_trial["units"], by_trial["crashes"], by_trial["estimate"]) == (40, crashes, crashes / 40)
+    assert (by_trial["units"], by_trial["crashes"], by_trial["estimate"]) == (24, crashes, crashes / 24)
     for rate in (by_trial, by_hour, by_km):
         assert 0 < rate["certain"]["low"] < rate["estimate"] < rate["certain"]["high"]
     (parts,) = rates(toy, "h", "--by", "speed:3")
-    assert sum(part["trials"] for part in parts["parts"]) == 40
+    assert sum(part["trials"] for part in parts["parts"]) == 24
     assert sum(part["crashes"] for part in parts["parts"]) == crashes
     said = toy.crashhunt("rate", "h", "--by", "kind", "--html", "page.html").out
-    assert f"h: {crashes} crashes in 40 trials (95 %, valid whenever you look)" in said
+    assert f"h: {crashes} crashes in 24 trials (95 %, valid whenever you look)" in said
     assert "Crash rates" in (toy.folder / "page.html").read_text(encoding="utf-8")
     lines = toy.crashhunt("rate", "h", "--csv", "--by", "fault").out.splitlines()
     assert lines[0].startswith("dir,per,by,part")

@@ -221,8 +221,8 @@ def test_a_full_disk_leaves_no_half_film(crash):
         try:
             os.chdir(crash.folder)
             with out.open("w", encoding="utf-8") as file, redirect_stdout(file):
-                resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-                main(["replay", "h", "--from-log", "--video", "a.mp4", "--fps", "100", "--json"])
+                resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))
+                main(["replay", "h", "--from-log", "--video", "a.mp4", "--json"])
         except SystemExit as leaving:
             code = leaving.code
         finally:
