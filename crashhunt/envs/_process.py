@@ -164,9 +164,9 @@ class RemoteEpisodes:
     def _exchange(self, name: str, words: tuple[object, ...], passes: int) -> tuple[bool, Any]:
         """Send a request, and return its answer.
 
-        Ctrl-C nearly always arrives during the wait. Its request is still answered later, and that answer is skipped:
-        the next request must not be given the answer to an earlier one. In the middle of a message Ctrl-C ends the
-        process, because the rest of the stream cannot be read.
+        Ctrl-C nearly always arrives during the wait. If a request was interrupted, its answer arrives later and is
+        skipped, so that the next request does not receive it. In the middle of a message Ctrl-C ends the process,
+        because the rest of the stream cannot be read.
         """
         is_in_message = False
         try:

@@ -66,7 +66,7 @@ class ScenarioCounts:
         pairs: that count.
         only_base: number of the pairs in which only BASE crashes.
         only_head: number of pairs in which only HEAD crashes.
-        both: in which both do.
+        both: number of pairs in which both crash.
         invalid: pairs with an invalid trial, which leave both sides.
     """
 

@@ -48,7 +48,7 @@ _NOT_OURS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
 def main() -> None:
-    """Be the fork server; standard error is a log."""
+    """Run the fork server; standard error is a log."""
     control = socket.socket(fileno=int(sys.argv[1]))
     job: ForkServerJob = json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
     if job["sys_path"]:
@@ -96,7 +96,7 @@ class _Server:
         self._watch = ImportWatch(settings.timeout_s)
 
     def serve(self) -> None:
-        """Do what the pool says until it or the template is gone."""
+        """Carry out the requests of the pool until the pool or the template has ended."""
         while True:
             wait_s = _LOOK_EVERY_S if len(self._ends) < len(self._slots) else _ORPHANS_EVERY_S
             watched = [self._control.fileno(), self._orders.fileno(), *self._ends.values()]
@@ -117,7 +117,7 @@ class _Server:
             end_descendants(frozenset(self._slots) | {self._template})
 
     def _hear_template(self) -> bool:
-        """Pass on what the template has said; return whether it is still there."""
+        """Pass on the messages of the template; return whether the template is still running."""
         while True:
             try:
                 data = self._orders.recv(_MESSAGE, socket.MSG_DONTWAIT)
@@ -135,7 +135,7 @@ class _Server:
                 _send(self._control, said)
 
     def _obey(self) -> bool:
-        """Do what the pool asks for; return whether it is still there."""
+        """Carry out a request of the pool; return whether the pool is still connected."""
         data, descriptors, _, _ = socket.recv_fds(self._control, _MESSAGE, 1)
         if not data:
             return False
@@ -187,7 +187,7 @@ class _Server:
                 self._leave_as(code)
 
     def _leave_as(self, code: int) -> NoReturn:
-        """End as the template did: who started this process decides what that means."""
+        """End with the exit status of the template; the parent process interprets it."""
         if self._watch.importing and is_sent_from_outside(code):
             _send(self._control, {"importing": self._watch.importing})
         elif self._watch.importing:
@@ -200,7 +200,7 @@ class _Server:
 
 
 def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool) -> None:
-    """Import what trials need, and fork a zygote whenever the fork server asks for one."""
+    """Import the modules that trials need, and fork a zygote at each request of the fork server."""
     adopt_orphans()
     try:
         report = lambda importing: _send(orders, {"importing": importing})  # noqa: E731
@@ -239,7 +239,7 @@ def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool)
 
 
 def _understood(data: bytes) -> FromForkServer:
-    """Return what the template says of itself; an agent that is being imported may have written something else."""
+    """Return the message of the template; None if an imported agent has written other data to the connection."""
     said: FromForkServer = {}
     with suppress(ValueError, KeyError, TypeError):
         message = json.loads(data)
@@ -256,7 +256,7 @@ def _understood(data: bytes) -> FromForkServer:
 
 
 def fork_zygote(settings: WorkerSettings, *, late: bool = False) -> socket.socket:
-    """Fork a zygote that imports what trials need; return a socket to it, with which it ends.
+    """Fork a zygote that imports the modules that trials need; return a socket to it. The zygote ends with the socket.
 
     Args:
         settings: settings of the hunt.

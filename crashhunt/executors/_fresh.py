@@ -1,4 +1,4 @@
-"""A process of its own for every trial: slower than a pool, and nothing that ran before can matter."""
+"""A new process for every trial: slower than a pool, but independent of everything that ran before."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ def _has_words(stack: Path) -> bool:
 
 
 def main() -> None:
-    """Run the one trial that a file describes; what comes of it goes into another one."""
+    """Run the trial that a job file describes, and write its result to another file."""
     # A KeyboardInterrupt would end this process, and the forks that import agents, with 1, as if an import had failed.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     job: FreshJob = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
@@ -311,7 +311,7 @@ class SharedExecutors:
         """Run a trial.
 
         Returns:
-            What came of it, and the folder in which it was recorded; None if it was stopped.
+            The result of the trial, and the folder with its recording; None if it was stopped.
 
         Raises:
             CrashhuntError: the crash cannot be run.
@@ -362,7 +362,7 @@ class _Shared:
         return replace(self._ended.pop(number), spec=spec), scratch_of(self._scratch, number)
 
     def _receive(self) -> None:
-        """Take in the trials that have ended."""
+        """Collect the trials that have ended."""
         if self._error is not None:
             raise self._error
         try:

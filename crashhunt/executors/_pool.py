@@ -1,4 +1,4 @@
-"""A pool of slots: a supervisor each, which runs one trial after another, each in its own process."""
+"""A pool of slots: each slot has a supervisor, which runs one trial after another, each in a new process."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ForkServerLink:
 
     Args:
         settings: settings of the hunt.
-        late: whether each trial imports its agents itself, because what has imported them cannot be forked.
+        late: whether each trial imports its agents itself, because a process that has imported them cannot be forked.
         deaths: number of earlier kills of the process.
         snapshot: whether crashhunt itself comes from the code of the settings.
     """
@@ -91,17 +91,17 @@ class ForkServerLink:
         self.control.setblocking(False)
 
     def fork(self, slot: int, end: socket.socket) -> None:
-        """Ask for a supervisor, which is given one end of a socket."""
+        """Request a supervisor, which receives one end of a socket."""
         with suppress(OSError):  # it is gone, which shows when it is listened to
             socket.send_fds(self.control, [json.dumps({"slot": slot}).encode()], [end.fileno()])
 
     def kill(self, slot: int) -> None:
-        """Kill a supervisor, and with it what runs its trial, if it is still there."""
+        """Kill a supervisor and the process of its trial, if they are still running."""
         with suppress(OSError):
             self.control.send(json.dumps({"kill": slot}).encode())
 
     def receive(self) -> list[FromForkServer] | None:
-        """Return which supervisors have ended, and how; None if the fork server itself is gone.
+        """Return the supervisors that have ended, and how; None if the fork server itself has ended.
 
         Raises:
             CrashhuntError: what trials need cannot be imported.
@@ -126,10 +126,10 @@ class ForkServerLink:
             self._importing = message.get("importing", self._importing)
 
     def restart(self) -> ForkServerLink:
-        """Start a new one in its place, after its end.
+        """Start a new fork server after the end of this one.
 
         Raises:
-            CrashhuntError: it has ended by itself, or too often.
+            CrashhuntError: the fork server ended by itself, or too often.
         """
         try:
             code = self._kept.process.wait(_END_S)
@@ -152,7 +152,7 @@ class ForkServerLink:
         return ForkServerLink(self._settings, late=self._late, deaths=self.deaths + 1, snapshot=self._snapshot)
 
     def end(self) -> None:
-        """Kill it, and everything that it has started."""
+        """Kill the fork server and everything that it has started."""
         self._kept.end()
         self.control.close()
 
@@ -304,7 +304,7 @@ class PoolExecutor:
             self._done.put(error)
 
     def _hand_out(self) -> None:
-        """Give trials to slots that have none, in the order of the queue."""
+        """Give trials to free slots, in the order of the queue."""
         while self._waiting:
             running = [worker.attempt for worker in self._workers.values() if worker.attempt is not None]
             if any(attempt.alone for attempt in running) or (running and self._waiting[0].alone):
@@ -362,7 +362,7 @@ class PoolExecutor:
             self._take(worker, line)
 
     def _take(self, worker: _Worker, line: bytes) -> None:
-        """Account for what a supervisor says about its trial."""
+        """Process the message of a supervisor about its trial."""
         attempt = worker.attempt
         if attempt is None:
             return  # it was cancelled meanwhile
@@ -389,7 +389,7 @@ class PoolExecutor:
             worker.socket.shutdown(socket.SHUT_WR)
 
     def _hear_fork_server(self) -> None:
-        """Take what the fork server says about the ends of supervisors, and its own."""
+        """Process the messages of the fork server about ended supervisors, and its own end."""
         assert self._link is not None
         messages = self._link.receive()
         for message in messages or ():
@@ -398,7 +398,7 @@ class PoolExecutor:
             self._restart()
 
     def _restart(self) -> None:
-        """Start another fork server, and run everything again that was running when it, and all below it, ended."""
+        """Start another fork server, and run the trials again that were running when the old one ended."""
         assert self._link is not None
         for worker in list(self._workers.values()):
             self._discard(worker)

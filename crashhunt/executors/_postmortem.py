@@ -1,4 +1,4 @@
-"""What a process that died or hung left behind, as the result of its trial."""
+"""Makes the result of a trial from the remains of a process that died or hung."""
 
 from __future__ import annotations
 
@@ -58,16 +58,16 @@ _ATTEMPTS = 3  # of a trial whose process is killed from outside
 
 @dataclass(slots=True)
 class Attempt:
-    """A trial that is to be run, and what has become of it so far.
+    """A trial to run, and the ends of its processes so far.
 
     A process that ends by certain signals may have been ended from outside: by an administrator, a batch system, the
-    kernel because memory ran out. Then the trial is run again, alone. Where it ends in the same way at the same step
-    it was the trial itself. Where it ends at another step each time, the trial is not the cause. Before the first step
-    that says nothing: what forks the processes of trials may have been killed, and started again.
+    kernel because memory ran out. Then the trial is run again, alone. If it ends in the same way at the same step, the
+    trial itself is the cause. If it ends at another step each time, the trial is not the cause. An end before the first
+    step is no evidence, because the process that forks trials may have been killed.
 
     Args:
         spec: the trial.
-        ends: how its processes ended: which signal, at which step.
+        ends: the signal and the step at which each of its processes ended.
     """
 
     spec: TrialSpec
@@ -75,7 +75,7 @@ class Attempt:
 
     @property
     def alone(self) -> bool:
-        """Whether no other trial may run meanwhile."""
+        """Whether no other trial may run at the same time."""
         return bool(self.ends)
 
     @property
@@ -84,7 +84,7 @@ class Attempt:
         return len(self.ends) >= _ATTEMPTS and len(set(self.ends)) == len(self.ends)
 
     def again(self, scratch: Path, exit_code: int) -> str:
-        """Why it is to be run once more, in words; empty if what has happened is its outcome."""
+        """Return why the trial must run again, in words; empty if its outcome is known."""
         if not is_sent_from_outside(exit_code):
             return ""
         header = where_it_is(scratch, self.spec.number)
@@ -98,7 +98,7 @@ class Attempt:
 
 
 def where_it_is(scratch: Path, number: int) -> BlackBoxHeader | None:
-    """Return where a running trial is, or None if it has not begun."""
+    """Return the progress of a running trial; None if it has not begun."""
     header = read_header(scratch_of(scratch, number) / layout.BLACK_BOX)
     return header if header is not None and header.trial == number else None
 
@@ -112,7 +112,7 @@ def died(spec: TrialSpec, scratch: Path, exit_code: int, agents: Mapping[str, st
         spec: the trial.
         scratch: the folder in which it recorded.
         exit_code: exit code of its process, negative for a signal.
-        agents: identifier of each agent to its module, where no other code comes from that module.
+        agents: identifier of each agent to its module, if only this agent's code comes from the module.
     """
     header = where_it_is(scratch, spec.number)
     message = (
@@ -159,7 +159,7 @@ def damaged(spec: TrialSpec, scratch: Path, message: str, *, agent: str = "", re
         spec: the trial.
         scratch: the folder in which it recorded.
         message: what is damaged, as a sentence.
-        agent: identifier of the agent that did it, where the recording cannot be read; empty if that is not known.
+        agent: identifier of the agent that did the damage, if the recording cannot be read; empty if unknown.
         recorded: whether the recording can be read.
     """
     if recorded:
@@ -279,7 +279,7 @@ def agent_in_stack(stack: str, agents: Mapping[str, str]) -> str:
 
 
 def read_map(scratch: Path, trial: Path) -> list[Lane]:
-    """Return the map of a trial that is kept, or that of its hunt; nothing if none has been written down."""
+    """Return the map of a kept trial, or the map of its hunt; None if neither was written."""
     for folder in (trial, scratch):
         with suppress(OSError, ValueError, TypeError):
             data = json.loads((folder / layout.MAP).read_text(encoding="utf-8"))
@@ -288,7 +288,7 @@ def read_map(scratch: Path, trial: Path) -> list[Lane]:
 
 
 def read_tail(path: Path) -> str:
-    """Return the last few thousand characters of a file; nothing if there is none."""
+    """Return the last few thousand characters of a file; empty if the file does not exist."""
     try:
         with path.open("rb") as file:
             file.seek(0, os.SEEK_END)
@@ -299,7 +299,7 @@ def read_tail(path: Path) -> str:
 
 
 def signal_name(exit_code: int) -> str:
-    """Return what people call the signal that a process died of."""
+    """Return the name of a signal, such as ``SIGKILL``."""
     try:
         return signal.Signals(-exit_code).name
     except ValueError:
@@ -328,7 +328,7 @@ _SUPERVISED = (Outcome.PROCESS_DIED, Outcome.HANG)
 class Report(TypedDict):
     """What the process of a trial reports at its end.
 
-    ``result`` is without the specification, which the supervisor knows. ``notices`` are lines for people.
+    ``result`` is without the specification, which the supervisor knows. ``notices`` are lines for the user.
     """
 
     result: Mapping[str, object]
@@ -363,18 +363,18 @@ def encode_report(
 def check_report(
     report: bytes, *, key: bytes, spec: TrialSpec, header: BlackBoxHeader, records: bytes, pid: int
 ) -> tuple[TrialResult, Report] | str:
-    """Check what the process of a trial left behind.
+    """Check the report and the records of the process of a trial.
 
     Args:
-        report: as it lies behind the records.
+        report: the bytes of the report behind the records.
         key: key of the trial.
-        spec: the trial that was asked for.
+        spec: the requested trial.
         header: header of the black box.
         records: all committed records.
-        pid: the process that was to run the trial.
+        pid: id of the process that should have run the trial.
 
     Returns:
-        The result and the whole report; in words what does not agree, where something does not.
+        The result and the whole report; or a description of the first disagreement.
 
     Raises:
         InternalError: crashhunt itself failed in that process.
@@ -410,7 +410,7 @@ def _fault_of(data: ErrorData) -> CrashhuntError:
 
 
 def _contradiction(result: TrialResult, spec: TrialSpec, steps: int, time_s: float, digest: str) -> str:
-    """What in a result contradicts its recording; empty if nothing does."""
+    """Return the first contradiction between a result and its recording; empty if there is none."""
     outcome = result.outcome
     if outcome in _SUPERVISED:
         return f"a process cannot report {outcome} of itself"
@@ -432,7 +432,7 @@ def _contradiction(result: TrialResult, spec: TrialSpec, steps: int, time_s: flo
 
 
 def _walk(records: bytes) -> tuple[int, float, list[memoryview]] | str:
-    """Return the last step, its simulation time and the parts that are evidence; in words what is wrong."""
+    """Return the last step, its simulation time and the evidence of the records; or the first error in words."""
     whole, offset, end = memoryview(records), 0, len(records)
     step, time_s, begins = -1, 0.0, 0
     evidence: list[memoryview] = []

@@ -93,7 +93,7 @@ class Executor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class NodeFigures:
-    """A machine on which trials run, for people who watch.
+    """A machine on which trials run, for the status screen.
 
     Args:
         name: name of it.
@@ -109,22 +109,22 @@ class NodeFigures:
 
 
 class HasNodes(Protocol):
-    """The faculty of an executor that runs trials on several machines."""
+    """An executor that runs trials on several machines."""
 
     def nodes(self) -> Sequence[NodeFigures]:
-        """Return those that take part now; none while all are waited for."""
+        """Return the machines that run trials now; empty while the hunt waits for all machines."""
 
 
 class ExecutorFactory(Protocol):
     """The factory of ``--executor NAME``: makes the executor of a hunt.
 
-    With ``--executor NAME:ARG``, it is called with ``argument=ARG`` as well; one that takes none may leave that out.
-    It raises a `CrashhuntError` with the fix where no trial could run, before it has started anything. See also
+    With ``--executor NAME:ARG``, it is called with ``argument=ARG`` as well; a factory without this argument need not
+    accept it. If no trial can run, it raises a `CrashhuntError` with the fix before it has started anything. See also
     `SizesItself`.
     """
 
     def __call__(self, settings: WorkerSettings, *, parallel: int, recycle_after: int) -> Executor:
-        """Make one.
+        """Make an executor.
 
         Args:
             settings: settings of the hunt.
@@ -140,7 +140,7 @@ class ExecutorFactory(Protocol):
 
 @final
 class Done(TypedDict):
-    """What came of a trial; ``notices`` are for people, ``retires`` says that the supervisor runs no other trial."""
+    """The result of a trial; ``retires`` means that the supervisor runs no other trial."""
 
     result: JsonObject
     notices: NotRequired[list[str]]
@@ -149,7 +149,7 @@ class Done(TypedDict):
 
 @final
 class Lost(TypedDict):
-    """A trial that was ended from outside: the exit code of its process, and what failed if it still imported."""
+    """A trial that was killed from outside: the exit code, and the failed import if it still imported."""
 
     lost: int
     importing: NotRequired[str]
@@ -160,7 +160,7 @@ Answer: TypeAlias = Done | Lost | ErrorData
 
 
 class FreshJob(TypedDict):
-    """What a fresh process is to do, and into which file its answer goes."""
+    """The job of a fresh process, and the file for its result."""
 
     settings: JsonObject
     spec: JsonObject
@@ -168,7 +168,7 @@ class FreshJob(TypedDict):
 
 
 class ForkServerJob(TypedDict):
-    """What a fork server needs to know; ``late`` where every trial imports its agents itself.
+    """The job of a fork server; ``late`` is true if every trial imports its agents itself.
 
     ``sys_path`` is empty if crashhunt itself comes from the snapshot, as its environment says.
     """
@@ -179,14 +179,14 @@ class ForkServerJob(TypedDict):
 
 
 class ToForkServer(TypedDict, total=False):
-    """What the pool asks of its fork server: the supervisor of a slot to be started, or to be killed."""
+    """A request of the pool to its fork server: to start or to kill the supervisor of a slot."""
 
     slot: int
     kill: int
 
 
 class FromForkServer(TypedDict, total=False):
-    """What a fork server says: that it is ready, cannot fork, or fails; and which supervisor has ended, and how.
+    """A message of a fork server: it is ready, cannot fork, or has failed; or a supervisor has ended.
 
     ``importing`` is what has failed if its template never reports again, in words; empty if that has imported all.
     """
@@ -207,9 +207,9 @@ class KillTrial(TypedDict):
 
 
 class FromZygote(TypedDict, total=False):
-    """What a zygote says: that it is ready or why it cannot be; how the process of a trial ended.
+    """A message of a zygote: it is ready, or why not; or how the process of a trial ended.
 
-    ``unfit`` says that files of the simulator have changed, so that no other trial may begin from this zygote.
+    ``unfit`` means that files of the simulator have changed, so that no other trial may start from this zygote.
     """
 
     ready: int
@@ -240,7 +240,7 @@ class Notes:
         self._all[note] = None
 
     def fresh(self) -> list[str]:
-        """Return what has not been returned before."""
+        """Return the notices that were not returned before."""
         with suppress(OSError):
             text = self._file.read_text(encoding="utf-8", errors="replace")
             self._all |= dict.fromkeys(text.splitlines())
@@ -256,8 +256,8 @@ def make_executor(word: str, settings: WorkerSettings, *, parallel: int, recycle
     """Make the executor that ``--executor`` names.
 
     Raises:
-        PluginError: there is no such executor, or it fails in its own way.
-        CrashhuntError: it says why no trial could run.
+        PluginError: the executor does not exist, or its factory raises an exception.
+        CrashhuntError: no trial can run; the message has the reason.
     """
     factory = executor_of(word)
     try:

@@ -1,7 +1,7 @@
-"""The supervisor of a slot: it hands trials to a zygote, and decides what came of each. It never runs foreign code.
+"""The supervisor of a slot: it gives trials to a zygote, and determines their results. It never runs foreign code.
 
-The socket to the hunt, the black box, the scratch folder of the trial and its result belong to the supervisor. What the
-process of a trial leaves behind is evidence, which `check_report` checks.
+The socket to the hunt, the black box, the scratch folder of the trial and its result belong to the supervisor.
+`check_report` checks the evidence that the process of a trial leaves.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _LARGEST_OUTPUT = 64 << 20  # bytes of a run.log that are written again where an
 
 
 class LostTrialError(Exception):
-    """The process of a trial was ended from outside, or by an agent that attacked what it is a fork of.
+    """The process of a trial was killed from outside, or by an agent that attacked its zygote.
 
     Args:
         exit_code: exit code of the process, negative for a signal.
@@ -63,7 +63,7 @@ class LostTrialError(Exception):
 
 
 class UnfitZygoteError(Exception):
-    """What has imported the agents cannot be forked, so that each trial has to import them itself."""
+    """A process that has imported the agents cannot be forked, so each trial must import them itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +72,8 @@ class Ended:
 
     Args:
         result: the result.
-        notices: what people should know.
-        braking: how the vehicle brakes that collided, where the settings ask for that.
+        notices: messages for the user.
+        braking: the full braking of the vehicle that collided, if the settings request it.
     """
 
     result: TrialResult
@@ -82,7 +82,7 @@ class Ended:
 
 
 class Supervisor:
-    """Has a zygote run one trial after another, each in its own process.
+    """Lets a zygote run one trial after another, each in a new process.
 
     Args:
         settings: settings of the hunt.
@@ -104,7 +104,7 @@ class Supervisor:
         self._made = self._trials = 0
 
     def run(self, spec: TrialSpec) -> Ended:
-        """Run a trial. Its scratch folder stays where the result says that it is kept.
+        """Run a trial. Its scratch folder stays if the result says that it is kept.
 
         Raises:
             LostTrialError: its process was ended from outside, or its zygote is gone.
@@ -136,7 +136,7 @@ class Supervisor:
         return replace(ended, result=result, notices=notices)
 
     def _judge(self, spec: TrialSpec, box: BlackBoxFile, key: bytes, said: FromZygote, *, was_killed: bool) -> Ended:
-        """Decide what came of a trial whose process has ended."""
+        """Determine the result of a trial whose process has ended."""
         scratch, code, pid = self._settings.scratch, said["ended"], said["pid"]
         is_there = self._is_ours(scratch_of(scratch, spec.number))
         self._secure(spec)
@@ -166,7 +166,7 @@ class Supervisor:
         return self._keep(*found)
 
     def _modules(self) -> dict[str, str]:
-        """The modules of which only an agent's code comes, by agent."""
+        """Return the modules that only one agent uses, by agent."""
         scenario = self._settings.scenario
         others = {*scenario.modules()}
         found = {name: setup.agent.partition(":")[0] for name, setup in scenario.agents.items() if ":" in setup.agent}
@@ -179,7 +179,7 @@ class Supervisor:
         return damaged(spec, self._settings.scratch, message, agent=agent, recorded=recorded)
 
     def _keep(self, result: TrialResult, report: Report) -> Ended:
-        """Write down what a trial leaves for the hunt."""
+        """Write the files that a trial leaves for the hunt."""
         settings, folder = self._settings, scratch_of(self._settings.scratch, result.spec.number)
         kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
         kept = kept or settings.is_audited(result)
@@ -198,7 +198,7 @@ class Supervisor:
         return Ended(result, tuple(map(str, report["notices"])), report.get("braking"))
 
     def _write_map(self, text: str | None, kept: Path | None) -> None:
-        """Write the map down, once for all trials; for a trial that is kept, where an argument makes it another."""
+        """Write the map once for all trials; if an argument changes the map, write it for each kept trial."""
         if text is None:
             return
         path = self._settings.scratch / layout.MAP
@@ -211,7 +211,7 @@ class Supervisor:
                 (kept / layout.MAP).write_text(text, encoding="utf-8")
 
     def _wait(self, box: BlackBoxFile, given_at: float) -> tuple[FromZygote, bool]:
-        """Wait for the end of a trial's process; kill it where it hangs. Return whether that was so."""
+        """Wait for the end of a trial's process, and kill it if it hangs; return whether it hung."""
         was_killed = False
         while True:
             message = self._next(_LOOK_EVERY_S)
@@ -274,7 +274,7 @@ class Supervisor:
         return message
 
     def _prepare(self, spec: TrialSpec) -> tuple[BlackBoxFile, Path]:
-        """Give the trial its scratch folder: that of the last one, whose pages are warm, or a new one."""
+        """Give the trial its scratch folder: the folder of the last trial, whose pages are warm, or a new one."""
         folder = scratch_of(self._settings.scratch, spec.number)
         _remove(folder)  # of an earlier attempt at the same trial
         if self._folder is None or self._box is None or not self._box.is_reusable() or not self._is_ours(self._folder):
@@ -307,7 +307,7 @@ class Supervisor:
         self._folder = folder
 
     def _is_ours(self, folder: Path) -> bool:
-        """Whether a folder is there, and has the files that this process has open."""
+        """Return whether a folder exists and has the files that this process has open."""
         assert self._box is not None
         try:
             return not folder.is_symlink() and all(
@@ -322,7 +322,7 @@ class Supervisor:
             return False
 
     def _secure(self, spec: TrialSpec) -> None:
-        """See that the folder of a trial has the evidence, whatever the trial did to the folder."""
+        """Restore the evidence in the folder of a trial, whatever the trial did to the folder."""
         folder = scratch_of(self._settings.scratch, spec.number)
         if self._is_ours(folder):
             for entry in os.scandir(folder):
@@ -404,7 +404,7 @@ def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) 
     """Return the result of a trial with its last escape, if the settings request it and it can be determined.
 
     Args:
-        supervisor: which has run the trial.
+        supervisor: the supervisor that has run the trial.
         settings: settings of the hunt.
         ended: the trial.
     """

@@ -1,4 +1,4 @@
-"""Which trials hang, over their time limit; and how long they may write down where, before they are killed."""
+"""Time limits of trials and imports, and the time to write a stack before a kill."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ _NO_WORDS_S = 3.0  # the same, on a machine that has no time for it at once
 def has_hung(
     header: BlackBoxHeader | None, *, begun: bool, given_at: float, limit_s: float, has_words: Callable[[], bool]
 ) -> bool:
-    """Whether a trial is to be ended because it takes too long.
+    """Return whether a trial exceeds its time limit.
 
     Args:
         header: header of its black box; None if there is none.
         begun: whether the process of the trial itself wrote the header; until then `START_UP_S` is added to the limit.
-        given_at: when its process was given it, as of `time.monotonic`.
+        given_at: when its process received the trial, in `time.monotonic`.
         limit_s: wall time that it may take from its beginning on, in s.
-        has_words: returns whether the process has written down where it is stuck.
+        has_words: returns whether the process has written its stack.
     """
     now, began, allowed_s = time.monotonic(), given_at, limit_s
     if header is None or not begun:
@@ -66,7 +66,7 @@ class ImportKilledError(Exception):
 
     Args:
         exit_code: exit code of the process, negative for a signal.
-        importing: what it could not do, in words.
+        importing: the failed import, in words.
     """
 
     def __init__(self, exit_code: int, importing: str) -> None:
@@ -91,7 +91,7 @@ class ImportWatch:
         self._ends_at = time.monotonic() + self._limit_s
 
     def begin(self, importing: object) -> None:
-        """Note what the process imports from now on."""
+        """Record the import that the process begins."""
         self.importing = str(importing)[:_LONGEST]
 
     @property

@@ -1,4 +1,4 @@
-"""What happens in the process of one trial: a fork of a process that has run nothing, which ends with its trial."""
+"""Runs one trial in its own process, a fork of a process that has run no trial."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ _dumps, _leave, _open, _dup2, _close = json.dumps, os._exit, os.open, os.dup2, o
 
 
 class Job(TypedDict):
-    """What the process of a trial is given.
+    """The job of the process of a trial.
 
     ``folder`` is that of the trial. Its black box has ``reserved`` bytes. ``key`` is for its report, in hexadecimal.
     ``wants_map`` asks for the map in any case, ``tries_copy`` for whether the trial can be copied.
@@ -85,7 +85,7 @@ class TrialProcess:
 
     Args:
         settings: settings of the hunt.
-        parts: what has been imported already; None to import it in the process of each trial.
+        parts: the imported parts; None to import them in the process of each trial.
     """
 
     def __init__(self, settings: WorkerSettings, parts: Parts | None) -> None:
@@ -112,10 +112,10 @@ class TrialProcess:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)  # ends a simulator that does not return to Python as well
 
     def make_simulator(self) -> Simulator:
-        """Make the simulator, and what each process of a trial would have to make again.
+        """Make the simulator and everything else that the processes of trials share.
 
         Raises:
-            CrashhuntError: it cannot be made.
+            CrashhuntError: the simulator cannot be made.
         """
         if self._parts is None:
             self._parts = loaded(self._settings)
@@ -145,7 +145,7 @@ class TrialProcess:
 
         Args:
             job: the trial.
-            reset: what resets the simulator, where it has been reset already.
+            reset: a function in place of the simulator's `reset`, if it has already been reset.
         """
         code = 1
         try:
@@ -216,7 +216,7 @@ class TrialProcess:
         return 0
 
     def _is_mistake(self, error: BaseException) -> bool:
-        """Whether an error is a mistake in the scenario: its parts are made before the trial begins."""
+        """Return whether an error is a mistake in the scenario, which appears before the trial begins."""
         return not self._has_begun and issubclass(type(error), CrashhuntError)
 
     def _report_fault(self, error: BaseException, job: Job) -> None:
@@ -232,7 +232,7 @@ class TrialProcess:
         self._box.report(encode_report(fault, bytes.fromhex(job["key"]), "", dumps=_dumps))
 
     def _redirect(self, folder: Path) -> None:
-        """Have what is printed, and where this process is when it dies, written into the folder of the trial."""
+        """Redirect the output, and the stack of a dying process, into the folder of the trial."""
         output = _open(folder / layout.RUN_LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         _dup2(output, 1)
         _dup2(output, 2)

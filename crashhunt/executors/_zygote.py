@@ -56,7 +56,7 @@ _dumps, _loads, _write = json.dumps, json.loads, os.write
 
 
 class _Said(TypedDict, total=False):
-    """What a suspended process reports: how long its reset took, or that it failed; how a trial's process ended."""
+    """A report of a suspended process: the duration of its reset, its failure, or the end of a trial's process."""
 
     took_s: float
     unfit: str
@@ -69,8 +69,8 @@ class WarmTraffics:
 
     Args:
         limit: largest number of suspended processes.
-        notify: called with what people should know.
-        worth_s: wall time of a warm-up from which on a process is kept for it, in s.
+        notify: called with messages for the user.
+        worth_s: least wall time of a warm-up for which a process is kept, in s.
     """
 
     def __init__(self, limit: int, notify: Callable[[str], None], *, worth_s: float = _WORTH_S) -> None:
@@ -83,7 +83,7 @@ class WarmTraffics:
         self._simulator: Simulator | None = None
 
     def prepare(self, trial: TrialProcess, simulator: Simulator) -> None:
-        """Note what trials run with."""
+        """Store the settings with which trials run."""
         self._trial, self._simulator = trial, simulator
 
     @property
@@ -92,17 +92,17 @@ class WarmTraffics:
         return frozenset(one.pid for one in self._suspended.values())
 
     def forget(self) -> None:
-        """Close what this process, which runs a trial, has of them."""
+        """Close the pipes to the suspended processes in this process, which runs a trial."""
         for one in self._suspended.values():
             one.close()
         self._suspended.clear()
 
     def run(self, job: Job, wait: Wait) -> tuple[int, int] | None:
-        """Run a trial in a fork of the process for its traffic, which is made where there is none.
+        """Run a trial in a fork of the suspended process for its traffic; make that process if it is missing.
 
         Args:
             job: the trial.
-            wait: waits until a descriptor can be read; its second argument kills what is waited for.
+            wait: waits until a descriptor can be read; its second argument kills the process behind it.
 
         Returns:
             The process that ran it and its exit code; None if the trial has to run in a fork of the zygote.
@@ -183,8 +183,8 @@ class _Suspended:
 
     Args:
         pid: process id.
-        asks: the end of a pipe to it.
-        says: the end of one from it.
+        asks: the pipe for requests to the process.
+        says: the pipe for answers of the process.
         used: number of the trial that used it last.
     """
 
@@ -194,7 +194,7 @@ class _Suspended:
     used: int
 
     def ask(self, text: bytes, wait: Wait) -> _Said | None:
-        """Return what it answers; None if it is gone."""
+        """Return the answer of the process; None if it has ended."""
         try:
             while text:
                 text = text[_write(self.asks, text) :]
@@ -211,7 +211,7 @@ class _Suspended:
         return said
 
     def _kill(self) -> None:
-        """Kill the trial, or the process itself where it is still resetting the simulator."""
+        """Kill the trial, or the process itself if it is still resetting the simulator."""
         for pid in children_of(self.pid) or [self.pid]:
             kill(pid)
 
@@ -231,7 +231,7 @@ class _Suspended:
 
 
 def _be_suspended(wakes: int, says: int, trial: TrialProcess, simulator: Simulator, spec: TrialSpec) -> None:
-    """Reset the simulator; then have a fork run each trial that is asked for."""
+    """Reset the simulator; then run each requested trial in a fork."""
     adopt_orphans()
     began = time.monotonic()
     try:
@@ -273,7 +273,7 @@ def _say(says: int, said: _Said) -> None:
 
 
 def _key(spec: TrialSpec) -> str:
-    """What the traffic of a trial follows from."""
+    """Return the key of a trial's traffic: its seed and the scenario's arguments."""
     script = None if spec.script is None else spec.script.to_json()
     return json.dumps([spec.seed, dict(spec.scenario_arguments), spec.only, script], sort_keys=True)
 
@@ -286,7 +286,7 @@ class Imported:
     """The preparation of the processes of trials, done once before they are forked.
 
     Args:
-        parts: what has been imported; None if each trial imports its agents itself.
+        parts: the imported parts; None if each trial imports its agents itself.
         makes_simulator: whether the zygote makes the simulator; if not, each trial makes its own.
     """
 
@@ -298,7 +298,7 @@ _EACH_ITSELF: Final = Imported(None, makes_simulator=False)
 
 
 def import_parts(settings: WorkerSettings, report: Callable[[str], None]) -> Imported | None:
-    """Import what trials need, and find out whether the simulator may be made in a zygote.
+    """Import the modules that trials need, and check whether the simulator may be made in a zygote.
 
     Args:
         settings: settings of the hunt.
@@ -331,7 +331,7 @@ def import_nothing(settings: WorkerSettings) -> Imported:
 
 
 def _is_forkable_with(parts: Parts) -> bool:
-    """Whether a process that has made the simulator can still be forked, as a fork of this one finds out.
+    """Return whether a process can still be forked after it has made the simulator; a fork of this process tries it.
 
     An environment may start threads, which a fork does not have.
     """
@@ -349,7 +349,7 @@ def _is_forkable_with(parts: Parts) -> bool:
 
 
 def _can_be_forked() -> bool:
-    """Whether what has been imported allows it: a thread does not come along, and neither does a graphics card."""
+    """Return whether this process can be forked after its imports, without other threads or a graphics card."""
     try:
         threads = len(os.listdir("/proc/self/task"))  # noqa: PTH208 - how many is enough
     except OSError:
@@ -364,7 +364,7 @@ def be_zygote(control: socket.socket, settings: WorkerSettings, imported: Import
     Args:
         control: connection to the supervisor.
         settings: settings of the hunt.
-        imported: what has been done already.
+        imported: the completed preparation.
     """
     try:
         _Zygote(control, settings, imported).serve()
@@ -387,7 +387,7 @@ class _Zygote:
         self._makes_simulator = imported.makes_simulator
 
     def serve(self) -> None:
-        """Do what the supervisor says until it is gone."""
+        """Carry out the requests of the supervisor until it has ended."""
         try:
             if self._makes_simulator:
                 simulator = self._trial.make_simulator()
@@ -450,7 +450,7 @@ class _Zygote:
         return pid, code
 
     def _wait(self, end: int | None, kill_trial: Callable[[], None]) -> None:
-        """Wait until something can be read from a descriptor; a moment where there is none."""
+        """Wait until a descriptor can be read; without a descriptor, wait a moment."""
         while True:
             watched = [self._control.fileno(), *([end] if end is not None else [])]
             ready, _, _ = select.select(watched, [], [], _LOOK_EVERY_S if end is None else None)
@@ -466,7 +466,7 @@ class _Zygote:
                 return
 
     def _next(self) -> Job | KillTrial | None:
-        """Return the next message; None if the supervisor is gone."""
+        """Return the next message; None if the supervisor has ended."""
         while b"\n" not in self._received:
             try:
                 data = self._control.recv(_RECEIVED)

@@ -101,7 +101,7 @@ class Shot:
         recording: what to show.
         lanes: lanes of its map.
         agent: the vehicle in the centre of the picture.
-        other: the one it crashed with.
+        other: the collision partner.
         crash_step: where the crash is.
         panels: step to the agent's own panels, by label, as pictures.
         meanings: names of its discrete actions, where they are known.

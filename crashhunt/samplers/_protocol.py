@@ -97,8 +97,8 @@ class Sampler(Protocol):
 class OnlyAsked(Protocol):
     """A sampler that may vary only the arguments that the user asks for by name.
 
-    Where ``only_asked`` is true, every other argument is a constant in its space. It is a class attribute, because it
-    is read before a sampler is created.
+    Where ``only_asked`` is true, every other argument is a constant in its space. ``only_asked`` is a class attribute,
+    because it is read before a sampler is created.
     """
 
     only_asked: bool

@@ -179,7 +179,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_it_offers_faculties_as_a_whole(self, make: Make) -> None:
-        """A simulator with one method of an optional protocol has all of them; else the protocol is ignored."""
+        """A simulator with one method of an optional protocol has all its methods, or the protocol is ignored."""
         simulator = make()
         simulator.reset(seed=1)
         for faculty in FACULTIES:

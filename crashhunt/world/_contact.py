@@ -1,7 +1,7 @@
 """The first contact of two actors between two scenes: when, with which sides, and which one drives into the other.
 
-Computes when two moving rectangles first overlap. Scenes are steps apart (0.1 s to 1 s), so a test of the scenes alone
-misses contacts in between and reports others too late.
+Computes when two moving rectangles first overlap. Scenes are one step apart (0.1 s to 1 s). A test of the scenes alone
+would miss contacts between them, and report other contacts too late.
 
 Each rectangle follows a cubic between its poses (`_Way`). Conservative advancement then moves forward in time by the
 gap divided by a bound of the approach speed, so no contact is skipped (B. Mirtich, Impulse-based dynamic simulation of

@@ -204,7 +204,7 @@ class Work:
         return said
 
     def _map(self) -> bytes:
-        """The map that trials of this node have in common, once."""
+        """Return the map that all trials of this node share; None after the first call."""
         if self._map_sent or self._place is None:
             return b""
         with suppress(OSError):

@@ -97,7 +97,7 @@ def split_names(value: str) -> list[str]:
 
 
 def changes(options: Mapping[str, str]) -> list[str]:
-    """Return what a trial does not take over from a configuration, and why, in words."""
+    """Return the options of a configuration that a trial changes, with the reasons, in words."""
     found = []
     for name, value in options.items():
         if name == "seed":
