@@ -18,10 +18,11 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from highway_env.road.road import Road
     from highway_env.vehicle.kinematics import Vehicle
 
 
-__all__ = ["CompiledNetwork", "Contents", "Snapshot", "Traffic", "kernel", "why_not"]
+__all__ = ["CompiledNetwork", "Contents", "Poses", "Snapshot", "Traffic", "kernel", "why_not"]
 
 
 _MODULE = "_crashhunt_highway"
@@ -30,6 +31,9 @@ _INTERFACE = 4
 
 class Traffic(Protocol):
     """The vehicles and objects of a road in the kernel."""
+
+    def is_current(self, road: Road, /) -> bool:
+        """Whether they are those of the road, with everything about them that must stay the same except their state."""
 
     def read(self) -> bool:
         """Read the state of all vehicles; return False if a value is unusual, and the kernel must not be used."""
@@ -89,6 +93,7 @@ class Contents(Protocol):
         """Whether all containers still have the same members in the same order, and all arrays the same bytes."""
 
 
+Poses = tuple[list[tuple[float, float]], list[float], list[float]]
 _Check = tuple[str, Any, "Sequence[tuple[float, ...]]"]  # the kernel's name of a function, NumPy's function, arguments
 
 
@@ -102,6 +107,8 @@ class _Module(Protocol):
     def bind(self, *given: object) -> None: ...
 
     def bind_turn(self, rounds: int, /) -> None: ...
+
+    def mirrored_poses(self, things: list[Any], halves: list[float], /) -> Poses | None: ...
 
     def compute(self, name: str, /, *numbers: float) -> float: ...
 

@@ -11,7 +11,7 @@ from highway_env.road.road import Road
 from crashhunt.accelerator._frames import Frame
 from crashhunt.accelerator._network import Network
 from crashhunt.accelerator._roster import Roster
-from crashhunt.accelerator._versions import Own, Watch, is_plain, kinds_of
+from crashhunt.accelerator._versions import Own, Watch, is_plain
 
 if TYPE_CHECKING:
     from crashhunt.accelerator._kernel import Traffic
@@ -60,10 +60,8 @@ class Prepared:
         road = self.road
         if road.record_history:
             return None
-        things = road.vehicles + road.objects
-        kinds = kinds_of(things)
-        if self._roster is None or not self._roster.is_of(road, things, kinds):
-            self._roster = Roster(road, things, kinds, self.network)
+        if self._roster is None or not self._roster.is_of(road):
+            self._roster = Roster(road, self.network)
         traffic = self._roster.traffic
         return self._roster if traffic is not None and traffic.read() else None
 

@@ -11,7 +11,7 @@ from highway_env.vehicle.objects import Landmark, Obstacle
 
 from crashhunt.accelerator._frames import are_plain
 from crashhunt.accelerator._kernel import kernel
-from crashhunt.accelerator._versions import NUMBERS_OF, are_numbers
+from crashhunt.accelerator._versions import NUMBERS_OF, are_numbers, kinds_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,7 +43,6 @@ _OF_GAPS = ("COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DISTANCE_WANTED", "TIME_WANTE
 _MAX_EXPONENT = 20.0  # with a larger IDM exponent, an acceleration may overflow
 _PARAMETERS_OF: dict[str, Callable[[RoadObject], Row]] = {how: attrgetter(*names) for how, names in NUMBERS_OF.items()}
 _DELTA = attrgetter("DELTA")
-_is_disjoint = frozenset.isdisjoint
 assert all(_PARAMETERS[: len(names)] == names for names in NUMBERS_OF.values())
 
 
@@ -52,8 +51,6 @@ class Roster:
 
     Args:
         road: The road.
-        things: Its vehicles, then its objects.
-        kinds: The properties of the class of each.
         network: The lanes of the road.
 
     Attributes:
@@ -65,48 +62,27 @@ class Roster:
         kinds: The properties of the class of each vehicle and object.
     """
 
-    def __init__(self, road: Road, things: list[RoadObject], kinds: list[Kind], network: Network) -> None:
+    def __init__(self, road: Road, network: Network) -> None:
+        things: list[RoadObject] = road.vehicles + road.objects
+        kinds = self.kinds = kinds_of(things)
         vehicles = kinds[: len(road.vehicles)]
         self._ids = list(map(id, things))
-        self.kinds = kinds
+        self._distinct = list(dict.fromkeys(kinds))
         self._looks_further = road.neighbour_vehicles_connected_lanes
         self.decides = all(kind.drives for kind in vehicles)
         self.moves = all(kind.moves for kind in vehicles)
         self.predicts = all(kind.predicts for kind in vehicles)
-        self._fixed = [kind.fixed for kind in kinds]
-        self._is_shared = all(map(_is_disjoint, self._fixed, map(vars, things)))
-        #: one thing of each class, for the parameters of the class
-        self._examples = [things[kinds.index(kind)] for kind in dict.fromkeys(kinds)]
         self.describes = all(kind.describes for kind in kinds)
-        self._thinking = [thing for thing, kind in zip(things, kinds, strict=True) if kind.times]
         self.traffic = self._in_kernel(road, things, network)
-        if self.traffic is not None:
-            self._parameters, self._deltas = self._read()
 
-    def is_of(self, road: Road, things: list[RoadObject], kinds: list[Kind]) -> bool:
+    def is_of(self, road: Road) -> bool:
         """Whether the kernel still knows the vehicles and objects of a road, apart from their state."""
-        return (
-            self.kinds == kinds
-            and self._ids == list(map(id, things))
-            and self._looks_further == road.neighbour_vehicles_connected_lanes
-            and (self.traffic is None or self._is_current(road, things))
-        )
-
-    def _is_current(self, road: Road, things: list[RoadObject]) -> bool:
-        return (
-            self._is_shared
-            and all(map(_is_disjoint, self._fixed, map(vars, things)))
-            and all(vehicle.road is road for vehicle in road.vehicles)
-            and self._read() == (self._parameters, self._deltas)
-        )
-
-    def _read(self) -> tuple[list[Row], list[object]]:
-        """Return the parameters of each class with their types, and the exponents of all drivers."""
-        found: list[Row] = []
-        for thing, kind in zip(self._examples, dict.fromkeys(self.kinds), strict=True):
-            numbers = _PARAMETERS_OF[kind.base](thing)
-            found += [numbers, tuple(map(type, numbers))]
-        return found, list(map(_DELTA, self._thinking))
+        if self._looks_further != road.neighbour_vehicles_connected_lanes:
+            return False
+        if self.traffic is not None:
+            return all(kind.own.current for kind in self._distinct) and self.traffic.is_current(road)
+        things = road.vehicles + road.objects
+        return self._ids == list(map(id, things)) and self.kinds == kinds_of(things)
 
     def _in_kernel(self, road: Road, things: list[RoadObject], network: Network) -> Traffic | None:
         module, kinds = kernel(), self.kinds
@@ -123,7 +99,20 @@ class Roster:
         models += [_MODELS[""]] * (len(kinds) - count)
         flags = bytes(map(_flags_of, things, kinds))
         lanes = network.in_kernel(looks_further=bool(self._looks_further))
-        return module.Traffic(lanes, things, bytes(models), flags, parameters)
+        fixed = [kind.fixed for kind in kinds]
+        return module.Traffic(lanes, things, bytes(models), flags, parameters, road, fixed, _examples(things, kinds))
+
+
+def _examples(things: list[RoadObject], kinds: list[Kind]) -> list[tuple[RoadObject, tuple[str, ...]]]:
+    """Return the objects with parameters of their own, and one of each class without, with the names of parameters."""
+    found: list[tuple[RoadObject, tuple[str, ...]]] = []
+    seen: set[int] = set()
+    for thing, kind in zip(things, kinds, strict=True):
+        if not kind.fixed.isdisjoint(vars(thing)) or id(kind) not in seen:
+            found.append((thing, NUMBERS_OF[kind.base]))
+            if kind.fixed.isdisjoint(vars(thing)):
+                seen.add(id(kind))
+    return found
 
 
 def _flags_of(thing: RoadObject, kind: Kind) -> int:

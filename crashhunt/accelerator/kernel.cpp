@@ -33,6 +33,12 @@ PyObject *fail(Traffic *self, bool moved) {
 
 PyObject *traffic_read(Traffic *self, PyObject *) { return PyBool_FromLong(read_all(self)); }
 
+// is_current(road): whether the road has the same vehicles and objects, and everything about them that must stay the same.
+PyObject *traffic_is_current(Traffic *self, PyObject *road) {
+    const int found = is_current(self, road);
+    return found < 0 ? nullptr : PyBool_FromLong(found);
+}
+
 PyObject *traffic_act(Traffic *self, PyObject *) {
     if (!act_all(self)) {
         return fail(self, false);
@@ -109,6 +115,25 @@ void traffic_dealloc(Traffic *self) {
             Py_XDECREF(actor.object);
         }
     }
+    if (self->watched) {
+        for (Watched &watched : *self->watched) {
+            Py_XDECREF(reinterpret_cast<PyObject *>(watched.type));
+            Py_XDECREF(watched.fixed);
+            for (PyObject *key : watched.keys) {
+                Py_DECREF(key);
+            }
+        }
+    }
+    if (self->examples) {
+        for (Example &example : *self->examples) {
+            Py_XDECREF(example.object);
+            Py_XDECREF(example.names);
+            Py_XDECREF(example.values);
+        }
+    }
+    Py_XDECREF(self->road);
+    delete self->watched;
+    delete self->examples;
     delete self->actors;
     delete self->along;
     delete self->across;
@@ -122,17 +147,18 @@ void traffic_dealloc(Traffic *self) {
 
 PyTypeObject *network_type = nullptr;
 
-// Traffic(network, actors, models, flags, parameters)
+// Traffic(network, actors, models, flags, parameters, road, fixed, examples): `fixed` has a frozenset for each actor, and
+// `examples` pairs of an actor and the names of attributes.
 PyObject *traffic_new(PyTypeObject *type, PyObject *args, PyObject *) {
-    PyObject *network, *actors;
+    PyObject *network, *actors, *road, *fixed, *examples;
     Py_buffer models, flags, parameters;
-    if (!PyArg_ParseTuple(args, "O!O!y*y*y*", network_type, &network, &PyList_Type, &actors, &models, &flags,
-                          &parameters)) {
+    if (!PyArg_ParseTuple(args, "O!O!y*y*y*OO!O!", network_type, &network, &PyList_Type, &actors, &models, &flags,
+                          &parameters, &road, &PyList_Type, &fixed, &PyList_Type, &examples)) {
         return nullptr;
     }
     size_t count = static_cast<size_t>(PyList_GET_SIZE(actors));
     Traffic *self = nullptr;
-    if (static_cast<size_t>(models.len) != count || static_cast<size_t>(flags.len) != count ||
+    if (static_cast<size_t>(PyList_GET_SIZE(fixed)) != count || static_cast<size_t>(models.len) != count || static_cast<size_t>(flags.len) != count ||
         static_cast<size_t>(parameters.len) != count * sizeof(Parameters)) {
         PyErr_SetString(PyExc_ValueError, "one model, flag and row of parameters is needed for each actor");
     } else {
@@ -167,6 +193,12 @@ PyObject *traffic_new(PyTypeObject *type, PyObject *args, PyObject *) {
             std::memcpy(&actor.parameters, numbers, sizeof(Parameters));
             actor.gap_root = 2 * std::sqrt(-actor.parameters.comfort_acc_max * actor.parameters.comfort_acc_min);
             self->vehicles += actor.moves;
+        }
+        self->road = Py_NewRef(road);
+        self->watched = new std::vector<Watched>();
+        self->examples = new std::vector<Example>();
+        if (!watch_all(self, fixed, examples)) {
+            Py_CLEAR(self);
         }
     }
     PyBuffer_Release(&models);
@@ -296,6 +328,7 @@ PyObject *traffic_completed(Traffic *self, PyObject *) { return PyLong_FromLong(
 
 PyMethodDef traffic_methods[] = {
     {"read", reinterpret_cast<PyCFunction>(traffic_read), METH_NOARGS, nullptr},
+    {"is_current", reinterpret_cast<PyCFunction>(traffic_is_current), METH_O, nullptr},
     {"act", reinterpret_cast<PyCFunction>(traffic_act), METH_NOARGS, nullptr},
     {"step", reinterpret_cast<PyCFunction>(traffic_step), METH_O, nullptr},
     {"collide", reinterpret_cast<PyCFunction>(traffic_collide), METH_O, nullptr},
@@ -598,6 +631,52 @@ PyObject *compute(PyObject *, PyObject *args) {
     return nullptr;
 }
 
+// mirrored_poses(objects, half_lengths): the points half a length ahead of objects, their headings and their speeds, with the
+// y axis up; None if one of them has an unusual type. The cosine and the sine are those of Python's `math`.
+PyObject *mirrored_poses(PyObject *, PyObject *args) {
+    PyObject *objects, *halves;
+    if (!PyArg_ParseTuple(args, "O!O!", &PyList_Type, &objects, &PyList_Type, &halves)) {
+        return nullptr;
+    }
+    const Py_ssize_t count = PyList_GET_SIZE(objects);
+    if (PyList_GET_SIZE(halves) != count) {
+        PyErr_SetString(PyExc_ValueError, "one half of a length is needed for each object");
+        return nullptr;
+    }
+    PyObject *points = PyList_New(count), *headings = PyList_New(count), *speeds = PyList_New(count), *all = nullptr;
+    bool known = points && headings && speeds;
+    for (Py_ssize_t at = 0; known && at < count; at++) {
+        PyObject *object = PyList_GET_ITEM(objects, at), *position = attribute(object, s_position);
+        Number heading, speed;
+        Py_buffer view;
+        known = position && open_floats(position, view, 2, 0);
+        if (known) {
+            const double *place = static_cast<const double *>(view.buf);
+            const double x = place[0], y = place[1], half = PyFloat_AsDouble(PyList_GET_ITEM(halves, at));
+            PyBuffer_Release(&view);
+            known = read_number(object, s_heading, heading) && read_number(object, s_speed, speed) &&
+                    std::isfinite(heading.value) && !PyErr_Occurred();
+            if (known) {
+                const double c = std::cos(heading.value), s = std::sin(heading.value);
+                PyList_SET_ITEM(points, at, Py_BuildValue("(dd)", x + half * c, 0.0 - (y + half * s)));
+                PyList_SET_ITEM(headings, at, PyFloat_FromDouble(0.0 - heading.value));
+                PyList_SET_ITEM(speeds, at, PyFloat_FromDouble(speed.value));
+                known = !PyErr_Occurred();
+            }
+        }
+        Py_XDECREF(position);
+    }
+    if (known) {
+        all = PyTuple_Pack(3, points, headings, speeds);
+    } else if (!PyErr_Occurred()) {
+        all = Py_NewRef(Py_None);
+    }
+    Py_XDECREF(points);
+    Py_XDECREF(headings);
+    Py_XDECREF(speeds);
+    return all;
+}
+
 // bind_turn(rounds): how NumPy multiplies a matrix by a vector.
 PyObject *bind_turn(PyObject *, PyObject *number) {
     const long rounds = PyLong_AsLong(number);
@@ -614,6 +693,7 @@ PyObject *bind_turn(PyObject *, PyObject *number) {
 PyMethodDef methods[] = {
     {"bind", bind, METH_VARARGS, nullptr},
     {"bind_turn", bind_turn, METH_O, nullptr},
+    {"mirrored_poses", mirrored_poses, METH_VARARGS, nullptr},
     {"compute", compute, METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
@@ -651,6 +731,10 @@ bool intern_names() {
         {&s_data, "data"},
         {&s_solid, "solid"},
         {&s_hit, "hit"},
+        {&s_road, "road"},
+        {&s_vehicles, "vehicles"},
+        {&s_objects, "objects"},
+        {&s_delta, "DELTA"},
         {&s_prediction_type, "prediction_type"},
         {&s_lateral_speed, "lateral_speed"},
         {&s_yaw_rate, "yaw_rate"},

@@ -73,7 +73,8 @@ struct Actor {
 PyObject *s_position, *s_heading, *s_speed, *s_lane, *s_lane_index, *s_target_lane_index, *s_target_speed, *s_timer,
     *s_crashed, *s_impact, *s_action, *s_steering, *s_acceleration, *s_route, *s_enable_lane_change, *s_check_collisions,
     *s_collidable, *s_diagonal, *s_follow_road, *s_handle_collisions, *s_acceleration_parameters,
-    *s_steering_parameters, *s_collecting_data, *s_data, *s_solid, *s_hit, *s_prediction_type, *s_lateral_speed, *s_yaw_rate, *s_mass,
+    *s_steering_parameters, *s_collecting_data, *s_data, *s_solid, *s_hit, *s_road, *s_vehicles,
+    *s_objects, *s_delta, *s_prediction_type, *s_lateral_speed, *s_yaw_rate, *s_mass,
     *s_length_a, *s_length_b, *s_inertia_z, *s_friction_front, *s_friction_rear, *s_max_angular_speed;
 PyObject *numpy_float; // the type np.float64
 PyObject *numpy_int;   // the type np.int64
@@ -90,9 +91,24 @@ struct Queue {
     std::vector<std::pair<double, size_t>> places; // longitudinal coordinates with rows
 };
 
+// What must stay the same about an actor, apart from its state.
+struct Watched {
+    PyTypeObject *type;
+    PyObject *fixed;               // a frozenset: the names of attributes that the actor must not get
+    std::vector<PyObject *> keys;  // of its attributes, which are none of these, or had them at the beginning
+};
+
+// Attributes that an actor shares with the others of its class, or its own ones that replace them.
+struct Example {
+    PyObject *object, *names, *values; // the latter are tuples
+};
+
 struct Traffic {
     PyObject_HEAD
     Network *network;
+    PyObject *road;
+    std::vector<Watched> *watched;     // by row
+    std::vector<Example> *examples;
     std::vector<Actor> *actors;          // vehicles, then objects
     std::vector<double> *along, *across; // coordinates of actors on lanes
     std::vector<uint64_t> *stamps;       // the instant at which these are valid

@@ -91,19 +91,6 @@ PyType_Slot snapshot_slots[] = {
 };
 PyType_Spec snapshot_spec = {"_crashhunt_highway.Snapshot", sizeof(Snapshot), 0, Py_TPFLAGS_DEFAULT, snapshot_slots};
 
-// --------------------------------------------------------------------------------------------------------------- Contents
-
-// The contents of containers at one time: dictionaries and lists, arrays of NumPy, and objects with their attributes.
-struct Contents {
-    PyObject_HEAD
-    PyObject *containers;                // a list
-    std::vector<PyTypeObject *> *types;  // of each container
-    std::vector<PyObject *> *members;    // of all containers, one after the other: keys and values, or values
-    std::vector<size_t> *ends;           // of the members of each container
-    std::vector<Py_buffer> *views;       // of the arrays
-    std::vector<char> *bytes;            // of the arrays, one after the other
-};
-
 // Calls a function for each member of a container until it returns false; returns whether it never did.
 template <typename Function> bool visit(PyObject *container, Function see) {
     if (PyList_CheckExact(container)) {
@@ -127,6 +114,19 @@ template <typename Function> bool visit(PyObject *container, Function see) {
     Py_XDECREF(space);
     return all;
 }
+
+// --------------------------------------------------------------------------------------------------------------- Contents
+
+// The contents of containers at one time: dictionaries and lists, arrays of NumPy, and objects with their attributes.
+struct Contents {
+    PyObject_HEAD
+    PyObject *containers;                // a list
+    std::vector<PyTypeObject *> *types;  // of each container
+    std::vector<PyObject *> *members;    // of all containers, one after the other: keys and values, or values
+    std::vector<size_t> *ends;           // of the members of each container
+    std::vector<Py_buffer> *views;       // of the arrays
+    std::vector<char> *bytes;            // of the arrays, one after the other
+};
 
 void contents_dealloc(Contents *self) {
     for (PyObject *member : *self->members) {
@@ -222,5 +222,144 @@ PyType_Slot contents_slots[] = {
     {0, nullptr},
 };
 PyType_Spec contents_spec = {"_crashhunt_highway.Contents", sizeof(Contents), 0, Py_TPFLAGS_DEFAULT, contents_slots};
+
+// ----------------------------------------------------------------------------------------------------------------- Traffic
+
+// The values of attributes; null with an error if one is missing.
+PyObject *values_of(PyObject *object, PyObject *names) {
+    PyObject *values = PyTuple_New(PyTuple_GET_SIZE(names));
+    for (Py_ssize_t at = 0; values && at < PyTuple_GET_SIZE(names); at++) {
+        PyObject *value = PyObject_GetAttr(object, PyTuple_GET_ITEM(names, at));
+        if (value) {
+            PyTuple_SET_ITEM(values, at, value);
+        } else {
+            Py_CLEAR(values);
+        }
+    }
+    return values;
+}
+
+// Notes everything about the actors that must stay the same. False: an error.
+bool watch_all(Traffic *self, PyObject *fixed, PyObject *examples) {
+    for (size_t row = 0; row < self->actors->size(); row++) {
+        PyObject *object = (*self->actors)[row].object;
+        PyObject *names = PyList_GET_ITEM(fixed, static_cast<Py_ssize_t>(row));
+        Watched watched = {reinterpret_cast<PyTypeObject *>(Py_NewRef(Py_TYPE(object))), Py_NewRef(names), {}};
+        bool is_key = true; // keys and values take turns
+        visit(object, [&watched, &is_key](PyObject *member) {
+            if (is_key) {
+                watched.keys.push_back(Py_NewRef(member));
+            }
+            is_key = !is_key;
+            return true;
+        });
+        self->watched->push_back(watched);
+    }
+    for (Py_ssize_t at = 0; at < PyList_GET_SIZE(examples) && !PyErr_Occurred(); at++) {
+        PyObject *object, *names;
+        if (!PyArg_ParseTuple(PyList_GET_ITEM(examples, at), "OO!", &object, &PyTuple_Type, &names)) {
+            return false;
+        }
+        PyObject *values = values_of(object, names);
+        if (values) {
+            self->examples->push_back({Py_NewRef(object), Py_NewRef(names), values});
+        }
+    }
+    return !PyErr_Occurred();
+}
+
+// Whether an actor has got no attribute that it must not get. -1: an error.
+int has_kept_attributes(PyObject *object, Watched &watched) {
+    size_t at = 0;
+    bool is_key = true;
+    const bool same = visit(object, [&watched, &at, &is_key](PyObject *member) {
+        const bool fits = !is_key || (at < watched.keys.size() && watched.keys[at++] == member);
+        is_key = !is_key;
+        return fits;
+    });
+    if (PyErr_Occurred()) {
+        return -1;
+    }
+    if (same && at == watched.keys.size()) {
+        return 1;
+    }
+    std::vector<PyObject *> keys;
+    is_key = true;
+    const bool free = visit(object, [&watched, &keys, &is_key](PyObject *member) {
+        if (is_key) {
+            keys.push_back(member);
+        }
+        const bool fits = !is_key || PySet_Contains(watched.fixed, member) == 0;
+        is_key = !is_key;
+        return fits;
+    });
+    if (!free || PyErr_Occurred()) {
+        return PyErr_Occurred() ? -1 : 0;
+    }
+    for (PyObject *key : keys) {
+        Py_INCREF(key);
+    }
+    keys.swap(watched.keys);
+    for (PyObject *key : keys) {
+        Py_DECREF(key);
+    }
+    return 1;
+}
+
+// Whether an example has equal values of the same types. -1: an error.
+int has_kept_values(const Example &example) {
+    PyObject *values = values_of(example.object, example.names);
+    if (!values) {
+        PyErr_Clear(); // an attribute is missing
+        return 0;
+    }
+    int same = 1;
+    for (Py_ssize_t at = 0; same > 0 && at < PyTuple_GET_SIZE(values); at++) {
+        PyObject *before = PyTuple_GET_ITEM(example.values, at), *now = PyTuple_GET_ITEM(values, at);
+        if (before != now) {
+            same = Py_TYPE(before) == Py_TYPE(now) ? PyObject_RichCompareBool(before, now, Py_EQ) : 0;
+        }
+    }
+    Py_DECREF(values);
+    return same;
+}
+
+// Whether a list has the actors from a row on. False also if it is no list.
+bool has_actors(const Traffic *self, PyObject *list, size_t first, size_t count) {
+    bool same = list && PyList_CheckExact(list) && static_cast<size_t>(PyList_GET_SIZE(list)) == count;
+    for (size_t at = 0; same && at < count; at++) {
+        same = PyList_GET_ITEM(list, static_cast<Py_ssize_t>(at)) == (*self->actors)[first + at].object;
+    }
+    return same;
+}
+
+// Whether the actors of a road are those of the kernel, with everything that must stay the same. -1: an error.
+int is_current(Traffic *self, PyObject *road) {
+    const size_t objects = self->actors->size() - self->vehicles;
+    PyObject *vehicles = attribute(road, s_vehicles), *others = attribute(road, s_objects);
+    bool same = road == self->road && has_actors(self, vehicles, 0, self->vehicles) &&
+                has_actors(self, others, self->vehicles, objects);
+    Py_XDECREF(vehicles);
+    Py_XDECREF(others);
+    int kept = same;
+    for (size_t row = 0; kept > 0 && row < self->actors->size(); row++) {
+        const Actor &actor = (*self->actors)[row];
+        Watched &watched = (*self->watched)[row];
+        kept = Py_TYPE(actor.object) == watched.type ? has_kept_attributes(actor.object, watched) : 0;
+        if (kept > 0 && actor.moves) {
+            PyObject *its_road = attribute(actor.object, s_road);
+            kept = its_road == road;
+            Py_XDECREF(its_road);
+        }
+        Number delta;
+        if (kept > 0 && actor.changes_lanes) {
+            kept = read_number(actor.object, s_delta, delta) && delta.value == actor.parameters.delta;
+        }
+    }
+    for (size_t at = 0; kept > 0 && at < self->examples->size(); at++) {
+        kept = has_kept_values((*self->examples)[at]);
+    }
+    return kept;
+}
 
 } // namespace

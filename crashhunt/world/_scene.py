@@ -120,6 +120,11 @@ class Roster:
         return np.array([(actor.length / 2, actor.width / 2) for actor in self.actors]).reshape(-1, 2)
 
     @cached_property
+    def half_lengths(self) -> list[float]:
+        """Half the length of each actor, in m."""
+        return [actor.length / 2 for actor in self.actors]
+
+    @cached_property
     def lengths(self) -> list[float]:
         """The length of each actor, in m."""
         return [actor.length for actor in self.actors]

@@ -573,3 +573,18 @@ def test_search_for_close_objects_of_a_users_road_is_called():
     road.vehicles += [IDMVehicle(road, [12.0 * number, 0.0], 0.0, 20.0) for number in range(3)]
     env = SimpleNamespace(road=road, vehicle=road.vehicles[0], PERCEPTION_DISTANCE=200)
     assert not observation.KinematicObservation(env).observe()[1:].any()
+
+
+def test_poses_in_a_scene_are_those_of_python():
+    vehicles = crowded(3).vehicles
+    halves = [1.1 + number for number in range(len(vehicles))]
+    found = _kernel.kernel().mirrored_poses(vehicles, halves)
+    for vehicle, half, point, heading, speed in zip(vehicles, halves, *found, strict=True):
+        (x, y), angle = vehicle.position.tolist(), float(vehicle.heading)
+        expected = (x + half * math.cos(angle), 0.0 - (y + half * math.sin(angle)))
+        assert (point, heading, speed) == (expected, 0.0 - angle, float(vehicle.speed))
+        assert {type(number) for number in (*point, heading, speed)} == {float}
+    vehicles[1].heading = np.float32(1)
+    assert _kernel.kernel().mirrored_poses(vehicles, halves) is None
+    vehicles[1].heading = math.inf  # Python's cosine raises an error
+    assert _kernel.kernel().mirrored_poses(vehicles, halves) is None

@@ -25,7 +25,7 @@ from highway_env.envs.common.observation import MultiAgentObservation
 from highway_env.envs.parking_env import ParkingEnv
 from highway_env.vehicle.objects import Obstacle, RoadObject
 
-from crashhunt.accelerator import Onlooker, SkippedObservation, switch_off, switch_on
+from crashhunt.accelerator import Onlooker, SkippedObservation, kernel, switch_off, switch_on
 from crashhunt.base.boundaries import Party
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.scenario import argument_values
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from highway_env.envs.common.action import ActionType
     from numpy.typing import NDArray
 
+    from crashhunt.accelerator import Poses
     from crashhunt.scenario import Scenario
     from crashhunt.simulators._protocol import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
@@ -80,10 +81,12 @@ class HighwaySimulator:
         self._setup = scenario.table(HighwaySetup)
         self._kinematics = Kinematics(scenario.observation) if scenario.observation is not None else None
         self._possible = tuple(scenario.agents)
+        reason = ""
         if not self._setup.accelerate:
             switch_off()
         elif reason := switch_on():
             logging.getLogger(__name__).warning("the accelerator is disabled: %s", reason)
+        self._compiled = kernel() if self._setup.accelerate and not reason else None
         self.agents: list[str] = []
         self._lane_names: dict[tuple[str, str, int], str] = {}
         try:
@@ -382,17 +385,10 @@ class HighwaySimulator:
         if seen != self._seen:
             self._seen = seen
             self._roster = Roster(tuple(map(self._actor, things)))
-        points, headings, speeds = [], [], []
-        for thing, actor in zip(things, self._roster.actors, strict=True):
-            if isinstance(thing, Puppet):
-                points.append((thing.shown.x, thing.shown.y))
-                headings.append(thing.shown.heading)
-                speeds.append(thing.shown.speed)
-                continue
-            (x, y), heading, half = thing.position.tolist(), float(thing.heading), actor.length / 2
-            points.append((x + half * math.cos(heading), 0.0 - (y + half * math.sin(heading))))  # avoids -0.0
-            headings.append(0.0 - heading)
-            speeds.append(float(thing.speed))
+        poses = None
+        if self._compiled is not None and self._puppets is None:
+            poses = self._compiled.mirrored_poses(things, self._roster.half_lengths)
+        points, headings, speeds = poses if poses is not None else self._poses(things)
         contacts = tuple(self._contacts)
         lanes: tuple[str, ...] = ()
         if self._steps % _LANES_EVERY == 0 or contacts or off_road:
@@ -401,6 +397,21 @@ class HighwaySimulator:
         self._scene = Scene(time_s, self._roster, points, headings, speeds, contacts, off_road, lanes)
         for agent, vehicle in self._controlled.items():
             self._scene.agent_lanes[agent] = self._lane_name(vehicle.lane_index)
+
+    def _poses(self, things: list[RoadObject]) -> Poses:
+        """Return the points, headings and speeds of objects in a scene."""
+        points, headings, speeds = [], [], []
+        for thing, half in zip(things, self._roster.half_lengths, strict=True):
+            if isinstance(thing, Puppet):
+                points.append((thing.shown.x, thing.shown.y))
+                headings.append(thing.shown.heading)
+                speeds.append(thing.shown.speed)
+                continue
+            (x, y), heading = thing.position.tolist(), float(thing.heading)
+            points.append((x + half * math.cos(heading), 0.0 - (y + half * math.sin(heading))))  # avoids -0.0
+            headings.append(0.0 - heading)
+            speeds.append(float(thing.speed))
+        return points, headings, speeds
 
     def _events_of(self, agent: str) -> Iterator[Event]:
         vehicle = self._controlled[agent]
