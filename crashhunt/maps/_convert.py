@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import math
 import re
 import shutil
 from dataclasses import dataclass, replace
@@ -23,6 +25,7 @@ __all__ = ["NET", "ConvertOptions", "Converted", "convert"]
 NET = "map.net.xml"
 _RAIL = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
 _LEFT_HAND = re.compile(rb"""\brule\s*=\s*["']LHT["']""")
+_LENGTH = re.compile(rb"""<(road|geometry)\b[^>]*?\slength\s*=\s*["']([^"']*)["']""")
 _LANELET = re.compile(rb"""\bv\s*=\s*["']lanelet["']""")
 _AT_LINE = re.compile(r"^\s*At line/column", re.MULTILINE)
 """What the programs add to an error of the XML itself, in contrast to one of its content."""
@@ -85,6 +88,8 @@ def convert(source: MapSource, options: ConvertOptions, tools: Tools, folder: Pa
     notes: list[str] = []
     if source.path is not None:
         _bring(source, folder)
+        if source.kind == "opendrive":
+            _check_lengths(source.path)
         if source.kind == "opendrive" and not options.left_hand and _keeps_left(source.path):
             options = replace(options, left_hand=True)
             notes.append("traffic keeps to the left: the map has roads with rule LHT")
@@ -150,6 +155,26 @@ def _keeps_left(path: Path) -> bool:
         return _LEFT_HAND.search(file.read(_HEAD_BYTES)) is not None
 
 
+def _check_lengths(path: Path) -> None:
+    """Refuse roads of a length that OpenDRIVE forbids. netconvert makes some road of them, and reports nothing.
+
+    Raises:
+        ScenarioError: a road or a geometry has a negative length, or one that is no number.
+    """
+    data = gzip.decompress(path.read_bytes()) if _is_packed(path) else path.read_bytes()
+    for element, text in _LENGTH.findall(data):
+        try:
+            is_length = 0 <= float(text) < math.inf
+        except ValueError:
+            is_length = False
+        if not is_length:
+            raise ScenarioError(
+                f"a <{element.decode()}> has the length {text.decode('utf-8', 'replace')[:40]!r}",
+                fix="correct the map: a length is a number of at least 0, in m",
+                where=str(path),
+            )
+
+
 def _is_lanelet(path: Path) -> bool:
     """Return whether a map without roads is one of Lanelet2, which borrows the file format of OpenStreetMap."""
     return not _is_packed(path) and _LANELET.search(path.read_bytes()) is not None
@@ -161,8 +186,6 @@ def _is_packed(path: Path) -> bool:
 
 
 def _unpack(folder: Path) -> None:
-    import gzip
-
     packed = folder / f"{NET}.gz"
     if packed.exists():
         with gzip.open(packed) as read, (folder / NET).open("wb") as write:

@@ -105,6 +105,17 @@ def xodr(folder, rule=""):
     return MapSource(kind="opendrive", path=path)
 
 
+@pytest.mark.parametrize("length", ["-300", "many", "nan"])
+@pytest.mark.parametrize("element", ["road", "geometry"])
+def test_length_that_opendrive_forbids_is_refused(tmp_path, element, length):
+    source = xodr(tmp_path)
+    head, tail = source.path.read_text().split(f"<{element} ")
+    source.path.write_text(f"{head}<{element} {tail.replace('300', length, 1)}")
+    with pytest.raises(ScenarioError, match=f"a <{element}> has the length '{length}'") as caught:
+        converted(source, tmp_path)
+    assert caught.value.where == str(source.path)
+
+
 def test_road_of_rule_lht_keeps_to_the_left(tmp_path):
     made, _ = converted(xodr(tmp_path, 'rule="LHT"'), tmp_path)
     assert made.network.left_hand
