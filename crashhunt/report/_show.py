@@ -18,7 +18,7 @@ from crashhunt.crashes import (
 )
 from crashhunt.recording import describe_value, is_opaque
 from crashhunt.report._status_screen import format_inputs
-from crashhunt.report._table import NEAREST, aligned, steps_table
+from crashhunt.report._table import NEAREST, aligned, stacked, steps_table
 from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import (
     COLUMNS,
@@ -50,6 +50,7 @@ __all__ = ["Story"]
 
 _MAX_ACTION_CHARACTERS = 60  # of an action that is no array of numbers
 _ROWS = 20  # of the table; of more steps, the table shows a selection
+_WIDTH = 80  # characters of a line of the table, as on an ordinary terminal
 
 
 class Story:
@@ -194,7 +195,7 @@ class Story:
                 cells = cells if drives_into else cells[:-1]
             cells += danger_cells(self.danger, step.step) if self.danger is not None else []
             rows.append([*cells, self._mark(step.step, moments.get(step.step))])
-        return aligned([header, *rows])
+        return aligned([*stacked(header), *rows], width=_WIDTH)
 
     def _steps(self) -> list[StepRecord]:
         """Return the steps that are described."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -34,6 +35,7 @@ __all__ = [
     "argument_units",
     "check_fields",
     "format_table",
+    "stacked",
     "steps_table",
 ]
 
@@ -117,23 +119,36 @@ def format_table(rows: Sequence[TableRow]) -> list[str]:
     return aligned([list(rows[0])] + [[_format(value) for value in row.values()] for row in rows])
 
 
-def aligned(rows: Sequence[Sequence[str]], *, left: int = 0) -> list[str]:
-    """Return rows as lines of columns.
+def aligned(rows: Sequence[Sequence[str]], *, left: int = 0, width: int = 0) -> list[str]:
+    """Return rows as lines of columns, which are two spaces apart.
 
     Args:
-        rows: the heading first; what a row has beyond it follows as it is.
+        rows: the heading first; cells of a row beyond the heading follow without alignment.
         left: number of columns that are aligned to the left; the others are aligned to the right.
+        width: number of characters of a line; wider columns are only one space apart. 0 for no limit.
     """
     count = len(rows[0])
     widths = [max(len(row[column]) for row in rows) for column in range(count)]
+    gap = " " if 0 < width < sum(widths) + 2 * (count - 1) else "  "
     lines = []
     for row in rows:
         cells = [
-            cell.ljust(width) if column < left else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=False))
+            cell.ljust(wide) if column < left else cell.rjust(wide)
+            for column, (cell, wide) in enumerate(zip(row, widths, strict=False))
         ]
-        lines.append(one_line("  ".join([*cells, *row[count:]])))
+        lines.append(one_line(gap.join([*cells, *row[count:]])))
     return lines
+
+
+def stacked(heading: Sequence[str]) -> list[list[str]]:
+    """Return a heading as several rows, one for each word of the longest name, so that columns stay narrow.
+
+    >>> stacked(["step", "target_speed", "gap m"])
+    [['', 'target_', 'gap'], ['step', 'speed', 'm']]
+    """
+    words = [re.findall(r"[^ _]+_?", name) for name in heading]
+    rows = max(map(len, words))
+    return [[([""] * (rows - len(name)) + name)[row] for name in words] for row in range(rows)]
 
 
 def _item(array: NDArray[np.generic], place: tuple[int, ...], shape: tuple[int, ...]) -> Any:
