@@ -220,7 +220,8 @@ def release_shared_memory(scratch: Path, *, of_ended: bool = False) -> None:
         of_ended: whether to remove only segments of processes that have ended.
     """
     name = _RECORDS.format("*")
-    for records in [*scratch.glob(name), *([] if of_ended else scratch.glob(f"*/{name}"))]:
+    # At the end at any depth: processes that confirm crashes have folders of their own inside.
+    for records in [*(scratch.glob(name) if of_ended else scratch.rglob(name))]:
         owner = owner_in(records.name)
         if of_ended and (owner is None or not has_ended(owner)):
             continue

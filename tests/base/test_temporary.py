@@ -544,8 +544,8 @@ def created(scratch: Path) -> shared_memory.SharedMemory:
 
 
 def test_shared_memory_of_a_trial_goes_and_that_of_others_stays(tmp_path):
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
+    scratch = tmp_path / "confirmations" / "shared-0"
+    scratch.mkdir(parents=True)
     theirs = shared_memory.SharedMemory(create=True, size=8)
     names = tmp_path / "names"
 
@@ -571,7 +571,7 @@ def test_shared_memory_of_a_trial_goes_and_that_of_others_stays(tmp_path):
             assert [Path("/dev/shm", name).exists() for name in (mine, taken, theirs.name, living)] == [
                 False, True, True, True
             ]  # fmt: skip
-        remove_scratch(tmp_path)  # the folder of a hunt that has the one of its audit inside
+        remove_scratch(tmp_path)  # the folder of a hunt that has those of confirmations inside
         assert not Path("/dev/shm", living).exists()
         assert Path("/dev/shm", theirs.name).exists()
         Path("/dev/shm", taken).unlink()
