@@ -1,7 +1,7 @@
 """Work that imports foreign code, in a fork of this process that ends with the work.
 
 A foreign module may end its process when it is imported, hang, replace functions of Python, or start programs. The
-process of the command decides what a hunt reports, so no such module is imported there.
+process of the command decides what a hunt reports, so it imports no module of an agent.
 
 The work is done in a fork of a fork. The first fork, the keeper, runs no foreign code, so it can end every program that
 the work has started: at the end of the work, and when the command is interrupted or killed.

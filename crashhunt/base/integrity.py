@@ -225,7 +225,8 @@ def is_authentic(purpose: str, statement: Mapping[str, object], code: object) ->
 def user_key() -> bytes:
     """Return the secret key of this user on this machine; the first call creates it.
 
-    Where no folder can keep it, each process has its own key, so that nothing counts as made here later.
+    If no folder can store the key, each process has its own key, and later processes do not recognize its crashes as
+    made here.
     """
     for folder in state_folders():
         key = _kept_key(folder / layout.ARCHIVE_KEY)

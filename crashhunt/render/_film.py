@@ -411,7 +411,9 @@ def save_panels(folder: Path, step: int, panels: Sequence[tuple[str, Panel]]) ->
             try:
                 picture = panel.draw(label=label)
                 if picture.shape != _SHAPE or picture.dtype != np.uint8:
-                    raise ValueError(f"type {picture.dtype} and shape {picture.shape} are not uint8 and {_SHAPE}")
+                    raise ValueError(
+                        f"a panel has type {picture.dtype} and shape {picture.shape}, not uint8 and {_SHAPE}"
+                    )
             except Exception as error:  # an agent may put anything into its panels
                 picture = explanation(error).draw(label=label)
             Image.fromarray(picture).save(folder / name, compress_level=1)
