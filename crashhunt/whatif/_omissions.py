@@ -12,6 +12,7 @@ Cost: one run that watches, three or six for each candidate, and one repetition;
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
@@ -49,7 +50,9 @@ _BEFORE_S = 10.0  # a period that ended longer before the crash has not led to i
 _EARLIER_S = (0.0, 0.5, 1.0)  # the reference driver takes over from these times before the period
 _LONGER_S = 5.0  # simulation time past the crash: a reference driver may only postpone it
 _CANDIDATES = 4
-_SPEED_CHANGED_MPS = 0.5  # less is a kept speed
+_SPEED_CHANGED_MPS = 0.5  # less is no braking
+_INSTEAD_S = 2.0  # before the crash: whether the agent then sped up for most of the time
+_SPEEDS_UP_MPS2 = 0.3  # less is a kept speed
 _SAYS_NOTHING = (Outcome.INVALID, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
 _DIFFERS = "the trial was not bit-identical when it was run again"
 _OLD = "the crashhunt of the snapshot has no reference driver, and with this crashhunt the trial is not bit-identical"
@@ -225,14 +228,14 @@ class _Search:
 
     def _instead(self, first: int) -> str:
         """Return what the agent did from a step to the crash, without the change of speed in the crash itself."""
-        speeds = [
-            scene.speeds[scene.roster.index[self._agent]]
-            for scene in self._recording.scenes()[first:-1]
-            if self._agent in scene.roster.index
-        ]
+        scenes = [scene for scene in self._recording.scenes()[first:-1] if self._agent in scene.roster.index]
+        speeds = [scene.speeds[scene.roster.index[self._agent]] for scene in scenes]
         if speeds and speeds[-1] <= speeds[0] - _SPEED_CHANGED_MPS:
             return "braked too little"
-        return "sped up" if speeds and max(speeds) >= speeds[0] + _SPEED_CHANGED_MPS else "kept its speed"
+        # A period begins long before a crash, when many a driver still speeds up. The last seconds tell bugs apart.
+        last = speeds[-1 - round(_INSTEAD_S / self._dt) :]
+        faster = sum(after - before > _SPEEDS_UP_MPS2 * self._dt for before, after in pairwise(last))
+        return "sped up" if 2 * faster > len(last) - 1 else "kept its speed"
 
 
 def _last_place(recording: Recording, agent: str) -> tuple[float, float]:

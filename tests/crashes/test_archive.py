@@ -279,7 +279,7 @@ def test_an_index_is_asked_for(tmp_path):
         archive.writestr("hunt.toml", "")
     assert "not an exported crash" in says()
     written(path, {}, schema=2)
-    assert says() == "schema 2 is not 1"
+    assert says() == "schema version 2 is not supported (supported: 1)"
     for index in ({"schema": "1"}, {"files": []}, {"files": {"a": {"size": "1", "blake2b": ""}}}, {"files": {"a": {}}}):
         written(path, {}, **{"listed": index.pop("files", {}), **index})
         assert "not an exported crash" in says(), index

@@ -1,0 +1,41 @@
+"""What an agent did instead of what it omitted, from speeds alone."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.whatif import _omissions
+
+
+def instead(*speeds, dt=0.5, first=0):
+    """Speeds in m/s at each step; the last one is that after the crash."""
+    roster = SimpleNamespace(index={"ego": 0})
+    scenes = [SimpleNamespace(roster=roster, speeds=[speed]) for speed in speeds]
+    search = object.__new__(_omissions._Search)
+    search._agent, search._dt = "ego", dt
+    search._recording = SimpleNamespace(scenes=lambda: scenes)
+    return search._instead(first)
+
+
+@pytest.mark.parametrize(
+    ("speeds", "expected"),
+    [
+        ((20, 21, 22, 23, 24, 25, 3), "sped up"),
+        ((20, 20, 20, 20, 20, 20, 3), "kept its speed"),
+        ((16, 18, 20, 20, 20, 20, 21, 3), "kept its speed"),  # it sped up before the last 2 s, and for a moment
+        ((20, 20, 20, 20, 19.9, 19.4, 3), "braked too little"),
+        ((25, 20, 21, 22, 23, 24, 3), "braked too little"),  # it has slowed down since the period began
+        ((20, 20, 21, 22, 22, 23, 30), "sped up"),  # for 1.5 s of 2 s; the crash itself does not count
+        ((20, 20, 20, 21, 21, 22, 30), "kept its speed"),  # for half of the time
+        ((20, 20.1, 20.2, 20.3, 20.4, 20.5, 3), "kept its speed"),  # by 0.2 m/s²
+        ((20, 3), "kept its speed"),
+    ],
+)
+def test_agent_sped_up_if_it_did_so_for_most_of_the_last_two_seconds(speeds, expected):
+    assert instead(*speeds) == expected
+
+
+def test_speeds_before_the_period_do_not_count():
+    assert instead(30, 20, 20, 20, 20, 20, 3, first=1) == "kept its speed"
