@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from crashhunt.crashes._lanes import LaneMap
+from crashhunt.crashes._lanes import LaneMap, _Lane
 from crashhunt.world import Actor, Roster, Scene
 
 ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0),))
@@ -151,3 +151,20 @@ def test_of_lanes_over_each_other_the_one_whose_middle_is_nearest_is_driven():
     scenes = drive_along([(80, 0.9, 0.0), (81, 2.0, 0.0)])
     assert not lanes.leaves_sideways(scenes, "ego")  # of the lane at 1.0, it has not left the side
     assert lanes.leaves_sideways(drive_along([(80, 0.4, 0.0), (81, 2.0, 0.0)]), "ego")
+
+
+@given(
+    st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=2, max_size=6, unique=True),
+    st.floats(0.5, 3.0),
+    st.floats(0.0, 1.0),
+    st.floats(-math.pi, math.pi),
+)
+def test_box_around_a_lane_leaves_out_no_point_in_it(points, half_width, share, direction):
+    middle = np.array(points)
+    aside = half_width * np.array([math.cos(direction), math.sin(direction)])
+    lane = _Lane(middle - aside, middle + aside)
+    for corner in middle:
+        for turn in range(8):
+            angle = direction + turn * math.pi / 4
+            point = corner + share * lane.half_width * np.array([math.cos(angle), math.sin(angle)])
+            assert abs(lane.place(point).aside_m) > lane.half_width or lane.may_hold(point)
