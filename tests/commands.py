@@ -47,7 +47,8 @@ _WHILE_RUNNING = (
     "crashhunt.samplers._space_filling", "crashhunt.scenario.backends.sumo._check",
     "crashhunt.scenario.backends.sumo._files", "crashhunt.suites._gate", "crashhunt.suites._suite",
     "crashhunt.whatif._engine", "encodings.ascii", "encodings.cp437", "gzip", "numpy.ma", "numpy.random",
-    "rich._emoji_codes", "rich.progress", "tomli_w", "urllib.request", "xml.etree.ElementTree", "xml.sax",
+    "pydantic.dataclasses", "rich._emoji_codes", "rich.progress", "tomli_w", "urllib.request",
+    "xml.etree.ElementTree", "xml.sax",
 )  # fmt: skip
 _FOR_COMMAND = {"compare": ("crashhunt.estimation", "scipy.stats")}  # the latter takes 0.8 s
 _MESSAGE = 1 << 20
