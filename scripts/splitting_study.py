@@ -39,13 +39,13 @@ from crashhunt.oracles import Overlap, ReportedCollision
 from crashhunt.rates import RareCounter, RateTest, Root
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.trial import CRASHES, TrialSpec
+from crashhunt.world import closing_rate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.json_types import Plain
-    from crashhunt.world import Frame
 
 PILOT_TREES: Final = 64
 """Trees for the test of the levels. They do not count for the estimate."""
@@ -241,27 +241,7 @@ def walks(repetitions: int, name: str) -> None:
 
 STEPS = 300
 PATIENCE_S = 600.0
-SAME_WAY = math.cos(math.pi / 6)
-HALF_LANE_M = 1.7
 EGO = "ego"
-
-
-def closing_rate(frame: Frame) -> float:
-    """Return the greatest closing speed by gap, in 1/s, of the vehicles ahead of the agent in the present scene."""
-    roster, columns = frame.roster, frame.columns[-1]
-    count, own = len(roster.actors), roster.index.get(EGO)
-    if own is None:
-        return 0.0
-    x, y = columns[0 : 2 * count : 2], columns[1 : 2 * count : 2]
-    heading, speed = columns[2 * count : 3 * count], columns[3 * count :]
-    cos, sin = math.cos(heading[own]), math.sin(heading[own])
-    along = (x - x[own]) * cos + (y - y[own]) * sin
-    across = (y - y[own]) * cos - (x - x[own]) * sin
-    ahead = (np.cos(heading - heading[own]) > SAME_WAY) & (np.abs(across) < HALF_LANE_M) & (along > 0)
-    if not ahead.any():
-        return 0.0
-    gaps = np.maximum(along[ahead] - np.array(roster.lengths)[ahead], 0.01)
-    return float((np.maximum(speed[own] - speed[ahead], 0.0) / gaps).max())
 
 
 class EpisodePath(SplitPath):
@@ -283,7 +263,7 @@ class EpisodePath(SplitPath):
     def level(self) -> float:  # type: ignore[override]
         """Closing speed by gap, in 1/s."""
         scene = self.episode.scene
-        return 0.0 if scene is None else closing_rate(scene.frame)
+        return 0.0 if scene is None else closing_rate(scene.frame, EGO)
 
     @property
     def is_over(self) -> bool:  # type: ignore[override]

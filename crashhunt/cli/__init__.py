@@ -13,6 +13,7 @@ import sys
 import textwrap
 import traceback
 from contextlib import suppress
+from itertools import pairwise
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import DISK, CrashhuntError, InternalError, UsageError, remedy
@@ -122,7 +123,7 @@ def _run(words: Sequence[str]) -> int:
         _check_names(words)
         parser = make_parser()
         complete(parser)
-        options = parser.parse_args(words)
+        options = parser.parse_args(_spell_out(words))
         remove_leftovers()
         with ended_by_signals():
             code: int = options.command(options, words)
@@ -191,6 +192,14 @@ def _check_names(words: Sequence[str]) -> None:
             word.encode()
         except UnicodeEncodeError:
             raise UsageError(f"{word!a} is not valid UTF-8", fix="rename it") from None
+
+
+def _spell_out(words: Sequence[str]) -> list[str]:
+    """Return the command line with ``--splitting`` in place of the second word of ``--rare splitting``.
+
+    An option with an optional value would take DIR for that value in ``run --rare DIR``.
+    """
+    return ["--splitting" if pair == ("--rare", "splitting") else pair[1] for pair in pairwise(["", *words])]
 
 
 def make_parser() -> argparse.ArgumentParser:

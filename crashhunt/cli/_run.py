@@ -18,6 +18,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.cli._common import (
     DONE,
     INTERRUPTED,
+    NO_ANSWER,
     NO_VALID_TRIAL,
     THE_ANSWER_IS_NO,
     add_json,
@@ -150,6 +151,8 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         print(json.dumps(report.to_json()))
     if report.stopped_because == "no_valid_trial":
         return NO_VALID_TRIAL
+    if report.stopped_because == "refused":
+        return NO_ANSWER
     if report.stopped_because == "interrupted":
         return INTERRUPTED
     if report.unconfirmed:

@@ -46,3 +46,9 @@ from ._settings import (
     answer_file as answer_file,
     scratch_of as scratch_of,
 )
+from ._splitting import (
+    COPIES_PER_LEVEL as COPIES_PER_LEVEL,
+    SplitPath as SplitPath,
+    Splitter as Splitter,
+    run_path as run_path,
+)

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from crashhunt.episode._probes import Prober
     from crashhunt.episode._questions import FirstCopy
     from crashhunt.episode._settings import WorkerSettings
+    from crashhunt.episode._splitting import Splitter
     from crashhunt.oracles import Oracle
     from crashhunt.recording import BlackBox
     from crashhunt.simulators import Simulator
@@ -73,7 +74,7 @@ def run_episode(
     prober: Prober | None = None,
     brancher: Brancher | None = None,
     first_copy: FirstCopy | None = None,
-    forcer: OnsetForcer | None = None,
+    forcer: OnsetForcer | Splitter | None = None,
 ) -> TrialResult:
     """Run one trial from its specification, recorded and measured, with the generators of the process seeded.
 
@@ -89,7 +90,7 @@ def run_episode(
         prober: runs robustness probes; None for none.
         first_copy: checks in the first step whether the episode can be copied.
         brancher: Runs forks with other disturbances where another actor is near.
-        forcer: Makes forks with a forced first onset; None if the trial is not a root.
+        forcer: Makes forks with a forced first onset, or with other noise; None if the trial is not a root.
 
     Returns:
         The result. Exceptions of agent and simulator are in the result.
@@ -117,10 +118,9 @@ def run_episode(
                 if result is None and forcer is not None and forcer.is_due(episode):
                     forcer.ask(episode)  # the first onset may begin in step 2, which an agent notices before step 1
                 while result is None:
-                    if spec.reseeding is not None and episode.steps == spec.reseeding.after:
-                        result = episode.reseed(spec.reseeding.seed)
-                        if result is not None:
-                            break
+                    seed = spec.reseeding.seed_after(episode.steps) if spec.reseeding is not None else None
+                    if seed is not None and (result := episode.reseed(seed)) is not None:
+                        break
                     result = episode.step()
                     for one in asking:
                         if result is None and one.is_due(episode):

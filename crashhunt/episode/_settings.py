@@ -63,6 +63,7 @@ class WorkerSettings(Serializable):
         probe_s: time between two probes of a trial, in s of simulation time; 0 for no probes.
         branch: The rates of disturbances in branches, ``NAME=RATE`` each; empty for no branches.
         force: The rates of disturbances of forks with a forced first onset, ``NAME=RATE`` each; empty for none.
+        splits: Whether roots have forks with other noise of the traffic, in place of forced onsets.
     """
 
     scenario: Scenario
@@ -81,10 +82,12 @@ class WorkerSettings(Serializable):
     probe_s: float = field(default=0.0, metadata=OMIT_DEFAULT)
     branch: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
     force: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
+    splits: bool = field(default=False, metadata=OMIT_DEFAULT)
 
     json_keys: ClassVar[tuple[str, ...]] = (
         "oracles", "crash_on", "scratch", "code", "argument_files", "timeout_s", "keep_trials", "sealed",
         "find_escapes", "audit", "hunt_seed", "warm_copies", "probe_s", "branch", "force",
+        "splits",
     )  # fmt: skip
 
     def is_audited(self, result: TrialResult) -> bool:

@@ -30,6 +30,7 @@ from crashhunt.episode import (
     Parts,
     Prober,
     ReferenceDriver,
+    Splitter,
     TakingOver,
     has_users_code,
     internal_error,
@@ -100,7 +101,7 @@ class TrialProcess:
         self._notices: list[str] = []
         self._reference: ReferenceDriver | None = None
         self._asking: tuple[
-            tuple[Prober | Brancher | OnsetForcer, str], ...
+            tuple[Prober | Brancher | OnsetForcer | Splitter, str], ...
         ] = ()  # copies of the trial, and what people call them
         # Line by line, so that what a dying process printed last is in the file.
         sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
@@ -266,8 +267,9 @@ class TrialProcess:
             report["braking"] = said
         return report
 
-    def _copies(self) -> tuple[Prober | None, Brancher | None, OnsetForcer | None]:
-        settings, prober, brancher, forcer = self._settings, None, None, None
+    def _copies(self) -> tuple[Prober | None, Brancher | None, OnsetForcer | Splitter | None]:
+        settings, prober, brancher = self._settings, None, None
+        forcer: OnsetForcer | Splitter | None = None
         if settings.probe_s:
             budget = BUDGET_BESIDE if settings.branch else BUDGET
             prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget, self._notices.append)
@@ -276,6 +278,10 @@ class TrialProcess:
         if settings.force:
             forcer = OnsetForcer(
                 settings.force, settings.crash_on, settings.timeout_s, self._delay, self._notices.append
+            )
+        elif settings.splits:
+            forcer = Splitter(
+                settings.crash_on, settings.timeout_s, self._delay, self._notices.append, self._cannot_copy
             )
         every = ((prober, "probes"), (brancher, "branches"), (forcer, "rare"))
         self._asking = tuple((asks, what) for asks, what in every if asks is not None)

@@ -15,7 +15,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.temporary import remove_at_once
 from crashhunt.crashes import list_near_misses
-from crashhunt.hunts._rates import RareWatch, crashed_copies
+from crashhunt.hunts._rates import crashed_copies, rare_watch
 from crashhunt.hunts._reports import BranchReport, ProbeReport, RareReport
 from crashhunt.hunts._state import BRANCHES, PROBES
 from crashhunt.hunts._verification import Found
@@ -304,9 +304,9 @@ def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport
         None if the hunt is not in rare mode.
     """
     again = copies.again
-    if not again.settings.rare or copies.disturber is None:
+    rule = rare_watch(again.settings, again.ledger, copies.disturber)
+    if rule is None:
         return None
-    rule = RareWatch(again.settings, again.ledger, copies.disturber)
     rule.read()
     found = [
         _crash_of_copy(result, max(crashed_copies(result), key=lambda copy: copy.weight)) for result in rule.weightiest
@@ -322,11 +322,13 @@ def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport
             estimate, estimate=None, estimated=None, estimated_disturbed=None, why_not=why, why_not_disturbed=why,
             more_roots=None,
         )  # fmt: skip
-    return RareReport(estimate=estimate, verified=verified, not_finished=not_finished, crashes=crashes)
+    return RareReport(
+        estimate=estimate, verified=verified, not_finished=not_finished, crashes=crashes, more=tuple(rule.lines)
+    )
 
 
 def _crash_of_copy(result: TrialResult, copy: ForcedCopy) -> Found:
-    spec = replace(result.spec, disturbances=copy.disturbances, forcing=None, origin="rare")
+    spec = replace(result.spec, disturbances=copy.disturbances, reseeding=copy.reseeding, forcing=None, origin="rare")
     return Found(spec, copy.crash, copy.step)
 
 

@@ -21,7 +21,7 @@ from crashhunt.hunts._fork_results import CopiedCrashes, keep_near_misses, verif
 from crashhunt.hunts._next_trials import GREATEST_LAG, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
 from crashhunt.hunts._progress import HuntStatus, PhaseClock, PhaseStatus, Progress, RemainingTime
-from crashhunt.hunts._rates import Forcings, RareWatch, bar_watch, rate_watch, refuse_training_traffic
+from crashhunt.hunts._rates import bar_watch, forcings_of, rare_watch, rate_watch, refuse_training_traffic
 from crashhunt.hunts._reports import HuntReport, StoppedBecause
 from crashhunt.hunts._state import (
     HEARTBEAT_S,
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.plugins import ImportedModules
-    from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.executors import Executor
     from crashhunt.ledger import Facts, Noted
     from crashhunt.plans import HuntSettings
@@ -184,9 +183,9 @@ class Hunt:
             begun_with=(before.get("sampler_version") or 1) if finished else None,
             disturber=self._disturber,
             unanswered=again,
-            forcings=self._rare(ledger, Forcings),
+            forcings=forcings_of(settings, ledger, self._disturber),
         )
-        progress.rare = self._rare(ledger, RareWatch)
+        progress.rare = rare_watch(settings, ledger, self._disturber)
         ledger.enter(
             "running",
             owner=ledger_owner(),
@@ -332,12 +331,6 @@ class Hunt:
         if probes is not None and probes["crashed_trials"] and probes["trial"] is not None:
             progress.stressed = ledger.result(probes["trial"])
 
-    def _rare(self, ledger: Ledger, make: Callable[[HuntSettings, Ledger, DisturbanceSampler], T]) -> T | None:
-        """Return a part of rare mode; None in any other hunt."""
-        if not self.settings.rare or self._disturber is None:
-            return None
-        return make(self.settings, ledger, self._disturber)
-
     def _hunt(
         self,
         runs_again: TrialReruns,
@@ -367,7 +360,7 @@ class Hunt:
             while True:
                 if progress.rare is not None:
                     progress.rare.read(min(in_flight, default=trials.upcoming))
-                precise = progress.rare is not None and progress.rare.is_met
+                precise = progress.rare is not None and progress.rare.is_over
                 stopping = progress.last_wanted is not None or progress.time_left_s <= 0 or precise
                 for spec in [] if stopping else trials.take(_under_way(executor.capacity) - len(in_flight)):
                     executor.submit(spec)
@@ -420,8 +413,8 @@ class Hunt:
             confirmation.close(progress)
         if self._stops:
             return "interrupted"
-        if progress.rare is not None and progress.rare.is_met:
-            return "precise"
+        if progress.rare is not None and progress.rare.is_over:
+            return "refused" if progress.rare.refusal else "precise"
         if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
             return "no_valid_trial"
         return "all_trials" if trials.exhausted else "time"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.hunts._progress import Progress
-    from crashhunt.hunts._rates import Forcings
+    from crashhunt.hunts._rates import Forcings, SplittingForcings
     from crashhunt.ledger import Ledger
     from crashhunt.plans import HuntSettings
     from crashhunt.samplers import NamedSampler
@@ -101,7 +101,7 @@ class Trials:
         begun_with: int | None = None,
         disturber: DisturbanceSampler | None = None,
         unanswered: Sequence[TrialSpec] = (),
-        forcings: Forcings | None = None,
+        forcings: Forcings | SplittingForcings | None = None,
     ) -> None:
         self._settings = settings
         self._sampler = sampler
@@ -239,6 +239,7 @@ def spec_of(
     scenario's arguments. Other samplers propose these arguments themselves.
 
     With a forcing the trial is a root, in which nothing is drawn from the step on in which a first onset can be forced.
+    With splitting, a root has the disturbances of a plain trial.
 
     Raises:
         CrashhuntError: the sampler fails.
@@ -274,7 +275,8 @@ def spec_of(
 
 def _drawn(disturber: DisturbanceSampler, seed: int, steps: int, forcing: Forcing | None) -> tuple[Disturbance, ...]:
     """Return the disturbances of a trial; for a root, only those before the first step with a forced onset."""
-    return disturber.draw(seed, steps if forcing is None else min(steps, FIRST_STEP - 1))
+    forces = forcing is not None and forcing.levels is None
+    return disturber.draw(seed, min(steps, FIRST_STEP - 1) if forces else steps)
 
 
 # What the workers of a hunt need to know.
@@ -294,7 +296,8 @@ def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Pat
         hunt_seed=settings.seed,
         probe_s=settings.probe_s,
         branch=tuple(settings.disturb) if settings.branch else (),
-        force=tuple(settings.disturb) if settings.rare else (),
+        force=tuple(settings.disturb) if settings.rare and not settings.splitting else (),
+        splits=settings.splitting,
     )
 
 

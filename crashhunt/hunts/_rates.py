@@ -6,6 +6,7 @@ Cost: constant for each trial. A resumed hunt reads the number and the outcome o
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
@@ -13,6 +14,7 @@ from crashhunt.disturbances import first_forcing
 from crashhunt.plans import rate_of, share_of
 from crashhunt.rates import (
     BLOCK,
+    PILOT_ROOTS,
     TRIALS_PER_ROOT,
     BarWatch,
     CountingRule,
@@ -20,31 +22,39 @@ from crashhunt.rates import (
     RareCounter,
     RateWatch,
     TrialFacts,
+    choose_levels,
+    crash_shares,
     is_root,
     learn_forcing,
     root_of,
+    tree_of,
+    why_unfit,
     with_plain,
 )
-from crashhunt.trial import Outcome
+from crashhunt.trial import Forcing, Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.ledger import Facts, Ledger, RunningRate
     from crashhunt.plans import HuntSettings
-    from crashhunt.rates import RareEstimate
+    from crashhunt.rates import RareEstimate, Root
     from crashhunt.training import HeldOutTraffics
-    from crashhunt.trial import Forced, ForcedCopy, Forcing, TrialResult
+    from crashhunt.trial import Forced, ForcedCopy, TrialResult
 
 
 __all__ = [
     "Forcings",
     "RareWatch",
+    "SplittingForcings",
+    "SplittingWatch",
     "bar_watch",
     "counting_rule",
     "crashed_copies",
+    "forcings_of",
     "greatest_weight",
+    "rare_watch",
     "rate_watch",
     "refuse_training_traffic",
     "why_no_interval",
@@ -196,18 +206,22 @@ class RareWatch:
     Args:
         settings: settings of the hunt.
         ledger: ledger of the hunt.
-        sampler: sampler of its disturbances.
+        sampler: sampler of its disturbances; None for splitting.
 
     Attributes:
         weightiest: the greatest weights of roots with a crash of a copy, in descending order.
         is_met: whether the interval is narrow enough; no trial is read after that.
+        refusal: why the hunt is of no use, as its first trials show; empty if they do not.
     """
 
-    def __init__(self, settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler) -> None:
+    def __init__(self, settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler | None) -> None:
         self.weightiest: list[TrialResult] = []
         self.is_met = False
+        self.refusal = ""
         self._settings, self._ledger = settings, ledger
-        self._hazard = len(sampler.agents) * math.fsum(sampler.chance(name) for name in sampler.models)
+        self._hazard = 1.0
+        if sampler is not None:
+            self._hazard = len(sampler.agents) * math.fsum(sampler.chance(name) for name in sampler.models)
         self._counter = RareCounter(min(1.0, self._hazard * settings.max_steps))
         self._until = share_of(settings.run.until_error) if settings.run.until_error else 0.0
         self._read = 0  # trials
@@ -219,13 +233,23 @@ class RareWatch:
         """The number of roots that were read together with their plain trials."""
         return self._counter.roots + self._counter.excluded
 
+    @property
+    def is_over(self) -> bool:
+        """Whether the hunt ends at the trials that were read."""
+        return self.is_met or bool(self.refusal)
+
+    @property
+    def lines(self) -> list[str]:
+        """What the user should know of the hunt besides the estimate."""
+        return []
+
     def read(self, finished: int | None = None) -> None:
         """Read the trials that have ended, up to the first one that has not.
 
         Args:
             finished: number of first trials that have ended; None to read it from the ledger.
         """
-        while not self.is_met and (finished is None or self._read < finished):
+        while not self.is_over and (finished is None or self._read < finished):
             result = self._ledger.result(self._read)
             if result is None:
                 return
@@ -236,19 +260,27 @@ class RareWatch:
                 self._group.clear()
 
     def _count(self, first: TrialResult, *plain: TrialResult) -> None:
-        crash_on = self._settings.crash_on
-        root = root_of(first, crash_on, self._hazard)
+        root = self._value_of(first, plain)
         if root is None:
-            valid = [one for one in plain if one.outcome is not Outcome.INVALID]
-            self._counter.add(None, (one.outcome in crash_on for one in valid), len(plain) - len(valid))
+            self._counter.add(None, *self._crashes_of(plain))
         else:
-            self._counter.add(with_plain(root, plain, crash_on))
+            self._counter.add(root)
             if any(crashed_copies(first)):
                 self.weightiest.append(first)
                 self.weightiest.sort(key=greatest_weight, reverse=True)
                 del self.weightiest[_WEIGHTIEST:]
         if self._until and self.roots % BLOCK == 0:
             self.is_met = self.estimate().relative_error <= self._until
+
+    def _value_of(self, first: TrialResult, plain: Sequence[TrialResult]) -> Root | None:
+        """Return a root with its plain trials; None if it has no complete result."""
+        root = root_of(first, self._settings.crash_on, self._hazard)
+        return None if root is None else with_plain(root, plain, self._settings.crash_on)
+
+    def _crashes_of(self, plain: Sequence[TrialResult]) -> tuple[list[bool], int]:
+        """Return which of the valid plain trials crashed, and how many are invalid."""
+        valid = [one for one in plain if one.outcome is not Outcome.INVALID]
+        return [one.outcome in self._settings.crash_on for one in valid], len(plain) - len(valid)
 
     def estimate(self) -> RareEstimate:
         """Return the estimate of the trials that were read."""
@@ -261,6 +293,125 @@ class RareWatch:
             now: whether the rate must be new; otherwise it may be some moments old.
         """
         return self._paced(self.roots, now=now)
+
+
+class SplittingForcings:
+    """The levels of each root of ``--rare splitting``: none of the first pilots, then what those suggest.
+
+    Args:
+        settings: settings of the hunt.
+        ledger: ledger of the hunt.
+    """
+
+    def __init__(self, settings: HuntSettings, ledger: Ledger) -> None:
+        self._ledger = ledger
+        self._levels: tuple[float, ...] | None = None
+
+    @staticmethod
+    def needed(number: int) -> int:
+        """Return how many trials, from number 0 on, have to have ended before a trial begins."""
+        return min(2, number // TRIALS_PER_ROOT // PILOT_ROOTS) * PILOT_ROOTS * TRIALS_PER_ROOT
+
+    def of(self, number: int) -> Forcing | None:
+        """Return the forcing of a root, None of a plain trial."""
+        if not is_root(number):
+            return None
+        if number < PILOT_ROOTS * TRIALS_PER_ROOT:
+            return Forcing(1.0, levels=())
+        if self._levels is None:
+            every = range(0, PILOT_ROOTS * TRIALS_PER_ROOT, TRIALS_PER_ROOT)
+            self._levels = choose_levels(_peaks_of(result for one in every if (result := self._ledger.result(one))))
+        return Forcing(1.0, levels=self._levels)
+
+
+class SplittingWatch(RareWatch):
+    """The same for ``--rare splitting``; the pilots do not count for the estimate, but for the certain bounds.
+
+    Args:
+        settings: settings of the hunt.
+        ledger: ledger of the hunt.
+
+    Attributes:
+        levels: the levels; empty until the pilots have ended that they are chosen from.
+        shares: crash probability in the pilot trees, of all paths and from each level; empty until they have ended.
+    """
+
+    def __init__(self, settings: HuntSettings, ledger: Ledger) -> None:
+        super().__init__(settings, ledger, None)
+        self.levels: tuple[float, ...] = ()
+        self.shares: tuple[float, ...] = ()
+        self._pilots: list[TrialResult] = []
+        self._trees: list[tuple[Forced, bool]] = []
+
+    def _count(self, first: TrialResult, *plain: TrialResult) -> None:
+        group = first.spec.number // TRIALS_PER_ROOT
+        if group < PILOT_ROOTS:  # without copies, so the root is a plain trial
+            self._pilots.append(first)
+            self._counter.add_plain(*self._crashes_of((first, *plain)))
+            if group == PILOT_ROOTS - 1:
+                self.levels = choose_levels(_peaks_of(self._pilots))
+                self.refusal = "" if self.levels else why_unfit([0.0])
+        elif group < 2 * PILOT_ROOTS:
+            if tree_of(first, self._settings.crash_on) is not None and first.forced is not None:
+                self._trees.append((first.forced, first.outcome in self._settings.crash_on))
+            self._counter.add_plain(*self._crashes_of(plain))
+            if group == 2 * PILOT_ROOTS - 1:
+                self.shares = tuple(crash_shares(self._trees, len(self.levels)))
+                self.refusal = why_unfit(self.shares)
+        else:
+            super()._count(first, *plain)
+
+    def _value_of(self, first: TrialResult, plain: Sequence[TrialResult]) -> Root | None:
+        tree = tree_of(first, self._settings.crash_on)
+        # A tree knows more of undisturbed crashes than a plain trial, so its plain trials stay out of its value.
+        return (
+            None
+            if tree is None
+            else replace(with_plain(tree, plain, self._settings.crash_on), undisturbed=tree.undisturbed)
+        )
+
+    def estimate(self) -> RareEstimate:
+        """Return the estimate of the trials that were read."""
+        found = super().estimate()
+        if self.refusal:
+            return replace(found, why_not=self.refusal, why_not_disturbed=self.refusal)
+        if not self.roots and not found.why_not.endswith("described"):
+            why = f"{self._read // TRIALS_PER_ROOT} of {2 * PILOT_ROOTS} pilot roots have ended"
+            return replace(found, why_not=why, why_not_disturbed=why)
+        return found
+
+    @property
+    def lines(self) -> list[str]:
+        """The levels, and the crash probability from each."""
+        if not self.shares:
+            return []
+        levels = ", ".join(f"{level:.2g}" for level in self.levels)
+        shares = ", ".join(f"{share:.2g}" for share in self.shares[1:])
+        what = f"  levels (closing speed by gap): {levels} per s"
+        return [f"{what}; P(crash) in {PILOT_ROOTS} pilot roots: {self.shares[0]:.2g}, from each level {shares}"]
+
+
+def _peaks_of(pilots: Iterable[TrialResult]) -> list[float]:
+    return [pilot.forced.peak for pilot in pilots if pilot.forced is not None and not pilot.forced.unanswered]
+
+
+def forcings_of(
+    settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler | None
+) -> Forcings | SplittingForcings | None:
+    """Return the forcing of roots; None if the hunt is not in rare mode."""
+    if not settings.rare:
+        return None
+    if settings.splitting:
+        return SplittingForcings(settings, ledger)
+    assert sampler is not None
+    return Forcings(settings, ledger, sampler)
+
+
+def rare_watch(settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler | None) -> RareWatch | None:
+    """Return what estimates the rate; None if the hunt is not in rare mode."""
+    if not settings.rare:
+        return None
+    return SplittingWatch(settings, ledger) if settings.splitting else RareWatch(settings, ledger, sampler)
 
 
 def crashed_copies(result: TrialResult) -> Iterator[ForcedCopy]:

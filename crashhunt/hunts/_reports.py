@@ -182,17 +182,14 @@ class RareReport:
         verified: number of the weightiest crashes of copies that were run from the start.
         not_finished: number of these runs that did not finish.
         crashes: the runs that crashed in the same way at the same step, and again bit-identically.
+        more: further lines for the user, such as the levels of splitting.
     """
 
     estimate: RareEstimate
     verified: int
     not_finished: int
     crashes: tuple[Bundle, ...]
-
-    @property
-    def is_verified(self) -> bool:
-        """Whether every completed run from the start has crashed again."""
-        return len(self.crashes) == self.verified - self.not_finished
+    more: tuple[str, ...] = ()
 
     def to_json(self) -> JsonObject:
         """Return the shape that ``run --json`` prints."""
@@ -209,7 +206,8 @@ class RareReport:
         """The estimate, its evidence and its limits, as lines for the user."""
         found = self.estimate
         if found.estimate is None:
-            return [f"rare: no estimate: {found.why_not or 'no root has ended'}"]
+            certain = [] if found.roots else self._certain_lines  # bounds that rest on plain trials alone
+            return [f"rare: no estimate: {found.why_not or 'no root has ended'}", *self.more, *certain]
         answer = f"rare: {found.estimate:.2g} per trial" if found.estimate else "rare: no crash yet"
         if found.estimated is not None:
             one = found.estimated
@@ -235,12 +233,18 @@ class RareReport:
             lines.append(f"  {spent}; plain trials alone need about {found.plain_equivalent_steps:.2g} steps")
         if self.verified:
             lines.append(f"  of the {self.verified} weightiest crashes, {len(self.crashes)} came again from the start")
-        if found.certain is not None:
-            low, high = found.certain
-            crashed = f"{found.plain_crashes} of {found.plain} plain trials crashed"
-            lines.append(f"  certain: at least {low:.2g}, at most {high:.2g} ({found.confidence:.0%}; {crashed})")
+        lines += [*self.more, *self._certain_lines]
         lines.append("  the estimate omits failures that no copy has met; the certain bounds include them")
         return lines
+
+    @property
+    def _certain_lines(self) -> list[str]:
+        found = self.estimate
+        if found.certain is None:
+            return []
+        low, high = found.certain
+        crashed = f"{found.plain_crashes} of {found.plain} plain trials crashed"
+        return [f"  certain: at least {low:.2g}, at most {high:.2g} ({found.confidence:.0%}; {crashed})"]
 
 
 _CELLS_SHOWN = 5  # parts of the estimate of rare mode
@@ -256,7 +260,9 @@ def kind_data(group: Group) -> KindData:
     }
 
 
-StoppedBecause = Literal["crash", "distinct", "rate", "all_trials", "interrupted", "no_valid_trial", "time", "precise"]
+StoppedBecause = Literal[
+    "crash", "distinct", "rate", "all_trials", "interrupted", "no_valid_trial", "time", "precise", "refused"
+]
 
 
 @dataclass(frozen=True, slots=True)

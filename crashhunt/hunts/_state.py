@@ -177,7 +177,7 @@ HEARTBEAT_S = 1.0  # every so often a hunt says in its ledger that it is alive
 _SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
 _ENDED: dict[str, State] = {
     "crash": "crashed", "distinct": "crashed", "all_trials": "finished", "no_valid_trial": "error",
-    "rate": "finished", "interrupted": "interrupted", "time": "finished", "precise": "finished",
+    "rate": "finished", "interrupted": "interrupted", "time": "finished", "precise": "finished", "refused": "finished",
     "error": "error", "queued": "queued",
 }  # fmt: skip
 

@@ -168,6 +168,12 @@ class TrialOptions(_Options):
         "a first disturbance, weighted by its probability; needs --disturb with rates and implies --keep-going",
         flag="--rare", group="faults",
     )  # fmt: skip
+    splitting: bool = option(
+        False, "with ``rare``, whether copies of a trial differ by the noise of other drivers, and not by disturbances",
+        help="with --rare: copy trials that come close to the vehicle ahead, each with other noise of the drivers; "
+        "the same as --rare splitting; needs no --disturb",
+        flag="--splitting", group="faults",
+    )  # fmt: skip
     seeds: int = option(
         0, "number of traffics, each used for many arguments of the agents; 0: a new traffic in each trial",
         help="draw this many traffics (a seed and the scenario's arguments), and use each for many arguments of the "

@@ -489,12 +489,14 @@ def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str]
     if not settings.rare:
         if run.until_error:
             raise UsageError(f"--until-error {run.until_error} needs --rare", fix="add --rare")
+        if settings.splitting:
+            raise UsageError("--splitting needs --rare", fix="add --rare")
         return
-    if not parse_rates(settings.disturb):
+    if not settings.splitting and not parse_rates(settings.disturb):
         fix = "say how often what happens, such as --disturb brake=0.02,cut_in=0.02"
         raise UsageError("--rare needs disturbances with rates, but the hunt has none", fix=fix)
     agents = tuple(settings.agents)
-    if fixed := parse_fixed(settings.disturb, agents):
+    if not settings.splitting and (fixed := parse_fixed(settings.disturb, agents)):
         message = f"--rare: --disturb {word_of(fixed[0], agents)} begins in every trial"
         raise UsageError(message, fix="give rates only")
     if not sampler_of(settings).independent:
@@ -506,9 +508,9 @@ def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str]
     }  # fmt: skip
     if given := next((flag for flag, value in excluded.items() if value), None):
         raise UsageError(f"--rare and {given} exclude each other", fix=f"omit {given}")
-    sampler = disturber(scenario, settings.disturb, agents, find=find)
-    assert sampler is not None
-    for name, rate in sampler.rates.items():
+    sampler = None if settings.splitting else disturber(scenario, settings.disturb, agents, find=find)
+    for name, rate in sampler.rates.items() if sampler is not None else ():
+        assert sampler is not None
         if sampler.chance(name) > _MAX_RARE_CHANCE:
             most = _MAX_RARE_CHANCE / sampler.step_length_s
             message = f"--rare: --disturb {name}={rate:g} has a chance of {sampler.chance(name):.2g} per step"

@@ -35,6 +35,13 @@ from ._running import (
     Paced as Paced,
     RateWatch as RateWatch,
 )
+from ._splitting import (
+    PILOT_ROOTS as PILOT_ROOTS,
+    choose_levels as choose_levels,
+    crash_shares as crash_shares,
+    tree_of as tree_of,
+    why_unfit as why_unfit,
+)
 from ._units import (
     MAX_INVALID_SHARE as MAX_INVALID_SHARE,
     PERS as PERS,

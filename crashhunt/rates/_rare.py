@@ -449,8 +449,7 @@ class RareCounter:
         """
         if root is None:
             self.excluded += 1
-            self._counts["invalid"] += invalid
-            self._add_plain(list(plain))
+            self.add_plain(plain, invalid)
             return
         self.roots += 1
         self._whole.add(root.value)
@@ -469,8 +468,19 @@ class RareCounter:
             whole, copies = self._tests
             bound = 1.0 + root.bound
             whole.add((root.own + root.copies) / bound, 1.0 / bound)
-            copies.add(root.copies / root.bound, 1.0 / root.bound)
+            if root.bound:
+                copies.add(root.copies / root.bound, 1.0 / root.bound)
         self._add_plain([True] * root.plain_crashes + [False] * (root.plain - root.plain_crashes))
+
+    def add_plain(self, crashed: Iterable[bool], invalid: int = 0) -> None:
+        """Add plain trials that belong to no root that counts: they count for the certain interval.
+
+        Args:
+            crashed: of the valid ones, which crashed.
+            invalid: number of the others.
+        """
+        self._counts["invalid"] += invalid
+        self._add_plain(list(crashed))
 
     def _add_plain(self, crashed: Sequence[bool]) -> None:
         self._counts.update(plain=len(crashed), plain_crashes=sum(crashed))

@@ -348,7 +348,8 @@ def _digest(array: NDArray[np.generic]) -> bytes:
 
 def _advance(episode: Episode, actions: Mapping[str, NDArray[np.generic]]) -> TrialResult | None:
     reseeding = episode.spec.reseeding
-    if reseeding is not None and episode.steps == reseeding.after and episode.reseed(reseeding.seed) is not None:
+    seed = reseeding.seed_after(episode.steps) if reseeding is not None else None
+    if seed is not None and episode.reseed(seed) is not None:
         return episode.result
     return episode.step(actions)
 

@@ -10,7 +10,7 @@ from crashhunt.base.codec import OMIT_DEFAULT, Serializable, from_plain, null_is
 from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._evidence import KILLED, Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
-from crashhunt.trial._specification import TrialSpec
+from crashhunt.trial._specification import Reseeding, TrialSpec
 from crashhunt.world import ClosestApproach, Event
 
 __all__ = ["Branch", "Branches", "Forced", "ForcedCopy", "Stress", "TrialResult", "in_effect", "summarize"]
@@ -92,6 +92,7 @@ class ForcedCopy(Serializable):
         within: conditional probability of this copy, given its first onset. It is 1 if later disturbances are drawn as
             usual. With forced second onsets, it is the probability of the forced second onset, or of no second onset.
         second: the cell of its forced second onset; empty for none.
+        reseeding: with splitting, when its simulator's generators got other seeds; None without splitting.
     """
 
     cell: str
@@ -104,6 +105,7 @@ class ForcedCopy(Serializable):
     disturbances: tuple[Disturbance, ...] = field(default=(), metadata=OMIT_DEFAULT)
     within: float = field(default=1.0, metadata=OMIT_DEFAULT)
     second: str = field(default="", metadata=OMIT_DEFAULT)
+    reseeding: Reseeding | None = field(default=None, metadata=OMIT_DEFAULT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +113,14 @@ class Forced(Serializable):
     """The results of the copies of a root.
 
     Args:
-        survival: probability that no first onset begins before the root ends.
+        survival: probability that no first onset begins before the root ends; with splitting, weight of the root.
         masses: masses by cell, the probability that the first onset is of this cell and begins before the root ends.
         copies: copies in the order of their onsets; after each copy its own copies, with a second onset.
         steps: number of steps of the copies.
         unanswered: number of planned copies without a result.
         why_unanswered: the reason for the first of them; empty if there is none.
         may_be_asked_again: whether a reason lies outside of the trial, so that another run may get all answers.
+        peak: with splitting, the greatest measure of the root, to which the levels are compared.
     """
 
     survival: float
@@ -127,6 +130,7 @@ class Forced(Serializable):
     unanswered: int = field(default=0, metadata=_NOT_ALL_ANSWERED)
     why_unanswered: str = field(default="", metadata=_NOT_ALL_ANSWERED)
     may_be_asked_again: bool = field(default=False, metadata=_NOT_ALL_ANSWERED)
+    peak: float = field(default=0.0, metadata=OMIT_DEFAULT)
 
     def by_first_onset(self) -> list[tuple[ForcedCopy, ...]]:
         """Return the copies of each first onset: the copy of the root, then the copies of that with a second onset."""

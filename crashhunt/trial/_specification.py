@@ -75,10 +75,16 @@ class Reseeding(Serializable):
     Args:
         after: the step; the next step is the first that draws from the new seeds.
         seed: seed of all generators of the simulator; 0 to 2**31 - 1.
+        earlier: further re-seedings at earlier steps, each as its step and its seed.
     """
 
     after: int
     seed: int
+    earlier: tuple[tuple[int, int], ...] = field(default=(), metadata=_ESSENTIAL)
+
+    def seed_after(self, step: int) -> int | None:
+        """Return the seed that the generators get after a step; None if they continue."""
+        return self.seed if step == self.after else dict(self.earlier).get(step)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +97,15 @@ class Forcing(Serializable):
             missing. A cell is a model with one strength, such as ``brake=4.0``.
         second: cells of first onsets whose copies have forced second onsets.
         second_spacing: probability per forced second onset; 0 for none.
+        levels: with splitting, the levels at which a path of the root continues as several; copies then get other
+            random numbers, and no onset is forced. None without splitting.
     """
 
     spacing: float
     ratios: Mapping[str, float] = field(default_factory=dict)
     second: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
     second_spacing: float = field(default=0.0, metadata=OMIT_DEFAULT)
+    levels: tuple[float, ...] | None = field(default=None, metadata=OMIT_DEFAULT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +148,8 @@ class TrialSpec(Serializable):
     def to_json(self) -> JsonObject:
         """Return plain dicts and numbers; ``requires`` names what another version must know."""
         data = to_plain(self)
-        if requires := [*required_of(self), *(required_of(self.overruled) if self.overruled else ())]:
+        inner = [one for one in (self.overruled, self.reseeding) if one is not None]
+        if requires := [name for one in (self, *inner) for name in required_of(one)]:
             data["requires"] = requires
         return data
 

@@ -10,12 +10,13 @@ from types import SimpleNamespace
 import pytest
 
 import crashhunt
+from crashhunt.cli import _spell_out
 from crashhunt.disturbances import DisturbanceSampler, brake
 from crashhunt.errors import UsageError
 from crashhunt.hunts import _rates as rare_module, hunt_state
 from crashhunt.hunts._rates import Forcings, RareWatch
 from crashhunt.ledger import Ledger
-from crashhunt.rates import BLOCK, TRIALS_PER_ROOT, is_root
+from crashhunt.rates import BLOCK, TRIALS_PER_ROOT, _splitting as splitting, is_root
 from crashhunt.trial import CRASHES, Disturbance, Forced, ForcedCopy, Forcing, Outcome, TrialResult, TrialSpec
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
@@ -53,6 +54,8 @@ def _folder(tmp_path, monkeypatch):
         ({"disturb": ["stop=0.01"], "distinct": 2}, "--rare and --distinct exclude each other"),
         ({"disturb": ["stop=3"]}, "stop=3 has a chance of 0.3 per step"),
         ({"rare": False, "until_error": "30%"}, "--until-error 30% needs --rare"),
+        ({"rare": False, "splitting": True}, "--splitting needs --rare"),
+        ({"splitting": True, "sampler": "guided"}, "the sampler guided does not draw trials independently"),
         ({"disturb": ["stop=0.01"], "until_error": "300%"}, "--until-error is 300%"),
         ({"disturb": ["stop=0.01"], "until_error": "soon"}, "--until-error is soon"),
     ],
@@ -61,6 +64,12 @@ def test_rare_mode_refuses_what_it_has_no_law_for(tmp_path, options, says):
     with pytest.raises(UsageError, match=says) as refused:
         crashhunt.prepare(tmp_path / "h", 1, 8, 20, **(OPTIONS | options))
     assert refused.value.fix
+
+
+def test_splitting_needs_no_disturbance_and_is_written_as_the_second_word_of_rare(tmp_path):
+    assert crashhunt.prepare(tmp_path / "h", 1, 8, 20, **OPTIONS, splitting=True).settings.splitting
+    assert _spell_out(["run", "--rare", "splitting", "h"]) == ["run", "--rare", "--splitting", "h"]
+    assert _spell_out(["run", "splitting", "--rare", "h"]) == ["run", "splitting", "--rare", "h"]
 
 
 class Rows(dict):
@@ -205,7 +214,6 @@ def test_a_hunt_in_rare_mode_is_the_same_with_any_number_of_workers_and_resumed(
     crashhunt.run(tmp_path / "again", 3, 33, 60, **options)
     again = crashhunt.run(tmp_path / "again", 2, 60, 60, **options)
     assert estimate_of(whole) == estimate_of(again)
-    assert whole.rare.is_verified
     assert whole.rare.verified == len(whole.rare.crashes) > 0
     assert whole.rare.estimate.roots == 12
     with closing(Ledger(tmp_path / "whole" / "ledger.sqlite")) as ledger:
@@ -240,3 +248,24 @@ def test_result_with_copies_survives_json():
     lost = replace(result, forced=replace(result.forced, unanswered=1, may_be_asked_again=True))
     assert lost.is_to_be_run_again
     assert not lost.is_fully_asked
+
+
+@pytest.mark.nightly
+def test_hunt_with_splitting_copies_paths_whose_crashes_come_again_from_the_start(tmp_path, monkeypatch):
+    for module in (rare_module, splitting):
+        monkeypatch.setattr(module, "PILOT_ROOTS", 6)
+    monkeypatch.setattr(rare_module, "why_unfit", lambda shares: "")
+    (tmp_path / "toy.toml").write_text(TOY.replace("12.0", "5.0"))
+    options = OPTIONS | {"splitting": True, "keep": 1, "keep_going": True, "arguments": {"speed": 10.8}}
+    whole = crashhunt.run(tmp_path / "whole", 2, 90, 60, **options)
+    crashhunt.run(tmp_path / "again", 1, 63, 60, **options)
+    again = crashhunt.run(tmp_path / "again", 2, 90, 60, **options)
+    assert estimate_of(whole) == estimate_of(again)
+    with closing(Ledger(tmp_path / "whole" / "ledger.sqlite")) as ledger:
+        roots = [result for result in ledger.results() if is_root(result.spec.number)]
+    copies = [copy for result in roots for copy in result.forced.copies]
+    assert copies
+    assert not any(result.forced.copies for result in roots[:6])
+    assert whole.rare.estimate.roots == 6
+    assert whole.rare.verified == len(whole.rare.crashes) > 0
+    assert any("levels (closing speed by gap)" in line for line in whole.rare.lines)

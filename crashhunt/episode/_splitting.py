@@ -1,0 +1,320 @@
+"""Splitting: a path of a root that reaches a level continues as several, which differ by the noise of the traffic.
+
+A level is a threshold on a measure of the present scene: the closing speed by gap of the vehicle ahead. A path that
+reaches the next level for the first time continues as `COPIES_PER_LEVEL` paths with an equal share of its weight. The
+path itself keeps its random numbers. The simulator of each copy gets new seeds. The root and its copies form a tree.
+
+Invariant: the weights of a tree have the sum 1, and each copy has the law of the original from its state on. So the
+expected weight of the crashes of a tree is the crash probability of a plain trial, for any levels that are fixed before
+the root begins. This needs a measure of the past and the present only: one that looks ahead would choose paths by their
+ends. The root is a plain trial, bit by bit.
+
+Draws of the agent and of disturbances are the same in all copies. That correlates the paths of a tree, and biases
+nothing. Trees are independent.
+
+A copy always runs to the end of its trial. A tree with a copy that has no answer counts as incomplete.
+
+Source: P. Glasserman, P. Heidelberger, P. Shahabuddin and T. Zajic, Multilevel splitting for estimating rare event
+probabilities, Operations Research 47(4), 1999.
+Cost: the steps of the copies, a fork for each, and about 20 µs for the measure of a scene.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Final, Protocol, cast
+
+import numpy as np
+
+from crashhunt.base.capabilities import supports
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.forks import NoAnswer
+from crashhunt.episode._questions import Questions
+from crashhunt.simulators import Reseeds
+from crashhunt.trial import Forced, ForcedCopy, Outcome, Reseeding
+from crashhunt.world import closing_rate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.base.json_types import Plain
+    from crashhunt.episode._episode import Episode
+    from crashhunt.trial import TrialResult
+
+__all__ = ["COPIES_PER_LEVEL", "SplitPath", "Splitter", "run_path", "split_path"]
+
+COPIES_PER_LEVEL: Final = 3
+"""Paths as which a path continues from a level on: about as many as one of the pilots' levels is harder to reach."""
+_SPLITS = 0x73706C69  # separates the seeds of copies from others with the seed of the trial
+
+
+class SplitPath(Protocol):
+    """A running trial, or a copy of it.
+
+    Attributes:
+        reached: number of levels that it has reached.
+        weight: its share of the tree.
+        measure: of the present scene, to which levels are compared.
+        is_over: whether it has ended.
+    """
+
+    reached: int
+    weight: float
+
+    @property
+    def measure(self) -> float: ...
+    @property
+    def is_over(self) -> bool: ...
+
+    def step(self) -> None:
+        """Run one step."""
+
+    def fork(self, grow: Callable[[SplitPath], list[ForcedCopy]]) -> list[ForcedCopy]:
+        """Make a copy with new random numbers, and return what `grow` returns for it."""
+
+    def end(self) -> ForcedCopy:
+        """Return how it ended."""
+
+
+def split_path(path: SplitPath, levels: Sequence[float]) -> list[ForcedCopy]:
+    """Copy a path for each level that it has reached by now; return how these copies and their own copies ended."""
+    ends: list[ForcedCopy] = []
+    while path.reached < len(levels) and path.measure >= levels[path.reached]:
+        path.reached += 1
+        path.weight /= COPIES_PER_LEVEL
+        for _ in range(COPIES_PER_LEVEL - 1):
+            ends += path.fork(partial(run_path, levels=levels))
+    return ends
+
+
+def run_path(path: SplitPath, levels: Sequence[float]) -> list[ForcedCopy]:
+    """Run a path to its end, with copies of it; return how they ended, the path itself first."""
+    ends: list[ForcedCopy] = []
+    while not path.is_over:
+        ends += split_path(path, levels)
+        path.step()
+    return [path.end(), *ends]
+
+
+class Splitter:
+    """Grows the tree of one root after another.
+
+    Args:
+        crash_on: the outcomes that count as a crash.
+        patience_s: time limit of a copy without copies, in s of wall time.
+        delay: called with the wall time that copies have taken, in s.
+        tell: called with what the user should know.
+        refuse: called with the reason, where the simulator has no noise to draw again.
+    """
+
+    def __init__(
+        self,
+        crash_on: Sequence[Outcome],
+        patience_s: float,
+        delay: Callable[[float], None],
+        tell: Callable[[str], None] = lambda _: None,
+        refuse: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._crashes = frozenset(map(str, crash_on))
+        self._patience_s = patience_s
+        self._delay = delay
+        self._refuse = refuse
+        self._questions = Questions("rare", tell)
+        self._path: _EpisodePath | None = None
+        self._copies: list[ForcedCopy] = []
+        self._peak = 0.0
+
+    @property
+    def why_not(self) -> str:
+        """Why no copies can be made any more, in words; empty if they can."""
+        return self._questions.why_not
+
+    def stop(self, why_not: str) -> None:
+        """Make no copies any more."""
+        self._questions.stop(why_not)
+
+    def is_due(self, episode: Episode) -> bool:
+        """Whether the trial is a root of splitting: the peak is that of every step."""
+        return episode.spec.forcing is not None and episode.spec.forcing.levels is not None
+
+    def ask(self, episode: Episode) -> None:
+        """Make the copies that leave the root after the step that is complete; also called before the first step."""
+        assert episode.spec.forcing is not None
+        if self._path is None:
+            self._path = _EpisodePath(episode, self._crashes, self._patience_s, (), questions=self._questions)
+            if why_not := _why_no_noise(episode):
+                self._questions.stop(why_not)
+                self._refuse(why_not)
+        self._peak = max(self._peak, self._path.measure)
+        if self._questions.why_not and not self._questions.unanswered:
+            self._questions.skip()
+        if self._questions.unanswered:
+            return  # the tree is incomplete anyway
+        began = time.monotonic()
+        try:
+            self._copies += split_path(self._path, episode.spec.forcing.levels or ())
+        except CrashhuntError as error:
+            self._questions.stop(error.message)
+            self._questions.skip()
+        finally:
+            if self._path.has_forked:
+                self._path.has_forked = False
+                self._delay(time.monotonic() - began)
+
+    def result(self, result: TrialResult) -> TrialResult:
+        """Return the result of the root with what its copies have found; the next trial begins."""
+        path, copies, peak, asked = self._path, tuple(self._copies), self._peak, self._questions
+        self._path, self._copies, self._peak = None, [], 0.0
+        if path is None:
+            return result
+        forced = Forced(
+            survival=path.weight,
+            masses={},
+            copies=copies,
+            steps=sum(copy.step - copy.branched for copy in copies),
+            unanswered=asked.unanswered,
+            why_unanswered=asked.why_unanswered,
+            may_be_asked_again=asked.may_be_answered,
+            peak=peak,
+        )
+        asked.begin_trial()
+        return replace(result, forced=forced)
+
+
+class _LostError(Exception):
+    """A copy of a copy has no answer."""
+
+
+class _EpisodePath:
+    """An episode as a path; copies are forks of its process.
+
+    Args:
+        episode: it runs.
+        crashes: the outcomes that count as a crash.
+        patience_s: time limit of a copy without copies, in s of wall time.
+        key: numbers of the forks that led to it; they give the seeds of its copies.
+        reseedings: step and seed of each of these forks.
+        reached: number of levels that it has reached.
+        weight: its share of the tree.
+        questions: what counts copies without an answer, for the root; None for a copy, which is lost with its own.
+
+    Attributes:
+        has_forked: whether it has made a copy.
+    """
+
+    def __init__(
+        self,
+        episode: Episode,
+        crashes: frozenset[str],
+        patience_s: float,
+        key: tuple[int, ...],
+        reseedings: tuple[tuple[int, int], ...] = (),
+        reached: int = 0,
+        weight: float = 1.0,
+        questions: Questions | None = None,
+    ) -> None:
+        self.episode, self.reached, self.weight = episode, reached, weight
+        self.has_forked = False
+        self._crashes, self._patience_s, self._key, self._reseedings = crashes, patience_s, key, reseedings
+        self._questions = questions
+        self._branched = episode.steps
+        self._forks = 0
+
+    @property
+    def measure(self) -> float:
+        """The greatest closing speed by gap of a vehicle ahead of an agent, in 1/s."""
+        scene = self.episode.scene
+        return 0.0 if scene is None else max(closing_rate(scene.frame, name) for name in self.episode.names)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the trial has ended."""
+        return self.episode.result is not None
+
+    def step(self) -> None:
+        """Run one step."""
+        self.episode.step()
+
+    def fork(self, grow: Callable[[SplitPath], list[ForcedCopy]]) -> list[ForcedCopy]:
+        """Make a copy with new seeds of its simulator, and return what `grow` returns for it.
+
+        Raises:
+            _LostError: it has no answer, and this is a copy itself.
+        """
+        self._forks += 1
+        self.has_forked = True
+        key = (*self._key, self._forks)
+        sequence = np.random.SeedSequence(self.episode.spec.seed, spawn_key=(_SPLITS, *key))
+        seed = int(sequence.generate_state(1)[0] >> 1)
+        # A second level in the same step re-seeds all generators again, so only the last seed of a step counts.
+        earlier = tuple(one for one in self._reseedings if one[0] != self.episode.steps)
+        again = (*earlier, (self.episode.steps, seed))
+
+        def run(made: Episode) -> Plain:
+            path = _EpisodePath(made, self._crashes, self._patience_s, key, again, self.reached, self.weight)
+            made.reseed(seed)
+            try:
+                return {"ends": [one.to_json() for one in grow(path)]}
+            except _LostError as lost:
+                reason: NoAnswer = lost.args[0]
+                return {"lost": reason.why, "is_from_outside": reason.is_from_outside}
+
+        def attempt() -> tuple[Plain | None, NoAnswer | None]:
+            copy = self.episode.fork(run, observed=False)
+            return copy.answer(self._patience_s * COPIES_PER_LEVEL**self._levels_left), copy.no_answer
+
+        if self._questions is not None:
+            answer = self._questions.ask(attempt)
+            if answer is None:
+                return []
+        else:
+            answer, no_answer = attempt()
+            if answer is None:
+                raise _LostError(no_answer or NoAnswer("did not answer"))
+        if lost := answer.get("lost"):
+            reason = NoAnswer(str(lost), is_from_outside=bool(answer["is_from_outside"]))
+            if self._questions is None:
+                raise _LostError(reason)
+            self._questions.skip(f"a copy {reason.why}", is_from_outside=reason.is_from_outside)
+            return []
+        return [ForcedCopy.from_json(end) for end in cast("list[JsonObject]", answer["ends"])]
+
+    @property
+    def _levels_left(self) -> int:
+        forcing = self.episode.spec.forcing
+        return len(forcing.levels or ()) - self.reached if forcing is not None else 0
+
+    def end(self) -> ForcedCopy:
+        """Return how it ended.
+
+        Raises:
+            _LostError: its simulator failed, perhaps because it is a copy.
+        """
+        result = self.episode.result
+        assert result is not None
+        if result.outcome in (Outcome.SIMULATOR_ERROR, Outcome.INVALID):
+            raise _LostError(NoAnswer(f"ended by {result.outcome}"))
+        crashed = str(result.outcome) in self._crashes
+        *earlier, (after, seed) = self._reseedings
+        return ForcedCopy(
+            cell=f"level {self.reached}",
+            onset=after,
+            weight=self.weight,
+            branched=self._branched,
+            crash=str(result.outcome) if crashed else "",
+            step=result.steps,
+            disturbed=result.disturbed,
+            disturbances=self.episode.spec.disturbances if crashed else (),
+            reseeding=Reseeding(after, seed, tuple(earlier)) if crashed else None,
+        )
+
+
+def _why_no_noise(episode: Episode) -> str:
+    """Return why copies of an episode cannot get other random numbers; empty if they can."""
+    simulator = episode.simulator
+    if not supports(simulator, Reseeds):
+        return "its simulator offers no way to re-seed its random generators"
+    return simulator.why_no_reseeding
