@@ -54,7 +54,7 @@ class Traffic(Protocol):
         """Do what `Road.step` does after the movement: check all pairs for collisions."""
 
     def conflicts(self) -> list[tuple[int, int, bool]] | None:
-        """Return the pairs of `RegulatedRoad.is_conflict_possible`, each with whether that is certain.
+        """Return the pairs of vehicles with a possible conflict, and for each pair whether the conflict is certain.
 
         None if highway-env must decide.
         """

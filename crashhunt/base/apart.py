@@ -51,11 +51,12 @@ _MODULE = "see what the module does when it is imported, or give it more time wi
 def work_apart(work: Callable[[Report], Plain], *, task: str, timeout_s: float) -> Plain:
     """Return what some work returns. The work is done in a fork of this process.
 
-    It is done in this process if that cannot be forked, or if other threads of Python run. With other threads, this is
-    a program of the user that calls crashhunt, and that imports the user's modules anyway.
+    If this process cannot be forked, or other threads of Python run, the work is done in this process. With other
+    threads, this is a program of the user that calls crashhunt, and that imports the user's modules anyway.
 
     Args:
-        work: its result must be expressible as JSON. It is given a function that it calls with its next task.
+        work: the function to call; its result must be expressible as JSON. It is given a function that it calls with
+            its next task.
         task: what has failed if there is no result, as in "'planner:Planner' cannot be imported".
         timeout_s: time limit, in s of wall time.
 

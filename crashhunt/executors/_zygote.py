@@ -333,7 +333,7 @@ def import_nothing(settings: WorkerSettings) -> Imported:
 def _is_forkable_with(parts: Parts) -> bool:
     """Return whether a process can still be forked after it has made the simulator; a fork of this process tries it.
 
-    An environment may start threads, which a fork does not have.
+    The reason for the check: an environment may start threads, which a fork does not have.
     """
     pid = os.fork()
     if pid == 0:

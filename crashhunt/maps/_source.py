@@ -207,7 +207,7 @@ def _check_root(source: MapSource, head: bytes) -> None:
     if kind != source.kind:
         known = f"give it with --{kind}" if kind else _AGAIN
         raise ScenarioError(
-            f"the file begins with <{root[:40]}>, and {_TITLES[source.kind]} does not", fix=known, where=str(path)
+            f"the file begins with <{root[:40]}>, so it is not {_TITLES[source.kind]}", fix=known, where=str(path)
         )
 
 

@@ -230,7 +230,7 @@ class Search:
             self._runs.most_steps = before
 
     def _is_smaller(self, than: TrialSpec) -> bool:
-        """Return whether the best result is smaller than the best one without scripted actors."""
+        """Return whether the best specification is smaller than another one."""
         script = self.best.script
         if self._form == "scripted" or script is None or than.only is None:
             return True

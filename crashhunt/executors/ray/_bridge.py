@@ -1,7 +1,8 @@
-"""The process between a hunt and Ray: which nodes take part, with how many trials at a time, when one is lost.
+"""The process between a hunt and Ray: it assigns trials to nodes, and handles lost nodes.
 
-Ray ends the process that is connected to a cluster when the cluster goes, prints into its output and takes its signals;
-here none of that reaches the hunt. The hunt sends trials through a socket, and receives their results.
+Ray ends the process that is connected to a cluster when the cluster goes, prints into its output and takes its signals.
+In a separate process, none of this affects the hunt. The hunt sends trials through a socket, and receives their
+results.
 """
 
 from __future__ import annotations
@@ -61,8 +62,7 @@ class Trial:
     """A trial that was submitted.
 
     Args:
-        ticket: the order in which it was.
-        spec: as JSON.
+        ticket: position in the order of submission. spec: as JSON.
         losses: number of times that the node of the trial was lost.
     """
 
@@ -72,30 +72,28 @@ class Trial:
 
     @property
     def number(self) -> int:
-        """Which one it is."""
+        """The number of the trial."""
         return int(self.spec["number"])
 
     @property
     def alone(self) -> bool:
-        """Whether it gets its own node."""
+        """Whether the trial runs alone on a node."""
         return self.losses >= _TRIAL_LOSSES
 
 
 @dataclass(slots=True, eq=False)
 class Node:
-    """A machine that takes part, or a part of one whose CPUs became free one after another.
+    """A machine that runs trials, or a part of a machine whose CPUs became free at different times.
 
     Args:
-        id: of this part.
-        machine: Ray's.
-        name: name of the machine, for people.
+        id: identifier of this part. machine: Ray's identifier. name: name of the machine, for people.
         slots: number of trials at a time.
-        actor: that stands there.
-        stood: since when, as of `time.monotonic`.
-        doing: what it was asked last, and has not answered yet.
-        answer: where its answer to that will be.
+        actor: the actor on the node.
+        stood: time at which the actor was started, in `time.monotonic`.
+        doing: the last request without an answer.
+        answer: reference to the answer of this request.
         ready: whether it runs trials.
-        given: what goes along with the next question, by ticket; of what is running.
+        given: trials for the next request, by ticket.
         running: ticket to trial.
         done: trials so far.
         since: when it became ready, as of `time.monotonic`.
@@ -117,12 +115,12 @@ class Node:
 
     @property
     def has_room(self) -> bool:
-        """Whether it can be given a trial more."""
+        """Whether the node can run one more trial."""
         return self.ready and len(self.running) < _AHEAD * self.slots
 
     @property
     def rate_per_s(self) -> float:
-        """How many trials have ended a second, by the clock of this machine here."""
+        """The number of ended trials per second, by the clock of the hunt's machine."""
         elapsed_s = time.monotonic() - self.since if self.ready else 0.0
         return self.done / elapsed_s if elapsed_s > 0 else 0.0
 
@@ -136,16 +134,16 @@ class Roster:
 
     @property
     def capacity(self) -> int:
-        """How many trials run at a time, on nodes that are ready."""
+        """The number of trials that run at a time on ready nodes."""
         return sum(node.slots for node in self.nodes.values() if node.ready)
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to do."""
+        """Whether no trial is waiting or running."""
         return not self.waiting and not any(node.running for node in self.nodes.values())
 
     def figures(self) -> list[Figures]:
-        """Return what people want to know about the machines that are ready."""
+        """Return the numbers of the ready machines for the status screen."""
         found: dict[str, Figures] = {}
         for node in self.nodes.values():
             if node.ready:
@@ -157,11 +155,11 @@ class Roster:
         return list(found.values())
 
     def parts(self, machine: str) -> list[Node]:
-        """Return the parts of a machine that take part."""
+        """Return the nodes of a machine that run trials."""
         return [node for node in self.nodes.values() if node.machine == machine]
 
     def assign(self) -> dict[Node, list[Trial]]:
-        """Give trials that wait to nodes, in their order, each to the one that has least to do; return who got what."""
+        """Assign waiting trials to nodes in their order, each to the least busy node; return the assignments."""
         given: dict[Node, list[Trial]] = {}
         kept = {node.machine for node in self.nodes.values() for trial in node.running.values() if trial.alone}
         while self.waiting:
@@ -179,14 +177,14 @@ class Roster:
         return given
 
     def ended(self, node: Node, ticket: int) -> bool:
-        """Take note that a trial has ended on a node; return whether it is one that ran there, and was not given up."""
+        """Record that a trial has ended on a node; return whether it was running there and was not cancelled."""
         if node.running.pop(ticket, None) is None:
             return False
         node.done += 1
         return True
 
     def lose(self, node: Node) -> list[Trial]:
-        """Take a node out; return the trials that ran there and are not to run again, for they were alone on it."""
+        """Remove a node; return its trials that do not run again, because they ran alone on it."""
         self.nodes.pop(node.id, None)
         culprits = [trial for trial in node.running.values() if trial.alone]
         for trial in node.running.values():
@@ -239,7 +237,7 @@ _NODE_LOSSES = 3  # of a node without a trial between
 
 
 def main() -> None:
-    """Be the bridge; standard error is a log."""
+    """Run the bridge; standard error is a log."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     control = socket.socket(fileno=int(sys.argv[1]))
     job = json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
@@ -258,11 +256,11 @@ def main() -> None:
 
 
 class Bridge:
-    """Hands trials to nodes, and what comes of them back.
+    """Passes trials to nodes, and their results to the hunt.
 
     Args:
         control: the socket to the hunt.
-        job: what is to be done: see `RayExecutor`.
+        job: the job of the bridge: see `RayExecutor`.
     """
 
     def __init__(self, control: socket.socket, job: BridgeJob) -> None:
@@ -290,7 +288,7 @@ class Bridge:
         self._cluster = Cluster(job["address"], cpus=job["cpus"], temporary=job["temporary"])
 
     def run(self) -> None:
-        """Work until the hunt wants no more."""
+        """Run until the hunt ends the bridge."""
         threading.Thread(target=self._listen, daemon=True).start()
         while not self._closing:
             self.turn()
@@ -300,7 +298,7 @@ class Bridge:
             self._cluster.close([node.actor for node in nodes], ready, _CLOSE_S)
 
     def turn(self, wait_s: float = _WAIT_S) -> None:
-        """See who is there, have them work, and hear what they answer, waiting so long for a first one."""
+        """Update the nodes, submit trials, and process answers; wait at most this long for the first answer."""
         with self._lock:
             self._look_for_nodes()
             self._hand_out()
@@ -322,7 +320,7 @@ class Bridge:
             self._refilled.wait_for(lambda: self._missing <= 0, timeout=min(wait_s, _REFILL_S))
 
     def _listen(self) -> None:
-        """Take what the hunt wants, also while nodes are waited for."""
+        """Process the messages of the hunt, also while the bridge waits for nodes."""
         received = b""
         try:
             while data := self._control.recv(_RECEIVED):
@@ -361,7 +359,7 @@ class Bridge:
                 self._cluster.order(node.actor, "submit", given)
 
     def _look_for_nodes(self) -> None:
-        """Find nodes that have come or gone, and have new ones get ready."""
+        """Find new and lost nodes, and prepare the new ones."""
         if time.monotonic() - self._looked < _LOOK_EVERY_S:
             return
         self._looked = time.monotonic()
@@ -406,7 +404,7 @@ class Bridge:
             self._say(note="no node of the cluster is left; the hunt waits until one is back", capacity=0)
 
     def _room(self, found: Found) -> int:
-        """How many trials more a machine can run."""
+        """Return the number of further trials that a machine can run."""
         parts = self._roster.parts(found.id)
         if not parts:
             return found.free
@@ -415,7 +413,7 @@ class Bridge:
         return found.free if self._free[found.id] >= _LOOKS else 0
 
     def _is_too_late(self, node: Node, found: Found) -> bool:
-        """Whether an actor still waits for CPUs that were free: at once where another hunt has them."""
+        """Return whether an actor has waited too long for its CPUs, for example because another hunt uses them."""
         waited_s = time.monotonic() - node.stood
         if node.doing != "differs" or waited_s < _LOOK_EVERY_S or not self._cluster.waits(node.actor):
             return False
@@ -423,7 +421,7 @@ class Bridge:
         return taken or waited_s > self._patience.get(node.machine, _START_S)
 
     def _give_up(self, node: Node) -> None:
-        """Take back an actor that stands nowhere; the next one has more patience, as it may have been about to."""
+        """Cancel an actor that was not placed; the next actor waits longer."""
         self._patience[node.machine] = 2 * self._patience.get(node.machine, _START_S)
         self._roster.lose(node)
         self._cluster.kill(node.actor)
@@ -433,7 +431,7 @@ class Bridge:
         node.doing, node.answer = what, self._cluster.ask(node.actor, what, *arguments)
 
     def _hear(self, node: Node) -> None:
-        """Take what a node answers, and ask it the next thing."""
+        """Process the answer of a node, and send its next request."""
         answer, node.answer = node.answer, None
         try:
             said = self._cluster.value(answer)
@@ -467,7 +465,7 @@ class Bridge:
             self._refuse(node, said)
 
     def _take(self, node: Node, news: News) -> None:
-        """Pass on what has happened on a node."""
+        """Pass the events of a node on to the hunt."""
         if news.map:
             self._maps[node.id] = news.map
         found = [ended for ended in news.ended if self._roster.ended(node, ended.ticket)]
@@ -488,7 +486,7 @@ class Bridge:
             self._refuse(node, f"{error.where}: {error.message}" if error.where else error.message)
 
     def _keep(self, node: Node, ended: Ended) -> None:
-        """Write what a trial that is kept has left behind to where the hunt looks for it.
+        """Write the files of a kept trial to the folder where the hunt expects them.
 
         Raises:
             RecorderError: the disk is full.

@@ -1,4 +1,4 @@
-"""Ray itself, as far as a hunt needs it: which nodes there are, actors on them, calls and their answers."""
+"""The part of Ray that a hunt uses: nodes, actors, calls and their answers."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ _START = "start one with 'ray start --head', or give the address of one: --execu
 
 
 class Meant(NamedTuple):
-    """The cluster that is meant.
+    """The cluster that the user has chosen.
 
     Attributes:
         address: ``HOST:PORT``; empty for one of the hunt's own.
-        environment: variables that Ray needs besides those that there are.
-        spare: more of them, for a cluster that turns out to ask for a token.
+        environment: additional environment variables for Ray.
+        spare: further variables, for a cluster that requires a token.
     """
 
     address: str
@@ -71,10 +71,10 @@ class Meant(NamedTuple):
 
 
 def require_ray() -> None:
-    """See that Ray is installed, and not too old.
+    """Check that Ray is installed, and not too old.
 
     Raises:
-        PluginError: it is not, or it is.
+        PluginError: Ray is not installed, or too old.
     """
     spec = importlib.util.find_spec("ray")
     if spec is None or spec.origin is None:  # some folder of that name is none
@@ -91,11 +91,12 @@ def require_ray() -> None:
 
 
 def cluster_of(argument: str) -> Meant:
-    """Return the cluster that is meant.
+    """Return the cluster that the argument names.
 
-    Clusters may ask for a token. One of our own is given a new one, instead of one that Ray would leave in the home
-    folder. One that runs here and asks is shown what there is; another machine is not, as with Ray itself. Whether one
-    asks shows when it is joined: a process of Ray's that has a token does not speak to a cluster without.
+    Clusters may ask for a token. The hunt's own cluster gets a new token, because Ray would otherwise leave one in the
+    home folder. A cluster on this machine receives the existing token, but a cluster on another machine does not, as
+    with Ray itself. The need for a token shows when the hunt joins: a Ray process with a token cannot use a cluster
+    without one.
 
     Args:
         argument: ``HOST:PORT``; ``auto`` for one that runs here; ``local`` for one of the hunt's own; empty for one
@@ -153,7 +154,7 @@ def silent(address: str) -> str:
 
 
 def _greeting(connection: socket.socket) -> str:
-    """Return why the listening process is no head of Ray, which speaks HTTP/2; empty if it may be one."""
+    """Return why the listening process is not the head of a Ray cluster, which uses HTTP/2; empty if it may be one."""
     if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):
         return ""
     found = b""
@@ -170,10 +171,10 @@ def _greeting(connection: socket.socket) -> str:
 
 
 def _joined(address: str) -> Meant:
-    """A cluster that runs already.
+    """Return a cluster that already runs.
 
     Raises:
-        UsageError: Ray is to show a token, and there is none.
+        UsageError: the cluster requires a token, but there is none.
     """
     there_is = any(os.environ.get(name) for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"))
     there_is = there_is or Path("~/.ray/auth_token").expanduser().exists()
@@ -184,7 +185,7 @@ def _joined(address: str) -> Meant:
 
 
 def _here(address: str) -> bool:
-    """Whether an address is one of this machine: only then a process can listen there."""
+    """Return whether an address belongs to this machine; a process can listen only on such an address."""
     with suppress(OSError):
         kind, *_, place = socket.getaddrinfo(address.rpartition(":")[0].strip("[]"), 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(kind, socket.SOCK_STREAM) as probe:
@@ -194,7 +195,7 @@ def _here(address: str) -> bool:
 
 
 def _started_here() -> str:
-    """The cluster that was started on this machine last, as Ray writes it down."""
+    """Return the address of the last cluster that was started on this machine, as recorded by Ray."""
     try:
         folder = Path(os.environ.get("RAY_TMPDIR", "/tmp"))
         return (folder / "ray" / "ray_current_cluster").read_text(encoding="utf-8").strip()
@@ -211,7 +212,7 @@ _GROUPS |= {"submit": _ORDERS, "cancel": _ORDERS, "close": _ORDERS}
 
 
 class Lost(Exception):  # noqa: N818 - it is no fault
-    """The node, or the actor on it, is gone."""
+    """The node, or the actor on it, is lost."""
 
 
 class UnreachableError(UsageError):
@@ -219,7 +220,7 @@ class UnreachableError(UsageError):
 
 
 class TokenError(UnreachableError):
-    """The cluster asks for a token."""
+    """The cluster requires a token."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,10 +228,9 @@ class Found:
     """A node of a cluster.
 
     Args:
-        id: Ray's.
-        name: name for people.
+        id: Ray's identifier. name: name for people.
         cpus: number of CPUs for work.
-        free: those that are not in use.
+        free: number of CPUs that are not in use.
     """
 
     id: str
@@ -248,7 +248,7 @@ class Cluster:
         temporary: the folder for files of one of our own.
 
     Raises:
-        UnreachableError: it cannot be used.
+        UnreachableError: the cluster cannot be used.
     """
 
     def __init__(self, address: str, *, cpus: int, temporary: str | None) -> None:
@@ -283,10 +283,10 @@ class Cluster:
         self._shared: Any = None
 
     def nodes(self) -> dict[str, Found]:
-        """Return the nodes that are there now.
+        """Return the present nodes of the cluster.
 
         Raises:
-            UnreachableError: the cluster does not say.
+            UnreachableError: the cluster does not answer.
         """
         from ray._private.state import available_resources_per_node  # of which there is no public form
 
@@ -305,13 +305,13 @@ class Cluster:
         return found
 
     def stand(self, node: str, slots: int) -> Any:
-        """Have an actor stand on a node, which takes so many of its CPUs."""
+        """Start an actor on a node, with a number of its CPUs."""
         strategy = self._affinity(node_id=node, soft=False)
         name = f"{_NAME}{slots}-{secrets.token_hex(8)}"
         return self._kind.options(num_cpus=slots, scheduling_strategy=strategy, name=name).remote()
 
     def held(self, node: str) -> int:
-        """Return how many CPUs of a node hunts have, this one or others, whose actors stand there."""
+        """Return the number of CPUs of a node that actors of any hunt use."""
         from ray._private.state import actors
 
         found = 0
@@ -323,7 +323,7 @@ class Cluster:
         return found
 
     def waits(self, actor: Any) -> bool:
-        """Whether an actor is not placed yet: another job has the CPUs, or its process takes long to start."""
+        """Return whether an actor is still waiting for its CPUs or for the start of its process."""
         from ray._private.state import actors  # of which there is no public form
 
         with suppress(Exception):
@@ -332,25 +332,25 @@ class Cluster:
         return False
 
     def ask(self, actor: Any, what: str, *arguments: Any) -> Any:
-        """Call a method of an actor; return where its answer will be."""
+        """Call a method of an actor; return a reference to its answer."""
         return getattr(actor, what).remote(*arguments)
 
     def order(self, actor: Any, what: str, *arguments: Any) -> Any:
-        """Call one whose answer says nothing; orders are carried out one after another."""
+        """Call a method without an answer; such calls run one after another."""
         return getattr(actor, what).remote(*arguments)
 
     def answered(self, answers: Sequence[Any], wait_s: float) -> list[Any]:
-        """Return the answers that are there, waiting so long for a first one."""
+        """Return the answers that have arrived; wait at most this long for the first one."""
         ready, rest = self._ray.wait(list(answers), num_returns=1, timeout=wait_s)
         more, _ = self._ray.wait(rest, num_returns=len(rest), timeout=0) if ready and rest else ([], [])
         return [*ready, *more]
 
     def value(self, answer: Any) -> Any:
-        """Return an answer that is there.
+        """Return the value of an arrived answer.
 
         Raises:
-            Lost: the one who was asked is gone.
-            Exception: what it raised.
+            Lost: the called actor is lost.
+            Exception: the exception of the method.
         """
         from ray import exceptions
 
@@ -362,13 +362,13 @@ class Cluster:
             raise Lost(str(error)) from None
 
     def shared(self, make: Callable[[], bytes]) -> Any:
-        """Return what all nodes can be sent, made when the first one needs it."""
+        """Return an object that can be sent to all nodes; it is made at the first use."""
         if self._shared is None:
             self._shared = self._ray.put(make())
         return self._shared
 
     def kill(self, actor: Any, *, after_s: float = 0.0) -> None:
-        """End an actor, where it is still there."""
+        """End an actor, if it is still running."""
         if after_s:
             timer = threading.Timer(after_s, self.kill, [actor])
             timer.daemon = True
@@ -378,11 +378,11 @@ class Cluster:
             self._ray.kill(actor, no_restart=True)
 
     def close(self, actors: Sequence[Any], ready: Sequence[Any], wait_s: float) -> None:
-        """Have the ready actors end their work, then end all actors.
+        """Let the ready actors finish their work, then end all actors.
 
         Args:
-            actors: all that were started.
-            ready: those that run trials.
+            actors: all actors that were started.
+            ready: the actors that run trials.
             wait_s: time for the ready nodes to end their work, in s.
         """
         with suppress(Exception):
@@ -394,7 +394,7 @@ class Cluster:
 
 
 def _greet(address: str) -> None:
-    """See that a cluster answers, which Ray itself takes very long to doubt.
+    """Check that a cluster answers, because Ray itself waits very long for an answer.
 
     Raises:
         UnreachableError: the cluster does not answer.
@@ -430,5 +430,5 @@ def _greet(address: str) -> None:
 
 
 def _in_short(error: Exception) -> str:
-    """What an error of Ray's says, in one line."""
+    """Return the message of an error of Ray in one line."""
     return " ".join(str(error).split()).rstrip(":") or type(error).__name__

@@ -1,4 +1,4 @@
-"""What travels to a node before it can run trials: the scenario, the code and the files of a hunt, by digest."""
+"""The archive that a node needs before it can run trials: scenario, code and files of a hunt, by digest."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ class Parcel:
 
     @classmethod
     def of(cls, settings: WorkerSettings) -> Parcel:
-        """Return what a hunt's trials need.
+        """Return the parcel of a hunt.
 
         Raises:
-            UsageError: it is more than travels well.
+            UsageError: the files are too large to send.
             ScenarioError: the scenario names a file that is not there.
         """
         files = {f"{_SCENARIO}/{name}": settings.scenario.folder / name for name in settings.scenario.files()}
@@ -81,7 +81,7 @@ class Parcel:
         return cls(files, folders, next((folders[folder] for folder in settings.code if _is_here(Path(folder))), ""))
 
     def digest(self) -> str:
-        """Return the digest of all that is in it.
+        """Return the digest of the whole content.
 
         Raises:
             OSError: a file cannot be read.
@@ -89,7 +89,7 @@ class Parcel:
         return digest_of_data({_as_sent(place): _described(path) for place, path in self.files.items()})
 
     def packed(self) -> bytes:
-        """Return it as it travels.
+        """Return the parcel as compressed bytes.
 
         Raises:
             OSError: a file cannot be read.
@@ -102,7 +102,7 @@ class Parcel:
 
 
 def settings_in(settings: WorkerSettings, folders: dict[str, str], root: Path, scratch: Path) -> WorkerSettings:
-    """Return the settings of a hunt as they are where a parcel has been unpacked.
+    """Return the settings of a hunt with the paths of an unpacked parcel.
 
     Args:
         settings: settings of the hunt, on the machine where it was begun.
@@ -118,15 +118,15 @@ def settings_in(settings: WorkerSettings, folders: dict[str, str], root: Path, s
 
 
 def unpack(packed: bytes, digest: str, root: Path) -> None:
-    """Write what a parcel holds into a new folder.
+    """Unpack a parcel into a new folder.
 
     Args:
         packed: the parcel.
-        digest: what it must have.
+        digest: the expected digest.
         root: the folder, which is not there yet.
 
     Raises:
-        BundleError: it is not what was sent.
+        BundleError: the content differs from the sent parcel.
         OSError: it cannot be written.
     """
     (root / _SCENARIO).mkdir(parents=True)
@@ -150,7 +150,7 @@ def unpack(packed: bytes, digest: str, root: Path) -> None:
 
 
 def _is_here(folder: Path) -> bool:
-    """Whether a folder of a snapshot is what the current one was: of the same name, and all of it is here as well."""
+    """Return whether a folder of a snapshot is a copy of the current folder: same name and same files."""
     here = Path.cwd()
     _, tree, place = folder.as_posix().rpartition(f"/{layout.CODE}/@")
     if not tree or not here.as_posix().endswith(f"/{place}"):
@@ -164,12 +164,12 @@ def _as_sent(place: str) -> str:
 
 
 def _described(path: Path) -> str:
-    """What is in a file, and whether it can be run, as an agent may do with a program next to it."""
+    """Return the content of a file and whether it is executable, because an agent may run a program next to it."""
     return digest_of_file(path) + ("*" if path.stat().st_mode & stat.S_IXUSR else "")
 
 
 def _modules(folder: Path) -> Iterator[tuple[str, Path]]:
-    """The files below a folder of code, but for what Python has compiled of it."""
+    """Return the files below a folder of code, without Python's compiled files."""
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.suffix != ".pyc":
             yield path.relative_to(folder).as_posix(), path
@@ -263,7 +263,7 @@ class Store:
         return packed
 
     def keep(self, digest: str, packed: bytes) -> None:
-        """Keep a parcel, and let go of those that were not used for longest."""
+        """Store a parcel, and delete those that were not used for longest."""
         file = self._file(digest)
         part = file.with_name(f".{digest}.{os.getpid()}")
         with suppress(OSError):  # it is sent again, then

@@ -1,4 +1,4 @@
-"""Runs trials on all machines of a Ray cluster: the part of it that is in the hunt's process."""
+"""Runs trials on all machines of a Ray cluster; this part runs in the process of the hunt."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class RayExecutor:
 
     @property
     def capacity(self) -> int:
-        """How many trials run at a time, at least 1: without nodes, the hunt waits for them."""
+        """The number of trials that run at a time, at least 1; without nodes, the hunt waits."""
         return max(1, self._parallel if self._slots is None else self._slots)
 
     def submit(self, spec: TrialSpec) -> None:
@@ -119,13 +119,13 @@ class RayExecutor:
         self._send({"cancel": above})
 
     def where(self) -> dict[int, BlackBoxHeader]:
-        """Return where running trials were half a second ago, for people who watch."""
+        """Return the progress of running trials half a second ago, for the status screen."""
         running = {spec.number for spec in self._open.values()}
         found = [pair for headers in self._where.values() for pair in headers.items()]
         return {number: header for number, header in found if number in running}
 
     def nodes(self) -> list[NodeFigures]:
-        """Return the nodes that take part now."""
+        """Return the nodes that run trials now."""
         return [NodeFigures(**figures) for figures in self._nodes]
 
     def notes(self) -> list[str]:
@@ -133,7 +133,7 @@ class RayExecutor:
         return self._notes.fresh()
 
     def close(self) -> None:
-        """End everything on every node, and a cluster of our own."""
+        """End everything on every node, and the hunt's own cluster."""
         if self._closed:
             return
         self._closed = True
@@ -146,13 +146,13 @@ class RayExecutor:
         self._end()
 
     def _load_order(self) -> dict[str, str]:
-        """Return the library that a node must have too, because trials depend on the order that it fixes."""
+        """Return the library for the link order, which a node must also have."""
         if load_order_of(self._settings.scenario) != FIXED:
             return {}
         return {"_crashhunt_link_order": "installed"}
 
     def _start(self) -> None:
-        """Start a bridge, and submit everything to it that has not come back."""
+        """Start a bridge, and submit all trials without a result to it."""
         number = next(_numbers)
         scratch = self._settings.scratch
         job, self._log = scratch / f"ray-{number}.json", scratch / f"ray-{number}.log"
@@ -184,7 +184,7 @@ class RayExecutor:
         self._send({"submit": [(ticket, spec.to_json()) for ticket, spec in self._open.items()]})
 
     def _send(self, message: ToBridge) -> None:
-        """Tell the bridge something; where it waits to be heard before it listens, hear it meanwhile."""
+        """Send a message to the bridge, and receive its messages while the bridge does not read."""
         if self._control is None:
             return
         left = memoryview(json.dumps(message).encode() + b"\n")
@@ -198,7 +198,7 @@ class RayExecutor:
                     return
 
     def _receive(self, wait_s: float) -> None:
-        """Take what the bridge says, waiting so long for something."""
+        """Receive messages of the bridge; wait at most this long for the first."""
         if self._control is None:
             if self._closed or not self._is_back():
                 time.sleep(wait_s)
@@ -215,7 +215,7 @@ class RayExecutor:
             self._lose()
 
     def _take_in(self, control: socket.socket) -> bool:
-        """Take what has come from the bridge; return whether it is still there."""
+        """Process the received messages; return whether the bridge is still connected."""
         try:
             data = control.recv(_RECEIVED)
         except OSError:
@@ -262,7 +262,7 @@ class RayExecutor:
             }
 
     def _lose(self, why: str = "") -> None:
-        """Take note that the bridge is gone, and with it the cluster, or the connection to it.
+        """Handle the loss of the bridge, and of the cluster or the connection to it.
 
         Raises:
             CrashhuntError: it has never come up, or a cluster of our own has ended too often.
@@ -281,7 +281,7 @@ class RayExecutor:
         self._notes.add(f"the Ray cluster was lost{f' ({why})' if why else ''}; the hunt waits until it is back")
 
     def _is_back(self) -> bool:
-        """Whether a cluster that was lost answers again; the hunt then resumes there."""
+        """Return whether a lost cluster answers again, so that the hunt can resume on it."""
         if time.monotonic() - self._lost_at < (_RETRY_S if self._address else 0.0):
             return False
         self._lost_at = time.monotonic()

@@ -1,4 +1,4 @@
-"""The shapes of what a hunt, its bridge to Ray and the nodes tell each other."""
+"""The messages between a hunt, its bridge to Ray, and the nodes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Header = tuple[int, int, float, int, int, int, int]
 
 
 class BridgeJob(TypedDict):
-    """What a bridge needs to know.
+    """The job of a bridge.
 
     ``address`` is empty for a cluster of the hunt's own, which has ``cpus`` CPUs and ``temporary`` files. ``versions``
     and ``code`` are the requirements for nodes. ``resumed`` is true if an earlier bridge of the same hunt had nodes.
@@ -35,7 +35,7 @@ class BridgeJob(TypedDict):
 
 
 class NodeJob(TypedDict):
-    """What a node needs to know: ``folders`` there to their places in the parcel, and how many trials at a time.
+    """The job of a node: ``folders`` to their places in the parcel, and the number of trials at a time.
 
     ``home`` is the place in the parcel where trials run, as they do in the current folder there; empty for none.
     """
@@ -49,14 +49,14 @@ class NodeJob(TypedDict):
 
 
 class ToBridge(TypedDict, total=False):
-    """What a hunt wants: trials to be run, or those above a number to be given up."""
+    """A request of a hunt: run trials, or cancel those above a number."""
 
     submit: list[Submitted]
     cancel: int
 
 
 class Figures(TypedDict):
-    """A node for people who watch: number of trials at a time, how many have ended, and how many a second."""
+    """A node on the status screen: trials at a time, ended trials, and trials per second."""
 
     name: str
     parallel: int
@@ -65,7 +65,7 @@ class Figures(TypedDict):
 
 
 class FromBridge(TypedDict, total=False):
-    """What a bridge says: a trial has ended, or what has become of nodes.
+    """A message of a bridge: a trial has ended, or the state of a node has changed.
 
     ``passing`` belongs to an error that may be over at the next attempt, ``token`` to one for want of a token;
     ``where`` belongs to a ``node``.
@@ -100,7 +100,7 @@ class Ended(NamedTuple):
 
 
 class News(NamedTuple):
-    """What has happened on a node.
+    """The events on a node since the last call.
 
     Attributes:
         ended: trials.

@@ -1,6 +1,7 @@
-"""The actor that stands on each node. It travels as it is: a node need not have crashhunt for it to say so.
+"""The actor on each node.
 
-So it imports nothing of crashhunt before it has looked which one there is.
+It is sent as source, so that it can report a node without crashhunt. It therefore imports nothing of crashhunt before
+it has checked the installed version.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ class Site:
         self._work: Any = None
 
     def differs(self, versions: dict[str, str], code: str) -> str:
-        """Say what is installed here in another version than where the hunt runs; empty if nothing is.
+        """Return the differences between the versions on this node and on the hunt's machine; empty for none.
 
         Args:
             versions: name to version of what results depend on.
@@ -53,7 +54,7 @@ class Site:
         return ", ".join(found)
 
     def begin(self, job: Any) -> str:
-        """Get ready for the trials of a hunt; return ``ready``, ``lacks`` where the parcel is wanted, or an error."""
+        """Prepare for the trials of a hunt; return ``ready``, ``lacks`` if the parcel is missing, or an error."""
         from crashhunt.executors.ray._node_worker import Work
 
         if self._work is None:
@@ -61,7 +62,7 @@ class Site:
         return str(self._work.begin())
 
     def deliver(self, packed: bytes) -> str:
-        """Take the parcel; return as `begin` does."""
+        """Receive the parcel; return the same values as `begin`."""
         return str(self._work.deliver(packed))
 
     def submit(self, trials: list[tuple[int, dict[str, Any]]]) -> None:

@@ -1,4 +1,4 @@
-"""What a node does for a hunt: keeps the pool, and hands over what comes of it."""
+"""The work of a node for a hunt: it runs the pool, and returns its results."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Work:
         os.environ["PYTHONDONTWRITEBYTECODE"] = "1"  # of the code of a hunt, which is there for this hunt only
 
     def begin(self) -> str:
-        """Get ready; return what `Site.begin` returns."""
+        """Prepare the pool; return the value for `Site.begin`."""
         packed = self._store.find(self._job["digest"])
         if packed is None:
             return "lacks"
@@ -72,7 +72,7 @@ class Work:
         return "lacks"
 
     def deliver(self, packed: bytes) -> str:
-        """Get ready with a parcel that was sent."""
+        """Prepare the pool with a received parcel."""
         if not self._ready(packed):
             return "the parcel was damaged on its way"
         self._store.keep(self._job["digest"], packed)
@@ -95,7 +95,7 @@ class Work:
         return True
 
     def submit(self, trials: Sequence[Submitted]) -> None:
-        """Queue trials, but for those that were given up before they came."""
+        """Queue trials, except those that were cancelled before they arrived."""
         assert self._pool is not None
         try:
             for ticket, spec in trials:
@@ -107,9 +107,9 @@ class Work:
             self._broken = CrashhuntError(f"a trial cannot be begun: {type(error).__name__}: {error}")
 
     def cancel(self, above: int, before: int) -> None:
-        """Give up trials whose number is greater than ``above``, and whose ticket is less than ``before``.
+        """Cancel trials whose number is greater than ``above``, and whose ticket is less than ``before``.
 
-        Tickets tell those that were submitted later from those that are late: `take` brings trials beside `submit`.
+        The tickets distinguish trials that were submitted later from trials that arrive late.
         """
         assert self._pool is not None
         with self._lock:
@@ -118,7 +118,7 @@ class Work:
             self._pool.cancel(above=above)
 
     def take(self, wait_s: float, trials: Sequence[Submitted]) -> News:
-        """Queue trials; return what has happened, waiting so long for a trial to end."""
+        """Queue trials; return the events; wait at most this long for a trial to end."""
         assert self._pool is not None
         self.submit(trials)
         ended: list[Ended] = []
@@ -149,7 +149,7 @@ class Work:
     def _completed(self, wait_s: float) -> Iterator[TrialResult]:
         """Yield what has ended, and what ends soon after it: each call from another machine costs both some time.
 
-        Nobody waits for that: what is kept goes back at once, as does everything where workers may soon be idle.
+        Kept trials are returned at once, and so are all results if workers may soon be idle.
         """
         assert self._pool is not None
         deadline, urgent = 0.0, False
@@ -162,7 +162,7 @@ class Work:
                 return
 
     def close(self) -> None:
-        """End everything, and leave nothing behind."""
+        """End everything, and remove all files."""
         if self._pool is not None:
             self._pool.close()
         if self._place is not None:
@@ -193,7 +193,7 @@ class Work:
         return content
 
     def _named_as_there(self, said: Any) -> Any:
-        """The same with the names of files as they are on the machine where the hunt was begun."""
+        """Return a result with the file names of the machine of the hunt."""
         if isinstance(said, dict):
             return {key: self._named_as_there(value) for key, value in said.items()}
         if isinstance(said, list):
