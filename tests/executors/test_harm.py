@@ -112,13 +112,20 @@ def programs() -> list[int]:
     return found
 
 
-def test_harm_costs_its_own_trial_only_and_nothing_of_it_stays(start):
+def test_harm_costs_its_own_trial_only_and_nothing_of_it_stays(start, settings):
     pool = start(PoolExecutor, 2)
     names = list(HARM)
     for number, what in enumerate(names):
         pool.submit(spec(2 * number, what))
         pool.submit(spec(2 * number + 1))
     found = collect(pool, 2 * len(names))
+    # The limit is short for those that hang. On a busy machine, others may exceed it.
+    slow = [number for number, what in enumerate(names) if found[2 * number].outcome == "hang" != HARM[what]]
+    if slow:
+        patient = start(PoolExecutor, 2, replace(settings, timeout_s=60.0))
+        for number in slow:
+            patient.submit(spec(2 * number, names[number]))
+        found |= collect(patient, len(slow))
     outcomes = {what: str(found[2 * number].outcome) for number, what in enumerate(names)}
     assert outcomes == {what: expected or outcomes[what] for what, expected in HARM.items()}
     assert outcomes["no_modules"] in ("survived", "agent_error")
