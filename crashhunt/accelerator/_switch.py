@@ -333,7 +333,7 @@ class Acceleration:
 def accelerate() -> Acceleration:
     """Accelerate highway-env in this process: bit-identical results in a fraction of the time.
 
-    Hunts do this by themselves. Call this function in your own process, such as a training. highway-env's own code runs
+    Hunts call it by themselves. Call this function in your own process, such as a training. highway-env's own code runs
     for everything that the accelerator does not know, and the accelerator checks that in every step:
 
     - another version of highway-env

@@ -464,7 +464,8 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         check_disturbances(disturbances)
     typed({"events": data.get("events")}, {"events": dict[str, int] | None})
     if not 0 <= data["seed"] < 2**31 or min(data["trial"], data["step"]) < 0 or data["max_steps"] < 1:
-        raise ValueError("trial, seed, step or max_steps is out of range")
+        numbers = ", ".join(f"{name} = {data[name]}" for name in ("trial", "seed", "step", "max_steps"))
+        raise ValueError(f"one of these numbers is out of range: {numbers}")
     if not re.fullmatch(r"\w+", data["snapshot"]):
         raise ValueError(f"snapshot {data['snapshot']!r} is not the name of a snapshot")
     spec = TrialSpec(

@@ -158,7 +158,7 @@ class _Search:
         return f"at {said:.3g} m/s², {self.braking.how}," if abs(said - deceleration) < 0.01 * said else _AS_IT_CAN
 
     def changed(self, lanes: LaneMap) -> tuple[str, ...]:
-        """Return what else the agent does otherwise in the run from the last step that helps."""
+        """Return the further differences of the agent in the run from the last step from which braking helps."""
         if self.latest is None:
             return ()
         assert self.result.collision is not None

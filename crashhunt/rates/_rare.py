@@ -489,7 +489,7 @@ class RareCounter:
                 self._tests[0].add(float(one))
 
     def certain(self) -> tuple[float, float] | None:
-        """Return bounds that are valid whenever you look; None if they were not asked for, or nothing counts."""
+        """Return bounds that are valid at any time; None if they were not requested, or if no trial counts."""
         if self._tests is None or not self._tests[0].count:
             return None
         alpha = 1.0 - self.confidence
