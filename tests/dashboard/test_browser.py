@@ -214,11 +214,14 @@ def test_charts_draw_what_the_api_returns(hunts, page):
         curve = page.run("const [c] = document.getElementById('discovery').data; return [c.x, c.y]")
         detail = dashboard.get(f"/api/hunts/{identifier}")
         assert curve == [[one[0] for one in detail["curve"]], [one[2] for one in detail["curve"]]]
+        page.wait("!document.getElementById('near-box').hidden")  # their places come later: they need the logs
         where = dashboard.get(f"/api/hunts/{identifier}/map")
-        shown = page.run(
-            "return document.getElementById('map').data.filter((t) => t.customdata).flatMap((t) => t.customdata)"
-        )
-        assert sorted(shown) == sorted(point["id"] for point in where["points"])
+        drawn = "document.getElementById('map').data.filter((t) => t.customdata).flatMap((t) => t.customdata)"
+        crashed = [point["id"] for point in where["points"] if not point["near_miss"]]
+        assert sorted(page.run(f"return {drawn}")) == sorted(crashed)
+        page.run("document.getElementById('near').click(); document.getElementById('map').scrollIntoView()")
+        page.wait(f"{drawn}.length === {len(where['points'])}")
+        assert sorted(page.run(f"return {drawn}")) == sorted(point["id"] for point in where["points"])
         assert where["lanes"]
 
 
