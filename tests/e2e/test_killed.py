@@ -508,6 +508,8 @@ COMMANDS = {
     "run": (("run", "new", "2", "12", "60", *AGENT, "--near-misses", "2", "--keep", "2"), "new"),
     "probes": (("run", "new", "2", "6", "60", "--scenario", "toy", "--seed", "3", "--arg", "speed=9", "--disturb",
                 "brake=0.02", "--probe", "0.5", "--branch", "--keep-going", "--audit", "0.5"), "new"),
+    "sumo": (("run", "new", "2", "4", "60", "--scenario", "loop", "--seed", "3", "--arg", "speed=20", "--disturb",
+              "brake=0.1", "--probe", "2", "--branch", "--keep-going", "--audit", "0.5"), "new"),
     "suite": (("suite", "run", "suite.toml", "many", "2"), "many"),
     "shrink": (("shrink", "h", "--crash", "0", "--budget", "60"), "h"),
     "judge": (("judge", "h", "--crash", "0", "--why", "10"), ""),
