@@ -69,10 +69,12 @@ def in_child(function: str, *arguments: str) -> dict[str, float]:
     return found
 
 
-def hunt(directory: Path, parallel: int, trials: int, max_steps: int, *options: str) -> dict[str, float]:
+def hunt(
+    directory: Path, parallel: int, trials: int, max_steps: int, *options: str, cwd: Path | None = None
+) -> dict[str, float]:
     """Hunt through the command line; return what ``--json`` says."""
     command = [str(CRASHHUNT), "run", str(directory), str(parallel), str(trials), str(max_steps), "--json", *options]
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True)
+    done = subprocess.run(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True)
     found: dict[str, float] = json.loads(done.stdout)
     return found
 
@@ -429,6 +431,30 @@ def bench_waves() -> Iterator[Figure]:
     theirs = trials / (time.monotonic() - began)
     note = f"{60 * ours:.0f} against {60 * theirs:.0f} trials a minute, {steps} steps each"
     yield Figure(name="waves_ratio", value=ours / theirs, unit="x", better="higher", target=5.0, note=note)
+
+
+def bench_pool() -> Iterator[Figure]:
+    """A hunt on highway-fast-v0 against ``multiprocessing.Pool`` on plain highway-env, in turns, 200 steps a trial."""
+    import bench_pool as theirs
+
+    ratios, rates = [], []
+    with folder() as place:
+        chosen = str(theirs.scenario(place))
+        for number in range(3):
+            options = ("--scenario", chosen, "--keep-going", "--crash-on", "hang")
+            found = hunt(place / f"h{number}", 2, 600, 200, *options, cwd=place)
+            ours = 60 * found["trials_run"] / found["wall_s"]
+            done = subprocess.run(
+                [sys.executable, theirs.__file__, "2", "12", "200"], check=True, stdout=subprocess.PIPE
+            )
+            rates.append((ours, json.loads(done.stdout)["per_minute"]))
+            ratios.append(rates[-1][0] / rates[-1][1])
+    low, high = log_interval(ratios)
+    ours, plain = (statistics.median(column) for column in zip(*rates, strict=True))
+    note = f"95 %: {low:.1f} to {high:.1f}; {ours:.0f} against {plain:.1f} trials a minute"
+    yield Figure(
+        name="hunt_vs_pool", value=statistics.median(ratios), unit="x", better="higher", target=40.0, note=note
+    )
 
 
 def bench_warmup() -> Iterator[Figure]:
@@ -1327,6 +1353,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "orchestration": bench_orchestration,
     "ceiling": bench_ceiling,
     "waves": bench_waves,
+    "pool": bench_pool,
     "warmup": bench_warmup,
     "first_crash": bench_first_crash,
     "help": bench_help,

@@ -121,6 +121,32 @@ def test_numbers_that_are_not_finite_are_left_to_highway_env(given):
 @pytest.mark.parametrize("name", ["MASS", "LENGTH_A", "INERTIA_Z"])
 def test_a_division_by_zero_is_left_to_highway_env(name):
     assert both(BicycleVehicle, speed=0.5, **{name: 0}) > 0
+    assert both(BicycleVehicle, speed=8.0, **{name: 0}) > 0
+
+
+def test_a_steep_steering_angle_to_the_left_is_clipped_like_one_to_the_right():
+    for steering in (-1.4, -1.6, 1.6):
+        assert both(BicycleVehicle, steering=steering) == 0
+
+
+def test_highway_env_goes_on_from_what_the_kernel_has_computed():
+    """The first sub-steps are finite, and the kernel has not written them when highway-env has to take over."""
+
+    def played():
+        env = gymnasium.make("highway-fast-v0", disable_env_checker=True).unwrapped
+        config = {"vehicles_count": 2, "action": {"type": "ContinuousAction", "dynamical": True}}
+        env.reset(seed=4, options={"config": config})
+        env.vehicle.FRICTION_FRONT, env.vehicle.MASS = 1e60, 1e-60  # velocities explode after some sub-steps
+        try:
+            env.step(np.array([0.3, 0.2]))
+        except Exception as error:
+            return repr(error), state(env.vehicle)
+        return state(env.vehicle)
+
+    with np.errstate(all="ignore"):
+        slow = played()
+        assert not switch_on()
+        assert played() == slow
 
 
 def test_an_unknown_type_of_a_velocity_is_left_to_highway_env():

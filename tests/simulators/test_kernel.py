@@ -588,3 +588,23 @@ def test_poses_in_a_scene_are_those_of_python():
     assert _kernel.kernel().mirrored_poses(vehicles, halves) is None
     vehicles[1].heading = math.inf  # Python's cosine raises an error
     assert _kernel.kernel().mirrored_poses(vehicles, halves) is None
+
+
+def test_point_on_the_axis_has_no_negative_zero():
+    road = Road(RoadNetwork.straight_road_network(1))
+    points, headings, _ = _kernel.kernel().mirrored_poses([Vehicle(road, [3.0, 0.0], 0.0, 1.0)], [2.5])
+    assert (points[0][1].hex(), headings[0].hex()) == ((0.0).hex(), (0.0).hex())
+
+
+def test_neighbours_at_the_same_distance_stay_in_order_and_objects_behind_are_not_seen():
+    def seen():
+        road = Road(RoadNetwork.straight_road_network(4), np_random=np.random.default_rng(1))
+        road.vehicles += [IDMVehicle(road, [0.0, 4.0], 0.0, 20.0)]
+        road.vehicles += [IDMVehicle(road, [20.0 * (-1) ** n, 4.0 * (n % 4)], 0.0, 10.0 + n) for n in range(24)]
+        road.objects += [Obstacle(road, [12.0, 8.0], 0.3, 5.0), Obstacle(road, [-15.0, 8.0])]
+        env = SimpleNamespace(road=road, vehicle=road.vehicles[0], PERCEPTION_DISTANCE=200)
+        return exact(observation.KinematicObservation(env, vehicles_count=20, see_behind=True).observe())
+
+    slow = seen()
+    assert not switch_on()
+    assert seen() == slow
