@@ -58,10 +58,10 @@ double call(int number, double x, double y) {
     return z;
 }
 
-// BLAS begins a sum of products with 0, which decides the sign of a zero result.
+// BLAS begins a sum of products with 0, and adds it to 0: a product that is too small for a float64 gives no negative zero.
 double sum_of_products(bool is_fused, double ax, double ay, double bx, double by) {
     if (is_fused) {
-        return std::fma(ay, by, std::fma(ax, bx, 0.0));
+        return std::fma(ay, by, std::fma(ax, bx, 0.0)) + 0.0;
     }
     return (0.0 + ax * bx) + ay * by;
 }
@@ -83,7 +83,7 @@ double turned(double ax, double ay, double bx, double by) {
 // The same as `dot` for vectors of three numbers.
 double dot(const double *a, const double *b) {
     double found = dot(a[0], a[1], b[0], b[1]);
-    return fused ? std::fma(a[2], b[2], found) : found + a[2] * b[2];
+    return fused ? std::fma(a[2], b[2], found) + 0.0 : found + a[2] * b[2];
 }
 
 // Python's `x ** 2`, which is the C library's power; a compiler would otherwise make it a product.

@@ -129,7 +129,7 @@ def test_a_steep_steering_angle_to_the_left_is_clipped_like_one_to_the_right():
         assert both(BicycleVehicle, steering=steering) == 0
 
 
-def test_highway_env_goes_on_from_what_the_kernel_has_computed():
+def test_highway_env_resumes_from_what_the_kernel_has_computed():
     """The first sub-steps are finite, and the kernel has not written them when highway-env has to take over."""
 
     def played():
