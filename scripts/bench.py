@@ -192,7 +192,7 @@ def child_step(scenario: str) -> dict[str, float]:
             (Recorder, "lend", "others recorded"),
             (FastEpisode, "_complete", "steps in Python"),
             (FastEpisode, "_show_step", "oracles asked"),
-            (Nearness, "_take_in", "frames"),
+            (Nearness, "_measure_frames", "frames"),
             (ApproachMeter, "measure", "closest approach"),
             (DangerMeter, "_summed", "danger"),
             (Recorder, "end", "digest"),

@@ -168,8 +168,8 @@ def asking(crashes: tuple[Outcome, ...]) -> tuple[Prober, Brancher]:
             return outcome, step
 
     class Branches(Brancher):
-        def _take(self, episode: Episode, found: Any) -> None:
-            super()._take(episode, found)
+        def _record_crash(self, episode: Episode, found: Any) -> None:
+            super()._record_crash(episode, found)
             branch = self._branches.crashes[-1]
             raise FoundError("a branch", episode.steps, branch.disturbances, branch.outcome, branch.step)
 

@@ -89,7 +89,7 @@ class Place(Protocol):
 
 
 @dataclass(slots=True)
-class AtOnce:
+class FastStepper:
     """Trials of a problem without a simulator."""
 
     problem: Problem
@@ -234,7 +234,7 @@ def synthetic_run(name: str, sampler: str, seed: int, lag: str = LAG) -> Run:
             argument: ArgumentSpec(spec=spec, kind=kind) for argument, (spec, kind) in problem.arguments.items()
         })},
     )  # fmt: skip
-    found = hunted(settings, AtOnce(problem), math.ceil(GIVE_UP / problem.rate), name, lag=lag)
+    found = hunted(settings, FastStepper(problem), math.ceil(GIVE_UP / problem.rate), name, lag=lag)
     return Run(
         problem=name,
         sampler=sampler,

@@ -234,6 +234,9 @@ def _be_command(request: dict, typed: int, out: int, err: int) -> NoReturn:
     for descriptor, copy in ((typed, 0), (out, 1), (err, 2)):
         os.dup2(descriptor, copy)
         os.close(descriptor)
+    # The streams of this process know whether the file that they had before could seek; a terminal cannot.
+    sys.stdout = open(1, "w", buffering=1, encoding="utf-8", closefd=False)  # noqa: SIM115
+    sys.stderr = open(2, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
     if request["apart"]:
         os.setsid()
     os.environ.clear()

@@ -1,4 +1,4 @@
-from ._frames import Frame as Frame
+from ._frames import TrafficFrame as TrafficFrame
 from ._kernel import Poses as Poses, kernel as kernel
 from ._network import Network as Network
 from ._substep_loop import Onlooker as Onlooker, SkippedObservation as SkippedObservation

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.accelerator._network import Network
-    from crashhunt.accelerator._versions import Kind
+    from crashhunt.accelerator._versions import VehicleClass
 
 
-__all__ = ["Frame", "are_plain"]
+__all__ = ["TrafficFrame", "are_plain"]
 
 
-class Frame:
+class TrafficFrame:
     """The positions of all objects at one instant, with lazily computed coordinates on the lanes.
 
     Args:
@@ -128,7 +128,7 @@ def _places_of(things: list[RoadObject]) -> NDArray[np.float64]:
     return np.array([thing.position for thing in things], float).reshape(-1, 2)
 
 
-def are_plain(things: list[RoadObject], kinds: list[Kind] | None = None) -> bool:
+def are_plain(things: list[RoadObject], kinds: list[VehicleClass] | None = None) -> bool:
     """Whether all positions have the usual type, no two objects share a position array, and no object occurs twice."""
     if not all(map(_PLAIN, kinds or kinds_of(things))):
         return False

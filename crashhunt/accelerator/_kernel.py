@@ -114,7 +114,7 @@ class _Module(Protocol):
 
 
 @cache
-def _found() -> tuple[_Module | None, str]:
+def _load_kernel() -> tuple[_Module | None, str]:
     """Return the kernel, or None and the reason why it is not used."""
     try:
         module: _Module = importlib.import_module(_MODULE)
@@ -127,7 +127,7 @@ def _found() -> tuple[_Module | None, str]:
         return None, "a function of NumPy has been replaced"
     # NumPy's BLAS rounds a product of vectors or of matrices once or twice, and NumPy squares or raises to the power
     # of 2: find out.
-    objects = (np.float64, np.int64, np.float32, np.ndarray, np.zeros, _slide)
+    objects = (np.float64, np.int64, np.float32, np.ndarray, np.zeros, _derivatives)
     wrong = ""
     for fused, product_fused, step in product((True, False), (True, False), (0, 8)):
         try:
@@ -160,7 +160,7 @@ def _bind_turn(module: _Module) -> None:
             return
 
 
-def _slide(vehicle: Vehicle, dt: float) -> None:
+def _derivatives(vehicle: Vehicle, dt: float) -> None:
     """Move a vehicle by highway-env's dynamic bicycle model, without the search for its lane."""
     road, vehicle.road = vehicle.road, None
     try:
@@ -171,12 +171,12 @@ def _slide(vehicle: Vehicle, dt: float) -> None:
 
 def kernel() -> _Module | None:
     """Return the compiled kernel; None if it cannot be used in this process."""
-    return _found()[0]
+    return _load_kernel()[0]
 
 
 def why_not() -> str:
     """Return why the kernel is not used; empty if it is used."""
-    return _found()[1]
+    return _load_kernel()[1]
 
 
 def _differs(module: _Module) -> str:

@@ -39,8 +39,8 @@ class Network:
 
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network
-        self.keys, self.lanes = _laid_out(network)
-        self._reach = _reach()
+        self.keys, self.lanes = _ordered_lanes(network)
+        self._lane_extensions = _lane_extensions()
         self._contents = _contents(network, self.lanes)
         self.index = {key: number for number, key in enumerate(self.keys)}
         self.number = {id(lane): number for number, lane in enumerate(self.lanes)}
@@ -49,7 +49,7 @@ class Network:
 
     def is_of(self, network: RoadNetwork) -> bool:
         """Whether the network still has the same lane objects with unchanged keys and attributes."""
-        return network is self.network and self._contents.is_same() and self._reach == _reach()
+        return network is self.network and self._contents.is_same() and self._lane_extensions == _lane_extensions()
 
     def in_kernel(self, *, looks_further: bool) -> CompiledNetwork:
         """Return the lanes in the kernel, which must exist.
@@ -98,7 +98,7 @@ class Network:
         return bool(abs(r) <= lane.width / 2 + _ON_LANE_MARGIN_M and -5 <= s < lane.length + 5)
 
 
-def _laid_out(network: RoadNetwork) -> tuple[list[tuple[str, str, int]], list[AbstractLane]]:
+def _ordered_lanes(network: RoadNetwork) -> tuple[list[tuple[str, str, int]], list[AbstractLane]]:
     """Return all keys and lanes in highway-env's order of comparison; empty if the network is unusual.
 
     An unusual network has its own methods, or its graph has containers of other types.
@@ -135,7 +135,7 @@ def _is_array(value: object) -> bool:
     return type(value) is np.ndarray and value.dtype in _DTYPES and value.flags.c_contiguous
 
 
-def _reach() -> list[float]:
+def _lane_extensions() -> list[float]:
     """Return the distance in m by which each class of lanes extends beyond its end."""
     return [kind.VEHICLE_LENGTH for kind in _KNOWN]
 

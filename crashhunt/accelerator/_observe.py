@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
 
-    from crashhunt.accelerator._frames import Frame
+    from crashhunt.accelerator._frames import TrafficFrame
     from crashhunt.accelerator._network import Network
-    from crashhunt.accelerator._roads import State
+    from crashhunt.accelerator._roads import RoadState
 
 
 __all__ = [
@@ -46,19 +46,21 @@ __all__ = [
 ]
 
 
-_BASIC = frozenset(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))
-_OF_LANES = ("long_off", "lat_off", "ang_off")
-_OF_DESTINATIONS = ("cos_d", "sin_d")
-_LATE = frozenset((*_OF_LANES, *_OF_DESTINATIONS))  # highway-env's own code computes them, if they are shown
-_KNOWN = _BASIC | _LATE
-_ALL = sorted(_BASIC)
+_BASIC_FEATURES = frozenset(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))
+_LANE_FEATURES = ("long_off", "lat_off", "ang_off")
+_DESTINATION_FEATURES = ("cos_d", "sin_d")
+_UNCOMPILED_FEATURES = frozenset(
+    (*_LANE_FEATURES, *_DESTINATION_FEATURES)
+)  # highway-env's own code computes them, if they are shown
+_KNOWN_FEATURES = _BASIC_FEATURES | _UNCOMPILED_FEATURES
+_SORTED_BASIC_FEATURES = sorted(_BASIC_FEATURES)
 _CODES = {name: code for code, name in enumerate(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))}
 """The features in the order of the kernel."""
-_OF_OBJECTS = _BASIC - {"heading"}
+_OBJECT_FEATURES = _BASIC_FEATURES - {"heading"}
 
 
 def close_objects(
-    frame: Frame,
+    frame: TrafficFrame,
     vehicle: Vehicle,
     distance: float,
     count: int | None,
@@ -93,10 +95,10 @@ def close_objects(
     return [frame.things[number] for _, number in found]
 
 
-def observe_in_kernel(kinematic: KinematicObservation, state: State) -> NDArray[np.generic] | None:
+def observe_in_kernel(kinematic: KinematicObservation, state: RoadState) -> NDArray[np.generic] | None:
     """Return the result of `KinematicObservation.observe`; None if the kernel does not know a part of it."""
     features, rows, env = kinematic.features, kinematic.vehicles_count, kinematic.env
-    if not _are_known(features) or not _BASIC.issuperset(features) or not state.roster.describes:
+    if not _are_known(features) or not _BASIC_FEATURES.issuperset(features) or not state.roster.describes:
         return None
     if type(rows) is not int or rows < 2 or not are_numbers((env.PERCEPTION_DISTANCE,)):
         return None
@@ -133,7 +135,7 @@ def observe_in_kernel(kinematic: KinematicObservation, state: State) -> NDArray[
     return shown.astype(np.float32)
 
 
-def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.generic] | None:
+def observe(kinematic: KinematicObservation, frame: TrafficFrame | None) -> NDArray[np.generic] | None:
     """Return the result of `KinematicObservation.observe`; None if highway-env's own code must run."""
     env, vehicle = kinematic.env, kinematic.observer_vehicle
     if frame is None or not _is_known(kinematic):
@@ -146,11 +148,11 @@ def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.
         sort=kinematic.order == "sorted",
         vehicles_only=not kinematic.include_obstacles,
     )
-    shown = _show(kinematic, frame, close, {})
+    shown = _visible_rows(kinematic, frame, close, {})
     return None if shown is None else shown.astype(np.float32)
 
 
-def observe_exit(kinematic: ExitObservation, frame: Frame | None) -> NDArray[np.generic] | None:
+def observe_exit(kinematic: ExitObservation, frame: TrafficFrame | None) -> NDArray[np.generic] | None:
     """Return the result of `ExitObservation.observe`; None if highway-env's own code must run."""
     env, vehicle = kinematic.env, kinematic.observer_vehicle
     if frame is None or not env.road or not _is_known(kinematic):
@@ -159,7 +161,7 @@ def observe_exit(kinematic: ExitObservation, frame: Frame | None) -> NDArray[np.
     close = env.road.close_vehicles_to(
         vehicle, env.PERCEPTION_DISTANCE, count=kinematic.vehicles_count - 1, see_behind=kinematic.see_behind
     )
-    shown = _show(kinematic, frame, close, {"x": float(before_exit)})
+    shown = _visible_rows(kinematic, frame, close, {"x": float(before_exit)})
     return None if shown is None else shown.astype(kinematic.space().dtype)
 
 
@@ -167,8 +169,8 @@ def _is_known(kinematic: KinematicObservation) -> bool:
     return _are_known(kinematic.features) and _is_plain(kinematic.observer_vehicle, kinematic.features)
 
 
-def _show(
-    kinematic: KinematicObservation, frame: Frame, close: list[RoadObject], replaced: dict[str, float]
+def _visible_rows(
+    kinematic: KinematicObservation, frame: TrafficFrame, close: list[RoadObject], replaced: dict[str, float]
 ) -> NDArray[np.float64] | None:
     """Return the rows of the agent and of close objects; None if highway-env's own code must run.
 
@@ -182,16 +184,16 @@ def _show(
     close = close[-kinematic.vehicles_count + 1 :]
     if not all(_is_plain(thing, features) and _arrives(thing, frame.network) for thing in (vehicle, *close)):
         return None
-    late = _LATE.intersection(features)
-    own = _values(vehicle, late)
+    late = _UNCOMPILED_FEATURES.intersection(features)
+    own = _vehicle_values(vehicle, late)
     rows = [own | replaced]
     for thing in close:
-        values = _values(thing, late)
+        values = _vehicle_values(thing, late)
         if not kinematic.absolute:
             for name in ("x", "y", "vx", "vy"):
                 values[name] -= own[name]
         if not kinematic.observe_intentions:
-            values |= dict.fromkeys(_OF_DESTINATIONS, 0.0)
+            values |= dict.fromkeys(_DESTINATION_FEATURES, 0.0)
         rows.append(values)
     shown = np.zeros((max(len(rows), kinematic.vehicles_count), len(features)))
     for column, name in enumerate(features):
@@ -207,7 +209,7 @@ def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.f
     """Return the result of `KinematicsGoalObservation.observe`; None if highway-env's own code must run."""
     vehicle, features = kinematic.observer_vehicle, kinematic.features
     goal = getattr(vehicle, "goal", None)
-    if vehicle is None or goal is None or type(features) is not list or not _BASIC.issuperset(features):
+    if vehicle is None or goal is None or type(features) is not list or not _BASIC_FEATURES.issuperset(features):
         return None
     things = [vehicle, goal]
     if not are_plain(things) or not all(_is_plain(thing, features) for thing in things):
@@ -216,12 +218,14 @@ def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.f
         getattr(thing, "route", None) for thing in things
     ):  # `to_dict` would compute the destination, which may fail
         return None
-    here, there = (np.array([values[name] for name in features]) for values in (_values(vehicle), _values(goal)))
+    here, there = (
+        np.array([values[name] for name in features]) for values in (_vehicle_values(vehicle), _vehicle_values(goal))
+    )
     scales = kinematic.scales
     return OrderedDict(observation=here / scales, achieved_goal=here / scales, desired_goal=there / scales)
 
 
-def observe_grid(grid: OccupancyGridObservation, frame: Frame | None) -> NDArray[np.generic] | None:
+def observe_grid(grid: OccupancyGridObservation, frame: TrafficFrame | None) -> NDArray[np.generic] | None:
     """Return the result of `OccupancyGridObservation.observe`; None if highway-env's own code must run.
 
     The features of all vehicles are normalized in one array, without a data frame. highway-env writes the vehicles in
@@ -229,22 +233,26 @@ def observe_grid(grid: OccupancyGridObservation, frame: Frame | None) -> NDArray
     """
     observer, features = grid.observer_vehicle, grid.features
     shown = [name for name in features if name != "on_road"] if type(features) is list else None
-    if frame is None or grid.absolute or shown is None or not _BASIC.issuperset(shown):
+    if frame is None or grid.absolute or shown is None or not _BASIC_FEATURES.issuperset(shown):
         return None
     vehicles = grid.env.road.vehicles
     if observer is None or not vehicles or type(observer.position) is not np.ndarray:
         return None
-    if not all(_is_plain(thing, _ALL) and _arrives(thing, frame.network) for thing in (observer, *vehicles)):
+    if not all(
+        _is_plain(thing, _SORTED_BASIC_FEATURES) and _arrives(thing, frame.network) for thing in (observer, *vehicles)
+    ):
         return None
-    own = _values(observer)
-    columns = {name: np.array([values[name] for values in map(_values, vehicles)]) for name in _ALL}
+    own = _vehicle_values(observer)
+    columns = {
+        name: np.array([values[name] for values in map(_vehicle_values, vehicles)]) for name in _SORTED_BASIC_FEATURES
+    }
     for name in ("x", "y", "vx", "vy"):
         columns[name] = columns[name] - own[name]
     ranges = grid.features_range or {
         "vx": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
         "vy": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
     }
-    if type(ranges) is not dict or not _LATE.isdisjoint(ranges):
+    if type(ranges) is not dict or not _UNCOMPILED_FEATURES.isdisjoint(ranges):
         return None
     for name, limits in ranges.items():
         if name in columns:
@@ -314,7 +322,7 @@ def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, rea
 
 
 def fill_times(
-    env: AbstractEnv, state: State, vehicle: MDPVehicle, quantum: float, horizon: float
+    env: AbstractEnv, state: RoadState, vehicle: MDPVehicle, quantum: float, horizon: float
 ) -> NDArray[np.float64] | None:
     """Return the result of `compute_ttc_grid`; None if highway-env's own code must run.
 
@@ -356,7 +364,7 @@ def _as_tuple(value: object) -> object:
 
 def _are_known(features: object) -> bool:
     """Whether all features are known and each occurs once; a data frame repeats the column of a repeated feature."""
-    return type(features) is list and _KNOWN.issuperset(features) and len(set(features)) == len(features)
+    return type(features) is list and _KNOWN_FEATURES.issuperset(features) and len(set(features)) == len(features)
 
 
 def _arrives(thing: RoadObject, network: Network) -> bool:
@@ -375,10 +383,10 @@ def _is_plain(thing: RoadObject, features: list[str]) -> bool:
     kind = kind_of(type(thing))
     if not kind.describes or not kind.is_of(thing) or not are_numbers((thing.heading, thing.speed)):
         return False
-    return isinstance(thing, Vehicle) or _OF_OBJECTS.issuperset(features)
+    return isinstance(thing, Vehicle) or _OBJECT_FEATURES.issuperset(features)
 
 
-def _values(thing: RoadObject, late: Iterable[str] = ()) -> dict[str, float]:
+def _vehicle_values(thing: RoadObject, late: Iterable[str] = ()) -> dict[str, float]:
     """Return the part of highway-env's `to_dict` that observations use.
 
     Args:
@@ -399,8 +407,8 @@ def _values(thing: RoadObject, late: Iterable[str] = ()) -> dict[str, float]:
         "sin_h": s,
     }
     if late:
-        values |= zip(_OF_LANES, thing.lane_offset.tolist(), strict=True)
-        values |= zip(_OF_DESTINATIONS, thing.destination_direction.tolist(), strict=True)
+        values |= zip(_LANE_FEATURES, thing.lane_offset.tolist(), strict=True)
+        values |= zip(_DESTINATION_FEATURES, thing.destination_direction.tolist(), strict=True)
     return values
 
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from crashhunt.accelerator._frames import Frame
+from crashhunt.accelerator._frames import TrafficFrame
 from crashhunt.accelerator._network import Network
-from crashhunt.accelerator._roster import Roster
+from crashhunt.accelerator._roster import KernelRoster
 from crashhunt.accelerator._versions import Own, Watch, is_plain
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Prepared",
-    "State",
+    "RoadState",
     "forget",
     "frame_of",
     "is_known",
@@ -50,26 +50,26 @@ class Prepared:
     def __init__(self, road: Road) -> None:
         self.road = road  # keeps the road alive, so that no other road can get its id()
         self.network = Network(road.network)
-        self.frame: Frame | None = None
+        self.frame: TrafficFrame | None = None
         self.alone = False
-        self._roster: Roster | None = None
-        self._kept: State | None = None
+        self._roster: KernelRoster | None = None
+        self._kept: RoadState | None = None
 
-    def roster(self) -> Roster | None:
+    def roster(self) -> KernelRoster | None:
         """Return all vehicles in the kernel, with their current state; None if the kernel does not know them."""
         road = self.road
         if road.record_history:
             return None
         if self._roster is None or not self._roster.is_of(road):
-            self._roster = Roster(road, self.network)
+            self._roster = KernelRoster(road, self.network)
         traffic = self._roster.traffic
         return self._roster if traffic is not None and traffic.read() else None
 
-    def keep(self, state: State) -> None:
+    def keep(self, state: RoadState) -> None:
         """Keep the state of all vehicles in the kernel until foreign code runs."""
         self._kept = state if self.alone else None
 
-    def trusted(self) -> State | None:
+    def trusted(self) -> RoadState | None:
         """Return the kept state and discard it; None if no state has been kept since the last call."""
         kept, self._kept = self._kept, None
         return kept
@@ -79,27 +79,27 @@ class Prepared:
         self._kept = None
 
 
-class State(NamedTuple):
+class RoadState(NamedTuple):
     """The current state of a road in the kernel."""
 
     owner: Prepared
-    roster: Roster
+    roster: KernelRoster
     traffic: Traffic
 
 
-def take(road: Road) -> State | None:
+def take(road: Road) -> RoadState | None:
     """Return the kept state of a road; None if foreign code may have run since."""
     found = _roads.get(id(road))
     return found.trusted() if found is not None and found.road is road else None
 
 
-def look(road: Road) -> State | None:
+def look(road: Road) -> RoadState | None:
     """Return the current state of a road; None if the kernel cannot be used for the road."""
     found = prepared(road) if is_known(road) else None
     roster = found.roster() if found is not None else None
     if found is None or roster is None or roster.traffic is None:
         return None
-    return State(found, roster, roster.traffic)
+    return RoadState(found, roster, roster.traffic)
 
 
 def forget() -> None:
@@ -128,15 +128,22 @@ class _RoadKind:
 
     def __init__(self, kind: type[Road]) -> None:
         base = RegulatedRoad if issubclass(kind, RegulatedRoad) else Road
-        self.own = Own(kind, base, _READ)
+        self.own = Own(kind, base, _READ_ATTRIBUTES)
         self.is_seen = self.own.plain
-        self.is_known = self.own.plain and not any(map(self.own.has, _BYPASSED))
+        self.is_known = self.own.plain and not any(map(self.own.has, _BYPASSED_METHODS))
 
 
-_READ = ("network", "vehicles", "objects", "np_random", "record_history", "neighbour_vehicles_connected_lanes")
-_BYPASSED = ("neighbour_vehicles", "is_conflict_possible")
+_READ_ATTRIBUTES = (
+    "network",
+    "vehicles",
+    "objects",
+    "np_random",
+    "record_history",
+    "neighbour_vehicles_connected_lanes",
+)
+_BYPASSED_METHODS = ("neighbour_vehicles", "is_conflict_possible")
 """The methods of a road that the accelerator does not call; it calls all others."""
-_CALLED = {"act", "step"}  # a road object may have its own, which call the methods of the class
+_OVERRIDABLE_METHODS = {"act", "step"}  # a road object may have its own, which call the methods of the class
 _road_kinds: dict[type, _RoadKind] = {}
 
 
@@ -175,13 +182,13 @@ def network_of(road: Road) -> Network | None:
     return found.network if found is not None else None
 
 
-def frame_of(road: Road) -> Frame | None:
+def frame_of(road: Road) -> TrafficFrame | None:
     """Return the current positions on a road; None if the road or an object is unknown."""
     found = prepared(road) if _is_seen(road) else None
     if found is None:
         return None
     if found.frame is None or not found.frame.is_of(road):
-        found.frame = Frame(found.network, road)
+        found.frame = TrafficFrame(found.network, road)
     return found.frame if found.frame.plain else None
 
 
@@ -190,4 +197,4 @@ def methods_of(kind: type) -> frozenset[str]:
     return frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name)))
 
 
-_ROAD_METHODS = methods_of(RegulatedRoad) - _CALLED
+_ROAD_METHODS = methods_of(RegulatedRoad) - _OVERRIDABLE_METHODS

@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 
     from crashhunt.accelerator._kernel import Traffic
     from crashhunt.accelerator._network import Network
-    from crashhunt.accelerator._versions import Kind
+    from crashhunt.accelerator._versions import VehicleClass
 
     Row = tuple[object, ...]
 
 
-__all__ = ["Roster"]
+__all__ = ["KernelRoster"]
 
 
-_MODELS = {"": 0, "nothing": 1, "controlled": 2, "idm": 3, "linear": 4}
-_FOREIGN = 5
+_POLICY_CODES = {"": 0, "nothing": 1, "controlled": 2, "idm": 3, "linear": 4}
+_FOREIGN_POLICY_CODE = 5
 _PARAMETERS = (
     "LENGTH", "WIDTH", "MAX_SPEED", "MIN_SPEED",
     "TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "MAX_STEERING_ANGLE", "KP_A",
@@ -39,14 +39,16 @@ _PARAMETERS = (
     "LANE_CHANGE_DELAY", "LANE_CHANGE_MIN_ACC_GAIN", "LANE_CHANGE_MAX_BRAKING_IMPOSED",
 )  # fmt: skip
 """The parameters in the order of the kernel, which adds ``DELTA``."""
-_OF_GAPS = ("COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DISTANCE_WANTED", "TIME_WANTED")
+_GAP_PARAMETERS = ("COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DISTANCE_WANTED", "TIME_WANTED")
 _MAX_EXPONENT = 20.0  # with a larger IDM exponent, an acceleration may overflow
-_PARAMETERS_OF: dict[str, Callable[[RoadObject], Row]] = {how: attrgetter(*names) for how, names in NUMBERS_OF.items()}
-_DELTA = attrgetter("DELTA")
+_PARAMETER_READERS: dict[str, Callable[[RoadObject], Row]] = {
+    how: attrgetter(*names) for how, names in NUMBERS_OF.items()
+}
+_READ_DELTA = attrgetter("DELTA")
 assert all(_PARAMETERS[: len(names)] == names for names in NUMBERS_OF.values())
 
 
-class Roster:
+class KernelRoster:
     """The vehicles and objects of a road in the kernel, with everything that must stay the same while they are there.
 
     Args:
@@ -95,15 +97,15 @@ class Roster:
         parameters = _read_parameters(things, kinds)
         if parameters is None:
             return None
-        models = [_MODELS[kind.drives] if kind.drives else _FOREIGN for kind in kinds[:count]]
-        models += [_MODELS[""]] * (len(kinds) - count)
+        models = [_POLICY_CODES[kind.drives] if kind.drives else _FOREIGN_POLICY_CODE for kind in kinds[:count]]
+        models += [_POLICY_CODES[""]] * (len(kinds) - count)
         flags = bytes(map(_flags_of, things, kinds))
         lanes = network.in_kernel(looks_further=bool(self._looks_further))
         fixed = [kind.fixed for kind in kinds]
         return module.Traffic(lanes, things, bytes(models), flags, parameters, road, fixed, _examples(things, kinds))
 
 
-def _examples(things: list[RoadObject], kinds: list[Kind]) -> list[tuple[RoadObject, tuple[str, ...]]]:
+def _examples(things: list[RoadObject], kinds: list[VehicleClass]) -> list[tuple[RoadObject, tuple[str, ...]]]:
     """Return the objects with parameters of their own, and one of each class without, with the names of parameters."""
     found: list[tuple[RoadObject, tuple[str, ...]]] = []
     seen: set[int] = set()
@@ -115,11 +117,11 @@ def _examples(things: list[RoadObject], kinds: list[Kind]) -> list[tuple[RoadObj
     return found
 
 
-def _flags_of(thing: RoadObject, kind: Kind) -> int:
+def _flags_of(thing: RoadObject, kind: VehicleClass) -> int:
     return isinstance(thing, Landmark) | 2 * kind.slides | 4 * kind.times | 8 * isinstance(thing, Obstacle)
 
 
-def _read_parameters(things: list[RoadObject], kinds: list[Kind]) -> bytes | None:
+def _read_parameters(things: list[RoadObject], kinds: list[VehicleClass]) -> bytes | None:
     """Return the kernel's row of parameters for each object; None if one is missing or unusual."""
     shared: dict[int, Row] = {}  # of objects without parameters of their own, by class
     rows = []
@@ -130,13 +132,13 @@ def _read_parameters(things: list[RoadObject], kinds: list[Kind]) -> bytes | Non
                 return None
             row = None if own else shared.get(id(kind))
             if row is None:
-                row = _PARAMETERS_OF[kind.base](thing)
+                row = _PARAMETER_READERS[kind.base](thing)
                 # A limit that is a NumPy float makes speeds NumPy floats.
                 if not are_numbers(row) or any(type(number) is np.float64 for number in row[2:4]):
                     return None
                 if not own:
                     shared[id(kind)] = row
-            delta = _DELTA(thing) if kind.times else math.nan
+            delta = _READ_DELTA(thing) if kind.times else math.nan
             if not are_numbers((delta,)):
                 return None
             rows.append((*row, *[math.nan] * (len(_PARAMETERS) - len(row)), delta))
@@ -154,7 +156,7 @@ def _read_parameters(things: list[RoadObject], kinds: list[Kind]) -> bytes | Non
 
 def _is_tame(rows: NDArray[np.float64]) -> bool:
     """Whether the parameters of drivers guarantee finite accelerations for finite velocities."""
-    comfort, braking, wanted, time = (rows[:, _PARAMETERS.index(name)] for name in _OF_GAPS)
+    comfort, braking, wanted, time = (rows[:, _PARAMETERS.index(name)] for name in _GAP_PARAMETERS)
     return bool(
         np.isfinite([comfort, braking, wanted, time]).all()
         and (comfort * braking < 0).all()

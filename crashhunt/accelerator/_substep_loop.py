@@ -88,14 +88,14 @@ class Onlooker:
         self.look()
 
 
-_CALLED = ("_simulate", "_automatic_rendering")
-_READ = ("steps", "config", "viewer", "enable_auto_render", "road", "action_type")
+_CALLED_METHODS = ("_simulate", "_automatic_rendering")
+_READ_ATTRIBUTES = ("steps", "config", "viewer", "enable_auto_render", "road", "action_type")
 _kinds: dict[type, Own] = {}
 
 
 def can_run_alone() -> bool:
     """Whether the functions that highway-env calls between sub-steps are its own; stores them in `originals`."""
-    found = {f"AbstractEnv.{name}": getattr(AbstractEnv, name) for name in _CALLED}
+    found = {f"AbstractEnv.{name}": getattr(AbstractEnv, name) for name in _CALLED_METHODS}
     originals.update(found)
     return all(is_genuine(name, function) for name, function in found.items())
 
@@ -184,7 +184,7 @@ def _runs_alone(env: AbstractEnv) -> bool:
         return False
     own = _kinds.get(kind)
     if own is None or not own.current:
-        own = _kinds[kind] = Own(kind, AbstractEnv, _READ)
+        own = _kinds[kind] = Own(kind, AbstractEnv, _READ_ATTRIBUTES)
     return own.plain and not own.has("_automatic_rendering") and type(env.config) is dict
 
 
@@ -209,8 +209,10 @@ def _interferes(road: Road) -> bool:
 
 # Skips an environment's own observation if the agent gets another observation and the skip has no other effect.
 
-_STATELESS = (KinematicObservation, ExitObservation, OccupancyGridObservation)
-_HOMES = tuple(str(Path(file).parent) for file in (highway_env.__file__, __file__))  # the accelerator replaces a method
+_STATELESS_OBSERVATIONS = (KinematicObservation, ExitObservation, OccupancyGridObservation)
+_GENUINE_FOLDERS = tuple(
+    str(Path(file).parent) for file in (highway_env.__file__, __file__)
+)  # the accelerator replaces a method
 
 
 class SkippedObservation:
@@ -264,7 +266,7 @@ def _observe_nothing() -> None:
 
 def _is_stateless(eye: ObservationType) -> bool:
     """Whether making an observation has no effect except its return value."""
-    if type(eye) not in _STATELESS:
+    if type(eye) not in _STATELESS_OBSERVATIONS:
         return False
     values = vars(eye)
     # The first observation sets the range of the features, which later observations use.
@@ -290,7 +292,7 @@ def _is_own(kind: type) -> bool:
         return False
     functions = (getattr(found, "fget", None) or getattr(found, "__func__", found) for found in vars(kind).values())
     codes = (inspect.unwrap(function).__code__ for function in functions if inspect.isfunction(function))
-    return all(code.co_filename.startswith(_HOMES) for code in codes)
+    return all(code.co_filename.startswith(_GENUINE_FOLDERS) for code in codes)
 
 
 _observation_types: dict[type, _Environments] = {}

@@ -66,13 +66,13 @@ def switch_on() -> str:
     reason = reason_against()
     if not reason:
         alone = can_run_alone()
-        for owner, name, faster in _REPLACED:
+        for owner, name, faster in _REPLACEMENTS:
             if owner is not AbstractEnv or alone:
                 originals[_name(owner, name)] = getattr(owner, name)
                 setattr(owner, name, faster)
         # highway-env calls a replacement of one of our methods, so watching them is unnecessary. The exception is
         # `neighbour_vehicles`, which accelerated decisions bypass.
-        ours = {_name(owner, name) for owner, name, _ in _REPLACED}
+        ours = {_name(owner, name) for owner, name, _ in _REPLACEMENTS}
         watches["roads"] = Watch.of_roads(ours - {"Road.neighbour_vehicles"})
         watches["observations"] = Watch.of_observations(ours)
     return reason
@@ -85,7 +85,7 @@ def switch_off() -> None:
 
 
 def _restore() -> None:
-    for owner, name, faster in _REPLACED:
+    for owner, name, faster in _REPLACEMENTS:
         if vars(owner).get(name) is faster:
             setattr(owner, name, originals[_name(owner, name)])
 
@@ -155,7 +155,7 @@ def _simulate(self: AbstractEnv, action: object = None) -> None:
     if self.road is None or len(self.road.vehicles) < 2:
         originals["AbstractEnv._simulate"](self, action)
     else:
-        simulate(self, action, _OF_ROADS)
+        simulate(self, action, _ROAD_REPLACEMENTS)
 
 
 def _neighbour_vehicles(self: Road, vehicle: Vehicle, lane_index: LaneIndex | None = None) -> object:
@@ -259,13 +259,13 @@ def _is_plain(observation: KinematicObservation | OccupancyGridObservation, kind
         and watches
         and watches["observations"].intact
         and isinstance(observation.env.road, Road)
-        and _SHOWN[kind].isdisjoint(vars(observation))
+        and _OBSERVATION_METHODS[kind].isdisjoint(vars(observation))
     )
 
 
 _OBSERVATIONS = (KinematicObservation, ExitObservation, KinematicsGoalObservation, OccupancyGridObservation)
-_SHOWN = {kind: methods_of(kind) for kind in _OBSERVATIONS}
-_REPLACED: tuple[tuple[type | ModuleType, str, Callable[..., object]], ...] = (
+_OBSERVATION_METHODS = {kind: methods_of(kind) for kind in _OBSERVATIONS}
+_REPLACEMENTS: tuple[tuple[type | ModuleType, str, Callable[..., object]], ...] = (
     (Road, "act", _act),
     (Road, "step", _step),
     (Road, "neighbour_vehicles", _neighbour_vehicles),
@@ -279,7 +279,7 @@ _REPLACED: tuple[tuple[type | ModuleType, str, Callable[..., object]], ...] = (
     (OccupancyGridObservation, "fill_road_layer_by_lanes", _fill_road_layer_by_lanes),
     (highway_env_observation, "compute_ttc_grid", _compute_ttc_grid),
 )
-_OF_ROADS = [replaced for replaced in _REPLACED if replaced[0] in (Road, RegulatedRoad)]
+_ROAD_REPLACEMENTS = [replaced for replaced in _REPLACEMENTS if replaced[0] in (Road, RegulatedRoad)]
 
 
 # ``crashhunt.accelerate()`` accelerates highway-env in the user's process, such as a training of a policy.

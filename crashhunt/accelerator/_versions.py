@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 __all__ = [
     "MODULES",
     "NUMBERS_OF",
-    "Kind",
     "Own",
+    "VehicleClass",
     "Watch",
     "are_numbers",
     "is_genuine",
@@ -186,13 +186,35 @@ def _is_method(owner: str, name: str) -> bool:
 
 _MODULES = (*MODULES, observation)
 
-_COLLIDES = ("handle_collisions", "_is_colliding", "polygon", "direction", "velocity", "lane_distance_to", "on_road")
-_MOVES = ("step", "clip_actions", "on_state_update")
-_DRIVES: tuple[str, ...] = ("act", "follow_road", "steering_control", "speed_control", "acceleration", "desired_gap")
-_DRIVES += ("change_lane_policy", "mobil", "collect_data", "add_features", "acceleration_features", "steering_features")
-_SLIDES = ("state", "derivative_func")
-_PREDICTS = ("predict_trajectory_constant_speed",)
-_DESCRIBES = ("to_dict", "destination", "destination_direction", "lane_offset")
+_COLLISION_METHODS = (
+    "handle_collisions",
+    "_is_colliding",
+    "polygon",
+    "direction",
+    "velocity",
+    "lane_distance_to",
+    "on_road",
+)
+_MOVEMENT_METHODS = ("step", "clip_actions", "on_state_update")
+_DRIVING_METHODS: tuple[str, ...] = (
+    "act",
+    "follow_road",
+    "steering_control",
+    "speed_control",
+    "acceleration",
+    "desired_gap",
+)
+_DRIVING_METHODS += (
+    "change_lane_policy",
+    "mobil",
+    "collect_data",
+    "add_features",
+    "acceleration_features",
+    "steering_features",
+)
+_DYNAMICS_METHODS = ("state", "derivative_func")
+_PREDICTION_METHODS = ("predict_trajectory_constant_speed",)
+_DESCRIPTION_METHODS = ("to_dict", "destination", "destination_direction", "lane_offset")
 _SPECIAL = (
     "__bool__", "__len__", "__eq__", "__ne__", "__lt__", "__hash__", "__getattribute__", "__getattr__", "__setattr__",
     "__delattr__", "__copy__", "__deepcopy__", "__reduce__", "__reduce_ex__", "__getstate__", "__setstate__",
@@ -217,20 +239,43 @@ _BASES = {
     objects.Landmark: "",
     objects.RoadObject: "",
 }
-_OUTLINE: tuple[str, ...] = ("LENGTH", "WIDTH")
-_LIMITED = (*_OUTLINE, "MAX_SPEED", "MIN_SPEED")
-_STEERED = (*_LIMITED, "TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "MAX_STEERING_ANGLE", "KP_A")
-_THINKING = (*_STEERED, "COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DISTANCE_WANTED", "TIME_WANTED", "ACC_MAX", "POLITENESS")
-_THINKING += ("LANE_CHANGE_DELAY", "LANE_CHANGE_MIN_ACC_GAIN", "LANE_CHANGE_MAX_BRAKING_IMPOSED")
-NUMBERS_OF = {"": _OUTLINE, "nothing": _LIMITED, "controlled": _STEERED, "idm": _THINKING, "linear": _THINKING}
+_OUTLINE_CONSTANTS: tuple[str, ...] = ("LENGTH", "WIDTH")
+_LIMIT_CONSTANTS = (*_OUTLINE_CONSTANTS, "MAX_SPEED", "MIN_SPEED")
+_STEERING_CONSTANTS = (*_LIMIT_CONSTANTS, "TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "MAX_STEERING_ANGLE", "KP_A")
+_IDM_CONSTANTS = (
+    *_STEERING_CONSTANTS,
+    "COMFORT_ACC_MAX",
+    "COMFORT_ACC_MIN",
+    "DISTANCE_WANTED",
+    "TIME_WANTED",
+    "ACC_MAX",
+    "POLITENESS",
+)
+_IDM_CONSTANTS += ("LANE_CHANGE_DELAY", "LANE_CHANGE_MIN_ACC_GAIN", "LANE_CHANGE_MAX_BRAKING_IMPOSED")
+NUMBERS_OF = {
+    "": _OUTLINE_CONSTANTS,
+    "nothing": _LIMIT_CONSTANTS,
+    "controlled": _STEERING_CONSTANTS,
+    "idm": _IDM_CONSTANTS,
+    "linear": _IDM_CONSTANTS,
+}
 """Class attributes with the parameters of vehicles, by model of decision; a vehicle may override them."""
-_METHODS = frozenset((*_COLLIDES, *_MOVES, *_SLIDES, *_DRIVES, *_PREDICTS, *_DESCRIBES))
+_METHODS = frozenset(
+    (
+        *_COLLISION_METHODS,
+        *_MOVEMENT_METHODS,
+        *_DYNAMICS_METHODS,
+        *_DRIVING_METHODS,
+        *_PREDICTION_METHODS,
+        *_DESCRIPTION_METHODS,
+    )
+)
 _ORIGINALS = {
     (owner, name): inspect.getattr_static(owner, name, None)
     for owner in _BASES
     for name in (*_METHODS, *_SPECIAL, "index_to_speed")
 }
-_OWN = frozenset(module.__name__ for module in MODULES) | {"abc", "builtins"}
+_HIGHWAY_ENV_MODULES = frozenset(module.__name__ for module in MODULES) | {"abc", "builtins"}
 
 originals: dict[str, Callable[..., Any]] = {}
 """The replaced methods of highway-env by ``Class.name``; empty until the accelerator is first switched on."""
@@ -249,19 +294,19 @@ class Own:
         self._kind, self._base = kind, base
         self._mro = kind.__mro__
         # The members that a user can change later; `Watch` covers highway-env's own classes.
-        parts = [part for part in self._mro if part.__module__ not in _OWN]
+        parts = [part for part in self._mro if part.__module__ not in _HIGHWAY_ENV_MODULES]
         self._sizes = [len(vars(part)) for part in parts]
         self._snapshot = snapshot_of([(part, vars(part)) for part in parts]) if parts else None
         values = {*values, *(name for name in dir(base) if is_plain(inspect.getattr_static(base, name)))}
         self.names = [name for name in _SPECIAL if self.has(name)]
-        self.names += [name for name in sorted(values) if name[:2] != "__" and not is_plain(self._of(name))]
+        self.names += [name for name in sorted(values) if name[:2] != "__" and not is_plain(self._member(name))]
         self.plain = type(kind) is type(base) and not self.names
 
     def has(self, name: str) -> bool:
         """Whether the class overrides this member of its base class."""
-        return self._of(name) is not inspect.getattr_static(self._base, name, None)
+        return self._member(name) is not inspect.getattr_static(self._base, name, None)
 
-    def _of(self, name: str) -> object:
+    def _member(self, name: str) -> object:
         return inspect.getattr_static(self._kind, name, None)
 
     @property
@@ -272,7 +317,7 @@ class Own:
         )
 
 
-class Kind:
+class VehicleClass:
     """The behaviour that a class of vehicles or objects inherits unchanged from its base class in highway-env.
 
     Args:
@@ -304,13 +349,15 @@ class Kind:
             )
 
         moving = issubclass(kind, kinematics.Vehicle)
-        self.collides = leaves(_COLLIDES)
+        self.collides = leaves(_COLLISION_METHODS)
         self.slides = base is dynamics.BicycleVehicle
-        self.moves = moving and self.collides and leaves((*_MOVES, *(_SLIDES if self.slides else ())))
+        self.moves = (
+            moving and self.collides and leaves((*_MOVEMENT_METHODS, *(_DYNAMICS_METHODS if self.slides else ())))
+        )
         self.times = base in (behavior.IDMVehicle, behavior.LinearVehicle)
-        self.drives = _BASES[base] if base is not None and self.collides and leaves(_DRIVES) else ""
-        self.predicts = self.moves and leaves((*_PREDICTS, *_DRIVES))
-        self.describes = self.collides and leaves(_DESCRIBES)
+        self.drives = _BASES[base] if base is not None and self.collides and leaves(_DRIVING_METHODS) else ""
+        self.predicts = self.moves and leaves((*_PREDICTION_METHODS, *_DRIVING_METHODS))
+        self.describes = self.collides and leaves(_DESCRIPTION_METHODS)
         self.chooses = self.collides and issubclass(kind, controller.MDPVehicle) and leaves(("index_to_speed",))
         self.base = _BASES[base] if base is not None else ""
         self.methods = frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name, None)))
@@ -334,22 +381,22 @@ left_alone: dict[str, list[str]] = {}
 """Classes that are not accelerated, or only in part, each with the members that it overrides."""
 
 
-def kind_of(kind: type) -> Kind:
+def kind_of(kind: type) -> VehicleClass:
     """Return the properties of a class in its current state."""
     found = _kinds.get(kind)
     if found is None or not found.own.current:
-        found = _kinds[kind] = Kind(kind)
+        found = _kinds[kind] = VehicleClass(kind)
     return found
 
 
-def kinds_of(things: Iterable[object]) -> list[Kind]:
+def kinds_of(things: Iterable[object]) -> list[VehicleClass]:
     """Return the properties of the class of each object."""
     types = list(map(type, things))
     known = {kind: kind_of(kind) for kind in set(types)}
     return list(map(known.__getitem__, types))
 
 
-_kinds: dict[type, Kind] = {}
+_kinds: dict[type, VehicleClass] = {}
 
 
 def are_numbers(values: Iterable[object]) -> bool:

@@ -93,7 +93,7 @@ class LaneChanger:
     def act(self, observation: NDArray[np.float32]) -> tuple[float, int] | int:
         """Return (target speed, lane change), or the meta-action for it."""
         curvature = self._path.update(observation)
-        self._look_for_lanes(observation, curvature)
+        self._update_lanes(observation, curvature)
         speed = float(observation[0, VX])
         leader = find_leader(observation, curvature=curvature)
         acceleration = idm_acceleration(speed, leader, desired_speed=self.desired_speed, headway_s=1.2)
@@ -117,7 +117,7 @@ class LaneChanger:
                 return change
         return 0
 
-    def _look_for_lanes(self, observation: NDArray[np.float32], curvature: float) -> None:
+    def _update_lanes(self, observation: NDArray[np.float32], curvature: float) -> None:
         """Update the agent's lane, and the rightmost lane in which a vehicle in its direction was seen."""
         from_left = float(observation[0, Y])
         if abs(from_left - self._from_left) > LANE_WIDTH_M / 2:
@@ -150,7 +150,9 @@ def _is_too_close(row: Sequence[float]) -> bool:
 
 # The Intelligent Driver Model with MOBIL lane changes: the baseline against which others are compared.
 
-_SAFE_BRAKING = 2.0  # m/s²: the greatest deceleration that MOBIL imposes on the follower in the new lane
+_MAX_IMPOSED_DECELERATION_MPS2 = (
+    2.0  # m/s²: the greatest deceleration that MOBIL imposes on the follower in the new lane
+)
 
 
 class IntelligentDriver(LaneChanger):
@@ -205,7 +207,7 @@ class IntelligentDriver(LaneChanger):
     def act(self, observation: NDArray[np.float32]) -> tuple[float, int] | int:
         """Return (target speed, lane change), or the meta-action for it."""
         curvature = self._path.update(observation)
-        self._look_for_lanes(observation, curvature)
+        self._update_lanes(observation, curvature)
         speed = float(observation[0, VX])
         own = self._accelerate(speed, find_leader(observation, curvature=curvature))
         self._waited_s += self.step_length_s
@@ -236,13 +238,13 @@ class IntelligentDriver(LaneChanger):
             if behind is not None:
                 gap, its_speed = behind[0], speed + behind[1]
                 braking = self._accelerate(its_speed, Leader(gap, behind[1]))
-                if braking < -_SAFE_BRAKING:
+                if braking < -_MAX_IMPOSED_DECELERATION_MPS2:
                     continue
                 before = None
                 if leader is not None:
                     before = Leader(gap + CAR_LENGTH_M + leader.gap, behind[1] + leader.closing_speed)
                 loss = self._accelerate(its_speed, before) - braking
-            if leader is not None and (leader.gap < 0 or after < -_SAFE_BRAKING):
+            if leader is not None and (leader.gap < 0 or after < -_MAX_IMPOSED_DECELERATION_MPS2):
                 continue
             advantage = after - own - self.politeness * loss
             if advantage > best:

@@ -66,7 +66,7 @@ class StableBaselines3:
         try:
             self._model = kind.load(file, device="cpu")
         except Exception as error:
-            why = f"{type(error).__name__}: {_line(error)}"
+            why = f"{type(error).__name__}: {_first_line(error)}"
             raise ValueError(
                 f"{path!r} is not a model of {name}, or was saved with another version of its libraries ({why})"
             ) from error
@@ -113,7 +113,7 @@ class _Network(ABC):
         except ValueError:
             raise
         except Exception as error:
-            raise ValueError(f"{path!r} cannot be loaded: {type(error).__name__}: {_line(error)}") from error
+            raise ValueError(f"{path!r} cannot be loaded: {type(error).__name__}: {_first_line(error)}") from error
         self._flatten = flatten
         self._space = action_space
         if observation_space is not None and observation_space.shape is not None:
@@ -126,7 +126,7 @@ class _Network(ABC):
         try:
             values = np.asarray(self._answer(batch))
         except Exception as error:
-            why = f"{type(error).__name__}: {_line(error)}"
+            why = f"{type(error).__name__}: {_first_line(error)}"
             raise ValueError(f"{path!r} does not take observations of the shape {batch.shape} ({why})") from error
         wanted = _count(self._space)
         if values.shape[:1] != (1,) or (wanted and values[0].size != wanted):
@@ -242,7 +242,7 @@ def _existing(path: str) -> Path:
     return Path(path)
 
 
-def _line(error: BaseException) -> str:
+def _first_line(error: BaseException) -> str:
     """The message of a library in one line of at most 200 characters."""
     text = " ".join(str(error).split())
     return text if len(text) <= 200 else f"{text[:199]}…"
@@ -275,7 +275,7 @@ def _shape(space: Space[object]) -> object:
 
 # A small trained policy: a multi-layer perceptron in plain NumPy.
 
-_MEANINGS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
+_META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 
 
 class NumpyPolicy:
@@ -323,8 +323,8 @@ class NumpyPolicy:
             self._target_speeds = data["target_speeds"].tolist()
             self._hold = max(1, round(float(data["period_s"]) / step_length_s))
             values = self.evaluate(np.zeros(self._rows * len(self._columns), np.float32))
-            if values.shape != (len(_MEANINGS),):
-                raise ValueError(f"the weights give values of the shape {values.shape}, not ({len(_MEANINGS)},)")
+            if values.shape != (len(_META_ACTIONS),):
+                raise ValueError(f"the weights give values of the shape {values.shape}, not ({len(_META_ACTIONS)},)")
         except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
             raise ValueError(f"{path!r} has no weights of a policy: {error}") from error
         self.reset(0)
@@ -333,7 +333,7 @@ class NumpyPolicy:
         """Begin an episode without a pending decision."""
         self._left = 0
         self._target = -1.0
-        self.values = np.zeros(len(_MEANINGS), np.float32)
+        self.values = np.zeros(len(_META_ACTIONS), np.float32)
 
     def act(self, observation: NDArray[np.float32]) -> object:
         """Return the meta-action of the greatest value, or (target speed, lane change)."""
@@ -341,7 +341,7 @@ class NumpyPolicy:
         if self._left == 0:
             self._left = self._hold
             self.values = self.evaluate(self.features(observation, self._rows, self._columns, self._scale))
-            decision = _MEANINGS[int(self.values.argmax())]
+            decision = _META_ACTIONS[int(self.values.argmax())]
         self._left -= 1
         if self._meta is not None:
             return self._meta[decision]
@@ -371,7 +371,7 @@ class NumpyPolicy:
         """Return a panel with the value of each action."""
         from crashhunt import panels
 
-        names = [name.removeprefix("LANE_") for name in _MEANINGS]
+        names = [name.removeprefix("LANE_") for name in _META_ACTIONS]
         return {"values": panels.Bar(dict(zip(names, self.values.tolist(), strict=True)))}
 
     def _continuous(self, decision: str, observation: NDArray[np.float32]) -> tuple[float, int]:

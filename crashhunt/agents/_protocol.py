@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from crashhunt.base.capabilities import supports
-from crashhunt.simulators import HasMeanings
+from crashhunt.simulators import NamesMetaActions
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -66,7 +66,7 @@ class NeedsLibraries(Protocol):
 
 # How agents that think in speeds and lanes say so in discrete meta-actions.
 
-_ALL = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
+_META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 _FASTER, _SLOWER = 0.5, -0.75  # m/s²
 
 
@@ -90,11 +90,17 @@ def meta_actions(space: Space[object] | None) -> Mapping[str, int] | None:
         return None
     meanings: Sequence[str] = ()
     if isinstance(space, Discrete):
-        meanings = space.meanings if supports(space, HasMeanings) else _ALL if space.n == len(_ALL) else ()
+        meanings = (
+            space.meanings
+            if supports(space, NamesMetaActions)
+            else _META_ACTIONS
+            if space.n == len(_META_ACTIONS)
+            else ()
+        )
     numbers = {name: number for number, name in enumerate(meanings)}
     if "IDLE" not in numbers:
         raise ValueError(f"the agent needs actions (target speed, lane change) or meta-actions, not the space {space}")
-    return {name: numbers.get(name, numbers["IDLE"]) for name in _ALL}
+    return {name: numbers.get(name, numbers["IDLE"]) for name in _META_ACTIONS}
 
 
 def wanted_meta_action(acceleration: float, change: int = 0) -> str:

@@ -42,15 +42,15 @@ _MAX_NAME_CHARACTERS: Final = 200
 _MAX_EXCEPTIONS: Final = 50
 _MAX_FRAMES: Final = 2_000
 # What exceeds them is cut to these, from both ends.
-_SHOWN_FRAMES: Final = 50  # at each end of a traceback
-_SHOWN_LINKS: Final = 8  # at each end of a chain of exceptions
-_SHOWN_MEMBERS: Final = 10  # of a group of exceptions
+_FRAMES_PER_END: Final = 50  # at each end of a traceback
+_EXCEPTIONS_PER_END: Final = 8  # at each end of a chain of exceptions
+_MAX_GROUP_MEMBERS: Final = 10  # of a group of exceptions
 _MAX_ELEMENTS: Final = 100_000  # of a container that is the argument of an exception
 _MAX_SOURCE_BYTES: Final = 10 << 20
 _NO_MESSAGE: Final = "(its message cannot be had: {})"
 
-_CAUSED = "\nThe above exception was the direct cause of the following exception:\n\n"
-_WHILE = "\nDuring handling of the above exception, another exception occurred:\n\n"
+_CAUSE_LINE = "\nThe above exception was the direct cause of the following exception:\n\n"
+_CONTEXT_LINE = "\nDuring handling of the above exception, another exception occurred:\n\n"
 
 
 def class_name(error: BaseException) -> str:
@@ -99,7 +99,7 @@ def _large_argument(error: BaseException) -> str:
     """Return a short description in place of a message that only shows a large container; otherwise an empty string."""
     if type(error).__str__ not in (BaseException.__str__, KeyError.__str__):
         return ""
-    for argument in error.args[:_SHOWN_MEMBERS]:
+    for argument in error.args[:_MAX_GROUP_MEMBERS]:
         if type(argument) in (list, tuple, dict, set, frozenset, bytes, bytearray) and len(argument) > _MAX_ELEMENTS:
             return f"({type(argument).__name__} of {len(argument)} elements)"
     return ""
@@ -168,15 +168,15 @@ def _skip_large_sources(files: Iterable[str]) -> None:
 def _formatted_chain(error: BaseException) -> Iterator[str]:
     """Yield the texts of an exception and of the exceptions that led to it, the oldest first."""
     newest: list[tuple[BaseException, str]] = []
-    oldest: deque[tuple[BaseException, str]] = deque(maxlen=_SHOWN_LINKS)
+    oldest: deque[tuple[BaseException, str]] = deque(maxlen=_EXCEPTIONS_PER_END)
     seen, count = {id(error)}, 0
     next_one: BaseException | None = error
     joint = ""
     while next_one is not None:
         count += 1
-        (newest if len(newest) < _SHOWN_LINKS else oldest).append((next_one, joint))
+        (newest if len(newest) < _EXCEPTIONS_PER_END else oldest).append((next_one, joint))
         cause, context = next_one.__cause__, next_one.__context__
-        joint = _CAUSED if cause is not None else _WHILE
+        joint = _CAUSE_LINE if cause is not None else _CONTEXT_LINE
         next_one = cause if cause is not None else (None if next_one.__suppress_context__ else context)
         if next_one is not None and id(next_one) in seen:
             next_one = None
@@ -200,27 +200,27 @@ def _formatted(error: BaseException) -> Iterator[str]:
     yield f"{_qualified_name(error)}: {_without_middle(_whole_message(error), MAX_TRACEBACK_CHARACTERS // 2)}\n"
     notes = getattr(error, "__notes__", None)
     if isinstance(notes, list | tuple):
-        for note in notes[:_SHOWN_MEMBERS]:
+        for note in notes[:_MAX_GROUP_MEMBERS]:
             yield f"{_without_middle(note, MAX_MESSAGE_CHARACTERS)}\n" if isinstance(note, str) else ""
-        if len(notes) > _SHOWN_MEMBERS:
-            yield f"… ({len(notes) - _SHOWN_MEMBERS} more notes are omitted)\n"
+        if len(notes) > _MAX_GROUP_MEMBERS:
+            yield f"… ({len(notes) - _MAX_GROUP_MEMBERS} more notes are omitted)\n"
     if isinstance(error, BaseExceptionGroup):
         members = error.exceptions
-        for number, member in enumerate(members[:_SHOWN_MEMBERS], 1):
+        for number, member in enumerate(members[:_MAX_GROUP_MEMBERS], 1):
             yield f"  {number} of {len(members)}: {_qualified_name(member)}: {message_of(member, 1000)}\n"
-        if len(members) > _SHOWN_MEMBERS:
-            yield f"  … ({len(members) - _SHOWN_MEMBERS} more exceptions are omitted)\n"
+        if len(members) > _MAX_GROUP_MEMBERS:
+            yield f"  … ({len(members) - _MAX_GROUP_MEMBERS} more exceptions are omitted)\n"
 
 
 def _formatted_frames(first: TracebackType) -> Iterator[str]:
     head: list[TracebackType] = []
-    tail: deque[TracebackType] = deque(maxlen=_SHOWN_FRAMES)
+    tail: deque[TracebackType] = deque(maxlen=_FRAMES_PER_END)
     count = 0
     for link in _links(first):
         count += 1
-        (head if len(head) < _SHOWN_FRAMES else tail).append(link)
+        (head if len(head) < _FRAMES_PER_END else tail).append(link)
     _skip_large_sources({link.tb_frame.f_code.co_filename for link in (*head, *tail)})
-    yield from traceback.format_tb(first, limit=_SHOWN_FRAMES)
+    yield from traceback.format_tb(first, limit=_FRAMES_PER_END)
     omitted = count - len(head) - len(tail)
     if omitted > 0:
         yield f"  … ({omitted} frames are omitted) …\n"
@@ -245,10 +245,10 @@ def _without_middle(text: str, limit: int) -> str:
 # The place of an exception in user code: the file and line that the user can correct.
 
 _MAX_LINE_CHARACTERS = 1_000
-_OURS = str(PACKAGE)
-_NOBODYS = ("<", importlib.__file__)  # of importing itself
+_CRASHHUNT_FOLDER = str(PACKAGE)
+_IMPORT_SYSTEM_FILES = ("<", importlib.__file__)  # of importing itself
 # Users look for their mistakes neither in the standard library nor in installed packages.
-_OTHERS = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
+_LIBRARY_FOLDERS = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
 
 
 def in_words(error: BaseException) -> str:
@@ -258,7 +258,7 @@ def in_words(error: BaseException) -> str:
 
 def is_users(filename: str) -> bool:
     """Whether a source file belongs to a user: not to crashhunt, nor to what is installed, nor to Python itself."""
-    return not filename.startswith((_OURS, *_OTHERS, *_NOBODYS))
+    return not filename.startswith((_CRASHHUNT_FOLDER, *_LIBRARY_FOLDERS, *_IMPORT_SYSTEM_FILES))
 
 
 def blamed(what: str, error: BaseException, *, fix: str = "correct the code") -> PluginError:
@@ -280,9 +280,13 @@ def place_of(error: BaseException) -> str:
     if isinstance(error, SyntaxError) and error.filename:
         # Nothing of the file has run, so that it is in no traceback; and there may be no line, as with null bytes.
         return shown_path(error.filename) + (f", line {error.lineno}" if error.lineno else "")
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(_NOBODYS)]
-    found = [frame for frame in frames if not frame.filename.startswith(_OURS)]
-    own = [frame for frame in found if not frame.filename.startswith(_OTHERS)]
+    frames = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith(_IMPORT_SYSTEM_FILES)
+    ]
+    found = [frame for frame in frames if not frame.filename.startswith(_CRASHHUNT_FOLDER)]
+    own = [frame for frame in found if not frame.filename.startswith(_LIBRARY_FOLDERS)]
     last = (own or found)[-1:]
     return f"{shown_path(last[0].filename)}, line {last[0].lineno}" if last else ""
 

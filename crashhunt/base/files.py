@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["cannot_write", "exchange", "is_empty_folder", "put_in_place", "sync_folder", "sync_tree", "whole_file"]
 
-_THREADS = 8  # fsync calls that overlap; more threads are not faster
+_PARALLEL_SYNCS = 8  # fsync calls that overlap; more threads are not faster
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # of <fcntl.h> and <linux/fs.h>
 
 
@@ -99,8 +99,8 @@ def sync_tree(folder: Path) -> None:
         folders.append(parent)
         files += [path for name in names if os.path.isfile(path := os.path.join(parent, name))]  # noqa: PTH113, PTH118
     # A file system with a journal commits once for several concurrent syncs.
-    with ThreadPoolExecutor(_THREADS) as threads:
-        for _ in threads.map(_sync_all, [files[share::_THREADS] for share in range(_THREADS)]):
+    with ThreadPoolExecutor(_PARALLEL_SYNCS) as threads:
+        for _ in threads.map(_sync_all, [files[share::_PARALLEL_SYNCS] for share in range(_PARALLEL_SYNCS)]):
             pass  # iterating raises the errors of the threads
         for _ in threads.map(sync_folder, folders):
             pass

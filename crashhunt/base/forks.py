@@ -131,10 +131,12 @@ def explain_silence(pid: int) -> NoAnswer:
 
 MEMORY = "crashhunt-copy"
 """Prefix of the names of memory files that belong to one fork. A fork of a fork replaces such a file explicitly."""
-_FILE = "crashhunt-file"
-_HARMLESS = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom", "/dev/tty", "/dev/pts/")
-_LARGEST = 16 << 20  # bytes: a larger file that is both written and read is not copied, because copying takes too long
-_RECEIVED = 1 << 16  # bytes per read: the capacity of a pipe on Linux
+_COPIED_FILE_NAME = "crashhunt-file"
+_SHAREABLE_DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom", "/dev/tty", "/dev/pts/")
+_MAX_COPIED_FILE_BYTES = (
+    16 << 20
+)  # bytes: a larger file that is both written and read is not copied, because copying takes too long
+_PIPE_CHUNK_BYTES = 1 << 16  # bytes per read: the capacity of a pipe on Linux
 _copying = False
 ends: set[int] = set()
 """Descriptors of pipes to the forks of this process and, inside a fork, to its parent. Forks do not inherit them."""
@@ -306,7 +308,7 @@ class Copy:
             while not received.endswith(b"\n"):
                 left_s = deadline - time.monotonic()
                 ready, _, _ = select.select([self._end], [], [], max(0.0, min(left_s, _CHECK_EVERY_S)))
-                data = os.read(self._end, _RECEIVED) if ready else b""
+                data = os.read(self._end, _PIPE_CHUNK_BYTES) if ready else b""
                 received += data
                 if ready and not data:
                     self.no_answer = explain_silence(self.pid)
@@ -454,12 +456,12 @@ def _replacement(descriptor: int, what: str, known: Held) -> tuple[int, int]:
             return _READ, place
         if flags == os.O_WRONLY or ours or MEMORY in what:
             return _NOTHING, 0
-        if os.fstat(descriptor).st_size > _LARGEST:
+        if os.fstat(descriptor).st_size > _MAX_COPIED_FILE_BYTES:
             raise CannotForkError(
                 f"a fork cannot copy a file that is open for writing and reading and is so large: {what}"
             )
         return _OWN, place
-    if stat.S_ISDIR(mode) or what.startswith(_HARMLESS):
+    if stat.S_ISDIR(mode) or what.startswith(_SHAREABLE_DEVICES):
         return _READ if stat.S_ISDIR(mode) else _NOTHING, 0
     if ours:
         return _NOTHING if descriptor == 0 else _CLOSE, 0
@@ -477,8 +479,8 @@ def _replace(replaced: list[tuple[int, int, int]]) -> None:
         if how == _READ:
             new = os.open(f"/proc/self/fd/{descriptor}", os.O_RDONLY)
         elif how == _OWN:
-            new = os.memfd_create(_FILE)
-            os.sendfile(new, descriptor, 0, _LARGEST)
+            new = os.memfd_create(_COPIED_FILE_NAME)
+            os.sendfile(new, descriptor, 0, _MAX_COPIED_FILE_BYTES)
         if new != nothing:
             os.lseek(new, place, os.SEEK_SET)
         os.dup2(new, descriptor, inheritable=os.get_inheritable(descriptor))
@@ -564,29 +566,29 @@ class SuspendedFork:
             while text:
                 text = text[_write(self._jobs, text) :]
         except BrokenPipeError:
-            self._lose(explain_silence(self.pid))
+            self._record_end(explain_silence(self.pid))
             return None
         while not received.endswith(b"\n"):
             ready, _, _ = select.select([self._answers], [], [], max(0.0, deadline - time.monotonic()))
             if not ready:
-                self._lose(took_longer(timeout_s))
+                self._record_end(took_longer(timeout_s))
                 return None
-            data = os.read(self._answers, _RECEIVED)
+            data = os.read(self._answers, _PIPE_CHUNK_BYTES)
             if not data:
-                self._lose(explain_silence(self.pid))
+                self._record_end(explain_silence(self.pid))
                 return None
             received += data
         answer: Plain | None
         try:
             answer, self.raised, why = _loads(received)
         except (ValueError, TypeError):
-            self._lose(NoAnswer("sent data that are no answer"))
+            self._record_end(NoAnswer("sent data that are no answer"))
             return None
         if answer is None:
             self.no_answer = NoAnswer(*why)
         return answer
 
-    def _lose(self, why: NoAnswer) -> None:
+    def _record_end(self, why: NoAnswer) -> None:
         self.no_answer, self.is_usable = why, False
 
     def end(self) -> None:

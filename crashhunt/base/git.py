@@ -33,7 +33,7 @@ _TIMEOUT_S = 60
 
 # Git sets these variables for its hooks and for `rebase --exec`, and they take precedence over `-C FOLDER`. They are
 # the ones of `git rev-parse --local-env-vars` that name a repository or parts of it.
-_OF_A_REPOSITORY = frozenset({
+_REPOSITORY_VARIABLES = frozenset({
     "GIT_ALTERNATE_OBJECT_DIRECTORIES", "GIT_COMMON_DIR", "GIT_DIR", "GIT_GRAFT_FILE", "GIT_IMPLICIT_WORK_TREE",
     "GIT_INDEX_FILE", "GIT_OBJECT_DIRECTORY", "GIT_PREFIX", "GIT_SHALLOW_FILE", "GIT_WORK_TREE",
 })  # fmt: skip
@@ -41,7 +41,7 @@ _OF_A_REPOSITORY = frozenset({
 
 def environment_of_git() -> dict[str, str]:
     """Return the environment variables of this process without those that name a repository."""
-    return {name: value for name, value in os.environ.items() if name not in _OF_A_REPOSITORY}
+    return {name: value for name, value in os.environ.items() if name not in _REPOSITORY_VARIABLES}
 
 
 def work_tree(folder: Path) -> Path | None:

@@ -44,7 +44,7 @@ def registered(group: Group) -> dict[str, EntryPoint]:
     found: dict[str, EntryPoint] = {}
     seen: set[str] = set()
     for distribution in distributions():
-        name, points = _points_of(distribution)
+        name, points = _entry_points_of(distribution)
         if name not in seen:  # of two versions, the first is the one that is imported
             seen.add(name)
             found |= points.get(group, {})
@@ -55,16 +55,16 @@ def distributions() -> Iterator[Distribution]:
     """Yield the installed distributions as `importlib.metadata` does, but cached until a distribution changes."""
     # To look through all that is installed takes milliseconds, and a hunt asks some twenty times.
     for place in sys.path:
-        yield from _lying_in(place, _changed_at(place))
+        yield from _distributions_in(place, _changed_at(place))
 
 
 @lru_cache(maxsize=64)
-def _lying_in(place: str, changed_at: int) -> list[Distribution]:  # noqa: ARG001 - as of when
+def _distributions_in(place: str, changed_at: int) -> list[Distribution]:  # noqa: ARG001 - as of when
     return list(metadata.distributions(path=[place]))
 
 
 @lru_cache(maxsize=1024)
-def _points_of(distribution: Distribution) -> tuple[str, dict[str, dict[str, EntryPoint]]]:
+def _entry_points_of(distribution: Distribution) -> tuple[str, dict[str, dict[str, EntryPoint]]]:
     """Return the name of a distribution, and its entry points of crashhunt's groups: group to name to entry point."""
     found: dict[str, dict[str, EntryPoint]] = {}
     for point in distribution.entry_points:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Kept"]
 
-_PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+_FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _LOOK_EVERY_S = 0.02  # where the kernel does not notify when a child ends
 _RESUME_EVERY_S = 1.0  # one check takes 20 µs
 _END_S = 5.0  # for the keeper to end all processes
@@ -63,7 +63,7 @@ class Kept:
     ) -> None:
         theirs, self._lifeline = os.pipe()
         # While Python starts, SIGINT would end the reaper with 1, as if its child had failed. The mask is inherited.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _PASSED_ON)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _FORWARDED_SIGNALS)
         try:
             self.process = subprocess.Popen(
                 [sys.executable, "-P", __file__, str(theirs), module, *arguments],
@@ -105,7 +105,7 @@ def _main() -> None:
         sys.argv = [module, *arguments]
         # A signal of the terminal ends the imports, and prints no traceback of them.
         interrupted = signal.signal(signal.SIGINT, signal.SIG_DFL)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, _PASSED_ON)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _FORWARDED_SIGNALS)
         found = _imported(module)
         signal.signal(signal.SIGINT, interrupted)
         if "main" in vars(found):
@@ -114,12 +114,12 @@ def _main() -> None:
             del sys.modules[module]
             runpy.run_module(module, run_name="__main__", alter_sys=True)
         return
-    for number in _PASSED_ON:  # the child, or the owner, handles signals that are sent to the whole group
+    for number in _FORWARDED_SIGNALS:  # the child, or the owner, handles signals that are sent to the whole group
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _PASSED_ON)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _FORWARDED_SIGNALS)
     status = _wait(child, int(lifeline), processes.resume)
     processes.end_descendants()
-    _leave(status)
+    _exit_as(status)
 
 
 def _imported(name: str) -> ModuleType:
@@ -166,7 +166,7 @@ def _wait(child: int, lifeline: int, resume: Callable[[int], None]) -> int | Non
             resume(child)
 
 
-def _leave(status: int | None) -> None:
+def _exit_as(status: int | None) -> None:
     """Exit with the status of the child, so the owner sees the same status as without a keeper."""
     if status is None:
         os._exit(1)

@@ -12,7 +12,12 @@ __all__ = ["FREE", "free_memory", "limit_behind"]
 
 
 _MEBIBYTE = 1 << 20
-_NO_MEMORY = ("can't start new thread", "failed to map segment", "cannot allocate memory", "unable to allocate")
+_NO_MEMORY_MESSAGES = (
+    "can't start new thread",
+    "failed to map segment",
+    "cannot allocate memory",
+    "unable to allocate",
+)
 
 
 def limit_behind(error: BaseException) -> str:
@@ -39,7 +44,9 @@ def _is_no_memory(error: BaseException) -> bool:
         said = str(error).lower()
     except BaseException:  # of a class that cannot even say its message
         return False
-    return isinstance(error, ImportError | RuntimeError | OSError) and any(words in said for words in _NO_MEMORY)
+    return isinstance(error, ImportError | RuntimeError | OSError) and any(
+        words in said for words in _NO_MEMORY_MESSAGES
+    )
 
 
 def _soft_limit(which: int) -> int | None:
@@ -51,7 +58,7 @@ def _soft_limit(which: int) -> int | None:
 
 FREE: Final = 0.25
 """The share of the memory that must be free before another suspended fork is kept."""
-_LINES = 30  # what is looked for stands further up
+_MAX_STATUS_LINES = 30  # what is looked for stands further up
 
 
 def free_memory(root: Path = Path("/")) -> float:
@@ -61,20 +68,20 @@ def free_memory(root: Path = Path("/")) -> float:
         root: where the kernel's own files are.
     """
     with suppress(OSError, ValueError, KeyError, ZeroDivisionError):
-        found = _numbers(root / "proc" / "meminfo")
+        found = _status_values(root / "proc" / "meminfo")
         free = found["MemAvailable"] / found["MemTotal"]
         with suppress(OSError, ValueError):  # of a container
             group = root / "sys" / "fs" / "cgroup"
             most = int((group / "memory.max").read_text(encoding="ascii"))
             used = int((group / "memory.current").read_text(encoding="ascii"))
             with suppress(OSError, ValueError, KeyError):  # files that were read or written once are in there, too
-                used -= min(used, _numbers(group / "memory.stat")["inactive_file"])
+                used -= min(used, _status_values(group / "memory.stat")["inactive_file"])
             free = min(free, 1 - used / most)
         return free
     return 1.0
 
 
-def _numbers(path: Path) -> dict[str, int]:
+def _status_values(path: Path) -> dict[str, int]:
     """Return the numbers after the names in the first lines of a file."""
-    lines = path.read_text(encoding="ascii").splitlines()[:_LINES]
+    lines = path.read_text(encoding="ascii").splitlines()[:_MAX_STATUS_LINES]
     return {name.rstrip(":"): int(number) for name, number, *_ in map(str.split, lines)}

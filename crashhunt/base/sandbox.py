@@ -22,15 +22,15 @@ _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
 _VERSION_ONLY, _PATH_BENEATH, _PR_SET_NO_NEW_PRIVS = 1, 1, 38  # of <linux/landlock.h> and <sys/prctl.h>
 
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR, _TRUNCATE = 1 << 0, 1 << 1, 1 << 2, 1 << 3, 1 << 14
-_READ = _EXECUTE | _READ_FILE | _READ_DIR
-_OF_A_FILE = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE
+_READ_RIGHTS = _EXECUTE | _READ_FILE | _READ_DIR
+_FILE_RIGHTS = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE
 # What each version of the kernel's interface has added: rights to files, to ports, and to other processes.
-_RIGHTS = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 5: (1 << 16) - 1}
-_PORTS = {4: 0b11}  # to listen and to connect
-_OTHERS = {6: 0b11}  # abstract sockets and signals
+_FILE_RIGHTS_BY_VERSION = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 5: (1 << 16) - 1}
+_PORT_RIGHTS_BY_VERSION = {4: 0b11}  # to listen and to connect
+_SCOPES_BY_VERSION = {6: 0b11}  # abstract sockets and signals
 
 # What a Python process reads besides what is installed: libraries and their list, the clock, random numbers, itself.
-_SYSTEM = """
+_SYSTEM_PATHS = """
 /usr /lib /lib64 /bin /opt /etc/ld.so.cache /etc/localtime /etc/fonts /dev/urandom /dev/null /proc
 /proc/meminfo /proc/stat /sys/devices/system /sys/fs/cgroup
 """
@@ -60,7 +60,9 @@ def confine(folder: Path, readable: Iterable[Path | str] = ()) -> bool:
     if not version:
         return False
     libc = ctypes.CDLL(None, use_errno=True)
-    rights, ports, others = (_newest(table, version) for table in (_RIGHTS, _PORTS, _OTHERS))
+    rights, ports, others = (
+        _newest(table, version) for table in (_FILE_RIGHTS_BY_VERSION, _PORT_RIGHTS_BY_VERSION, _SCOPES_BY_VERSION)
+    )
     content = struct.pack("=QQQ", rights, ports, others)
     # An older kernel knows the first ones only; it takes more if they are zero.
     ruleset = int(libc.syscall(_CREATE_RULESET, content, len(content), 0))
@@ -68,9 +70,9 @@ def confine(folder: Path, readable: Iterable[Path | str] = ()) -> bool:
         return False
     try:
         _allow(libc, ruleset, folder, rights)
-        _allow(libc, ruleset, Path("/dev/null"), (_READ | _WRITE_FILE | _TRUNCATE) & rights)
+        _allow(libc, ruleset, Path("/dev/null"), (_READ_RIGHTS | _WRITE_FILE | _TRUNCATE) & rights)
         for path in {*map(Path, readable), *_installed()}:
-            _allow(libc, ruleset, path, _READ)
+            _allow(libc, ruleset, path, _READ_RIGHTS)
         if libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) != 0:
             return False
         return int(libc.syscall(_RESTRICT_SELF, ruleset, 0)) == 0
@@ -84,7 +86,7 @@ def _newest(table: dict[int, int], version: int) -> int:
 
 def _installed() -> set[Path]:
     """Return the folders of Python's modules, and the system folders that they need."""
-    paths = {Path(path) for path in _SYSTEM.split()} | {PACKAGE, PACKAGE.parent / "scenarios"}
+    paths = {Path(path) for path in _SYSTEM_PATHS.split()} | {PACKAGE, PACKAGE.parent / "scenarios"}
     paths |= {
         Path(path).resolve()
         for path in (sys.prefix, sys.base_prefix, sys.exec_prefix, os.path.realpath(sys.executable))
@@ -98,7 +100,7 @@ def _allow(libc: ctypes.CDLL, ruleset: int, path: Path, rights: int) -> None:
         opened = os.open(path, os.O_PATH | os.O_CLOEXEC)
         try:
             if not path.is_dir():
-                rights &= _OF_A_FILE
+                rights &= _FILE_RIGHTS
             libc.syscall(_ADD_RULE, ruleset, _PATH_BENEATH, struct.pack("=Qi", rights, opened), 0)
         finally:
             os.close(opened)

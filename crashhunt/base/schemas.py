@@ -29,15 +29,15 @@ from crashhunt.base.codec import JsonObject, Serializable
 
 __all__ = ["describe_type", "json_schema"]
 
-_PLAIN = {bool: "boolean", int: "integer", float: "number", str: "string", NoneType: "null"}
-_ABSTRACT: Mapping[str, Any] = {
+_JSON_TYPES = {bool: "boolean", int: "integer", float: "number", str: "string", NoneType: "null"}
+_ABSTRACT_TYPES: Mapping[str, Any] = {
     "ClassVar": ClassVar,
     **{name: getattr(collections.abc, name) for name in ("Mapping", "Sequence", "Callable", "Iterable")},
 }
 """What modules usually import for the type checker only."""
 
 
-def json_schema(kind: Any, title: str, names: Mapping[str, Any] = _ABSTRACT) -> JsonObject:
+def json_schema(kind: Any, title: str, names: Mapping[str, Any] = _ABSTRACT_TYPES) -> JsonObject:
     """Return the schema of a type, with its title and the dialect.
 
     Args:
@@ -48,11 +48,11 @@ def json_schema(kind: Any, title: str, names: Mapping[str, Any] = _ABSTRACT) -> 
     Raises:
         NameError: an annotation has a name that neither its module nor ``names`` has.
     """
-    described = describe_type(kind, {**_ABSTRACT, **names})
+    described = describe_type(kind, {**_ABSTRACT_TYPES, **names})
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, **described}
 
 
-def describe_type(hint: Any, names: Mapping[str, Any] = _ABSTRACT) -> JsonObject:
+def describe_type(hint: Any, names: Mapping[str, Any] = _ABSTRACT_TYPES) -> JsonObject:
     """Return the schema of a type; ``{}``, which allows everything, if the type has several shapes in JSON."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Required, NotRequired):
@@ -69,8 +69,8 @@ def describe_type(hint: Any, names: Mapping[str, Any] = _ABSTRACT) -> JsonObject
     kind = hint if origin is None else origin
     if not isinstance(kind, type):
         return {}
-    if kind in _PLAIN:
-        return {"type": _PLAIN[kind]}
+    if kind in _JSON_TYPES:
+        return {"type": _JSON_TYPES[kind]}
     if issubclass(kind, Enum):
         return {"enum": [str(member) for member in kind]}
     if issubclass(kind, Path):

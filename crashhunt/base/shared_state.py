@@ -31,8 +31,10 @@ __all__ = ["SharedState"]
 
 _MAX_COPIED_BYTES: Final = 16 << 20  # of a file without a name, or of a mapping; a copy of it is made in every fork
 _MAP_FIXED: Final = 0x10
-_KEPT_FLAGS: Final = os.O_ACCMODE | os.O_APPEND | os.O_NONBLOCK | os.O_SYNC  # others say how a file was created
-_NAME: Final = "crashhunt-own"
+_RESTORED_OPEN_FLAGS: Final = (
+    os.O_ACCMODE | os.O_APPEND | os.O_NONBLOCK | os.O_SYNC
+)  # others say how a file was created
+_COPY_NAME: Final = "crashhunt-own"
 _CONNECTIONS: Final = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 
 
@@ -107,7 +109,7 @@ class SharedState:
         self._files.append(
             _File(
                 descriptor=descriptor,
-                flags=flags & _KEPT_FLAGS,
+                flags=flags & _RESTORED_OPEN_FLAGS,
                 position=position,
                 inode=inode,
                 is_nameless=is_nameless,
@@ -131,7 +133,7 @@ class SharedState:
     def _reopen(self, file: _File, copies: dict[tuple[int, int], int]) -> None:
         path = f"/proc/self/fd/{file.descriptor}"
         if file.is_nameless and file.inode not in copies:
-            copies[file.inode] = os.memfd_create(_NAME)
+            copies[file.inode] = os.memfd_create(_COPY_NAME)
             content = os.open(path, os.O_RDONLY)
             done = 0
             while done < file.size and (sent := os.sendfile(copies[file.inode], content, done, file.size - done)):

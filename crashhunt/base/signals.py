@@ -28,7 +28,7 @@ _SENT_FROM_OUTSIDE: Final = frozenset(
 # Bound here, before an agent is imported that could replace them.
 _set_mask, _ALL = signal.pthread_sigmask, tuple(signal.valid_signals())
 
-_STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SAME_REQUEST_S = 1.0
 """GNU timeout and batch systems send a signal to the process and then to its group. Two signals within this time are
 therefore one request, not a second request of an impatient user."""
@@ -129,7 +129,7 @@ def stop_requests() -> Iterator[list[int]]:
             os.kill(os.getpid(), number)
 
     try:
-        heeded = [number for number in _STOPS if signal.getsignal(number) is not signal.SIG_IGN]
+        heeded = [number for number in _STOP_SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
         before = {number: signal.signal(number, stop) for number in heeded}
     except ValueError:  # not in the main thread
         before = {}

@@ -1,7 +1,7 @@
 """Temporary files and folders of a process. All are removed, however the process ends.
 
 Each process has one folder for temporary files, ``crashhunt-temporary-UID/TOKEN`` in the system's folder for temporary
-files (``TMPDIR``, else ``/tmp``). `Owner` says what the token is. The folder holds
+files (``TMPDIR``, else ``/tmp``). `OwnerProcess` says what the token is. The folder holds
 
 * the folders that only this process needs (`temporary_folder`), and
 * a symbolic link for each temporary file or folder in another place (`temporary_beside`). Such files become permanent
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "Owner",
+    "OwnerProcess",
     "TemporaryFolder",
     "has_ended",
     "owner_in",
@@ -74,14 +74,14 @@ __all__ = [
 # owner for alive: a folder may be shared by NFS, by containers or by virtual machines.
 
 _BOOT_ID = "/proc/sys/kernel/random/boot_id"
-_NAMESPACES = "/proc/self/ns"  # of PIDs since Linux 3.8, of times since 5.6
+_NAMESPACE_FOLDER = "/proc/self/ns"  # of PIDs since Linux 3.8, of times since 5.6
 _BOOT_DIGITS = 12
 _UNKNOWN_BOOT = "0" * _BOOT_DIGITS  # where there is no /proc: such an owner counts as alive
 _TOKEN = re.compile(r"(?<![0-9])([0-9]{1,10})-([0-9]{1,20})-([0-9a-f]{12})-([0-9a-f]{8})(?![0-9a-f])")
 
 
 @dataclass(frozen=True, slots=True)
-class Owner:
+class OwnerProcess:
     """A process, as identified by the names of its temporary files.
 
     Args:
@@ -102,42 +102,42 @@ class Owner:
         return f"{self.pid}-{self.started}-{self.boot}-{self.namespace}"
 
 
-def this_process() -> Owner:
+def this_process() -> OwnerProcess:
     """Return the owner that this process is."""
     return _owner(os.getpid())
 
 
 @cache
-def _owner(pid: int) -> Owner:
+def _owner(pid: int) -> OwnerProcess:
     try:
         boot = Path(_BOOT_ID).read_text(encoding="ascii").replace("-", "")[:_BOOT_DIGITS]
         names = [_namespace(kind) for kind in ("pid", "time")]
     except (OSError, UnicodeError):
-        return Owner(pid=pid, started=0, boot=_UNKNOWN_BOOT, namespace="0" * 8)
+        return OwnerProcess(pid=pid, started=0, boot=_UNKNOWN_BOOT, namespace="0" * 8)
     started = start_time(pid)
     if started <= 0 or len(boot) < _BOOT_DIGITS:
-        return Owner(pid=pid, started=0, boot=_UNKNOWN_BOOT, namespace="0" * 8)
-    return Owner(pid=pid, started=started, boot=boot, namespace=f"{zlib.crc32(' '.join(names).encode()):08x}")
+        return OwnerProcess(pid=pid, started=0, boot=_UNKNOWN_BOOT, namespace="0" * 8)
+    return OwnerProcess(pid=pid, started=started, boot=boot, namespace=f"{zlib.crc32(' '.join(names).encode()):08x}")
 
 
 def _namespace(kind: str) -> str:
     """Return the identifier of a namespace of this process; empty if the kernel has no namespaces of this kind."""
     try:
-        return str(Path(_NAMESPACES, kind).readlink())
+        return str(Path(_NAMESPACE_FOLDER, kind).readlink())
     except FileNotFoundError:
         return ""
 
 
-def owner_in(name: str) -> Owner | None:
+def owner_in(name: str) -> OwnerProcess | None:
     """Return the owner that a file name gives; None if the name gives none, or several."""
     found = set(_TOKEN.findall(name))
     if len(found) != 1:  # a user's file name may have such a token as well
         return None
     ((pid, started, boot, namespace),) = found
-    return Owner(pid=int(pid), started=int(started), boot=boot, namespace=namespace)
+    return OwnerProcess(pid=int(pid), started=int(started), boot=boot, namespace=namespace)
 
 
-def has_ended(owner: Owner) -> bool:
+def has_ended(owner: OwnerProcess) -> bool:
     """Return whether it is certain that an owner has ended.
 
     An owner of another boot, of another host or of another container counts as alive, because this process cannot know.
@@ -181,9 +181,9 @@ def start_time(pid: int) -> int:
 # Every other segment stays, because nothing proves its origin: segments of C code, segments of a Python interpreter
 # that an agent starts itself, and named semaphores.
 
-_RECORDS = "shared-memory-{}.txt"  # with the token of the process that created what the file names
-_SEGMENTS = Path("/dev/shm")
-_NEW = os.O_CREAT | os.O_EXCL  # with both, shm_open has made the segment
+_SHARED_MEMORY_RECORD = "shared-memory-{}.txt"  # with the token of the process that created what the file names
+_SHARED_MEMORY_FOLDER = Path("/dev/shm")
+_CREATE_FLAGS = os.O_CREAT | os.O_EXCL  # with both, shm_open has made the segment
 
 
 def record_shared_memory(scratch: Path) -> None:
@@ -202,10 +202,12 @@ def record_shared_memory(scratch: Path) -> None:
     @wraps(original)
     def shm_open(path: str, flags: int, mode: int = 0o777) -> int:
         descriptor: int = original(path, flags, mode=mode)
-        if flags & _NEW == _NEW:
+        if flags & _CREATE_FLAGS == _CREATE_FLAGS:
             with suppress(OSError, ValueError):
                 found = os.fstat(descriptor)
-                with (folder / _RECORDS.format(this_process().token)).open("a", encoding="utf-8") as records:
+                with (folder / _SHARED_MEMORY_RECORD.format(this_process().token)).open(
+                    "a", encoding="utf-8"
+                ) as records:
                     records.write(f"{found.st_dev} {found.st_ino} {path.lstrip('/')}\n")
         return descriptor
 
@@ -219,7 +221,7 @@ def release_shared_memory(scratch: Path, *, of_ended: bool = False) -> None:
         scratch: the folder.
         of_ended: whether to remove only segments of processes that have ended.
     """
-    name = _RECORDS.format("*")
+    name = _SHARED_MEMORY_RECORD.format("*")
     # At the end at any depth: processes that confirm crashes have folders of their own inside.
     for records in [*(scratch.glob(name) if of_ended else scratch.rglob(name))]:
         owner = owner_in(records.name)
@@ -235,8 +237,8 @@ def release_shared_memory(scratch: Path, *, of_ended: bool = False) -> None:
 
 def _remove(name: str, device: int, number: int) -> None:
     """Remove a segment, if it is still the one that was recorded."""
-    path = _SEGMENTS / name
-    if path.parent != _SEGMENTS or not name.strip("."):
+    path = _SHARED_MEMORY_FOLDER / name
+    if path.parent != _SHARED_MEMORY_FOLDER or not name.strip("."):
         return
     with suppress(OSError):
         found = path.lstat()
@@ -245,10 +247,10 @@ def _remove(name: str, device: int, number: int) -> None:
             path.unlink()
 
 
-_LINK = "elsewhere"
-_WORK_TREES = "worktrees"  # in the folder of a Git repository
-_LONGEST_NAME = 255  # bytes, on every usual file system
-_TRIES = 5  # to make a folder that another process removes at the same moment, because it is empty
+_LINK_NAME = "elsewhere"
+_GIT_WORK_TREES_FOLDER = "worktrees"  # in the folder of a Git repository
+_MAX_NAME_BYTES = 255  # bytes, on every usual file system
+_MAX_MKDIR_ATTEMPTS = 5  # to make a folder that another process removes at the same moment, because it is empty
 
 
 class TemporaryFolder:
@@ -264,7 +266,7 @@ class TemporaryFolder:
     def __init__(self, purpose: str) -> None:
         self.path = _things.make(lambda folder: _new_folder(folder, purpose))
         # Python calls it at its end too, and when the caller loses the object.
-        self._remove = weakref.finalize(self, _end, self.path, os.getpid())
+        self._remove = weakref.finalize(self, _remove_of_owner, self.path, os.getpid())
 
     def remove(self) -> None:
         """Remove the folder and everything in it. A second call does nothing."""
@@ -310,7 +312,7 @@ def temporary_beside(path: Path, *, name: str = "") -> Iterator[Path]:
         if os.getpid() == pid:  # not in a fork of this process
             remove_scratch(target)
             if link is not None:
-                _things.end(link, removed=not _is_there(target))
+                _things.end(link, removed=not _exists(target))
 
 
 def temporary_name(path: Path, suffix: str = "") -> str:
@@ -322,7 +324,7 @@ def temporary_name(path: Path, suffix: str = "") -> str:
     """
     stem, suffix = (path.name, suffix) if suffix else (path.stem, path.suffix)
     rest = f".{this_process().token}{suffix}"
-    room = _LONGEST_NAME - 1 - len(os.fsencode(rest))
+    room = _MAX_NAME_BYTES - 1 - len(os.fsencode(rest))
     while len(os.fsencode(stem)) > room:
         stem = stem[:-1]
     return f".{stem}{rest}"
@@ -331,7 +333,7 @@ def temporary_name(path: Path, suffix: str = "") -> str:
 def remove_leftovers() -> None:
     """Remove the temporary files of processes that have ended; this lists one folder."""
     _things.swept = True
-    place, prefix = _place()
+    place, prefix = _base_folder()
     try:
         names = [entry.name for entry in os.scandir(place) if entry.name.startswith(prefix)]
     except OSError:
@@ -377,7 +379,7 @@ def remove_tree(path: Path) -> None:
             path.unlink()
             return
         shutil.rmtree(path, ignore_errors=True)
-        if _is_there(path):  # an agent may have taken permissions away
+        if _exists(path):  # an agent may have taken permissions away
             path.chmod(0o700)
             for parent, names, _ in os.walk(path):
                 for folder in (Path(parent, name) for name in names):
@@ -386,7 +388,7 @@ def remove_tree(path: Path) -> None:
             shutil.rmtree(path, ignore_errors=True)
 
 
-class _Things:
+class _TemporaryFiles:
     """The temporary files of this process: its folder exists while it has content."""
 
     def __init__(self) -> None:
@@ -411,9 +413,9 @@ class _Things:
         if not self.swept:
             remove_leftovers()
         with self._lock:
-            for left in reversed(range(_TRIES)):
+            for left in reversed(range(_MAX_MKDIR_ATTEMPTS)):
                 try:
-                    found = made(self._begun())
+                    found = made(self._create_folder())
                     self._count += 1
                     return found
                 except FileNotFoundError:  # another process removed it or its parent, which were empty or old
@@ -421,7 +423,7 @@ class _Things:
                     if not left:
                         raise
                 except BaseException:
-                    self._leave()
+                    self._remove_folder()
                     raise
         raise AssertionError
 
@@ -436,17 +438,17 @@ class _Things:
             if removed:
                 remove_tree(path)
             self._count -= 1
-            self._leave()
+            self._remove_folder()
 
     def next_name(self, purpose: str) -> str:
         """Return a name that is not used in the folder."""
         self._serial += 1
         return f"{purpose}-{self._serial}"
 
-    def _begun(self) -> Path:
+    def _create_folder(self) -> Path:
         if self._folder is not None:
             return self._folder
-        place, prefix = _place()
+        place, prefix = _base_folder()
         if not prefix:
             with suppress(FileExistsError):
                 place.mkdir(mode=0o700)
@@ -459,7 +461,7 @@ class _Things:
         self._folder, self._is_shared = folder, bool(prefix)
         return folder
 
-    def _leave(self) -> None:
+    def _remove_folder(self) -> None:
         if self._folder is not None and not self._count:
             with suppress(OSError):
                 self._folder.rmdir()
@@ -480,18 +482,18 @@ def _new_folder(folder: Path, purpose: str) -> Path:
 
 
 def _new_link(folder: Path, target: Path) -> Path:
-    made = folder / _things.next_name(_LINK)
+    made = folder / _things.next_name(_LINK_NAME)
     made.symlink_to(target)
     return made
 
 
-def _end(path: Path, pid: int) -> None:
+def _remove_of_owner(path: Path, pid: int) -> None:
     if os.getpid() == pid:  # not in a fork of this process
         remove_scratch(path)
-        _things.end(path, removed=not _is_there(path))
+        _things.end(path, removed=not _exists(path))
 
 
-def _place() -> tuple[Path, str]:
+def _base_folder() -> tuple[Path, str]:
     """Return the folder with the temporary folders of all processes of this user, and the prefix of their names."""
     usual = _temporary_files()
     place = usual / f"crashhunt-temporary-{os.getuid()}"
@@ -526,7 +528,7 @@ def _remove_left(folder: Path, token: str) -> None:
                 remove_scratch(path)
             elif _remove_if_ours(left := path.readlink(), token):
                 path.unlink()
-                if left.parent.name == _WORK_TREES:
+                if left.parent.name == _GIT_WORK_TREES_FOLDER:
                     with suppress(OSError):  # Git removes it with the last work tree too
                         left.parent.rmdir()
         folder.rmdir()
@@ -547,10 +549,10 @@ def _remove_if_ours(path: Path, token: str) -> bool:
     if owner is None or owner.token != token or not kind or found.st_uid != os.getuid():
         return True  # it is something else, and stays
     remove_scratch(path)
-    return not _is_there(path)
+    return not _exists(path)
 
 
-def _is_there(path: Path) -> bool:
+def _exists(path: Path) -> bool:
     """Return whether a path exists; a broken symbolic link counts."""
     try:
         path.lstat()
@@ -559,4 +561,4 @@ def _is_there(path: Path) -> bool:
     return True
 
 
-_things = _Things()
+_things = _TemporaryFiles()

@@ -20,11 +20,11 @@ __all__ = ["did_you_mean", "encodable", "in_lines", "listed", "near_path", "one_
 
 
 # Control and format characters, lone surrogates, and separators of lines that are no newline.
-_UNSEEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+_INVISIBLE_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 # Words of some languages, and emoji, are spelled with these two; they only join.
 _JOINERS = "\u200c\u200d"
 _ASCII = re.compile(r"[ -~\n\t]*")
-_BREAKS = re.compile(r"[^\S\n]*(?:\r\n|[\n\r\v\f\x1c-\x1e\x85\u2028\u2029])\s*")
+_LINE_BREAKS = re.compile(r"[^\S\n]*(?:\r\n|[\n\r\v\f\x1c-\x1e\x85\u2028\u2029])\s*")
 
 
 def encodable(text: str) -> str:
@@ -36,18 +36,18 @@ def visible(text: str) -> str:
     """Return a text in which escapes replace all control characters except newline and tab."""
     if _ASCII.fullmatch(text):
         return text
-    return "".join(map(_seen, text.replace("\r\n", "\n")))
+    return "".join(map(_visible_character, text.replace("\r\n", "\n")))
 
 
-def _seen(character: str) -> str:
-    if character in "\n\t" or character in _JOINERS or unicodedata.category(character) not in _UNSEEN:
+def _visible_character(character: str) -> str:
+    if character in "\n\t" or character in _JOINERS or unicodedata.category(character) not in _INVISIBLE_CATEGORIES:
         return character
     return character.encode("unicode_escape").decode("ascii")
 
 
 def one_line(text: str) -> str:
     """Return a text as one line that is visible."""
-    return visible(_BREAKS.sub(" ", text.rstrip())).replace("\t", " ")
+    return visible(_LINE_BREAKS.sub(" ", text.rstrip())).replace("\t", " ")
 
 
 def in_lines(lines: Iterable[str]) -> str:
@@ -57,13 +57,13 @@ def in_lines(lines: Iterable[str]) -> str:
 
 # What is proposed for a name that is not known: "did you mean …", or what there is.
 
-_SHOWN = 20  # a hunt may have thousands of crashes, and the answer is one line
+_MAX_LISTED_NAMES = 20  # a hunt may have thousands of crashes, and the answer is one line
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return ``did you mean 'NAME'?`` for the most similar name; empty if no name is similar."""
-    spelled = {_plain(other): str(other) for other in reversed(list(known))}  # of two that look alike, the first
-    close = difflib.get_close_matches(_plain(name), spelled, 1)
+    spelled = {_normalized(other): str(other) for other in reversed(list(known))}  # of two that look alike, the first
+    close = difflib.get_close_matches(_normalized(name), spelled, 1)
     return f"did you mean {spelled[close[0]]!r}?" if close else ""
 
 
@@ -90,8 +90,8 @@ def near_path(path: Path, *endings: str) -> str:
 def listed(known: Iterable[str], *, none: str = "none") -> str:
     """Return names in one line; a long list is cut."""
     names = list(known)
-    more = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
-    return f"{', '.join(names[:_SHOWN])}{more}" or none
+    more = f", … ({len(names)} in all)" if len(names) > _MAX_LISTED_NAMES else ""
+    return f"{', '.join(names[:_MAX_LISTED_NAMES])}{more}" or none
 
 
 def one_of(name: str, known: Iterable[str], *, give: str = "give one of", none: str = "none") -> str:
@@ -118,6 +118,6 @@ def out_of(done: int, planned: int, separator: str = " of ") -> str:
     return f"{done}{separator}{planned}" if planned and done <= planned else str(done)
 
 
-def _plain(name: str) -> str:
+def _normalized(name: str) -> str:
     """Return a name in lower case, with ``_`` in place of ``-``, so that similar names can be compared."""
     return name.lower().replace("_", "-")

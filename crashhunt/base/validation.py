@@ -27,8 +27,8 @@ __all__ = ["validate"]
 
 T = TypeVar("T")
 
-_UNKNOWN = ("unexpected_keyword_argument", "extra_forbidden")
-_MISSING = ("missing", "missing_argument")
+_UNKNOWN_KEY_ERRORS = ("unexpected_keyword_argument", "extra_forbidden")
+_MISSING_KEY_ERRORS = ("missing", "missing_argument")
 
 
 def validate(
@@ -131,11 +131,11 @@ def _validated(kind: type[T], data: object, place: _Place) -> T:
         first = _telling(problem.errors(include_url=False))
         path = tuple(str(part) for part in first["loc"])
         key = ".".join((place.under, *path) if place.under else path)
-        if first["type"] in _UNKNOWN:
+        if first["type"] in _UNKNOWN_KEY_ERRORS:
             known = list(place.keys()) if place.keys and len(path) == 1 else _known_keys(kind, path[:-1])
             fix = did_you_mean(path[-1], known) or f"the keys here are {', '.join(known)}"
             raise error(f"unknown key {key!r}", fix=fix, where=where) from None
-        if first["type"] in _MISSING:
+        if first["type"] in _MISSING_KEY_ERRORS:
             raise error(f"the key {key!r} is missing", fix="add it", where=where) from None
         message = first["msg"][0].lower() + first["msg"][1:]
         raise error(f"{key} = {first['input']!r}: {message}", fix="change the value", where=where) from None
@@ -144,9 +144,9 @@ def _validated(kind: type[T], data: object, place: _Place) -> T:
 def _telling(errors: Sequence[ErrorDetails]) -> ErrorDetails:
     """Return the error to report; a misspelt key is preferred to the missing key that it causes."""
     first = errors[0]
-    if first["type"] in _MISSING:
+    if first["type"] in _MISSING_KEY_ERRORS:
         for other in errors[1:]:
-            is_sibling = other["type"] in _UNKNOWN and other["loc"][:-1] == first["loc"][:-1]
+            is_sibling = other["type"] in _UNKNOWN_KEY_ERRORS and other["loc"][:-1] == first["loc"][:-1]
             if is_sibling and did_you_mean(str(other["loc"][-1]), [str(first["loc"][-1])]):
                 return other
     return first

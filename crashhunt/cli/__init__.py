@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except BrokenPipeError as error:
         code = 0
         if _is_output_closed():
-            _give_up_output()
+            _discard_output()
         else:
             code = _report(_explained(error), as_json="--json" in words)
     except KeyboardInterrupt:
@@ -144,7 +144,7 @@ def _report(error: CrashhuntError, *, as_json: bool) -> int:
         try:
             print(json.dumps(error.to_json()), flush=True)
         except OSError:
-            _give_up_output()
+            _discard_output()
     return error.exit_code
 
 
@@ -154,7 +154,7 @@ def _explained(error: Exception) -> CrashhuntError:
         traceback.print_exc()
     if isinstance(error, OSError):
         if error.filename is None and error.errno in DISK | {errno.EBADF}:
-            _give_up_output()
+            _discard_output()
             return CrashhuntError(f"the output cannot be written: {error.strerror}", fix="send it elsewhere")
         if fix := remedy(error):
             return CrashhuntError(str(error.strerror or error), fix=fix, where=str(error.filename or ""))
@@ -180,7 +180,7 @@ def _is_output_closed() -> bool:
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in closed.poll(0))
 
 
-def _give_up_output() -> None:
+def _discard_output() -> None:
     """Send what is still to be written to nowhere, so that Python does not fail over it when it leaves."""
     with suppress(OSError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["add_completion", "complete"]
 
 _OPTUNA = ("tpe", "cma-es", "gp", "nsgaii", "nsgaiii", "qmc", "random")  # to ask it itself takes most of a second
-_HOW = """\
+_INSTRUCTIONS = """\
 put one of these lines where your shell starts:
   ~/.bashrc                      eval "$(crashhunt completion bash)"
   ~/.zshrc, after compinit       eval "$(crashhunt completion zsh)"
@@ -36,7 +36,7 @@ def add_completion(commands: Commands) -> None:
         help="print a shell script that adds tab completion",
         description="Print a script for a shell, in which the tab key then completes commands, options, scenarios, "
         "agents, samplers, arguments, outcomes, directories and crashes.",
-        epilog=_HOW,
+        epilog=_INSTRUCTIONS,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     completion.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
@@ -63,14 +63,14 @@ def complete(parser: argparse.ArgumentParser) -> None:
 
 def _attach(parser: argparse.ArgumentParser) -> None:
     known: dict[str, Completer] = {
-        "--scenario": lambda prefix, **_: [*_scenarios(), *_paths(*_endings())(prefix)],
+        "--scenario": lambda prefix, **_: [*_scenarios(), *_paths(*_file_suffixes())(prefix)],
         "--agent": lambda **_: _registered("agents"),
         "--sampler": lambda **_: [*_registered("samplers"), *(f"optuna:{name}" for name in _OPTUNA)],
         "--executor": lambda **_: _registered("executors"),
         "--disturb": _several(lambda **_: [f"{name}=" for name in _registered("disturbances")]),
         "--crash-on": _several(lambda **_: _outcomes(crashes=True)),
         "--outcome": _several(lambda **_: _outcomes(crashes=False)),
-        "--print": _several(lambda **_: _FIELDS),
+        "--print": _several(lambda **_: _BREAKPOINT_FIELDS),
         "--crash": _several(_crashes),
         "--run": _runs,
         "--arg": lambda parsed_args, **_: [f"{name}=" for name in _arguments(parsed_args, of_agents=True)],
@@ -89,7 +89,17 @@ def _attach(parser: argparse.ArgumentParser) -> None:
             action.completer = completer  # type: ignore[attr-defined]
 
 
-_FIELDS = ("x", "y", "heading", "speed", "reward", "time_to_collision_s", "gap_m", "required_deceleration", "action")
+_BREAKPOINT_FIELDS = (
+    "x",
+    "y",
+    "heading",
+    "speed",
+    "reward",
+    "time_to_collision_s",
+    "gap_m",
+    "required_deceleration",
+    "action",
+)
 
 
 def _scenarios() -> list[str]:
@@ -104,7 +114,7 @@ def _topics() -> list[str]:
     return [page.topic for page in list_pages()]
 
 
-def _endings() -> tuple[str, ...]:
+def _file_suffixes() -> tuple[str, ...]:
     from crashhunt.scenario import endings
 
     return endings()

@@ -73,14 +73,14 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     hunts = list(dict.fromkeys(hunt for directory in options.directories for hunt in find_hunts(directory)))
     bundles = (bundle for hunt in hunts for bundle in list_bundles(hunt))
     found = group_crashes(bundles, dropped_crashes(hunts))
-    known = _known(found.groups, cases)
-    causes, interrupted = (None, False) if options.by_cause is None else _divided(options, found.groups)
+    known = _types_in_corpus(found.groups, cases)
+    causes, interrupted = (None, False) if options.by_cause is None else _divide_types(options, found.groups)
     say(describe_groups(found.groups, known), as_json=options.json)
     if causes is not None:
         say(describe_causes(found.groups, causes), as_json=options.json)
     for why in found.left_out:
         say(f"skipped: {why}", as_json=True)
-    _tell(options, found.groups, known)
+    _print_groups(options, found.groups, known)
     if options.json:
         groups = [dict(group.to_json()) for group in found.groups]
         if causes is not None:
@@ -94,7 +94,7 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     return INTERRUPTED if interrupted else DONE
 
 
-def _divided(options: argparse.Namespace, groups: Sequence[Group]) -> tuple[list[tuple[CauseGroup, ...]], bool]:
+def _divide_types(options: argparse.Namespace, groups: Sequence[Group]) -> tuple[list[tuple[CauseGroup, ...]], bool]:
     """Return the crashes of each type, divided by cause, and whether the user has stopped that."""
     from crashhunt.base.signals import stop_requests
     from crashhunt.replays import ReplayOptions
@@ -127,7 +127,7 @@ def _cases(corpus: Path | None) -> list[Case] | None:
     return [read_case(path) for path in find_cases([corpus])]
 
 
-def _known(groups: Sequence[Group], cases: list[Case] | None) -> dict[Signature, str] | None:
+def _types_in_corpus(groups: Sequence[Group], cases: list[Case] | None) -> dict[Signature, str] | None:
     """Return crash type to the case of the corpus; None if no corpus was given."""
     from crashhunt.corpus import known_kinds
 
@@ -137,7 +137,7 @@ def _known(groups: Sequence[Group], cases: list[Case] | None) -> dict[Signature,
     return {signature: str(case.path) for signature, case in found.items()}
 
 
-def _tell(options: argparse.Namespace, groups: Sequence[Group], known: dict[Signature, str] | None) -> None:
+def _print_groups(options: argparse.Namespace, groups: Sequence[Group], known: dict[Signature, str] | None) -> None:
     from crashhunt.report import crash_annotations, crashes_summary, findings_of, write_sarif
 
     if options.sarif is None and options.summary is None and not options.annotate:

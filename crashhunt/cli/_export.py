@@ -49,7 +49,7 @@ def add_export(commands: Commands) -> None:
 
 def _export(options: argparse.Namespace, _words: list[str]) -> int:
     if options.form:
-        return _hand_on(options)
+        return _convert(options)
     if options.recorded_agent:
         raise UsageError("--recorded-agent needs another format", fix=f"add --as {' or '.join(_FORMATS)}")
     from crashhunt.crashes import export_crash
@@ -65,7 +65,7 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
     return 0
 
 
-def _hand_on(options: argparse.Namespace) -> int:
+def _convert(options: argparse.Namespace) -> int:
     from crashhunt.formats import write_commonroad, write_openscenario
 
     suffix = _FORMATS[options.form]

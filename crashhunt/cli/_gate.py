@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 __all__ = ["add_gate"]
 
-_OPTIONS = (
+_HUNT_OPTIONS = (
     "scenario", "ego", "action", "agents", "arguments", "scenario_arguments", "oracles", "seed", "crash_on", "disturb",
     "timeout_s", "accelerate", "native", "executor", "snapshot_roots", "snapshot_limit_mb",
 )  # fmt: skip
-_OF_TRIALS = tuple(name for name in _OPTIONS if name != "executor")  # which a suite says itself
+_TRIAL_OPTIONS = tuple(name for name in _HUNT_OPTIONS if name != "executor")  # which a suite says itself
 _MOST, _MAX_STEPS, _MARGIN = 1000, 1500, 0.01
 _LINE_EVERY_S = 30.0  # where there is no terminal
 
@@ -97,7 +97,7 @@ def add_gate(commands: Commands) -> None:
         "--keep", metavar="DIR", type=Path,
         help="keep both hunts in this folder, for crashhunt compare, rate and report; the same command resumes them",
     )  # fmt: skip
-    add_options(defaultdict(lambda: how, what=what), _OPTIONS)
+    add_options(defaultdict(lambda: how, what=what), _HUNT_OPTIONS)
     add_trust(gate)
     gate.add_argument("--markdown", metavar="FILE", type=Path, help="write the verdict as Markdown, for a pull request")
     gate.add_argument("--junit", metavar="FILE", type=Path, help="write the verdict as JUnit's XML")
@@ -171,7 +171,7 @@ def _of_options(options: argparse.Namespace, folder: Path) -> dict[str, RunReque
     from crashhunt.scenario import shipped_scenarios
     from crashhunt.suites import RunRequest
 
-    asked = HuntOptions(**chosen_options(options, _OPTIONS))
+    asked = HuntOptions(**chosen_options(options, _HUNT_OPTIONS))
     max_steps = _MAX_STEPS if options.max_steps is None else options.max_steps
     request = request_of(asked, trials=1, max_steps=max_steps).checked()
     scenario = str(request.scenario)
@@ -189,7 +189,7 @@ def _of_suite(options: argparse.Namespace, words: list[str]) -> dict[str, RunReq
     from crashhunt.plans import hunt_options
     from crashhunt.suites import Suite
 
-    flags = {option.about.flag for option in hunt_options() if option.name in _OF_TRIALS and option.name != "seed"}
+    flags = {option.about.flag for option in hunt_options() if option.name in _TRIAL_OPTIONS and option.name != "seed"}
     if both := sorted(flags & _flags(words)):
         raise UsageError(f"--suite and {both[0]} exclude each other", fix=f"write {both[0]} into {options.suite}")
     suite = Suite.read(options.suite)

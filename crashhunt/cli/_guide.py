@@ -71,8 +71,8 @@ def _show(text: str) -> None:
     from rich.markdown import Markdown
 
     console = Console()
-    console.width = min(console.width, _WIDEST)
+    console.width = min(console.width, _MAX_COLUMNS)
     console.print(Markdown(text, code_theme="ansi_dark", hyperlinks=True))
 
 
-_WIDEST = 120
+_MAX_COLUMNS = 120

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_init"]
 
-_FILES = {"osm": "osm", "opendrive": "opendrive", "net": "net"}
+_KIND_BY_OPTION = {"osm": "osm", "opendrive": "opendrive", "net": "net"}
 
 
 def add_init(commands: Commands) -> None:
@@ -75,7 +75,7 @@ def _init(options: argparse.Namespace, _words: list[str]) -> int:
             print(f"\r\x1b[K{text} …" if text else "\r\x1b[K", end="", file=sys.stderr, flush=True)
 
     try:
-        made = make_scenario(_source(options), asked, options.directory, try_out=_try_out, tell=tell)
+        made = make_scenario(_source(options), asked, options.directory, try_out=_run_one_trial, tell=tell)
     except KeyboardInterrupt:
         tell("")
         if not (options.directory / layout.SCENARIO).exists():
@@ -152,7 +152,7 @@ def _check_agent(name: str) -> None:
         raise UsageError(f"--agent {name}: it needs the argument {required[0]!r}", fix=fix)
 
 
-def _try_out(folder: Path, steps: int) -> PlainTrial:
+def _run_one_trial(folder: Path, steps: int) -> PlainTrial:
     """Run one trial.
 
     Raises:

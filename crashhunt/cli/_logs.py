@@ -55,7 +55,7 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
             for title, text in reader.fresh():
                 found = True
                 where = title if name == "." else f"{name}: {title}"
-                print(visible(f"==> {one_line(where)} <==\n{_unwound(text).rstrip()}\n"), flush=True)
+                print(visible(f"==> {one_line(where)} <==\n{_split_progress_lines(text).rstrip()}\n"), flush=True)
         if not running:
             break
         time.sleep(0.5)
@@ -64,6 +64,6 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
     return 0
 
 
-def _unwound(text: str) -> str:
+def _split_progress_lines(text: str) -> str:
     """Return the lines of a progress bar that has overwritten its own line."""
     return text.replace("\r\n", "\n").replace("\r", "\n")

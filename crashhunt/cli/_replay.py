@@ -321,7 +321,7 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
             if film is not None and options.from_log:
                 shots.append(recorded_shot(bundle))
                 continue
-            one = replace(chosen, look=_look(options, bundle))
+            one = replace(chosen, look=_view_of(options, bundle))
 
             def run(trusted: bool | None, bundle: Bundle = bundle, one: ReplayOptions = one) -> tuple[Any, ...]:
                 with filmed(replace(one, trusted=trusted), bundle, film, to_stderr=options.json) as asked:
@@ -387,7 +387,7 @@ def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptio
     return report, answer
 
 
-def _look(options: argparse.Namespace, bundle: Bundle) -> Look | None:
+def _view_of(options: argparse.Namespace, bundle: Bundle) -> Look | None:
     """Return the options of a debugged replay; None for a plain replay."""
     from crashhunt.replays import Look
 

@@ -71,7 +71,7 @@ def _report(options: argparse.Namespace, _words: list[str]) -> int:
             )
     also = f", and the {len(near)} most critical of {len(near_misses)} near misses" if near else ""
     count = f"{len(shown)} of {found.tally.found} crashes"
-    say(f"{target} ({size / 1e6:.1f} MB) shows {count}{_which(found, shown)}{also}", as_json=options.json)
+    say(f"{target} ({size / 1e6:.1f} MB) shows {count}{_shown_crashes(found, shown)}{also}", as_json=options.json)
     if options.json:
         data: dict[str, object] = {
             "file": str(target),
@@ -86,7 +86,7 @@ def _report(options: argparse.Namespace, _words: list[str]) -> int:
     return 0
 
 
-def _which(found: FoundCrashes, shown: Sequence[Bundle]) -> str:
+def _shown_crashes(found: FoundCrashes, shown: Sequence[Bundle]) -> str:
     """Return in words which of the crashes are shown; empty if all are, or where the user has named one."""
     if not found.shown:
         return ""

@@ -119,7 +119,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     signal.signal(signal.SIGINT, lambda *_: _leave_at_once(as_json=options.json))
     from crashhunt.api import prepare
 
-    waiting = _tell_of_the_wait(options)
+    waiting = _start_wait_notice(options)
     try:
         hunt = prepare(
             options.directory,
@@ -163,7 +163,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     return THE_ANSWER_IS_NO if found and options.fail_on_crash else DONE
 
 
-def _tell_of_the_wait(options: argparse.Namespace) -> threading.Timer:
+def _start_wait_notice(options: argparse.Namespace) -> threading.Timer:
     """Return a timer that explains a long wait; the caller cancels it."""
 
     def tell() -> None:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_shrink"]
 
-_BUDGET = 500
+_DEFAULT_TRIALS = 500
 
 
 def add_shrink(commands: Commands) -> None:
@@ -46,8 +46,8 @@ def add_shrink(commands: Commands) -> None:
     )
     add_crash(shrink)
     shrink.add_argument(
-        "--budget", metavar="TRIALS", type=integer, default=_BUDGET,
-        help=f"maximum number of trials; default: {_BUDGET}",
+        "--budget", metavar="TRIALS", type=integer, default=_DEFAULT_TRIALS,
+        help=f"maximum number of trials; default: {_DEFAULT_TRIALS}",
     )  # fmt: skip
     shrink.add_argument(
         "--for", metavar="TIME", dest="time", default="",
@@ -106,29 +106,30 @@ def _summary_of(found: Shrunk) -> str:
     was, small = found.bundle.result, found.small
     lines = [f"{found.bundle.id}: {was.summary}"]
     if small is None:
-        what = "nothing has been removed yet" if _early(found) else "nothing can be removed"
+        what = "nothing has been removed yet" if _interruption_words(found) else "nothing can be removed"
         what = "cannot be minimized" if found.verdict == "not_reproduced" else what
-        why = found.why or (found.ended if _early(found) else "")
+        why = found.why or (found.ended if _interruption_words(found) else "")
         lines.append(f"  {what}: {why}" if why else f"  {what}")
         lines += [f"  note: {note}" for note in found.notes]
         return in_lines(lines)
     (before, after), result = found.actors, small.result
-    moved = "" if found.scripted is None else _moved(found.scripted)
+    moved = "" if found.scripted is None else _replaced_words(found.scripted)
     lines += [
         f"{small.id}: {result.summary}",
         f"  other actors: {before} before, {after} now; steps: {was.steps} before, {result.steps} now",
         *([f"  {moved}"] if moved else []),
         *([f"  the first {found.steps_cut} steps are removed"] if found.steps_cut else []),
         *(f"  {name} was {left} and is {right}" for name, (left, right) in found.changed.items()),
-        f"  {found.trials} trials" + (f"; stopped early: {found.why or found.ended}" if _early(found) else ""),
+        f"  {found.trials} trials"
+        + (f"; stopped early: {found.why or found.ended}" if _interruption_words(found) else ""),
         f"  saved in {small.path}",
-        _confirmed(small),
+        _confirmation_words(small),
         *(f"  note: {note}" for note in found.notes),
     ]
     return in_lines(lines)
 
 
-def _confirmed(small: Bundle) -> str:
+def _confirmation_words(small: Bundle) -> str:
     if small.confirmed:
         return "  confirmed: bit-identical when replayed in a new process"
     if small.confirmed is None:
@@ -136,11 +137,11 @@ def _confirmed(small: Bundle) -> str:
     return "  flaky: the replay in a new process deviates"
 
 
-def _moved(names: Sequence[str]) -> str:
+def _replaced_words(names: Sequence[str]) -> str:
     if not names:
         return "no traffic"
     return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} moved as recorded, independent of the agent"
 
 
-def _early(found: Shrunk) -> bool:
+def _interruption_words(found: Shrunk) -> bool:
     return found.ended != "done"

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 __all__ = ["add_status", "show_states", "states_console", "states_table"]
 
-_WIDTH = 120
-_NODES = 20  # of a hunt, one a line
-_COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "green", "interrupted": "yellow"}
+_MIN_COLUMNS = 120
+_MAX_LISTED_NODES = 20  # of a hunt, one a line
+_STATE_COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "green", "interrupted": "yellow"}
 
 
 def add_status(commands: Commands) -> None:
@@ -69,7 +69,7 @@ def states_console(*, stderr: bool = False) -> Console:
     from rich.console import Console
 
     console = Console(stderr=stderr, highlight=False)
-    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_WIDTH)
+    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_MIN_COLUMNS)
 
 
 def states_table(states: list[HuntState]) -> Group:
@@ -91,7 +91,7 @@ def states_table(states: list[HuntState]) -> Group:
         said = ", ".join(f"{name} {count}" for name, count in state.outcomes.items())
         table.add_row(
             Text(one_line(state.dir)),
-            Text(_state(state), style=_COLORS.get(state.state, ""), no_wrap=state.phase is None),
+            Text(_state(state), style=_STATE_COLORS.get(state.state, ""), no_wrap=state.phase is None),
             out_of(state.trials_run, state.trials_planned, "/"),
             format_pace(state.rate_per_s) if state.rate_per_s else "-",
             format_seconds(state.seconds_left) if state.seconds_left is not None else "-",
@@ -99,11 +99,11 @@ def states_table(states: list[HuntState]) -> Group:
             str(state.errors),
             Text(said),
         )
-        for node in (state.nodes or [])[:_NODES]:
+        for node in (state.nodes or [])[:_MAX_LISTED_NODES]:
             name = one_line(f"  {node['name']} ({node['parallel']} at a time)")
             table.add_row(Text(name), "", str(node["trials"]), format_pace(node["rate_per_s"]))
-        if len(state.nodes or []) > _NODES:
-            table.add_row(f"  and {len(state.nodes or []) - _NODES} more")
+        if len(state.nodes or []) > _MAX_LISTED_NODES:
+            table.add_row(f"  and {len(state.nodes or []) - _MAX_LISTED_NODES} more")
     lines = [Text(one_line(f"{state.dir}: {line}"), overflow="fold") for state in states for line in _facts(state)]
     return Group(table, *lines)
 

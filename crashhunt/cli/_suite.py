@@ -106,7 +106,7 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
     watch, finish = _watcher(as_json=options.json)
     try:
         machine = chosen_of_machine(options)
-        states = _asking(
+        states = _run_with_trust(
             lambda trusted: suite.run(
                 options.directory, options.parallel, watch=watch, machine=machine, trusted=trusted
             ),
@@ -114,12 +114,14 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
         )
     except KeyboardInterrupt:
         finish()
-        _tell([hunt_state(hunt) for hunt in find_hunts(options.directory)], options.directory, as_json=options.json)
+        _print_states(
+            [hunt_state(hunt) for hunt in find_hunts(options.directory)], options.directory, as_json=options.json
+        )
         say("Interrupted. Run the same command to resume.", as_json=options.json)
         raise
     finally:
         finish()
-    return _tell(states, options.directory, as_json=options.json)
+    return _print_states(states, options.directory, as_json=options.json)
 
 
 def _defaults(_options: argparse.Namespace, _words: list[str]) -> int:
@@ -136,7 +138,7 @@ def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
     watch, finish = _watcher(as_json=options.json)
     try:
         changes, machine = pairs(options.sets, "--set"), chosen_of_machine(options)
-        states, replaced = _asking(
+        states, replaced = _run_with_trust(
             lambda trusted: rerun(
                 hunts, everything=options.all, changes=changes, to=options.to, parallel=options.parallel, watch=watch,
                 machine=machine, trusted=trusted,
@@ -147,10 +149,10 @@ def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
         finish()
     for place in replaced:
         say(f"replaced: {place}", as_json=options.json)
-    return _tell(states, options.to or options.directory, as_json=options.json, replaced=replaced)
+    return _print_states(states, options.to or options.directory, as_json=options.json, replaced=replaced)
 
 
-def _asking(run: Callable[[bool], T], options: argparse.Namespace) -> T:
+def _run_with_trust(run: Callable[[bool], T], options: argparse.Namespace) -> T:
     """Run hunts; ask at the terminal for each that is not trusted, before the first one runs.
 
     Raises:
@@ -189,7 +191,9 @@ def _watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Calla
     return tell, lambda: None
 
 
-def _tell(states: list[HuntState], directory: Path, *, as_json: bool, replaced: list[Path] | None = None) -> int:
+def _print_states(
+    states: list[HuntState], directory: Path, *, as_json: bool, replaced: list[Path] | None = None
+) -> int:
     if as_json:
         extra = {"replaced": [str(place) for place in replaced]} if replaced is not None else {}
         print(json.dumps({"hunts": [state.to_json() for state in states], **extra}))

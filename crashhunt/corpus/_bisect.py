@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Bisected", "bisect"]
 
-_WORDS: dict[Got, str] = {"still": "bad", "fixed": "good", "changed": "skip", "cannot_run": "skip"}
-_FOUND = re.compile(r"^([0-9a-f]{7,64}) is the first \S+ commit", re.MULTILINE)
-_ORIGIN = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"
+_BISECT_WORDS: dict[Got, str] = {"still": "bad", "fixed": "good", "changed": "skip", "cannot_run": "skip"}
+_FIRST_BAD_COMMIT = re.compile(r"^([0-9a-f]{7,64}) is the first \S+ commit", re.MULTILINE)
+_ORIGIN_SCRIPT = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +93,12 @@ def bisect(
         _require_status(run(), "fixed", good, "--good")
         said = git(tree, "bisect", "start", ends[1], ends[0])
         judged = set()
-        while not (found := _FOUND.search(said)) and "only 'skip'ped commits left" not in said:
+        while not (found := _FIRST_BAD_COMMIT.search(said)) and "only 'skip'ped commits left" not in said:
             head = git(tree, "rev-parse", "HEAD")
             if head in judged:  # git proposes the same revision again if it finds no path
                 raise _no_way(good, bad, head)
             judged.add(head)
-            said = git(tree, "bisect", _WORDS[tried[head] if head in tried else run()], skipped=True)
+            said = git(tree, "bisect", _BISECT_WORDS[tried[head] if head in tried else run()], skipped=True)
         if found is not None:
             return Bisected(
                 commit=found[1],
@@ -130,7 +130,7 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
     """Run a case with the code of a work tree, in a new process."""
     environment = import_environment(folder, tree)
     for module in sorted(modules):
-        place = [sys.executable, "-c", _ORIGIN, module]
+        place = [sys.executable, "-c", _ORIGIN_SCRIPT, module]
         found = run_to_end(place, folder, environment)
         origin = found.stdout.strip()
         if found.returncode == 0 and not Path(origin).resolve().is_relative_to(tree):

@@ -38,7 +38,7 @@ __all__ = ["Added", "Case", "Expectation", "add_case", "find_cases", "known_kind
 
 
 Expectation = Literal["still", "fixed"]
-_ON_TOP = """\
+_CASE_COMMENT = """\
 # A crash that is kept: `crashhunt corpus run` and pytest run it again with today's code.
 # expect is "still" as long as it is known to crash, and "fixed" once it must not crash any more.
 """
@@ -127,7 +127,7 @@ class Case:
         said = asdict(_File(expect=self.expect, note=self.note, crash=self.crash, signature=self.signature))
         said = {"schema": said.pop("schema"), **said}
         with whole_file(into / layout.CASE) as temporary:
-            temporary.write_text(_ON_TOP + tomli_w.dumps(said), encoding="utf-8")
+            temporary.write_text(_CASE_COMMENT + tomli_w.dumps(said), encoding="utf-8")
 
     def to_json(self) -> JsonObject:
         """Return the shape that ``corpus list --json`` prints."""

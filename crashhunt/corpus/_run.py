@@ -39,7 +39,7 @@ __all__ = ["CaseReport", "Got", "run_cases", "untrusted_case"]
 
 Got = Literal["still", "fixed", "changed", "cannot_run"]
 _LOOK_EVERY_S = 0.01  # wait for a result of each running case
-_NO_CRASH = (Outcome.SURVIVED, Outcome.FINISHED)
+_HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,9 @@ class CaseReport(Serializable):
 
     def describe(self) -> str:
         """Return a text of several lines with the result and the command to show it."""
-        lines = [f"{self.path.name}: {_WORDS[self.got]}" + ("" if self.ok else f", and {self.expected} was expected")]
+        lines = [
+            f"{self.path.name}: {_RESULT_WORDS[self.got]}" + ("" if self.ok else f", and {self.expected} was expected")
+        ]
         if self.was:
             lines.append(f"  it was: {self.was}")
         if self.now:
@@ -99,7 +101,7 @@ class CaseReport(Serializable):
         return in_lines(lines)
 
 
-_WORDS = {
+_RESULT_WORDS = {
     "still": "crashes still",
     "fixed": "fixed",
     "changed": "crashes in another way",
@@ -236,9 +238,9 @@ class _Running:
 
     def _report(self, result: TrialResult, keep: Path | None) -> CaseReport:
         case = self._case
-        got: Got = "fixed" if result.outcome in _NO_CRASH else "cannot_run"
+        got: Got = "fixed" if result.outcome in _HARMLESS_OUTCOMES else "cannot_run"
         kept = None
-        if result.outcome not in (*_NO_CRASH, Outcome.INVALID):
+        if result.outcome not in (*_HARMLESS_OUTCOMES, Outcome.INVALID):
             kept = self._keep(
                 result, keep / case.name if keep is not None else self._scratch / "kept", whole=bool(keep)
             )
@@ -278,7 +280,7 @@ def _begin(path: Path, stack: ExitStack) -> _Running | CaseReport:
         case = read_case(path)
         expected, was, note = case.expect, case.crash, case.note
         bundle = case.bundle()
-        snapshot = _whole(Snapshot(path / layout.SNAPSHOTS / bundle.snapshot))
+        snapshot = _verified_snapshot(Snapshot(path / layout.SNAPSHOTS / bundle.snapshot))
         running = _Running(case, bundle, read_settings(path / layout.HUNT), snapshot)
     except CrashhuntError as error:
         return CaseReport(path=path, expected=expected, got="cannot_run", was=was, now=str(error), note=note)
@@ -286,7 +288,7 @@ def _begin(path: Path, stack: ExitStack) -> _Running | CaseReport:
     return running
 
 
-def _whole(snapshot: Snapshot) -> Snapshot:
+def _verified_snapshot(snapshot: Snapshot) -> Snapshot:
     """Return the snapshot of a case.
 
     Raises:

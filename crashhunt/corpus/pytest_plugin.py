@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 __all__ = ["pytest_collect_file"]
 
-_CASE = "crashhunt-case.toml"  # as in crashhunt.base.layout
+_CASE_FILE = "crashhunt-case.toml"  # as in crashhunt.base.layout
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
     """Collect a case."""
-    return _CaseFile.from_parent(parent, path=file_path) if file_path.name == _CASE else None
+    return _CaseFile.from_parent(parent, path=file_path) if file_path.name == _CASE_FILE else None
 
 
 class _CaseFile(pytest.File):

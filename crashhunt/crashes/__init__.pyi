@@ -61,8 +61,8 @@ from ._lanes import Borders as Borders, LaneMap as LaneMap
 from ._omission import Omission as Omission, Reference as Reference, ReferenceRun as ReferenceRun, Without as Without
 from ._signature import (
     SIGNATURE_VERSION as SIGNATURE_VERSION,
-    Frame as Frame,
     Signature as Signature,
+    StackFrame as StackFrame,
     own_frames as own_frames,
     signature_of as signature_of,
     signature_of_fault as signature_of_fault,

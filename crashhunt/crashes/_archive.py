@@ -37,7 +37,7 @@ __all__ = ["Archive", "export_crash", "open_archive"]
 SCHEMA = 1
 _MAX_BYTES = 4 * 10**9  # unpacked size, because a small zip file can contain terabytes
 _MAX_FILES = 100_000  # so many make a file system slow
-_CHUNK = 1 << 20  # bytes at a time, so that a large file needs little memory
+_CHUNK_BYTES = 1 << 20  # bytes at a time, so that a large file needs little memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +183,7 @@ def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, directory: Path, 
     target.parent.mkdir(parents=True, exist_ok=True)
     digest, size = hashlib.blake2b(digest_size=16), 0
     with archive.open(entry) as source, target.open("xb") as copy:
-        while chunk := source.read(_CHUNK):
+        while chunk := source.read(_CHUNK_BYTES):
             size += len(chunk)
             if size > listed["size"]:  # whatever the zip says of itself
                 raise _refusal(path, f"{entry.filename!r} is larger than it says")

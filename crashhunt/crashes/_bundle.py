@@ -219,19 +219,19 @@ def collect_output(result: TrialResult, scratch: Path, target: Path) -> None:
 
 
 SCHEMA = 5
-_ALL_DRIVE = 4  # schema of bundles without scripted actors
-_ALL_TAKE_PART = 3  # schema of bundles without excluded actors
-_UNDISTURBED = 2  # schema of bundles without disturbances, which older versions would ignore
-_PROTECTED = 2  # the first schema with digests of the file itself and of the other files
-_KNOWN = bool | float | str | None
-_NEEDED: Plain = {
+_SCHEMA_BEFORE_SCRIPTS = 4  # schema of bundles without scripted actors
+_SCHEMA_BEFORE_EXCLUSIONS = 3  # schema of bundles without excluded actors
+_SCHEMA_BEFORE_DISTURBANCES = 2  # schema of bundles without disturbances, which older versions would ignore
+_FIRST_SCHEMA_WITH_DIGESTS = 2  # the first schema with digests of the file itself and of the other files
+_SCALAR = bool | float | str | None
+_REQUIRED_KEYS: Plain = {
     **dict.fromkeys(("trial", "seed", "max_steps", "step"), int),
     **dict.fromkeys(("outcome", "digest", "snapshot"), str),
 }
 _TYPES: Plain = {
     "hunt_seed": int,
-    "arguments": dict[str, dict[str, _KNOWN]],
-    "scenario_arguments": dict[str, _KNOWN],
+    "arguments": dict[str, dict[str, _SCALAR]],
+    "scenario_arguments": dict[str, _SCALAR],
     "sim_time_s": float,
     "confirmed": bool | None,
     "divergence": dict | None,
@@ -246,7 +246,7 @@ _KEYS = CrashData.__required_keys__ | CrashData.__optional_keys__
 _PARTS: Mapping[str, type] = {
     "collision": Collision, "failure": Failure, "escape": Escape, "event": Event, "closest_approach": ClosestApproach,
 }  # fmt: skip
-_UNDAMAGED = "get an undamaged copy, or see with crashhunt check what can be saved"
+_DAMAGE_FIX = "get an undamaged copy, or see with crashhunt check what can be saved"
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,11 +316,11 @@ class Bundle:
             )
         found = read_log(log)
         if found.digest != self.result.digest:
-            raise BundleError("the digest of the log differs from that in crash.json", fix=_UNDAMAGED, where=str(log))
+            raise BundleError("the digest of the log differs from that in crash.json", fix=_DAMAGE_FIX, where=str(log))
         # The views for people, which have no part in the digest of the trial.
         wrong = changed_file(log, self.files[log.name]) if log.name in self.files else ""
         if wrong:
-            raise BundleError(f"the log {wrong} since it was written", fix=_UNDAMAGED, where=str(log))
+            raise BundleError(f"the log {wrong} since it was written", fix=_DAMAGE_FIX, where=str(log))
         return found
 
     def faults(self) -> list[str]:
@@ -420,8 +420,8 @@ def _schema_of(spec: TrialSpec) -> int:
     if spec.script is not None:
         return SCHEMA
     if spec.only is not None:
-        return _ALL_DRIVE
-    return _ALL_TAKE_PART if spec.disturbances else _UNDISTURBED
+        return _SCHEMA_BEFORE_SCRIPTS
+    return _SCHEMA_BEFORE_EXCLUSIONS if spec.disturbances else _SCHEMA_BEFORE_DISTURBANCES
 
 
 def read_bundle(path: Path) -> Bundle:
@@ -440,7 +440,7 @@ def read_bundle(path: Path) -> Bundle:
                 fix="use the version that wrote the trial",
                 where=str(file),
             )
-        if data["schema"] >= _PROTECTED or "integrity" in data:
+        if data["schema"] >= _FIRST_SCHEMA_WITH_DIGESTS or "integrity" in data:
             refuse_damaged(data)
         return _bundle(path, data)
     except OSError as error:
@@ -451,11 +451,11 @@ def read_bundle(path: Path) -> Bundle:
         ) from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-        raise BundleError(f"crash.json is damaged: {reason}", fix=_UNDAMAGED, where=str(file)) from None
+        raise BundleError(f"crash.json is damaged: {reason}", fix=_DAMAGE_FIX, where=str(file)) from None
 
 
 def _bundle(path: Path, data: CrashData) -> Bundle:
-    typed(data, _NEEDED)
+    typed(data, _REQUIRED_KEYS)
     typed_where_there(data, _TYPES)
     hit, failure, event, escape = data.get("collision"), data.get("failure"), data.get("event"), data.get("escape")
     closest = data.get("closest_approach", {})
@@ -495,7 +495,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         danger=data.get("danger"),
         why_no_escape=data.get("why_no_escape", ""),
     )
-    files = data.get("files", {}) if data["schema"] >= _PROTECTED else {}
+    files = data.get("files", {}) if data["schema"] >= _FIRST_SCHEMA_WITH_DIGESTS else {}
     return Bundle(
         path=path,
         result=result,
@@ -631,7 +631,7 @@ def write_trial(directory: Path, result: TrialResult, scratch: Path) -> None:
     target = directory / layout.TRIALS / f"{result.spec.number:06d}"
     target.mkdir(parents=True, exist_ok=True)
     collect_output(result, scratch, target)
-    data = {**result.to_json(), "schema": _UNDISTURBED, "files": describe_other_files(target)}
+    data = {**result.to_json(), "schema": _SCHEMA_BEFORE_DISTURBANCES, "files": describe_other_files(target)}
     data["integrity"] = digest_of_data(data)
     with whole_file(target / layout.PARAMS, lasting=False) as temporary:
         temporary.write_text(json.dumps(data, indent=2), encoding="utf-8")
@@ -685,12 +685,12 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
         return read_bundle(small)
     if crash:
         # What copies have found of a trial has its number as well, and may have the name of a crash.
-        found = (_readable(directory, crash, places) for places in _PLACES)
+        found = (_readable(directory, crash, places) for places in _FOLDERS_BY_PRIORITY)
         bundles = next((some for some in found if any(_may_be(bundle, crash) for bundle in some)), None)
-        bundles = bundles if bundles is not None else _readable(directory, crash, _PLACES[0])
+        bundles = bundles if bundles is not None else _readable(directory, crash, _FOLDERS_BY_PRIORITY[0])
     else:
         bundles = list_bundles(directory) or list_near_misses(directory)[:1] or _of_copies(directory)
-        bundles = bundles or _made_smaller(directory)
+        bundles = bundles or _minimized_sources(directory)
     if not bundles:
         if directory.is_file():
             raise BundleError(
@@ -708,7 +708,7 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
     return _named(bundles, crash, directory)
 
 
-_PLACES = ((layout.CRASHES, layout.NEAR_MISSES), (layout.PROBES,), (layout.BRANCHES,))
+_FOLDERS_BY_PRIORITY = ((layout.CRASHES, layout.NEAR_MISSES), (layout.PROBES,), (layout.BRANCHES,))
 
 
 def _of_copies(directory: Path) -> list[Bundle]:
@@ -717,7 +717,7 @@ def _of_copies(directory: Path) -> list[Bundle]:
     ]
 
 
-def _made_smaller(directory: Path) -> list[Bundle]:
+def _minimized_sources(directory: Path) -> list[Bundle]:
     found = sorted((directory / layout.CRASHES).glob(f"*{layout.SMALL}"))
     return [read_bundle(path) for path in found if (path / layout.CRASH).is_file()]
 

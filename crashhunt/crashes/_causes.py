@@ -20,7 +20,7 @@ __all__ = ["Cause", "CauseGroup", "Division", "cause_of", "features_of"]
 
 _LONG_M = 7.0  # a longer actor is a truck, a bus or a trailer, which agents that assume a car's length hit
 _LOOKS_S = (0.2, 1.0, 2.0)  # before the crash
-_SCALES = {"speed": 5.0, "gap": 5.0, "length": 4.0}  # m/s, m, m: a difference that matters
+_RELEVANT_DIFFERENCES = {"speed": 5.0, "gap": 5.0, "length": 4.0}  # m/s, m, m: a difference that matters
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -161,8 +161,12 @@ def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[flo
             (one for one in reversed(moments) if one.time_s <= end_s - before_s), moments[0] if moments else None
         )
         values = (0.0, 0.0, 0.0) if moment is None else (moment.speed, moment.other_speed, min(moment.gap_m, 50.0))
-        found += [values[0] / _SCALES["speed"], values[1] / _SCALES["speed"], values[2] / _SCALES["gap"]]
-    found.append(_length(recording, hit.other) / _SCALES["length"])
+        found += [
+            values[0] / _RELEVANT_DIFFERENCES["speed"],
+            values[1] / _RELEVANT_DIFFERENCES["speed"],
+            values[2] / _RELEVANT_DIFFERENCES["gap"],
+        ]
+    found.append(_length(recording, hit.other) / _RELEVANT_DIFFERENCES["length"])
     return tuple(found)
 
 
@@ -201,7 +205,7 @@ class Division:
         if not left or len(self._chosen) >= self._most:
             return None
         if self._chosen:
-            found = max(left, key=lambda number: (self._away(number, self._chosen), -number))
+            found = max(left, key=lambda number: (self._distance_to_judged(number, self._chosen), -number))
         else:
             found = min(left, key=lambda number: (self._steps[number], number))
         self._chosen.append(found)
@@ -259,7 +263,7 @@ class Division:
         own = self._features[number]
         return min(sorted(self._known), key=lambda other: _distance(own, self._features[other]))
 
-    def _away(self, number: int, others: Sequence[int]) -> float:
+    def _distance_to_judged(self, number: int, others: Sequence[int]) -> float:
         return min(_distance(self._features[number], self._features[other]) for other in others)
 
 

@@ -29,19 +29,19 @@ if TYPE_CHECKING:
     from crashhunt.world import Event, RightOfWay, Scene, Touch
 
 
-__all__ = ["SAME_WAY", "ContactRecord", "Way", "contact_record", "record_in"]
+__all__ = ["SAME_WAY", "ApproachPath", "ContactRecord", "contact_record", "record_in"]
 
 
 _WINDOW_S = 4.0  # earlier movements have not led to the contact
 _SAMPLE_S = 0.1  # as short as the usual steps of simulators
 _EVENTS_S = 10.0  # before the contact
 SAME_WAY = math.radians(45)
-_OPPOSITE = math.radians(135)
-_NOT_SWEPT = "crashed"  # highway-env's collisions: its vehicles drive through several collision checks in a step
+_OPPOSITE_RAD = math.radians(135)
+_UNSWEPT_CONTACT = "crashed"  # highway-env's collisions: its vehicles drive through several collision checks in a step
 _LATELY_S = 1.5
 _BEFORE_S = 1.0  # as long as the first half of a lane change takes
 _SIDEWAYS_M = 0.3  # less is drifting
-_STRAIGHT = math.radians(10)
+_MAX_STRAIGHT_TURN_RAD = math.radians(10)
 _DRIFTS_M = 0.1
 _ACROSS_M = 50.0  # from the line of a junction to where it ends; there are larger ones
 _BEND_M = 0.4  # with it, an actor on the neighbouring lane is still not in the way: its centre is more than 2 m away
@@ -49,7 +49,7 @@ _BESIDE_M = 1.2  # of the path that another one drives; less is in its way
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class ApproachPath:
     """How an actor moved before the contact, a row for each of the times of a `ContactRecord`.
 
     Args:
@@ -144,15 +144,15 @@ class ContactRecord:
         samples = first - _SAMPLE_S * np.arange(math.ceil((first - last) / _SAMPLE_S - 1e-6))
         return np.append(samples, last)
 
-    def way(self, actor: str) -> Way:
+    def way(self, actor: str) -> ApproachPath:
         """Return how one of them moved before the contact."""
         return self._ways[actor]
 
     @cached_property
-    def _ways(self) -> dict[str, Way]:
+    def _ways(self) -> dict[str, ApproachPath]:
         return {actor: self._way(actor) for actor in (self.agent, self.other)}
 
-    def _way(self, actor: str) -> Way:
+    def _way(self, actor: str) -> ApproachPath:
         rows = [(scene, scene.roster.index[actor]) for scene in self.before]
         scene, row = rows[-1]
         known = scene.roster.actors[row]
@@ -166,7 +166,7 @@ class ContactRecord:
             share = (at[place] - time_s) / (at[place] - at[after]) if after > place else 1.0
             (pose,) = poses_between(poses[place], poses[after], (share,), bends=bends)
             found.append(pose)
-        return Way(
+        return ApproachPath(
             id=actor,
             points=np.array([pose[:2] for pose in found]),
             headings=np.unwrap(np.array([pose[2] for pose in found])),
@@ -261,7 +261,7 @@ class ContactRecord:
         if self.is_disputed:
             return ""
         turn = self.touch.turn
-        if abs(turn) > _OPPOSITE:
+        if abs(turn) > _OPPOSITE_RAD:
             return "head-on"
         if not self.same_way:
             return "crossing from the right" if turn > 0 else "crossing from the left"
@@ -333,9 +333,9 @@ class ContactRecord:
         """
         lead, follow = self.way(leader), self.way(self.partner(leader))
         headings = np.unwrap(np.append(follow.headings, self._at_contact(follow.id)[1]))
-        straight = bool(np.ptp(headings) < _STRAIGHT) and self.ahead_m(leader) > 0
+        straight = bool(np.ptp(headings) < _MAX_STRAIGHT_TURN_RAD) and self.ahead_m(leader) > 0
         before = abs(math.remainder(lead.headings[0] - follow.headings[0], math.tau))
-        if not straight or before >= _STRAIGHT or self.turn < _STRAIGHT:
+        if not straight or before >= _MAX_STRAIGHT_TURN_RAD or self.turn < _MAX_STRAIGHT_TURN_RAD:
             return None
         asides = [abs(self.aside_m(leader, back)) for back in range(len(self.times))]
         left = next((back for back, aside in enumerate(asides) if aside > _BESIDE_M), len(asides))
@@ -515,7 +515,7 @@ def record_in(scenes: Sequence[Scene], hit: Collision) -> ContactRecord | None:
         time_s=time_s,
         began_s=scenes[0].time_s,
         lanes=lanes,
-        swept=hit.kind != _NOT_SWEPT,
+        swept=hit.kind != _UNSWEPT_CONTACT,
         reported=hit,
     )
 
@@ -558,7 +558,7 @@ def contact_record(bundle: Bundle, recording: Recording | None = None) -> Contac
         lanes=LaneMap(read_lanes(bundle.path / layout.LOG), (hit.x, hit.y)),
         events=events,
         # Earlier versions wrote the lane of SUMO's report, which may be the other actor's.
-        swept=hit.kind != _NOT_SWEPT,
+        swept=hit.kind != _UNSWEPT_CONTACT,
         reported=hit,
         lane=(last.lanes[last.roster.index[hit.agent]] if last.lanes else "") or hit.lane,
     )

@@ -328,11 +328,11 @@ def _turned(vectors: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArr
 # How dangerous a recorded trial was from step to step: for the agent, and by those behind it.
 
 _DECAY_S, _MOST = 1.2, 0.999  # as in `crashhunt.world._danger`
-_SAME_LANE = math.radians(30)
+_MAX_LANE_TURN_RAD = math.radians(30)
 _CHANGE_S = 3.0  # a gradual lane change takes no longer
-_BEND = math.radians(5)
+_MIN_BEND_RAD = math.radians(5)
 _SIDEWAYS_M = 0.8  # more than the other actor: less is drift within a lane
-_SAME_MEASURE = 1e-6  # s or m: the same pair, measured by another function
+_EQUAL_TOLERANCE = 1e-6  # s or m: the same pair, measured by another function
 _UNKNOWN_S = 4.0  # before the end, a criticality of 0 is unknown: later actors are not in the recording
 
 
@@ -445,7 +445,7 @@ def _behind_in_its_way(scene: Scene, row: int) -> list[int]:
     half = np.array(scene.roster.half_sizes)
     c, s = math.cos(scene.headings[row]), math.sin(scene.headings[row])
     dx, dy = (scene.centers - scene.centers[row]).T
-    same_way = np.cos(np.array(scene.headings) - scene.headings[row]) >= math.cos(_SAME_LANE)
+    same_way = np.cos(np.array(scene.headings) - scene.headings[row]) >= math.cos(_MAX_LANE_TURN_RAD)
     over = (dx * c + dy * s <= 0) & (np.abs(dy * c - dx * s) <= half[:, 1] + half[row, 1]) & same_way
     return [int(other) for other in np.flatnonzero(over) if other != row and on_one_level(scene, row, int(other))]
 
@@ -461,7 +461,7 @@ def _moved_into_its_way(scenes: Sequence[Scene], agent: str, after: Scene, other
         index = scene.roster.index
         if agent not in index or name not in index or scene.time_s < after.time_s - _CHANGE_S - 1e-6:
             break
-        if abs(math.remainder(scene.headings[index[name]] - heading, math.tau)) > _BEND:
+        if abs(math.remainder(scene.headings[index[name]] - heading, math.tau)) > _MIN_BEND_RAD:
             return False
         earliest = scene
     if earliest is None:
@@ -530,7 +530,7 @@ def _only(scene: Scene, measured: NDArray[np.float64], least: float) -> str:
     """Return the only actor with a measured value; empty if none or several have it."""
     if not math.isfinite(least):
         return ""
-    rows = np.flatnonzero(np.abs(measured - least) <= _SAME_MEASURE)
+    rows = np.flatnonzero(np.abs(measured - least) <= _EQUAL_TOLERANCE)
     return scene.roster.actors[rows[0]].id if len(rows) == 1 else ""
 
 
@@ -557,7 +557,7 @@ def most_dangerous(recording: Recording) -> DangerousMoment | None:
 # From when on an agent was shown the other one of a collision: looked up in what it was shown.
 
 _TOLERANCE_M = 0.02  # of single precision, some hundred metres away
-_COLUMNS = ("presence", "x", "y")
+_REQUIRED_COLUMNS = ("presence", "x", "y")
 
 
 def visible_from(recording: Recording, agent: str, other: str) -> int | None:
@@ -572,15 +572,15 @@ def visible_from(recording: Recording, agent: str, other: str) -> int | None:
         other: The actor to look for.
     """
     names = next((list(one.observation_names) for one in recording.prologue.agents if one.id == agent), [])
-    if not all(name in names for name in _COLUMNS):
+    if not all(name in names for name in _REQUIRED_COLUMNS):
         return None
-    columns = [names.index(name) for name in _COLUMNS]
+    columns = [names.index(name) for name in _REQUIRED_COLUMNS]
     before: Scene | None = None
     first = None
     for step in recording.all_steps:
         shown = step.observations.get(agent)
         if shown is not None and shown.ndim == 2 and before is not None and agent in before.roster.index:
-            seen = _shown(shown[:, columns].astype(float), before, agent)
+            seen = _actors_in_observation(shown[:, columns].astype(float), before, agent)
             if seen is None:
                 return None
             if first is None and other in seen:
@@ -589,7 +589,7 @@ def visible_from(recording: Recording, agent: str, other: str) -> int | None:
     return first
 
 
-def _shown(rows: NDArray[Any], scene: Scene, agent: str) -> set[str] | None:
+def _actors_in_observation(rows: NDArray[Any], scene: Scene, agent: str) -> set[str] | None:
     """Return the actors in the rows of an observation; None if a row matches no actor."""
     row = scene.roster.index[agent]
     offset = scene.centers - scene.centers[row]

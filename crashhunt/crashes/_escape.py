@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 __all__ = ["Ending", "changes_of", "ending_of", "find_escape", "overruled_trial", "partner", "slowing"]
 
-_RUNS = 12  # enough to bisect a thousand steps
+_MAX_RUNS = 12  # enough to bisect a thousand steps
 _BEFORE_S = 10.0  # earlier braking is not examined
 _WALL_S = 60.0  # the search runs while the user waits for the confirmation of a crash
-_GUESS = 4.5  # m/s², if the deceleration is unknown; a wrong guess only costs more runs
-_STANDS = 0.1  # m/s
+_ASSUMED_DECELERATION_MPS2 = 4.5  # m/s², if the deceleration is unknown; a wrong guess only costs more runs
+_MAX_STANDING_SPEED_MPS = 0.1  # m/s
 _MAX_DECELERATION_MPS2 = 15.0  # more than the tyres of a road vehicle hold
 _AFTERWARDS_S = 5.0  # past the old end, so that a collision that only comes later is seen
-_AS_IT_CAN = "as hard as it can"
-_UNCLEAR = {
+_FULL_BRAKING_WORDS = "as hard as it can"
+_UNCLEAR_REASONS = {
     "other": "another crash follows",
     "unclear": "the run ends before the outcome is clear",
     "diverged": "the run deviates before the braking",
@@ -89,7 +89,7 @@ def find_escape(
     deceleration = max(search.decelerations, default=0.0)
     return Escape(
         *found,
-        deceleration if deceleration > _STANDS else None,
+        deceleration if deceleration > _MAX_STANDING_SPEED_MPS else None,
         search.how(deceleration),
         changed=search.changed(LaneMap(borders(), (hit.x, hit.y))) if found[0] is not None else (),
     )
@@ -123,7 +123,7 @@ class _Search:
             self.why_not = "the recording has the two vehicles together only when they touch"
             return None
         first = max(both[0], end - math.ceil(_BEFORE_S / dt), 0)
-        agent, guess = self.result.collision.agent, self.braking.deceleration or _GUESS
+        agent, guess = self.result.collision.agent, self.braking.deceleration or _ASSUMED_DECELERATION_MPS2
         start = last_escape(self.recording, agent, self._other, braking=guess)
         start = min(max(first, end - 2 if start is None else start), end - 1)
         helps, late = -1, end  # after the step of the crash it is too late by itself
@@ -131,7 +131,7 @@ class _Search:
         while first <= step < end:
             ending = self._ending(step)
             if ending not in ("avoided", "hit"):
-                self.why_not = self.why_not or f"when it brakes after step {step}, {_UNCLEAR[ending]}"
+                self.why_not = self.why_not or f"when it brakes after step {step}, {_UNCLEAR_REASONS[ending]}"
                 return None
             if ending == "avoided":
                 helps = step
@@ -155,7 +155,11 @@ class _Search:
         said = self.braking.deceleration
         if said is None:
             return self.braking.how
-        return f"at {said:.3g} m/s², {self.braking.how}," if abs(said - deceleration) < 0.01 * said else _AS_IT_CAN
+        return (
+            f"at {said:.3g} m/s², {self.braking.how},"
+            if abs(said - deceleration) < 0.01 * said
+            else _FULL_BRAKING_WORDS
+        )
 
     def changed(self, lanes: LaneMap) -> tuple[str, ...]:
         """Return the further differences of the agent in the run from the last step from which braking helps."""
@@ -177,8 +181,8 @@ class _Search:
         """Run the trial with the agent overruled after a step, and say what became of the crash."""
         if after in self.endings:
             return self.endings[after]
-        if len(self.endings) >= _RUNS:
-            self.why_not = f"{_RUNS} runs did not find it"
+        if len(self.endings) >= _MAX_RUNS:
+            self.why_not = f"{_MAX_RUNS} runs did not find it"
         elif time.monotonic() - self.began > _WALL_S:
             self.why_not = f"the runs took longer than {_WALL_S:g} s"
         else:
@@ -213,7 +217,7 @@ def overruled_trial(
     assert result.collision is not None
     agent, scene = result.collision.agent, recording.scene(after)
     speed = scene.speeds[scene.roster.index[agent]]
-    afterwards = _AFTERWARDS_S + max(0.0, speed) / (deceleration or _GUESS)
+    afterwards = _AFTERWARDS_S + max(0.0, speed) / (deceleration or _ASSUMED_DECELERATION_MPS2)
     steps = result.steps + math.ceil(afterwards / recording.prologue.step_length_s)
     return replace(result.spec, overruled=Overruled(agent, after, manoeuvre), max_steps=steps)
 
@@ -259,7 +263,7 @@ def _is_over(recording: Recording, agent: str, other: str) -> bool:
     """Return whether the danger is over: one of the actors has left, stands, or drives elsewhere."""
     scene = recording.scenes()[-1]
     row = scene.roster.index.get(agent)
-    if row is None or other not in scene.roster.index or scene.speeds[row] < _STANDS:
+    if row is None or other not in scene.roster.index or scene.speeds[row] < _MAX_STANDING_SPEED_MPS:
         return True
     return math.isinf(Encounter(recording, agent, other).moments[-1].time_to_collision_s)
 

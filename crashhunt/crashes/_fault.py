@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from crashhunt.world import RightOfWay
 
 
-__all__ = ["RULES", "Blame", "Fault", "Finding", "Verdict", "fault_in", "fault_of", "safe_gap_m"]
+__all__ = ["RULES", "Blame", "Fault", "FaultFinding", "Verdict", "fault_in", "fault_of", "safe_gap_m"]
 
 
 # The rules that assign the fault of a collision. A rule returns a finding only if it is certain.
@@ -37,11 +37,11 @@ __all__ = ["RULES", "Blame", "Fault", "Finding", "Verdict", "fault_in", "fault_o
 Blame = Literal["ego", "other", "both"]
 
 _RESPONSE_S = 1.0  # RSS: response time
-_SPEEDS_UP = 3.5  # m/s², RSS: at most, until then
-_BRAKES = 4.0  # m/s², RSS: at least, from then on
-_BRAKES_HARD = 8.0  # m/s², RSS: at most, who is ahead
-_MERGES = math.radians(30)  # who meets at a smaller angle follows, or changes lanes
-_IMPOSSIBLE = 10.0  # m/s²; who stops faster has not braked
+_RSS_MAX_ACCELERATION_MPS2 = 3.5  # m/s², RSS: at most, until then
+_RSS_MIN_BRAKING_MPS2 = 4.0  # m/s², RSS: at least, from then on
+_RSS_MAX_BRAKING_MPS2 = 8.0  # m/s², RSS: at most, who is ahead
+_MAX_MERGE_ANGLE_RAD = math.radians(30)  # who meets at a smaller angle follows, or changes lanes
+_IMPOSSIBLE_BRAKING_MPS2 = 10.0  # m/s²; who stops faster has not braked
 _FOLLOWS_S = 3.5  # who has been ahead for so long has not just come there
 _CHANGE_S = 3.0  # a lane change that began longer ago is over
 _AT_ONCE_S = 1.5  # an event that begins less than this before the contact is too late for a driver behind
@@ -49,13 +49,13 @@ _TOGETHER_S = 0.5  # of each other: neither was there first
 _STANDS_S = 1.0
 _STEP_M = 1.0  # lateral distance from a car's side; a nearer person walks in its way
 _OFF_M = 2.5  # lateral distance from a car's axis; a nearer person may be on the road
-_WALKS = 3.0  # m/s; a slower vehicle can stop for any actor
+_WALKING_SPEED_MPS = 3.0  # m/s; a slower vehicle can stop for any actor
 _CLEARS_S = 3.0
 _RED_S = 8.0  # after a red light, a junction is left by then
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class FaultFinding:
     """The verdict of a rule.
 
     Args:
@@ -73,16 +73,18 @@ class Finding:
 
 def safe_gap_m(speed: float, ahead: float) -> float:
     """Return the safe gap to the vehicle ahead, in m, by lemma 2 of RSS; speeds are in m/s."""
-    then = speed + _RESPONSE_S * _SPEEDS_UP
-    driven = speed * _RESPONSE_S + _SPEEDS_UP * _RESPONSE_S**2 / 2
-    return float(max(0.0, driven + then * then / (2 * _BRAKES) - ahead * ahead / (2 * _BRAKES_HARD)))
+    then = speed + _RESPONSE_S * _RSS_MAX_ACCELERATION_MPS2
+    driven = speed * _RESPONSE_S + _RSS_MAX_ACCELERATION_MPS2 * _RESPONSE_S**2 / 2
+    return float(
+        max(0.0, driven + then * then / (2 * _RSS_MIN_BRAKING_MPS2) - ahead * ahead / (2 * _RSS_MAX_BRAKING_MPS2))
+    )
 
 
-def _who(case: ContactRecord, actor: str) -> Blame:
+def _name_of(case: ContactRecord, actor: str) -> Blame:
     return "ego" if actor == case.agent else "other"
 
 
-def _red_light(case: ContactRecord) -> Finding | None:
+def _red_light(case: ContactRecord) -> FaultFinding | None:
     """Blame the party that ran a red light at a junction with traffic from another side; blame both if both did."""
     if case.same_way:
         return None
@@ -94,26 +96,26 @@ def _red_light(case: ContactRecord) -> Finding | None:
             ran[event.agent] = f"{event.what}, {case.time_s - time_s:.1f} s before"
     if not ran:
         return None
-    blames = "both" if len(ran) == 2 else _who(case, *ran)
-    return Finding(
+    blames = "both" if len(ran) == 2 else _name_of(case, *ran)
+    return FaultFinding(
         rule="red light", blames=blames, words=", and ".join(ran.values()), source="Vienna, article 23; StVO § 37"
     )
 
 
-def _wrong_way(case: ContactRecord) -> Finding | None:
+def _wrong_way(case: ContactRecord) -> FaultFinding | None:
     """The vehicle that drove against the direction of its lane."""
     for time_s, event in reversed(case.events):
         if event.kind == "wrong_way" and event.agent in (case.agent, case.other) and case.time_s - time_s <= _RED_S:
-            return Finding(
+            return FaultFinding(
                 rule="wrong way",
-                blames=_who(case, event.agent),
+                blames=_name_of(case, event.agent),
                 words=event.what,
                 source="Vienna, article 10; StVO § 2",
             )
     return None
 
 
-def _lane_change(case: ContactRecord) -> Finding | None:
+def _lane_change(case: ContactRecord) -> FaultFinding | None:
     """A vehicle changed lanes into an occupied gap, or into a gap too short for the vehicle behind."""
     if not case.lanes or not case.same_way:
         return None
@@ -121,13 +123,15 @@ def _lane_change(case: ContactRecord) -> Finding | None:
     changers = [actor for actor, before in changed.items() if before is not None and before <= _CHANGE_S]
     source = "Vienna, articles 11 and 14; StVO § 7 (5)"
     if len(changers) == 2 and len(case.jumpers) == 1:
-        return _into_who_had_changed(case, case.jumpers[0], source)
+        return _into_changed_vehicle(case, case.jumpers[0], source)
     if len(changers) == 2:
         times = [before for before in changed.values() if before is not None]
         at_once = abs(times[0] - times[1]) <= _TOGETHER_S
         if case.follower or not at_once or not all(case.meets_sideways(actor) for actor in changers):
             return None  # the one may have been there when the other came
-        return Finding(rule="lane change", blames="both", words="both moved sideways into each other", source=source)
+        return FaultFinding(
+            rule="lane change", blames="both", words="both moved sideways into each other", source=source
+        )
     if len(changers) != 1:
         return None
     changer = changers[0]
@@ -139,30 +143,30 @@ def _lane_change(case: ContactRecord) -> Finding | None:
         if not case.meets_sideways(changer):
             return None
         words = f"{changer} moved sideways into {other}, which was next to it and stayed in its lane"
-        return Finding(rule="lane change", blames=_who(case, changer), words=words, source=source)
+        return FaultFinding(rule="lane change", blames=_name_of(case, changer), words=words, source=source)
     if case.follower == changer:
-        if case.hardest_braking(other) > _IMPOSSIBLE or case.way(other).speeds[-1] < -STANDS_MPS:
+        if case.hardest_braking(other) > _IMPOSSIBLE_BRAKING_MPS2 or case.way(other).speeds[-1] < -STANDS_MPS:
             return None
-        if case.turned(before) >= _MERGES or not case.was_off_path(
+        if case.turned(before) >= _MAX_MERGE_ANGLE_RAD or not case.was_off_path(
             changer, int(np.argmin(np.abs(case.times - before)))
         ):
             return None  # it turned off, or was behind all the time: that leaves a lane sideways, too
         words = f"{changer} changed lanes {before:.1f} s before, to behind {other}, and drove into it"
-        return Finding(rule="lane change", blames=_who(case, changer), words=words, source=source)
+        return FaultFinding(rule="lane change", blames=_name_of(case, changer), words=words, source=source)
     return _cut_in(case, changer, before, source)
 
 
-def _into_who_had_changed(case: ContactRecord, changer: str, source: str) -> Finding | None:
+def _into_changed_vehicle(case: ContactRecord, changer: str, source: str) -> FaultFinding | None:
     """Return the fault of an actor that moves sideways into one that completed its lane change a response time ago."""
     other = case.partner(changer)
     since = case.changed_s(other)
     if since is None or since < _RESPONSE_S - 1e-6 or case.turned(since) > SAME_WAY:
         return None  # the other may have been about to change as well, or came there in a bend
     words = f"{changer} moved sideways into {other}, which had changed to the lane next to it {since:.1f} s before"
-    return Finding(rule="lane change", blames=_who(case, changer), words=words, source=source)
+    return FaultFinding(rule="lane change", blames=_name_of(case, changer), words=words, source=source)
 
 
-def _cut_in(case: ContactRecord, changer: str, before: float, source: str) -> Finding | None:
+def _cut_in(case: ContactRecord, changer: str, before: float, source: str) -> FaultFinding | None:
     """Blame a cut-in, by its gap and by what the driver behind could do."""
     other = case.partner(changer)
     back = int(np.argmin(np.abs(case.times - before)))
@@ -173,24 +177,24 @@ def _cut_in(case: ContactRecord, changer: str, before: float, source: str) -> Fi
     words = f"{changer} changed lanes {before:.1f} s before, {max(0.0, gap):.1f} m ahead of {other}"
     if gap >= safe:
         return None
-    if before > _AT_ONCE_S and case.slowed(other, before - _RESPONSE_S) < _BRAKES:
+    if before > _AT_ONCE_S and case.slowed(other, before - _RESPONSE_S) < _RSS_MIN_BRAKING_MPS2:
         return None  # who drove behind had the time, and did not use it
-    return Finding(
+    return FaultFinding(
         rule="lane change",
-        blames=_who(case, changer),
+        blames=_name_of(case, changer),
         words=f"{words}; {safe:.1f} m would have been safe (RSS)",
         source=source,
     )
 
 
-def _rear_end(case: ContactRecord) -> Finding | None:
+def _rear_end(case: ContactRecord) -> FaultFinding | None:
     """Blame the follower that drove into the back of a vehicle that had been ahead for long."""
     follower = case.follower
     if not follower or is_person(case.partner(follower)):
         return None
     leader = case.partner(follower)
     ahead_s = case.in_its_way_s(leader)
-    if ahead_s < _FOLLOWS_S or case.hardest_braking(leader) > _IMPOSSIBLE:
+    if ahead_s < _FOLLOWS_S or case.hardest_braking(leader) > _IMPOSSIBLE_BRAKING_MPS2:
         return None
     lead, follow = case.way(leader), case.way(follower)
     if min(lead.speeds[-1], case.speed_at_contact(leader)) < -STANDS_MPS:
@@ -199,15 +203,15 @@ def _rear_end(case: ContactRecord) -> Finding | None:
     gap, safe = max(0.0, case.gap_m(leader, back)), safe_gap_m(float(follow.speeds[back]), float(lead.speeds[back]))
     words = f"{follower} drove into the back of {leader}, which had been ahead of it for at least {_FOLLOWS_S:g} s"
     words += f"; {case.times[back]:.1f} s before, the gap was {gap:.1f} m, and {safe:.1f} m is safe (RSS)"
-    return Finding(
+    return FaultFinding(
         rule="rear end",
-        blames=_who(case, follower),
+        blames=_name_of(case, follower),
         words=words,
         source="Vienna, article 13 (5); StVO § 4 (1); RSS, definition 1",
     )
 
 
-def _turns_off(case: ContactRecord) -> Finding | None:
+def _turns_off(case: ContactRecord) -> FaultFinding | None:
     """Blame the follower that drove straight on into a vehicle that had been ahead for long and was turning off."""
     if _rear_end(case) is not None:
         return None  # it says the same
@@ -219,17 +223,17 @@ def _turns_off(case: ContactRecord) -> Finding | None:
         if left_s is None or left_s > _AT_ONCE_S:
             continue
         lead = case.way(leader)
-        if case.hardest_braking(leader) > _IMPOSSIBLE or float(lead.speeds.min()) < -STANDS_MPS:
+        if case.hardest_braking(leader) > _IMPOSSIBLE_BRAKING_MPS2 or float(lead.speeds.min()) < -STANDS_MPS:
             continue
         words = f"{follower} drove straight on into {leader}, which had been ahead of it until {left_s:.1f} s before"
         words += " and was turning off"
-        return Finding(
-            rule="rear end", blames=_who(case, follower), words=words, source="Vienna, article 13 (5); StVO § 4 (1)"
+        return FaultFinding(
+            rule="rear end", blames=_name_of(case, follower), words=words, source="Vienna, article 13 (5); StVO § 4 (1)"
         )
     return None
 
 
-def _steps_out(case: ContactRecord) -> Finding | None:
+def _steps_out(case: ContactRecord) -> FaultFinding | None:
     """Blame a person that stepped onto the road too late for any driver to stop, except at junctions and crossings."""
     person, driver = (case.agent, case.other) if is_person(case.agent) else (case.other, case.agent)
     if not is_person(person) or is_person(driver) or not case.is_between_junctions(person, driver):
@@ -240,35 +244,35 @@ def _steps_out(case: ContactRecord) -> Finding | None:
     if not 0 < inside < len(asides) or max(asides[:inside]) < _OFF_M or case.times[inside] > _AT_ONCE_S:
         return None  # the person was there all the time, walked along the edge of the road, or is still off the road
     speed, gap = float(way.speeds[inside]), case.gap_m(person, inside)
-    stops = speed * _RESPONSE_S + speed * speed / (2 * _BRAKES_HARD)
-    if gap >= stops or speed < _WALKS or float(np.max(case.times[:inside], initial=0.0)) < _STANDS_S:
+    stops = speed * _RESPONSE_S + speed * speed / (2 * _RSS_MAX_BRAKING_MPS2)
+    if gap >= stops or speed < _WALKING_SPEED_MPS or float(np.max(case.times[:inside], initial=0.0)) < _STANDS_S:
         return None
     words = f"{person} came onto the road {case.times[inside]:.1f} s before, {max(0.0, gap):.1f} m ahead of {driver}"
     words += f", which needs {stops:.1f} m to stop"
-    return Finding(
-        rule="steps out", blames=_who(case, person), words=words, source="Vienna, article 20 (6); StVO § 25 (3)"
+    return FaultFinding(
+        rule="steps out", blames=_name_of(case, person), words=words, source="Vienna, article 20 (6); StVO § 25 (3)"
     )
 
 
-def _standing(case: ContactRecord) -> Finding | None:
+def _standing(case: ContactRecord) -> FaultFinding | None:
     """Blame the party that drove into an actor that had stood still for longer than stopping takes."""
     mover = case.collider
     actor = case.partner(mover)
     its = case.way(mover)
-    needs = max(_STANDS_S, _RESPONSE_S + float(its.speeds.max()) / _BRAKES)
+    needs = max(_STANDS_S, _RESPONSE_S + float(its.speeds.max()) / _RSS_MIN_BRAKING_MPS2)
     stood = case.stood_s(actor)
     if stood < needs or is_person(mover):
         return None
     words = f"{mover} drove into {actor}, which had stood for at least {stood:.1f} s"
-    return Finding(
-        rule="standing", blames=_who(case, mover), words=words, source="Vienna, article 13 (1); StVO § 3 (1)"
+    return FaultFinding(
+        rule="standing", blames=_name_of(case, mover), words=words, source="Vienna, article 13 (1); StVO § 3 (1)"
     )
 
 
-def _right_of_way(case: ContactRecord) -> Finding | None:
+def _right_of_way(case: ContactRecord) -> FaultFinding | None:
     """The vehicle that had to give way according to the map, at junctions without traffic lights."""
     rights = case.right_of_way
-    if rights is None or case.turn < _MERGES or not case.before:
+    if rights is None or case.turn < _MAX_MERGE_ANGLE_RAD or not case.before:
         return None
     places = {actor: case.links(actor) for actor in (case.agent, case.other)}
     if not all(places.values()):
@@ -285,18 +289,18 @@ def _right_of_way(case: ContactRecord) -> Finding | None:
         return None  # who had stood in the junction may have been let through
     if float(case.way(yields).speeds[case.times <= _CLEARS_S].max(initial=0.0)) < STANDS_MPS:
         return None  # who has stood there for so long could be seen
-    if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKS:
+    if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKING_SPEED_MPS:
         return None  # a vehicle that starts off must let the vehicle inside the junction clear it first
     words = f"{yields} had to give way to {goes} at the junction {links[0].junction}"
-    return Finding(
+    return FaultFinding(
         rule="right of way",
-        blames=_who(case, yields),
+        blames=_name_of(case, yields),
         words=words,
         source="the map of the scenario; Vienna, article 18; StVO § 8",
     )
 
 
-RULES: tuple[Callable[[ContactRecord], Finding | None], ...] = (
+RULES: tuple[Callable[[ContactRecord], FaultFinding | None], ...] = (
     _red_light, _wrong_way, _lane_change, _rear_end, _turns_off, _steps_out, _standing, _right_of_way,
 )  # fmt: skip
 """All rules. If two rules blame different parties, the fault is undecided. As an exception, a red light and the wrong
@@ -304,8 +308,8 @@ way take precedence over the right of way."""
 
 
 Verdict = Literal["ego", "the other", "both", "nobody can tell"]
-_VERDICTS: dict[str, Verdict] = {"ego": "ego", "other": "the other", "both": "both"}
-_FIRST = ("red light", "wrong way")
+_VERDICT_BY_ACTOR: dict[str, Verdict] = {"ego": "ego", "other": "the other", "both": "both"}
+_DECISIVE_RULES = ("red light", "wrong way")
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,7 +322,7 @@ class Fault:
     """
 
     verdict: Verdict
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[FaultFinding, ...] = ()
 
     @property
     def is_egos(self) -> bool:
@@ -330,7 +334,7 @@ class Fault:
         return {
             "verdict": self.verdict,
             "findings": [
-                {"rule": one.rule, "blames": _VERDICTS[one.blames], "words": one.words, "source": one.source}
+                {"rule": one.rule, "blames": _VERDICT_BY_ACTOR[one.blames], "words": one.words, "source": one.source}
                 for one in self.findings
             ],
         }
@@ -352,13 +356,18 @@ def fault_of(bundle: Bundle, recording: Recording | None = None, record: Contact
     if result.outcome is Outcome.AGENT_ERROR:
         words = "the code of the agent failed"
         return Fault(
-            "ego", (Finding(rule="agent error", blames="ego", words=words, source="the agent controls the vehicle"),)
+            "ego",
+            (FaultFinding(rule="agent error", blames="ego", words=words, source="the agent controls the vehicle"),),
         )
     if result.outcome is Outcome.OFF_ROAD and hit is not None and not hit.other:
         words = "it left the road without contact"
         return Fault(
             "ego",
-            (Finding(rule="off the road", blames="ego", words=words, source="Vienna, article 13 (1); StVO § 3 (1)"),),
+            (
+                FaultFinding(
+                    rule="off the road", blames="ego", words=words, source="Vienna, article 13 (1); StVO § 3 (1)"
+                ),
+            ),
         )
     if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
         return Fault("nobody can tell")
@@ -378,13 +387,13 @@ def fault_in(case: ContactRecord) -> Fault:
     return Fault(_verdict(findings), findings)
 
 
-def _verdict(findings: Iterable[Finding]) -> Verdict:
+def _verdict(findings: Iterable[FaultFinding]) -> Verdict:
     found = list(findings)
-    first = [one for one in found if one.rule in _FIRST]
+    first = [one for one in found if one.rule in _DECISIVE_RULES]
     if first:
         found = [one for one in found if one.rule != "right of way"]
     blamed = {one.blames for one in found}
-    return _VERDICTS[blamed.pop()] if len(blamed) == 1 else "nobody can tell"
+    return _VERDICT_BY_ACTOR[blamed.pop()] if len(blamed) == 1 else "nobody can tell"
 
 
 def _right_of_way_of(bundle: Bundle) -> RightOfWay | None:

@@ -178,7 +178,7 @@ def wilson(found: int, of: int) -> tuple[float, float]:
 INTERRUPTED = "it was interrupted"
 """The reason for an incomplete answer if the user has stopped the analysis."""
 
-_KEY = "judged"
+_CRASH_JSON_KEY = "judged"
 
 JudgementVerdict = Literal["avoidable", "too late when visible", "invalid", "unknown"]
 """Whether the crash could be avoided once the agent could see the collision partner.
@@ -319,7 +319,7 @@ class Judgement:
 
 def judgement_of(bundle: Bundle) -> Judgement | None:
     """Return the result of `judge` in a bundle; None if there is none, or if it cannot be read."""
-    data: Any = bundle.added.get(_KEY)
+    data: Any = bundle.added.get(_CRASH_JSON_KEY)
     try:
         attempts = []
         for each in data["attempts"]:
@@ -350,4 +350,4 @@ def judgement_of(bundle: Bundle) -> Judgement | None:
 
 def with_judgement(bundle: Bundle, judgement: Judgement) -> Bundle:
     """Return a bundle with a judgement, to be written."""
-    return replace(bundle, added={**bundle.added, _KEY: judgement.to_json()})
+    return replace(bundle, added={**bundle.added, _CRASH_JSON_KEY: judgement.to_json()})

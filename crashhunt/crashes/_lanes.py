@@ -24,8 +24,8 @@ Borders: TypeAlias = "tuple[NDArray[np.float64], NDArray[np.float64]]"
 
 
 _NEAR_M = 60.0  # around where it happens; a town has thousands of lanes further away
-_ALONG = math.radians(30)  # a vehicle within so much of a lane's direction drives along it
-_CROSSES = math.radians(30)  # lanes that differ by more cross each other, where they lie over each other
+_MAX_DRIVING_ANGLE_RAD = math.radians(30)  # a vehicle within so much of a lane's direction drives along it
+_MIN_CROSSING_ANGLE_RAD = math.radians(30)  # lanes that differ by more cross each other, where they lie over each other
 _MOVED_M = 0.4  # sideways; less is drifting within a lane
 _OVER_M = 0.1
 _MOVES_M = 0.01  # sideways in a step; who moves less does not change lanes yet
@@ -111,7 +111,7 @@ class LaneMap:
             if lane.may_hold(spot) and abs((place := lane.place(spot)).aside_m) < lane.half_width and place.inside
         ]
         return any(
-            abs(math.remainder(one - two, math.tau)) > _CROSSES
+            abs(math.remainder(one - two, math.tau)) > _MIN_CROSSING_ANGLE_RAD
             for number, one in enumerate(headings)
             for two in headings[:number]
         )
@@ -169,7 +169,7 @@ class LaneMap:
             if lane is None:
                 continue
             end = lane.place(point)
-            if not end.inside or abs(math.remainder(end.heading - heading, math.tau)) >= _ALONG:
+            if not end.inside or abs(math.remainder(end.heading - heading, math.tau)) >= _MAX_DRIVING_ANGLE_RAD:
                 continue  # that lane has ended by now, or it turned off
             moved = (end.aside_m - lane.place(before[0]).aside_m) * (1 if end.aside_m > 0 else -1)
             if moved < _MOVED_M or abs(end.aside_m) + half_width - lane.half_width < _OVER_M:
@@ -189,7 +189,7 @@ class LaneMap:
             if lane.may_hold(point)  # a box is compared in a fiftieth of the time, and most lanes are elsewhere
             and abs((place := lane.place(point)).aside_m) <= lane.half_width
             and place.inside
-            and abs(math.remainder(place.heading - heading, math.tau)) < _ALONG
+            and abs(math.remainder(place.heading - heading, math.tau)) < _MAX_DRIVING_ANGLE_RAD
         ]
         return min(found)[2] if found else None
 
@@ -198,14 +198,15 @@ class LaneMap:
         place = lane.place(point)
         if not place.inside or abs(place.aside_m) <= lane.half_width:
             return False
-        if abs(math.remainder(place.heading - heading, math.tau)) >= _ALONG:
+        if abs(math.remainder(place.heading - heading, math.tau)) >= _MAX_DRIVING_ANGLE_RAD:
             return False  # it turns off
         return self._is_in_parallel_lane(lane, point, place.heading)
 
     def _is_in_parallel_lane(self, lane: _Lane, point: NDArray[np.float64], heading: float) -> bool:
         """Whether a point lies in another lane that leads the same way."""
         return any(
-            abs(other.aside_m) <= near.half_width and abs(math.remainder(other.heading - heading, math.tau)) < _ALONG
+            abs(other.aside_m) <= near.half_width
+            and abs(math.remainder(other.heading - heading, math.tau)) < _MAX_DRIVING_ANGLE_RAD
             for near in self._lanes
             if near is not lane and near.may_hold(point)
             for other in (near.place(point),)

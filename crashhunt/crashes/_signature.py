@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import Collision, Failure, TrialResult
 
 
-__all__ = ["SIGNATURE_VERSION", "Frame", "Signature", "own_frames", "signature_of", "signature_of_fault"]
+__all__ = ["SIGNATURE_VERSION", "Signature", "StackFrame", "own_frames", "signature_of", "signature_of_fault"]
 
 SIGNATURE_VERSION = 3
 """Version of these rules. Raise it with each change by which a crash gets another type: types that an earlier version
@@ -28,19 +28,19 @@ has noted in a ledger are then determined again."""
 
 # The place of a software fault in the user's code: the calls of a traceback or of a recorded stack.
 
-_CALLERS = (
+_CALLER_MODULES = (
     ("crashhunt", "episode", "_fast_path.py"),
     ("crashhunt", "episode", "_episode.py"),
     ("crashhunt", "episode", "_blame.py"),
     ("crashhunt", "episode", "_ahead.py"),  # crashes that were saved by earlier versions name their files
     ("crashhunt", "episode.py"),
 )
-_FRAME = re.compile(r'^\s*File "(?P<file>[^"]+)", line (?P<line>\d+),? in (?P<function>\S+)', re.MULTILINE)
-_LIBRARIES = re.compile(r"(site|dist)-packages|python3\.\d+")
+_FRAME_LINE = re.compile(r'^\s*File "(?P<file>[^"]+)", line (?P<line>\d+),? in (?P<function>\S+)', re.MULTILINE)
+_LIBRARY_PATH = re.compile(r"(site|dist)-packages|python3\.\d+")
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class StackFrame:
     """A call.
 
     Args:
@@ -54,36 +54,39 @@ class Frame:
     function: str
 
 
-def own_frames(failure: Failure) -> list[Frame]:
+def own_frames(failure: Failure) -> list[StackFrame]:
     """Return the calls in the agent's own code, the innermost first; without any, the calls in libraries."""
     frames = _frames(failure.traceback) or _frames(failure.last_output)
     ours = [
         number
         for number, frame in enumerate(frames)
-        if any(frame.file.parts[-len(one) :] == one for one in _CALLERS)
+        if any(frame.file.parts[-len(one) :] == one for one in _CALLER_MODULES)
     ]  # fmt: skip
     inner = frames[: min(ours)] if ours else frames  # what the episode has called
     return [frame for frame in inner if not _is_of_a_library(frame.file)] or inner
 
 
-def _frames(text: str) -> list[Frame]:
+def _frames(text: str) -> list[StackFrame]:
     """Each call, the innermost first."""
-    found = [Frame(PurePath(match["file"]), int(match["line"]), match["function"]) for match in _FRAME.finditer(text)]
+    found = [
+        StackFrame(PurePath(match["file"]), int(match["line"]), match["function"])
+        for match in _FRAME_LINE.finditer(text)
+    ]
     # A stuck or dead process has written its stack that way already, an exception the other way.
     return found if "most recent call first" in text else found[::-1]
 
 
 def _is_of_a_library(file: PurePath) -> bool:
-    return any(_LIBRARIES.fullmatch(part) for part in file.parts)
+    return any(_LIBRARY_PATH.fullmatch(part) for part in file.parts)
 
 
 _BEFORE_S = 3.0  # a lane change that began longer ago is over
-_CHANGES = {
+_LANE_CHANGE_WORDS = {
     "agent": "while the agent changes lanes",
     "other": "while the other changes lanes",
     "both": "while both change lanes",
 }
-_FRAMES = 3  # of a stack, the innermost ones
+_MAX_FRAMES = 3  # of a stack, the innermost ones
 _NUMBERS = re.compile(r"0x[0-9a-fA-F]+|-?\d+(\.\d+)?")
 
 
@@ -116,7 +119,7 @@ class Signature(Serializable):
     def __str__(self) -> str:
         words = self.manner or self.outcome
         words += {"collider": ", the agent into the other", "victim": ", the other into the agent"}.get(self.role, "")
-        words += f", {_CHANGES[self.lane_change]}" if self.lane_change else ""
+        words += f", {_LANE_CHANGE_WORDS[self.lane_change]}" if self.lane_change else ""
         words += ", where lanes cross" if self.place == "crossing" else ""
         words += f" in {self.where}" if self.where else ""
         return f"{words}, disturbed" if self.disturbed else words
@@ -176,17 +179,17 @@ def signature_of_fault(result: TrialResult) -> Signature:
         return Signature(outcome, manner=event.kind)
     if failure is None:
         return Signature(outcome)
-    return Signature(outcome, manner=_kind(failure), where=_where(failure))
+    return Signature(outcome, manner=_failure_type(failure), where=_innermost_frames(failure))
 
 
-def _kind(failure: Failure) -> str:
+def _failure_type(failure: Failure) -> str:
     """The exception's type; of a process that died, of what."""
     return f"{failure.kind} {failure.exit_code}" if failure.exit_code is not None else failure.kind
 
 
-def _where(failure: Failure) -> str:
+def _innermost_frames(failure: Failure) -> str:
     """Return the innermost functions of the agent, or without any, the message without its numbers."""
     chosen = own_frames(failure)
     if chosen:
-        return " < ".join(f"{frame.file.name}:{frame.function}" for frame in chosen[:_FRAMES])
+        return " < ".join(f"{frame.file.name}:{frame.function}" for frame in chosen[:_MAX_FRAMES])
     return _NUMBERS.sub("#", failure.message)

@@ -55,9 +55,9 @@ __all__ = [
 
 # What this user trusts although it was not made here: a file for each origin in the folder of the user's state.
 
-_FOLDER = "trusted"
-_SHOWN = 12  # characters of a fingerprint
-_SHORTEST = 6  # characters of a fingerprint that name an origin
+_TRUST_FOLDER = "trusted"
+_FINGERPRINT_CHARACTERS = 12  # characters of a fingerprint
+_MIN_FINGERPRINT_CHARACTERS = 6  # characters of a fingerprint that name an origin
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class TrustedOrigin:
     @property
     def id(self) -> str:
         """The beginning of the fingerprint, which names the origin."""
-        return self.fingerprint[:_SHOWN]
+        return self.fingerprint[:_FINGERPRINT_CHARACTERS]
 
 
 def add_trusted(fingerprint: str, *, path: str, runs: str) -> TrustedOrigin:
@@ -145,7 +145,7 @@ def remove_trusted(names: Sequence[str]) -> list[TrustedOrigin]:
     for name in names:
         place = str(Path(name).resolve())
         found = [origin for origin in known if place == origin.path]
-        if not found and len(name) >= _SHORTEST:
+        if not found and len(name) >= _MIN_FINGERPRINT_CHARACTERS:
             found = [origin for origin in known if origin.fingerprint.startswith(name.lower())]
             if len(found) > 1:
                 raise UsageError(f"--remove {name!r} matches {len(found)} origins", fix="give more of the fingerprint")
@@ -164,7 +164,7 @@ def remove_trusted(names: Sequence[str]) -> list[TrustedOrigin]:
 
 
 def _folders() -> list[Path]:
-    return [folder / _FOLDER for folder in state_folders()]
+    return [folder / _TRUST_FOLDER for folder in state_folders()]
 
 
 def is_bundle_trusted(bundle: Bundle, *, faults: Sequence[str] | None = None) -> bool:

@@ -25,7 +25,7 @@ from crashhunt.base.version import __version__
 from crashhunt.crashes import export_crash
 from crashhunt.dashboard._control import Jobs, stop_hunt
 from crashhunt.dashboard._crashes import CrashList
-from crashhunt.dashboard._details import Compared, detail_of, importance_of_points
+from crashhunt.dashboard._details import HuntComparer, detail_of, importance_of_points
 from crashhunt.dashboard._hunt import HuntView
 from crashhunt.dashboard._security import Guard
 from crashhunt.report import argument_units, player_parts
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.dashboard._catalog import Catalog, Found
+    from crashhunt.dashboard._catalog import Catalog, FoundHunt
 
 __all__ = ["API_VERSION", "Application", "make_application"]
 
@@ -46,7 +46,7 @@ API_VERSION: Final = 1
 
 _MAX_COMPARED = 8
 _NO_STORE = {"cache-control": "no-store"}
-_TYPES = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
+_CONTENT_TYPES = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
 _SCRIPTS = ("common.js", "list.js", "hunt.js", "crash.js", "compare.js", "style.css")
 
 
@@ -81,7 +81,7 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
         text = _assets().get(name)
         if text is None:
             return _error(404, "there is no such file")
-        kind = _TYPES[name.rpartition(".")[2]]
+        kind = _CONTENT_TYPES[name.rpartition(".")[2]]
         return Response(text, media_type=kind, headers=_lasting(request, name))
 
     def page(name: str) -> Callable[[Request], Response]:
@@ -251,14 +251,14 @@ class _Shown:
         self._rows: dict[str, tuple[int, bytes]] = {}  # revision in which a row changed, and its digest
         self._revision = 0
         self._lock = threading.Lock()
-        self.compared = Compared()
+        self.compared = HuntComparer()
 
     def view(self, identifier: str) -> HuntView | None:
         """Return a hunt by its identifier; None if it is unknown or gone."""
         found = self._catalog.find(identifier)
         return None if found is None else self._view(found)
 
-    def _view(self, found: Found) -> HuntView:
+    def _view(self, found: FoundHunt) -> HuntView:
         with self._lock:
             view = self._views.get(found.id)
             if view is None or view.found != found:

@@ -21,13 +21,15 @@ from crashhunt.hunts import is_hunt
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-__all__ = ["Catalog", "Found", "is_inside", "unreadable", "unreadable_below"]
+__all__ = ["Catalog", "FoundHunt", "is_inside", "unreadable", "unreadable_below"]
 
-_DEPTH = 4  # of hunts below a named folder: a folder of suites has DIR/SUITE/ID/RUN
+_MAX_DEPTH = 4  # of hunts below a named folder: a folder of suites has DIR/SUITE/ID/RUN
 _MAX_FOLDERS = 20_000  # looked into; a home folder may have millions
 _SCAN_EVERY_S = 1.0
-_SHARE_OF_TIME = 0.05  # that looking for hunts may take
-_SKIPPED = frozenset({"__pycache__", "node_modules", "site-packages", layout.CRASHES, layout.SNAPSHOTS, *layout.BESIDE})
+_MAX_SHARE_OF_TIME = 0.05  # that looking for hunts may take
+_SKIPPED_FOLDERS = frozenset(
+    {"__pycache__", "node_modules", "site-packages", layout.CRASHES, layout.SNAPSHOTS, *layout.BESIDE}
+)
 _OWN_FILES = (
     layout.HUNT, layout.LEDGER, f"{layout.LEDGER}-wal", f"{layout.LEDGER}-shm", layout.REQUEST, layout.CRASHES,
     *layout.BESIDE, layout.SNAPSHOTS, layout.RUN_LOG, layout.ERROR_LOG,
@@ -37,7 +39,7 @@ _MAX_BYTES = {layout.HUNT: 4 << 20, layout.CRASH: 16 << 20}
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundHunt:
     """A hunt that was found.
 
     Args:
@@ -68,30 +70,30 @@ class Catalog:
     def __init__(self, roots: Sequence[Path], exported: dict[str, Path] | None = None) -> None:
         self.roots = tuple(dict.fromkeys(root.resolve() for root in roots))
         self._exported = dict(exported or {})
-        self._found: dict[str, Found] = {}
+        self._found: dict[str, FoundHunt] = {}
         self._due = 0.0
         self._lock = threading.Lock()
         self.is_cut = False
 
-    def hunts(self) -> dict[str, Found]:
+    def hunts(self) -> dict[str, FoundHunt]:
         """Return the hunts by identifier, in the order of the named folders."""
         with self._lock:
             began = time.monotonic()
             if began >= self._due:
                 self._found = {found.id: found for found in self._scan()}
                 ended = time.monotonic()
-                self._due = ended + max(_SCAN_EVERY_S, (ended - began) / _SHARE_OF_TIME)
+                self._due = ended + max(_SCAN_EVERY_S, (ended - began) / _MAX_SHARE_OF_TIME)
             return self._found
 
-    def find(self, identifier: str) -> Found | None:
+    def find(self, identifier: str) -> FoundHunt | None:
         """Return a hunt by its identifier; None if it is unknown, or its folder is gone."""
         found = self._found.get(identifier) or self.hunts().get(identifier)
         return found if found is not None and found.path.is_dir() else None
 
-    def _scan(self) -> Iterator[Found]:
+    def _scan(self) -> Iterator[FoundHunt]:
         for name, path in self._exported.items():
             place = path.resolve()
-            yield Found(id=_identifier(path, name), path=place, root=place, name=name, suite="", exported=True)
+            yield FoundHunt(id=_identifier(path, name), path=place, root=place, name=name, suite="", exported=True)
         self.is_cut = False
         seen: set[Path] = set()
         for root in self.roots:
@@ -102,7 +104,7 @@ class Catalog:
                     suite = below.parent.as_posix()
                     name = below.as_posix() if path != root else root.name or str(root)
                     suite = "" if suite == "." else suite
-                    yield Found(id=_identifier(path), path=path, root=root, name=name, suite=suite)
+                    yield FoundHunt(id=_identifier(path), path=path, root=root, name=name, suite=suite)
 
     def _below(self, root: Path) -> Iterator[Path]:
         """Yield the folders of hunts, parents before children; a hunt has no hunts inside."""
@@ -116,7 +118,7 @@ class Catalog:
             if is_hunt(folder):
                 yield folder
                 continue
-            if depth < _DEPTH:
+            if depth < _MAX_DEPTH:
                 folders += [(path, depth + 1) for path in self._folders_in(folder)]
 
     def _folders_in(self, folder: Path) -> list[Path]:
@@ -125,7 +127,9 @@ class Catalog:
                 names = sorted(entry.name for entry in entries if entry.is_dir())
         except OSError:
             return []
-        wanted = (name for name in names if name[0] != "." and layout.REPLACED not in name and name not in _SKIPPED)
+        wanted = (
+            name for name in names if name[0] != "." and layout.REPLACED not in name and name not in _SKIPPED_FOLDERS
+        )
         found = [(folder / name).resolve() for name in wanted]
         return [path for path in found if is_inside(path, self.roots)]
 

@@ -35,8 +35,8 @@ COMMANDS: Final = {"replay": "replay", "judge": "judge", "shrink": "shrink"}
 
 _MAX_WAITING = 20
 _MAX_KEPT = 50  # jobs that have ended
-_OUTPUT = 4_000  # characters of the end of a job's output
-_ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+_MAX_OUTPUT_CHARACTERS = 4_000  # characters of the end of a job's output
+_TERMINAL_ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 def stop_hunt(view: HuntView) -> None:
@@ -154,7 +154,7 @@ class Jobs:
         text = ""
         with process.stdout:
             while part := os.read(process.stdout.fileno(), 65_536):
-                text = (text + _ESCAPES.sub("", part.decode("utf-8", "replace")))[-_OUTPUT:]
+                text = (text + _TERMINAL_ESCAPES.sub("", part.decode("utf-8", "replace")))[-_MAX_OUTPUT_CHARACTERS:]
                 with self._changed:
                     job.output = visible(text)
         code = process.wait()

@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle
-    from crashhunt.dashboard._catalog import Found
+    from crashhunt.dashboard._catalog import FoundHunt
 
 __all__ = ["CrashList"]
 
-_PLACES = (layout.CRASHES, layout.NEAR_MISSES)
+_BUNDLE_FOLDERS = (layout.CRASHES, layout.NEAR_MISSES)
 _MAX_LISTED = 2_000
 _MAX_LANES = 4_000
-_MAP_LOGS = 40  # that lanes are read from
-_GENERATIONS = 50  # of a lineage
+_MAX_MAP_LOGS = 40  # that lanes are read from
+_MAX_GENERATIONS = 50  # of a lineage
 
 
 class _Entry(NamedTuple):
@@ -48,7 +48,7 @@ class CrashList:
         found: the hunt.
     """
 
-    def __init__(self, found: Found) -> None:
+    def __init__(self, found: FoundHunt) -> None:
         self._found = found
         self._entries: dict[str, _Entry] = {}
         self._analysed: dict[str, tuple[tuple[int, int], JsonObject]] = {}
@@ -74,7 +74,7 @@ class CrashList:
     def _folders(self) -> dict[str, Path]:
         path = self._found.path
         found: dict[str, Path] = {}
-        for place in reversed(_PLACES):  # a crash hides a near miss of the same name
+        for place in reversed(_BUNDLE_FOLDERS):  # a crash hides a near miss of the same name
             found |= {folder.name: folder for folder in crash_folders(path, place)}
         return found
 
@@ -189,7 +189,7 @@ class CrashList:
         ledger = Ledger(path, read_only=True)
         try:
             data = ledger.plain_trial(number)
-            while data is not None and len(found) < _GENERATIONS:
+            while data is not None and len(found) < _MAX_GENERATIONS:
                 row = TrialRow(data)
                 if row.parent is None or row.parent >= row.number:
                     break
@@ -219,7 +219,7 @@ class CrashList:
         with self._lock:
             rows = self.rows()["crashes"]
             folders = self._folders()
-            for name in [row["id"] for row in rows if not row["damaged"]][:_MAP_LOGS]:
+            for name in [row["id"] for row in rows if not row["damaged"]][:_MAX_MAP_LOGS]:
                 if name not in self._lanes and (path := self.log(name)) is not None:
                     try:
                         borders = read_lanes(path)

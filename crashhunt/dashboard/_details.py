@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import Value
 
 
-__all__ = ["Compared", "detail_of", "importance_of_points"]
+__all__ = ["HuntComparer", "detail_of", "importance_of_points"]
 
 _MAX_WORKERS = 256
 _MAX_EVENTS = 50
@@ -150,11 +150,11 @@ def importance_of_points(points: Sequence[Point]) -> list[JsonObject]:
 
 # Several hunts next to each other, with the numbers of ``crashhunt compare``.
 
-_SHARE_OF_TIME = 0.05  # that comparisons may take: each reads all trials
+_MAX_SHARE_OF_TIME = 0.05  # that comparisons may take: each reads all trials
 _MAX_TRIALS = 200_000  # of all hunts together
 
 
-class Compared:
+class HuntComparer:
     """Compares hunts, and keeps the last comparison."""
 
     def __init__(self) -> None:
@@ -198,15 +198,15 @@ class Compared:
             return {"hunts": {}, "pairs": [], "problem": why}
         try:
             with leave_untouched():
-                found = _plain(compare(*(view.path for view in views)), rows)
+                found = _figures_as_json(compare(*(view.path for view in views)), rows)
         except CrashhuntError as error:
             found = {"hunts": {}, "pairs": [], "problem": str(error)}
         ended = time.monotonic()
-        self._found, self._paths, self._due = (key, found), paths, ended + (ended - began) / _SHARE_OF_TIME
+        self._found, self._paths, self._due = (key, found), paths, ended + (ended - began) / _MAX_SHARE_OF_TIME
         return found
 
 
-def _plain(found: Comparison, rows: Sequence[JsonObject]) -> JsonObject:
+def _figures_as_json(found: Comparison, rows: Sequence[JsonObject]) -> JsonObject:
     data: JsonObject = found.to_json()
     names = {row["dir"]: row["name"] for row in rows}
     pairs = []

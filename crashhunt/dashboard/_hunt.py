@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.dashboard._catalog import Found
+    from crashhunt.dashboard._catalog import FoundHunt
     from crashhunt.ledger import Facts, KindData
     from crashhunt.plans import HuntSettings
     from crashhunt.rates import CrashRate
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 
 __all__ = ["HuntView", "read_tail"]
 
-_SPARKLINE = 48  # points of the curve in the list
-_SHARE_OF_TIME = 0.05  # that figures may take which read all trials
+_SPARKLINE_POINTS = 48  # points of the curve in the list
+_MAX_SHARE_OF_TIME = 0.05  # that figures may take which read all trials
 _MAX_TRIALS_READ = 200_000  # for such a figure
-_TAIL = 20_000  # bytes of a log
-_DETAIL = 2_000  # characters of an error, at most
+_LOG_TAIL_BYTES = 20_000  # bytes of a log
+_MAX_ERROR_CHARACTERS = 2_000  # characters of an error, at most
 
 _Key = tuple[object, ...]
 
@@ -49,7 +49,7 @@ class HuntView:
         found: the hunt.
     """
 
-    def __init__(self, found: Found) -> None:
+    def __init__(self, found: FoundHunt) -> None:
         self.found = found
         self._lock = threading.RLock()
         self._key: _Key = ()
@@ -96,7 +96,7 @@ class HuntView:
                 return self._broken(str(damaged(self.path / layout.LEDGER, text)))
 
     def _broken(self, why: str) -> HuntState:
-        return HuntState(str(self.path), "error", why[:_DETAIL], damaged=True)
+        return HuntState(str(self.path), "error", why[:_MAX_ERROR_CHARACTERS], damaged=True)
 
     def _forget(self) -> None:
         self._key, self.counts, self.sample = (), None, None
@@ -189,7 +189,7 @@ class HuntView:
             return
         self._copies = {"probes": sums_of_probes(ledger, self.facts), "branches": sums_of_branches(ledger, self.facts)}
         ended = time.monotonic()
-        self._copies_due = ended + (ended - began) / _SHARE_OF_TIME
+        self._copies_due = ended + (ended - began) / _MAX_SHARE_OF_TIME
 
     # What the pages show.
 
@@ -212,7 +212,9 @@ class HuntView:
                 "crashed_trials": counts.crashes if counts else 0,
                 "kinds_count": len(kinds) if kinds is not None else None,
                 "rate": self.rate(state),
-                "curve": [[trials, crashes] for trials, _, crashes in counts.curve(_SPARKLINE)] if counts else [],
+                "curve": [[trials, crashes] for trials, _, crashes in counts.curve(_SPARKLINE_POINTS)]
+                if counts
+                else [],
                 "newest_kind_at": self.facts.get("newest_kind") if kinds is not None else None,
                 "kind_firsts": self.kind_firsts(),
                 "active_at": self.active_at(),
@@ -251,7 +253,7 @@ class HuntView:
         try:
             held_out = self._held_out(settings)
         except CrashhuntError as error:
-            return {"why_not": str(error)[:_DETAIL]}
+            return {"why_not": str(error)[:_MAX_ERROR_CHARACTERS]}
         if counts_suffice(settings, self.facts, held_out):
             key = counts.prefix
             if key != self._rate_key:
@@ -286,7 +288,7 @@ class HuntView:
             finally:
                 ledger.close()
             ended = time.monotonic()
-            self._rate_due = ended + (ended - began) / _SHARE_OF_TIME
+            self._rate_due = ended + (ended - began) / _MAX_SHARE_OF_TIME
         return self._rate
 
 
@@ -306,7 +308,7 @@ def _sign(path: Path) -> tuple[int, int, int]:
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def read_tail(path: Path, root: Path, most: int = _TAIL) -> str:
+def read_tail(path: Path, root: Path, most: int = _LOG_TAIL_BYTES) -> str:
     """Return the end of a text file, from the beginning of a line; empty if it is missing or outside of a folder.
 
     Args:

@@ -41,14 +41,14 @@ MIN_TOKEN: Final = 16
 """Characters of a token that the user chooses, at least."""
 
 _COOKIE = "crashhunt-token"
-_POLICY = (
+_CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; connect-src 'self'; img-src 'self' data: blob:; "
     # plotly sets styles from its script. No text of a hunt becomes markup, so no style of a stranger gets in.
     "style-src 'self' 'unsafe-inline'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 _HEADERS = {
-    b"content-security-policy": _POLICY.encode(),
+    b"content-security-policy": _CONTENT_SECURITY_POLICY.encode(),
     b"x-content-type-options": b"nosniff",
     b"x-frame-options": b"DENY",
     b"referrer-policy": b"no-referrer",

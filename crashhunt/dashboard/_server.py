@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Address", "has_dashboard", "serve"]
 
-_EXTRA = ("starlette", "uvicorn", "plotly")
-_TRIED_PORTS = 100
+_EXTRA_LIBRARIES = ("starlette", "uvicorn", "plotly")
+_MAX_TRIED_PORTS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ def has_dashboard() -> bool:
 
 
 def _missing() -> list[str]:
-    return [name for name in _EXTRA if importlib.util.find_spec(name) is None]
+    return [name for name in _EXTRA_LIBRARIES if importlib.util.find_spec(name) is None]
 
 
 def _begin(address: Address, announce: Callable[[Address], None], *, browser: bool) -> None:
@@ -182,7 +182,7 @@ def _next_free(family: int, target: tuple[object, ...]) -> int:
     """Return the next port above that is free; 0 if none is near."""
     host, port, *rest = target
     assert isinstance(port, int)
-    for number in range(port + 1, min(port + _TRIED_PORTS, 65536)):
+    for number in range(port + 1, min(port + _MAX_TRIED_PORTS, 65536)):
         with suppress(OSError):
             _bound(family, (host, number, *rest)).close()
             return number

@@ -36,9 +36,9 @@ MAX_POINTS = 4_000
 MAX_CRASHES = 5_000
 """Crashes in a plot, at most. Of more, an even share is shown, and the page says so."""
 
-_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+_GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 _TAIL = 4_000  # numbers among which workers leave gaps
-_CHUNK = 65_536  # numbers at a time, so that the memory does not grow with the hunt
+_CHUNK_TRIALS = 65_536  # numbers at a time, so that the memory does not grow with the hunt
 _MAX_GAPS = 1_000  # that are read one by one; of more, the range over all of them is read
 
 Point: TypeAlias = "dict[str, object]"
@@ -287,9 +287,9 @@ class Sample:
         while crashes * self.crash_share > MAX_CRASHES:
             self.crash_share /= 2
         numbers = {number for number in ledger.numbers_of(self._crash_on) if _is_drawn(number, self.crash_share)}
-        for first in range(0, last + 1, _CHUNK):
-            block = np.arange(first, min(first + _CHUNK, last + 1))
-            numbers.update(block[block * _GOLDEN % 1.0 < self.share].tolist())
+        for first in range(0, last + 1, _CHUNK_TRIALS):
+            block = np.arange(first, min(first + _CHUNK_TRIALS, last + 1))
+            numbers.update(block[block * _GOLDEN_RATIO % 1.0 < self.share].tolist())
         self._take(ledger, sorted(numbers))
 
     def add(self, ledger: Ledger, trials: Iterable[tuple[int, str]]) -> None:
@@ -361,7 +361,7 @@ def _number(point: Point) -> int:
 
 def _is_drawn(number: int, share: float) -> bool:
     """Whether a trial is among a share of all, evenly over the hunt; a smaller share is part of a greater one."""
-    return number * _GOLDEN % 1.0 < share
+    return number * _GOLDEN_RATIO % 1.0 < share
 
 
 def _point(data: JsonObject, crash_on: Collection[str]) -> Point:

@@ -33,7 +33,7 @@ __all__ = [
 
 T = TypeVar("T")
 
-_AROUND = {"left": 1.0, "right": 1.0, "left ahead": 2.0, "right ahead": 2.0}
+_WEIGHT_BY_PLACE = {"left": 1.0, "right": 1.0, "left ahead": 2.0, "right ahead": 2.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +101,18 @@ def speed() -> Choices:
 
 def cut_in() -> Choices:
     """A vehicle changes from a neighbouring lane to the agent's, even into a small gap, and may brake there."""
-    return Choices(what="cut_in", who=_AROUND, how_strong={0.0: 2.0, 2.0: 1.0, 4.0: 1.0}, how_long={2.0: 1.0, 4.0: 1.0})
+    return Choices(
+        what="cut_in", who=_WEIGHT_BY_PLACE, how_strong={0.0: 2.0, 2.0: 1.0, 4.0: 1.0}, how_long={2.0: 1.0, 4.0: 1.0}
+    )
 
 
 def late_merge() -> Choices:
     """A vehicle next to or ahead of the agent merges at the very end of its lane, even into a small gap."""
     return Choices(
-        what="late_merge", who=_AROUND, how_strong={5.0: 1.0, 15.0: 1.0, 30.0: 1.0}, how_long={10.0: 1.0, 20.0: 1.0}
+        what="late_merge",
+        who=_WEIGHT_BY_PLACE,
+        how_strong={5.0: 1.0, 15.0: 1.0, 30.0: 1.0},
+        how_long={10.0: 1.0, 20.0: 1.0},
     )
 
 
@@ -148,7 +153,10 @@ def noisy_observation() -> Choices:
 def unseen() -> Choices:
     """The agent does not see another actor."""
     return Choices(
-        what="unseen", who={"ahead": 2.0, **_AROUND}, how_strong={1.0: 1.0}, how_long={1.0: 2.0, 2.0: 1.0, 4.0: 1.0}
+        what="unseen",
+        who={"ahead": 2.0, **_WEIGHT_BY_PLACE},
+        how_strong={1.0: 1.0},
+        how_long={1.0: 2.0, 2.0: 1.0, 4.0: 1.0},
     )
 
 

@@ -47,7 +47,7 @@ import numpy as np
 
 from crashhunt.base.capabilities import supports
 from crashhunt.disturbances._protocol import Drawn, Enumerates
-from crashhunt.trial import KINDS, OF_AGENT, Disturbance, Forcing, in_turn
+from crashhunt.trial import KINDS, SENSOR_KINDS, Disturbance, Forcing, in_turn
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -74,10 +74,12 @@ FIRST_STEP: Final = 2
 """The first step in which an onset is forced: a fork after step 0 is too late for what an agent sees in step 1."""
 SECONDS_PER_COPY: Final = 2
 """Mean number of second onsets that are forced on a copy, where that pays."""
-_POINTS = 0x6F6E7365  # separates these draws from others with the seed of the trial
-_LATER = 0x6C617465
-_ANY = Drawn("", 0.0, 0.0)  # of a model that cannot list what it draws
-_DEPENDS_ON_STRENGTH = "step_out"  # of the kinds of crashhunt the only one whose target depends on more than the place
+_ONSET_STREAM = 0x6F6E7365  # separates these draws from others with the seed of the trial
+_LATER_STREAM = 0x6C617465
+_UNLISTED_DRAW = Drawn("", 0.0, 0.0)  # of a model that cannot list what it draws
+_KIND_WITH_STRENGTH_TARGETS = (
+    "step_out"  # of the kinds of crashhunt the only one whose target depends on more than the place
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,11 +189,11 @@ class FirstOnsets:
         self._sampler, self._forcing, self._seed, self._last = sampler, forcing, seed, last
         self._first, self._after_place, self._stream = first, after_place, stream
         names = [(agent, name) for agent in sampler.agents for name in sampler.models]
-        names.sort(key=lambda pair: sampler.models[pair[1]].what not in OF_AGENT)
+        names.sort(key=lambda pair: sampler.models[pair[1]].what not in SENSOR_KINDS)
         places = [self._place(order, agent, name) for order, (agent, name) in enumerate(names)]
-        self._of_agent = [place for place in places if place.what in OF_AGENT]
-        self._traffic = [place for place in places if place.what not in OF_AGENT]
-        self._points = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_POINTS, *stream)))
+        self._of_agent = [place for place in places if place.what in SENSOR_KINDS]
+        self._traffic = [place for place in places if place.what not in SENSOR_KINDS]
+        self._points = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_ONSET_STREAM, *stream)))
         self._proposed = 0.0
         self._number = 0
         self._point = self._points.random() * forcing.spacing
@@ -211,7 +213,9 @@ class FirstOnsets:
                 if begins == self._first and place.order <= self._after_place:
                     continue
                 there = [
-                    asked for asked in place.cells if asked is _ANY or has_target(_disturbance(place, asked, begins))
+                    asked
+                    for asked in place.cells
+                    if asked is _UNLISTED_DRAW or has_target(_disturbance(place, asked, begins))
                 ]
                 cells = [cell for asked in there for cell in place.cells[asked]]
                 later = [*skipped, *((one, None) for one in self._traffic[number + 1 :])]
@@ -248,7 +252,7 @@ class FirstOnsets:
 
     def _place(self, order: int, agent: str, name: str) -> _Place:
         model, ratios = self._sampler.models[name], self._forcing.ratios
-        by_place = model.what in KINDS and model.what != _DEPENDS_ON_STRENGTH
+        by_place = model.what in KINDS and model.what != _KIND_WITH_STRENGTH_TARGETS
         cells: dict[Drawn, list[_Cell]] = {}
         if supports(model, Enumerates):
             for drawn, share in model.possibilities():
@@ -256,7 +260,9 @@ class FirstOnsets:
                 asked = Drawn(drawn.who, 1.0, 1.0) if by_place else drawn
                 cells.setdefault(asked, []).append(_Cell(key=key, drawn=drawn, share=share, ratio=ratios.get(key, 1.0)))
         else:  # every draw counts, whether it finds a vehicle or not
-            cells[_ANY] = [_Cell(key=cell_of(name), drawn=_ANY, share=1.0, ratio=ratios.get(name, 1.0))]
+            cells[_UNLISTED_DRAW] = [
+                _Cell(key=cell_of(name), drawn=_UNLISTED_DRAW, share=1.0, ratio=ratios.get(name, 1.0))
+            ]
         frozen = {asked: tuple(some) for asked, some in cells.items()}
         return _Place(
             order=order, agent=agent, name=name, what=model.what, chance=self._sampler.chance(name), cells=frozen
@@ -295,9 +301,11 @@ class FirstOnsets:
                 excluded because they are effective; None to draw as ever.
             number: number of the onset in the root.
         """
-        rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(_LATER, number, *self._stream)))
+        rng = np.random.default_rng(
+            np.random.SeedSequence(self._seed, spawn_key=(_LATER_STREAM, number, *self._stream))
+        )
         sampler, last = self._sampler, self._last
-        if cell.drawn is _ANY:
+        if cell.drawn is _UNLISTED_DRAW:
             planned = [sampler.draw_one(step, place.name, place.agent, rng)]
         else:
             planned = [_disturbance(place, cell.drawn, step)]
@@ -307,7 +315,7 @@ class FirstOnsets:
             while excluded and any(_drawn(one) in excluded for one in begun):
                 begun = sampler.draw_between(step - 1, step, other.name, other.agent, rng)
             # A model that cannot list its draws is effective whenever it begins.
-            planned += [] if excluded is not None and _ANY in excluded else begun
+            planned += [] if excluded is not None and _UNLISTED_DRAW in excluded else begun
         for other in (*self._of_agent, *self._traffic):
             planned += sampler.draw_between(step, last, other.name, other.agent, rng)
         return Onset(

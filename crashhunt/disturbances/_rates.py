@@ -17,7 +17,7 @@ from crashhunt.base.exceptions import blamed
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.text import one_of
 from crashhunt.disturbances._protocol import Closes, Drawn
-from crashhunt.trial import CELLS, KINDS, OF_AGENT, Disturbance, in_turn, why_not
+from crashhunt.trial import CELLS, KINDS, SENSOR_KINDS, Disturbance, in_turn, why_not
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -44,7 +44,7 @@ __all__ = [
 # ``brake@124=ahead:4:2``: a disturbance that every trial has, in a given step.
 
 FORM = "KIND@STEP=WHO:HOW_STRONG:HOW_LONG"
-_FIX = f"write {FORM}, such as brake@124=ahead:4:2 for 4 m/s² and 2 s from step 124 on"
+_FORM_FIX = f"write {FORM}, such as brake@124=ahead:4:2 for 4 m/s² and 2 s from step 124 on"
 
 
 def is_fixed(word: str) -> bool:
@@ -84,9 +84,9 @@ def _parsed(word: str, agents: Sequence[str], shown: str) -> Disturbance:
     name, equals, text = word.partition("=")
     kind, _, step = name.partition("@")
     parts = [part.strip() for part in text.split(":")]
-    agent, what = _whose(kind, agents, f"{shown} {word}")
+    agent, what = _agent_and_kind(kind, agents, f"{shown} {word}")
     if not (equals and what and len(parts) == 3 and step.isascii() and step.isdecimal() and int(step) > 0):
-        raise UsageError(f"{shown} {word!r} is not a disturbance", fix=_FIX)
+        raise UsageError(f"{shown} {word!r} is not a disturbance", fix=_FORM_FIX)
     who = parts[0].replace("_", " ")
     if who not in CELLS:
         raise UsageError(f"{shown} {word}: {parts[0]!r} is not a place around an agent", fix=one_of(who, CELLS))
@@ -98,7 +98,7 @@ def _parsed(word: str, agents: Sequence[str], shown: str) -> Disturbance:
     return one
 
 
-def _whose(name: str, agents: Sequence[str], shown: str) -> tuple[str, str]:
+def _agent_and_kind(name: str, agents: Sequence[str], shown: str) -> tuple[str, str]:
     """The agent around which it is, and the kind."""
     agent, dot, what = name.rpartition(".")
     if dot and agent not in agents:
@@ -118,11 +118,11 @@ def _number(text: str) -> float:
 
 NONE = "none"
 """The word for no disturbances, whatever the scenario says."""
-_STREAM = 0x64697374  # apart from what else is drawn of a trial's seed: agents count from 0
-_BRANCH = 0x6272616E  # and what is drawn for copies of it
-_STRONGEST = 0x73747267  # as strong as it may be
-_TRIED = 32  # draws of a model, of which the strongest is used: models do not report their maximum
-_SHOWN = "--disturb"
+_TRIAL_STREAM = 0x64697374  # apart from what else is drawn of a trial's seed: agents count from 0
+_BRANCH_STREAM = 0x6272616E  # and what is drawn for copies of it
+_STRONGEST_STREAM = 0x73747267  # as strong as it may be
+_STRONGEST_OF_DRAWS = 32  # draws of a model, of which the strongest is used: models do not report their maximum
+_OPTION = "--disturb"
 
 
 def parse_rates(words: Iterable[str]) -> dict[str, float]:
@@ -141,7 +141,7 @@ def parse_rates(words: Iterable[str]) -> dict[str, float]:
         if word == NONE:
             if len(given) > 1:
                 raise UsageError(
-                    f"{_SHOWN} {','.join(given)}: none cannot be combined with other disturbances",
+                    f"{_OPTION} {','.join(given)}: none cannot be combined with other disturbances",
                     fix="omit none, or the other disturbances",
                 )
             continue
@@ -150,9 +150,9 @@ def parse_rates(words: Iterable[str]) -> dict[str, float]:
         name, equals, text = word.rpartition("=")
         if not equals or not name:
             fix = f"write NAME=RATE with a rate per second, such as brake=0.02, or {FORM}"
-            raise UsageError(f"{_SHOWN} {word!r} has no rate", fix=fix)
+            raise UsageError(f"{_OPTION} {word!r} has no rate", fix=fix)
         if name in rates:
-            raise UsageError(f"{_SHOWN} gives {name!r} twice", fix="give it once")
+            raise UsageError(f"{_OPTION} gives {name!r} twice", fix="give it once")
         rates[name] = _rate(name, text)
     return {name: rate for name, rate in sorted(rates.items()) if rate > 0}
 
@@ -164,7 +164,7 @@ def _rate(name: str, text: str) -> float:
         rate = math.nan
     if not 0 <= rate < math.inf:
         fix = "give how often it happens a second, from 0 on, such as 0.02"
-        raise UsageError(f"{_SHOWN} {name}={text}: {text!r} is not a rate", fix=fix)
+        raise UsageError(f"{_OPTION} {name}={text}: {text!r} is not a rate", fix=fix)
     return rate
 
 
@@ -194,12 +194,12 @@ def disturber_of(
         if rate * step_length_s > 1:
             fix = f"give at most {1 / step_length_s:g} a second"
             raise UsageError(
-                f"{_SHOWN} {name}={rate:g}: the rate exceeds one disturbance per step of {step_length_s:g} s", fix=fix
+                f"{_OPTION} {name}={rate:g}: the rate exceeds one disturbance per step of {step_length_s:g} s", fix=fix
             )
-        _refuse_what_it_cannot(name, model.what, known, simulator)
+        _refuse_unsupported(name, model.what, known, simulator)
         twin = next((other for other, made in models.items() if made.what == model.what), None)
         if twin is not None:
-            message = f"{_SHOWN}: {twin} and {name} are both about {model.what!r}"
+            message = f"{_OPTION}: {twin} and {name} are both about {model.what!r}"
             raise UsageError(message, fix="choose one of the two")
         models[name] = model
     for one in fixed:
@@ -207,18 +207,18 @@ def disturber_of(
             continue  # whose simulator has not said what it can do
         if one.what not in (*KINDS, *(known or ())):
             fix = one_of(one.what, sorted({*KINDS, *(known or ())}))
-            raise UsageError(f"{_SHOWN}: there is no kind of disturbance {one.what!r}", fix=fix)
-        _refuse_what_it_cannot(f"{one.what}@{one.step}", one.what, known, simulator)
+            raise UsageError(f"{_OPTION}: there is no kind of disturbance {one.what!r}", fix=fix)
+        _refuse_unsupported(f"{one.what}@{one.step}", one.what, known, simulator)
     return DisturbanceSampler(
         models=models, rates=dict(rates), agents=tuple(agents), step_length_s=step_length_s, fixed=tuple(fixed)
     )
 
 
-def _refuse_what_it_cannot(name: str, what: str, known: Sequence[str] | None, simulator: str) -> None:
-    if known is None or what in known or what in OF_AGENT:
+def _refuse_unsupported(name: str, what: str, known: Sequence[str] | None, simulator: str) -> None:
+    if known is None or what in known or what in SENSOR_KINDS:
         return
-    able = sorted(point for point in registered("disturbances") if point in (*known, *OF_AGENT))
-    message = f"{_SHOWN} {name}: {simulator} cannot do {what!r}"
+    able = sorted(point for point in registered("disturbances") if point in (*known, *SENSOR_KINDS))
+    message = f"{_OPTION} {name}: {simulator} cannot do {what!r}"
     raise UsageError(message, fix=f"it can do {', '.join(able)}" if able else "omit the option")
 
 
@@ -235,7 +235,7 @@ def locate_model(name: str) -> DisturbanceModel:
     """
     if ":" not in name and name not in registered("disturbances"):
         fix = f"{one_of(name, registered('disturbances'), none='(none)')}, or module:attribute"
-        raise UsageError(f"{_SHOWN}: there is no disturbance {name!r}", fix=fix)
+        raise UsageError(f"{_OPTION}: there is no disturbance {name!r}", fix=fix)
     try:
         made: DisturbanceModel = locate("disturbances", name)()
     except CrashhuntError:
@@ -298,7 +298,7 @@ class DisturbanceSampler:
         found: list[Disturbance] = []
         for number, agent in enumerate(self.agents):
             for name in self.models:
-                key = (_STREAM, number, *name.encode())
+                key = (_TRIAL_STREAM, number, *name.encode())
                 rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
                 found += self.draw_between(0, max_steps, name, agent, rng)
         return self._with_fixed(found, 0, max_steps)
@@ -313,7 +313,7 @@ class DisturbanceSampler:
             soon: the first one begins within so many steps.
             last: the last step in which one begins.
         """
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_BRANCH, after, number)))
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_BRANCH_STREAM, after, number)))
         places = [(agent, name) for agent in self.agents for name in self.models]
         chances = np.array([self.chance(name) for _, name in places])
         agent, name = places[int(rng.choice(len(places), p=chances / chances.sum()))]
@@ -333,12 +333,12 @@ class DisturbanceSampler:
         Returns:
             Several alternatives per model and agent, because not every place has an actor that can be disturbed.
         """
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STRONGEST, after, number)))
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STRONGEST_STREAM, after, number)))
         found = []
         for agent in self.agents:
             for name in self.models:
                 step = after + 1 + int(rng.integers(soon))
-                drawn = dict.fromkeys(self.draw_one(step, name, agent, rng) for _ in range(_TRIED))
+                drawn = dict.fromkeys(self.draw_one(step, name, agent, rng) for _ in range(_STRONGEST_OF_DRAWS))
                 found.append(tuple(sorted(drawn, key=_strength, reverse=True)))
         return tuple(found)
 

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Episodes"]
 
-_SIZE = (960, 540)  # width and height of the picture, in pixels
+_PICTURE_PIXELS = (960, 540)  # width and height of the picture, in pixels
 _TRAIL_S = 4.0  # how long the picture shows the agent's past path, in s
-_OTHERS_SPEED = 10.0  # m/s
+_ASSUMED_SPEED_MPS = 10.0  # m/s
 
 
 class Episodes:
@@ -169,7 +169,7 @@ class Episodes:
             scene=lambda step: scenes[max(0, step - first)],
         )
         view: Any = SceneView
-        width, height = _SIZE
+        width, height = _PICTURE_PIXELS
         drawn: NDArray[np.generic] = view(
             seen, self._borders, agent=self.agent, width=width, height=height, crash_step=self._crash_step
         ).draw(steps)
@@ -216,7 +216,7 @@ def _disturber(scenario: Scenario, agent: str, disturb: Sequence[str], max_steps
 
 def _make_agent(agent: str, simulator: Simulator, _arguments: Mapping[str, Value]) -> KeepLaneWithSpeed:
     """Return the agent for the scenario's other controlled vehicles; the caller drives the environment's vehicle."""
-    return KeepLaneWithSpeed(_OTHERS_SPEED, simulator.actions[agent].space)
+    return KeepLaneWithSpeed(_ASSUMED_SPEED_MPS, simulator.actions[agent].space)
 
 
 def _raise_error(episode: Episode) -> None:

@@ -1,8 +1,8 @@
 from ._action_override import (
     Braking as Braking,
+    HandedOver as HandedOver,
     Keeping as Keeping,
     ReferenceDriver as ReferenceDriver,
-    TakingOver as TakingOver,
     overruled_agent as overruled_agent,
 )
 from ._blame import has_users_code as has_users_code, internal_error as internal_error

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.agents import Closes, Recorded
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.simulators import BrakesFully, HasMeanings, SeesSurroundings
+from crashhunt.simulators import NamesMetaActions, ReportsSurroundings, SupportsFullBraking
 from crashhunt.world import Neighbor, safe_distance, safe_speed, time_to_drive
 
 if TYPE_CHECKING:
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from crashhunt.world import Crossing, Side, Surroundings
 
 
-__all__ = ["Braking", "Keeping", "ReferenceDriver", "TakingOver", "overruled_agent"]
+__all__ = ["Braking", "HandedOver", "Keeping", "ReferenceDriver", "overruled_agent"]
 
-_LANES = ("LANE_LEFT", "LANE_RIGHT")
-_SPEEDS = ("FASTER", "SLOWER")
+_LANE_ACTIONS = ("LANE_LEFT", "LANE_RIGHT")
+_SPEED_ACTIONS = ("FASTER", "SLOWER")
 
 
 def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -> Agent:
@@ -61,7 +61,7 @@ class Braking:
     """
 
     def __init__(self, driver: Agent, simulator: Simulator, agent: str, after: int, manoeuvre: str = "brake") -> None:
-        braking = simulator.full_braking(agent) if supports(simulator, BrakesFully) else None
+        braking = simulator.full_braking(agent) if supports(simulator, SupportsFullBraking) else None
         if braking is None:
             raise InvalidEpisodeError(f"{agent} cannot be made to brake fully: its simulator has no action for it")
         self._driver, self._after = driver, after
@@ -137,12 +137,12 @@ class Keeping:
             speed, change = encoded.tolist()
             return (speed, 0) if self._stays else (self._speed, int(change))
         space = self._form.space
-        assert supports(space, HasMeanings)
+        assert supports(space, NamesMetaActions)
         word = space.meanings[int(encoded[0])]
-        return self._idle if word in (_LANES if self._stays else _SPEEDS) else action
+        return self._idle if word in (_LANE_ACTIONS if self._stays else _SPEED_ACTIONS) else action
 
 
-class TakingOver:
+class HandedOver:
     """Plays the recorded actions of a vehicle up to a step, and lets its agent act from that step on.
 
     The agent is made before the first step, as in every trial. The agent is reset after the last recorded action, with
@@ -181,7 +181,9 @@ class TakingOver:
 def _idle(form: ActionForm) -> int | None:
     """Return the action that changes nothing; None if there is none."""
     space = form.space
-    return tuple(space.meanings).index("IDLE") if supports(space, HasMeanings) and "IDLE" in space.meanings else None
+    return (
+        tuple(space.meanings).index("IDLE") if supports(space, NamesMetaActions) and "IDLE" in space.meanings else None
+    )
 
 
 def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
@@ -194,7 +196,7 @@ def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
     if tuple(form.names) == ("target_speed", "lane_change"):
         return 0.0, 1 if side == "left" else -1
     name = f"LANE_{side.upper()}"
-    if supports(form.space, HasMeanings) and name in form.space.meanings:
+    if supports(form.space, NamesMetaActions) and name in form.space.meanings:
         return tuple(form.space.meanings).index(name)
     raise InvalidEpisodeError(
         f"{agent} cannot be made to change to the {side} lane: its actions have no known lane change"
@@ -249,13 +251,13 @@ class ReferenceDriver:
     """
 
     def __init__(self, driver: Agent, simulator: Simulator, overruled: Overruled) -> None:
-        if not supports(simulator, SeesSurroundings):
+        if not supports(simulator, ReportsSurroundings):
             raise InvalidEpisodeError(
                 f"a reference driver cannot drive {overruled.agent}: the simulator reports no surroundings of the "
                 "vehicle"
             )
         form = simulator.actions[overruled.agent]
-        self._meanings = tuple(form.space.meanings) if supports(form.space, HasMeanings) else ()
+        self._meanings = tuple(form.space.meanings) if supports(form.space, NamesMetaActions) else ()
         if tuple(form.names) != ("target_speed", "lane_change") and not {"IDLE", "SLOWER"} <= {*self._meanings}:
             raise InvalidEpisodeError(
                 f"a reference driver cannot drive {overruled.agent}: the lanes and speeds that its actions mean are "

@@ -38,11 +38,11 @@ __all__ = [
     "party_of_simulator",
 ]
 
-_RESOURCES: Final = (OSError, MemoryError)
+_RESOURCE_ERRORS: Final = (OSError, MemoryError)
 _MAX_CAUSES: Final = 16
 _MAX_FRAMES: Final = 2_000
-_REPORT: Final = "report it with the output of the same command with CRASHHUNT_TRACEBACK=1: {}"
-_ISSUES: Final = "https://github.com/crashhunt/crashhunt/issues"
+_REPORT_FIX: Final = "report it with the output of the same command with CRASHHUNT_TRACEBACK=1: {}"
+_ISSUES_URL: Final = "https://github.com/crashhunt/crashhunt/issues"
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ def blame(error: BaseException, simulator: Simulator, place: str = "") -> Blame:
         party = party_of_simulator(simulator)
         is_agents = party is Party.SIMULATOR and is_ours(simulator)
         return Blame(error, Party.AGENT if is_agents else party, place)
-    return Blame(error, Party.CRASHHUNT, place, is_resource=issubclass(type(error), _RESOURCES))
+    return Blame(error, Party.CRASHHUNT, place, is_resource=issubclass(type(error), _RESOURCE_ERRORS))
 
 
 def has_users_code(error: BaseException) -> bool:
@@ -200,6 +200,6 @@ def internal_error(error: BaseException, trial: int | None = None, steps: int | 
     when = "" if steps is None else f" after {steps} steps" if steps >= 0 else " while the episode was being set up"
     trial_words = "" if trial is None else f" in trial {trial}{when}"
     message = f"crashhunt itself failed{trial_words}: {in_words(error)}"
-    fault = InternalError(message, fix=_REPORT.format(_ISSUES), where=where)
+    fault = InternalError(message, fix=_REPORT_FIX.format(_ISSUES_URL), where=where)
     fault.traceback = format_error(error) or message
     return fault

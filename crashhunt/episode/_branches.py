@@ -27,7 +27,7 @@ from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates
 from crashhunt.episode._observers import Observer
 from crashhunt.episode._questions import Questions
 from crashhunt.simulators import SupportsDisturbances
-from crashhunt.trial import OF_AGENT, Branch, Branches, Disturbance, Outcome, in_turn, steps_of
+from crashhunt.trial import SENSOR_KINDS, Branch, Branches, Disturbance, Outcome, in_turn, steps_of
 from crashhunt.world import approaches, dangers
 
 if TYPE_CHECKING:
@@ -45,11 +45,11 @@ __all__ = ["BRANCHED", "Brancher"]
 
 BRANCHED: Final = 4
 """Steps that branches may take for each step of their trial."""
-_DRAWN = 1  # of these steps, the part for branches with drawn disturbances
+_DRAWN_SHARE_OF_STEPS = 1  # of these steps, the part for branches with drawn disturbances
 _STRONGEST_S = 2  # time between two branches with all disturbances
 _AT_ONCE_S = 1.0  # all disturbances of such a branch begin within this time
-_NEAR = 0.2  # criticality: 1.9 s behind a vehicle, or 2.4 m/s² needed; see `crashhunt guide forks`
-_KEPT = 8  # number of suspended forks, one per second; the oldest is discarded
+_NEAR_DANGER = 0.2  # criticality: 1.9 s behind a vehicle, or 2.4 m/s² needed; see `crashhunt guide forks`
+_MAX_SUSPENDED_FORKS = 8  # number of suspended forks, one per second; the oldest is discarded
 _SEEN_S = 3  # simulation time after which the criticality of a moment is known
 _BEFORE_S = (0, 1, 3)  # branches start at these times before a critical moment
 _REST_S = 3  # shortest time between two such moments
@@ -57,11 +57,11 @@ _SOON_S = 2.0  # the first disturbance of a branch begins within this time
 _HORIZON_S = 6.0  # length of a branch
 _WINDOW_S = 10  # length of the scenes that determine the criticality of a moment
 _PATIENCE_S = 30.0  # wall-time limit of a branch
-_BEGINS = 2  # steps until the first disturbance: a late observation takes effect one step earlier
+_STEPS_TO_FIRST_ONSET = 2  # steps until the first disturbance: a late observation takes effect one step earlier
 
 
 @dataclass(frozen=True, slots=True)
-class _Sleeper:
+class _StoredFork:
     step: int
     copy: SuspendedFork
 
@@ -109,7 +109,7 @@ class Brancher(Observer):
         self._delay = delay
         self._questions = Questions("branches", tell)
         self._branches = Branches()
-        self._asleep: deque[_Sleeper] = deque()
+        self._asleep: deque[_StoredFork] = deque()
         self._frames: deque[Frame] = deque()
         self._disturber: DisturbanceSampler | None = None
         self._second = 1  # in steps
@@ -158,7 +158,7 @@ class Brancher(Observer):
             self._delay(time.monotonic() - began)
 
     def _ask(self, episode: Episode) -> None:
-        while self._asleep and self._asleep[0].step <= episode.steps - _KEPT * self._second:
+        while self._asleep and self._asleep[0].step <= episode.steps - _MAX_SUSPENDED_FORKS * self._second:
             self._asleep.popleft().copy.end()
         self._any = True
         near = self._is_near(episode)
@@ -174,12 +174,12 @@ class Brancher(Observer):
             if sleeper is not None and episode.steps >= self._strongest_at:
                 self._ask_for_everything(episode, sleeper)
         if not self._questions.is_over:
-            self._look(episode, episode.steps)
+            self._ask_dangerous_moment(episode, episode.steps)
 
-    def _suspend_fork(self, episode: Episode) -> _Sleeper | None:
+    def _suspend_fork(self, episode: Episode) -> _StoredFork | None:
         """Leave a suspended fork after the last step; return None if that is impossible now."""
         try:
-            self._asleep.append(_Sleeper(episode.steps, episode.suspend_fork(self._run_branch)))
+            self._asleep.append(_StoredFork(episode.steps, episode.suspend_fork(self._run_branch)))
         except NoProcessError as error:
             self._questions.miss(NoAnswer(f"could not be made: {error.message}", is_from_outside=True))
             return None
@@ -224,7 +224,7 @@ class Brancher(Observer):
         self._branches = replace(self._branches, left_out=self._branches.left_out + 1)
         return True
 
-    def _ask_for_everything(self, episode: Episode, sleeper: _Sleeper) -> None:
+    def _ask_for_everything(self, episode: Episode, sleeper: _StoredFork) -> None:
         """Run a branch with all disturbances at once; while it crashes, repeat it with one disturbance less."""
         self._strongest_at = episode.steps + _STRONGEST_S * self._second
         if self._is_spent(episode):
@@ -241,7 +241,7 @@ class Brancher(Observer):
         if anyway is not None or not self._questions.has_answer:
             return  # it is about to crash anyway, or may be
         first = not self._branches.crashes  # of which one that is likelier is looked for whatever it takes
-        self._take(episode, found)
+        self._record_crash(episode, found)
         kept = [one for one in found.took_place if one not in draws.fixed]
         for one in kept:
             fewer = [other for other in kept if other is not one]
@@ -250,9 +250,9 @@ class Brancher(Observer):
             found = self._branch(episode, sleeper, [*((other,) for other in fewer), *fixed], until)
             if found is not None:
                 kept = fewer
-                self._take(episode, found)
+                self._record_crash(episode, found)
 
-    def _look(self, episode: Episode, now: int) -> None:
+    def _ask_dangerous_moment(self, episode: Episode, now: int) -> None:
         """Run branches from a moment whose criticality is high, and higher than that of the moments around it."""
         second = self._second
         if not self._asleep or now < self._rests_until:
@@ -262,21 +262,21 @@ class Brancher(Observer):
         if ends < second:
             return
         moment, after = (float(found[ends + n * second :][:second].max()) for n in (-1, 0))
-        if moment < _NEAR or moment < after:  # in the second case it is the next one that is asked
+        if moment < _NEAR_DANGER or moment < after:  # in the second case it is the next one that is asked
             return
         self._rests_until = now + _REST_S * second
         self._branches = replace(self._branches, moments=self._branches.moments + 1)
         step = now - (_SEEN_S + 1) * second
         froms = [next((one for one in self._asleep if one.step >= step - ago * second), None) for ago in _BEFORE_S]
         for sleeper in dict.fromkeys(filter(None, froms)):
-            if self._drawn_steps >= _DRAWN * episode.steps:
+            if self._drawn_steps >= _DRAWN_SHARE_OF_STEPS * episode.steps:
                 self._branches = replace(self._branches, left_out=self._branches.left_out + 1)
             elif not self._is_spent(episode):
                 self._draw(episode, sleeper)
             if self._questions.is_over:
                 return
 
-    def _draw(self, episode: Episode, sleeper: _Sleeper) -> None:
+    def _draw(self, episode: Episode, sleeper: _StoredFork) -> None:
         """Run a branch with disturbances from the usual distributions."""
         begins, until = self._span(sleeper)
         soon, before = round(_SOON_S * self._second), self._branches.steps
@@ -285,14 +285,14 @@ class Brancher(Observer):
         found = self._branch(episode, sleeper, [(one,) for one in drawn], until)
         self._drawn_steps += self._branches.steps - before
         if found is not None:
-            self._take(episode, found)
+            self._record_crash(episode, found)
 
-    def _span(self, sleeper: _Sleeper) -> tuple[int, int]:
+    def _span(self, sleeper: _StoredFork) -> tuple[int, int]:
         """Return the step after which the disturbances of a branch begin, and the step in which the branch ends."""
-        return sleeper.step + _BEGINS - 1, sleeper.step + round(_HORIZON_S * self._second)
+        return sleeper.step + _STEPS_TO_FIRST_ONSET - 1, sleeper.step + round(_HORIZON_S * self._second)
 
     def _branch(
-        self, episode: Episode, sleeper: _Sleeper, choices: Sequence[Sequence[Disturbance]], until: int
+        self, episode: Episode, sleeper: _StoredFork, choices: Sequence[Sequence[Disturbance]], until: int
     ) -> _Crashed | None:
         """Run a branch with other disturbances: from each choice, the first disturbance with a target vehicle.
 
@@ -323,19 +323,19 @@ class Brancher(Observer):
             log_likelihood=likely,
         )
 
-    def _usable(self, episode: Episode, sleeper: _Sleeper) -> SuspendedFork:
+    def _usable(self, episode: Episode, sleeper: _StoredFork) -> SuspendedFork:
         """Return the suspended fork of a step; a killed fork is replaced if the trial is still at that step."""
         copy = next((one.copy for one in self._asleep if one.step == sleeper.step), sleeper.copy)
         if copy.is_usable or sleeper.step != episode.steps:
             return copy
         copy.end()
         self._asleep = deque(one for one in self._asleep if one.copy is not copy)
-        self._asleep.append(_Sleeper(sleeper.step, episode.suspend_fork(self._run_branch)))
+        self._asleep.append(_StoredFork(sleeper.step, episode.suspend_fork(self._run_branch)))
         return self._asleep[-1].copy
 
-    def _take(self, episode: Episode, found: _Crashed) -> None:
+    def _record_crash(self, episode: Episode, found: _Crashed) -> None:
         """Add a crashed branch, as a specification from the start."""
-        begun = [one for one in episode.spec.disturbances if one.step <= found.branched + _BEGINS - 1]
+        begun = [one for one in episode.spec.disturbances if one.step <= found.branched + _STEPS_TO_FIRST_ONSET - 1]
         planned = in_turn([*begun, *found.took_place])
         branch = Branch(
             disturbances=planned,
@@ -378,4 +378,4 @@ def _choice(copy: Episode, some: Sequence[Disturbance]) -> Disturbance | None:
     simulator = copy.simulator
     if len(some) == 1 or not supports(simulator, SupportsDisturbances):
         return some[0]
-    return next((one for one in some if one.what in OF_AGENT or simulator.resolve_target(one)), None)
+    return next((one for one in some if one.what in SENSOR_KINDS or simulator.resolve_target(one)), None)

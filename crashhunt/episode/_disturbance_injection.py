@@ -14,8 +14,8 @@ import numpy as np
 
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.simulators import HasMeanings, HoldsBack, NamesObservations, SupportsDisturbances
-from crashhunt.trial import HELD, OF_AGENT, Disturbance, in_effect, steps_of
+from crashhunt.simulators import NamesMetaActions, NamesObservations, SupportsDisturbances, SupportsHolds
+from crashhunt.trial import HOLD_KINDS, SENSOR_KINDS, Disturbance, in_effect, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -31,8 +31,14 @@ if TYPE_CHECKING:
 __all__ = ["DisturbanceInjector"]
 
 
-_NOISE = 0x6E6F6973  # apart from what else is drawn of a trial's seed
-_EXACT = ("presence", "kind", "heading", "cos_h", "sin_h")  # columns that noise leaves alone: they are no distances
+_NOISE_STREAM = 0x6E6F6973  # apart from what else is drawn of a trial's seed
+_NOISELESS_COLUMNS = (
+    "presence",
+    "kind",
+    "heading",
+    "cos_h",
+    "sin_h",
+)  # columns that noise leaves alone: they are no distances
 
 
 class _Filter(Protocol):
@@ -42,7 +48,7 @@ class _Filter(Protocol):
 
 
 @dataclass(slots=True)
-class _Going:
+class _OngoingDisturbance:
     """An active disturbance.
 
     Args:
@@ -86,20 +92,20 @@ class DisturbanceInjector:
         self._callbacks = callbacks
         self._dt = simulator.step_length_s
         self._traffic = simulator if supports(simulator, SupportsDisturbances) else None
-        self._holding = simulator if supports(simulator, HoldsBack) else None
+        self._holding = simulator if supports(simulator, SupportsHolds) else None
         known = tuple(self._traffic.disturbing_kinds) if self._traffic is not None else ()
-        able = (*known, *OF_AGENT, *(HELD if self._holding is not None else ()))
+        able = (*known, *SENSOR_KINDS, *(HOLD_KINDS if self._holding is not None else ()))
         odd = next((one.what for one in spec.disturbances if one.what not in able), None)
         if odd is not None:
             raise InvalidEpisodeError(
                 f"the simulator does not support the disturbance {odd!r}",
-                fix=f"it can do {', '.join((*known, *OF_AGENT))}",
+                fix=f"it can do {', '.join((*known, *SENSOR_KINDS))}",
             )
         # Of each sort, those that are still to come, the next one last.
         waiting = sorted(spec.disturbances, key=lambda one: one.step, reverse=True)
-        self._traffic_waits = [one for one in waiting if one.what not in OF_AGENT]
-        self._agent_waits = [one for one in waiting if one.what in OF_AGENT]
-        self._going: list[_Going] = []
+        self._traffic_waits = [one for one in waiting if one.what not in SENSOR_KINDS]
+        self._agent_waits = [one for one in waiting if one.what in SENSOR_KINDS]
+        self._active: list[_OngoingDisturbance] = []
         self._reported: list[Disturbance] = []
         self._step = 0
         self._next = 0  # the next step with a disturbance
@@ -107,7 +113,7 @@ class DisturbanceInjector:
 
     def add(self, disturbance: Disturbance) -> None:
         """Plan one more disturbance, which begins at the earliest in the step after the next."""
-        waits = self._agent_waits if disturbance.what in OF_AGENT else self._traffic_waits
+        waits = self._agent_waits if disturbance.what in SENSOR_KINDS else self._traffic_waits
         waits.append(disturbance)
         waits.sort(key=lambda one: (one.agent, one.what))  # as a specification has those of one step
         waits.sort(key=lambda one: one.step, reverse=True)
@@ -128,23 +134,23 @@ class DisturbanceInjector:
 
     def first(self, observations: Observations) -> Observations:
         """Return the observations of the agents for the first step."""
-        return self._shown(observations)
+        return self._filtered_observations(observations)
 
     def step(self, actions: Mapping[str, Array]) -> StepResult:
         """Run the simulator's next step with the active disturbances."""
         self._step = step = self._step + 1
-        if not self._going and not self._is_due(step):
+        if not self._active and not self._is_due(step):
             self._before = actions
             return self._advance(actions)
         self._end_before(step)
-        for going in self._going:
+        for going in self._active:
             if going.active is not None:
                 going.active.keep()
         while self._traffic_waits and self._traffic_waits[-1].step <= step:
             self._begin(self._traffic_waits.pop())
-        given, self._before = self._late(actions), actions
+        given, self._before = self._delayed_actions(actions), actions
         observations, *rest = self._advance(given)
-        return self._shown(observations), *rest  # type: ignore[return-value]
+        return self._filtered_observations(observations), *rest  # type: ignore[return-value]
 
     def end(self, result: TrialResult) -> TrialResult:
         """Return the result with the disturbances that took place."""
@@ -156,9 +162,9 @@ class DisturbanceInjector:
         return bool((traffic and traffic[-1].step <= step) or (agents and agents[-1].step <= step + 1))
 
     def _end_before(self, step: int) -> None:
-        over = [going for going in self._going if going.last < step]
+        over = [going for going in self._active if going.last < step]
         if over:
-            self._going = [going for going in self._going if going.last >= step]
+            self._active = [going for going in self._active if going.last >= step]
             for going in over:
                 if going.active is not None:
                     going.active.end()
@@ -171,45 +177,45 @@ class DisturbanceInjector:
         last = self._step + self._steps(planned.how_long) - 1
         vehicle = self._target(planned)
         active = None
-        if vehicle and all(going.vehicle != vehicle for going in self._going):  # one at a time
+        if vehicle and all(going.vehicle != vehicle for going in self._active):  # one at a time
             active = self._disturb(vehicle, planned)
         if active is None:
-            self._tell(replace(planned, vehicle=""))
+            self._notify_observers(replace(planned, vehicle=""))
             return
-        self._going.append(_Going(last=last, vehicle=vehicle, what=planned.what, active=active))
-        self._tell(planned.took_place(vehicle, active.how_strong, self._dt))
+        self._active.append(_OngoingDisturbance(last=last, vehicle=vehicle, what=planned.what, active=active))
+        self._notify_observers(planned.took_place(vehicle, active.how_strong, self._dt))
 
     def _target(self, planned: Disturbance) -> str:
-        if planned.what in HELD:
+        if planned.what in HOLD_KINDS:
             return planned.vehicle
         assert self._traffic is not None
         return self._traffic.resolve_target(planned) if planned.agent in self._simulator.agents else ""
 
     def _disturb(self, vehicle: str, planned: Disturbance) -> ActiveDisturbance | None:
-        if planned.what in HELD:
+        if planned.what in HOLD_KINDS:
             assert self._holding is not None
             return self._holding.hold(vehicle, planned.what)
         assert self._traffic is not None
         return self._traffic.disturb(vehicle, planned)
 
-    def _tell(self, disturbance: Disturbance) -> None:
+    def _notify_observers(self, disturbance: Disturbance) -> None:
         self._reported.append(disturbance)
         for tell in self._callbacks:
             tell(disturbance)
 
-    def _late(self, actions: Mapping[str, Array]) -> Mapping[str, Array]:
+    def _delayed_actions(self, actions: Mapping[str, Array]) -> Mapping[str, Array]:
         found = dict(actions)
-        for going in self._going:
+        for going in self._active:
             if going.what == "late_action" and going.vehicle in found and going.filters is not None:
                 found[going.vehicle] = going.filters(found[going.vehicle])
         return found
 
-    def _shown(self, observations: Observations) -> Observations:
+    def _filtered_observations(self, observations: Observations) -> Observations:
         """Return the observations of the agents for the next step, with their disturbances."""
         step, found = self._step + 1, dict(observations)
         while self._agent_waits and self._agent_waits[-1].step <= step:
             self._begin_of_agent(self._agent_waits.pop(), found)
-        for going in self._going:
+        for going in self._active:
             if going.filters is None or going.what == "late_action" or going.last < step:
                 continue
             if going.vehicle in found:
@@ -219,15 +225,15 @@ class DisturbanceInjector:
     def _begin_of_agent(self, planned: Disturbance, observations: Observations) -> None:
         """Begin a disturbance of an agent's observations or actions in the next step, unless one is active."""
         agent, kind = planned.agent, planned.what
-        going_on = (going for going in self._going if going.last > self._step)  # others are let go in the next step
+        going_on = (going for going in self._active if going.last > self._step)  # others are let go in the next step
         already = any(going.vehicle == agent and going.what == kind for going in going_on)
         made = self._filter(planned) if agent in observations and agent in self._simulator.agents else None
         if made is None or already:
-            self._tell(planned)
+            self._notify_observers(planned)
             return
         last = planned.step + self._steps(planned.how_long) - 1
-        self._going.append(_Going(last, agent, planned.what, filters=made))
-        self._tell(planned.took_place(agent, planned.how_strong, self._dt))
+        self._active.append(_OngoingDisturbance(last, agent, planned.what, filters=made))
+        self._notify_observers(planned.took_place(agent, planned.how_strong, self._dt))
 
     def _filter(self, planned: Disturbance) -> _Filter | None:
         agent, simulator = planned.agent, self._simulator
@@ -241,7 +247,7 @@ class DisturbanceInjector:
         if np.dtype(space.dtype).kind != "f":
             return None  # such as a picture
         rng = np.random.default_rng(
-            np.random.SeedSequence(self._seed, spawn_key=(_NOISE, planned.step, *agent.encode()))
+            np.random.SeedSequence(self._seed, spawn_key=(_NOISE_STREAM, planned.step, *agent.encode()))
         )
         return _Noisy(planned.how_strong, names, space.low, space.high, rng)
 
@@ -284,7 +290,7 @@ class _Held:
         action = first if self._before is None else self._before
         if tuple(form.names) == ("target_speed", "lane_change"):
             return form.encode((float(action[0]), 0))
-        if supports(space, HasMeanings) and "IDLE" in space.meanings:
+        if supports(space, NamesMetaActions) and "IDLE" in space.meanings:
             return form.encode(tuple(space.meanings).index("IDLE"))
         return action
 
@@ -302,7 +308,7 @@ class _Noisy:
 
     def __init__(self, share: float, names: Sequence[str], low: Array, high: Array, rng: np.random.Generator) -> None:
         self._share = share
-        self._columns = np.array([name not in _EXACT for name in names], bool) if names else np.True_
+        self._columns = np.array([name not in _NOISELESS_COLUMNS for name in names], bool) if names else np.True_
         self._bounds = low, high
         self._rng = rng
 

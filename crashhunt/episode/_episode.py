@@ -16,7 +16,7 @@ from crashhunt.episode._disturbance_injection import DisturbanceInjector
 from crashhunt.episode._failures import Ending, close_agent
 from crashhunt.episode._observers import agent_seed, callbacks_for, observation_restorers, options_of
 from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
-from crashhunt.simulators import CountsSetUp, HasMap, Reseeds
+from crashhunt.simulators import CountsSetUp, HasMap, SupportsReseeding
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec, in_turn
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class Forkable:
     def _is_running(self) -> bool:
         raise NotImplementedError
 
-    def _look_away(self) -> None:
+    def _detach_observers(self) -> None:
         raise NotImplementedError
 
     def fork(self, work: Callable[[Self], Plain], *, observed: bool = True) -> Copy:
@@ -89,7 +89,7 @@ class Forkable:
             for tell in self._on_copied if observed else ():
                 tell()
             if not observed:
-                self._look_away()
+                self._detach_observers()
             return work(self, *asked)
 
         copy = make(run_copy, self._held)
@@ -102,8 +102,8 @@ MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 Reset = Callable[..., "tuple[Observations, Info]"]
 """What `Simulator.reset` is: called with ``seed`` and ``options``."""
 
-_FORM = Boundary(Party.SIMULATOR, "action conversion")
-_MAP = Boundary(Party.ORACLE, "see_map")
+_ACTION_BOUNDARY = Boundary(Party.SIMULATOR, "action conversion")
+_MAP_BOUNDARY = Boundary(Party.ORACLE, "see_map")
 ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # never written to
 
 
@@ -323,7 +323,7 @@ class Episode(Forkable, Ending):
         for agent in agents.values():
             close_agent(agent)
         self._disturbed = None
-        self._look_away()  # observers may hold the episode
+        self._detach_observers()  # observers may hold the episode
 
     def disturb(self, disturbance: Disturbance) -> None:
         """Add a disturbance that was not planned; it begins at the earliest in the step after the next.
@@ -349,7 +349,7 @@ class Episode(Forkable, Ending):
             None if the next step can be taken, the result where not.
         """
         try:
-            assert supports(self.simulator, Reseeds)  # looked at when it was set up
+            assert supports(self.simulator, SupportsReseeding)  # looked at when it was set up
             self.simulator.reseed(seed)
         except BaseException as error:
             return self._fail_in_simulator(error)
@@ -362,7 +362,7 @@ class Episode(Forkable, Ending):
     def _is_running(self) -> bool:
         return self._scene is not None and self.result is None
 
-    def _look_away(self) -> None:
+    def _detach_observers(self) -> None:
         """Stop calling observers."""
         callbacks = (self._on_begin, self._on_observation, self._on_action, self._on_scene, self._on_disturbance)
         for listening in (*callbacks, self._on_copied, self._on_end):
@@ -410,7 +410,7 @@ class Episode(Forkable, Ending):
         for oracle in self._oracles:
             if isinstance(oracle, SeesMap):
                 lanes = simulator.lanes() if supports(simulator, HasMap) else ()
-                (oracle.see_map if is_ours(oracle) else _MAP.around(oracle.see_map))(lanes)
+                (oracle.see_map if is_ours(oracle) else _MAP_BOUNDARY.around(oracle.see_map))(lanes)
         # Oracles of a user's are asked inside a boundary; crashhunt's own fail only by a fault of crashhunt.
         self._checks = [oracle.check if is_ours(oracle) else guarded_check(oracle.check) for oracle in self._oracles]
         finding = self._find(scene)
@@ -421,7 +421,7 @@ class Episode(Forkable, Ending):
             return self._end(Outcome.INVALID, collision=hit, failure=failure)
         self.acting = tuple(range(len(self.names)))
         forms = [simulator.actions[name] for name in self.names]
-        self._encoders = [form.encode if is_ours(form) else _FORM.around(form.encode) for form in forms]
+        self._encoders = [form.encode if is_ours(form) else _ACTION_BOUNDARY.around(form.encode) for form in forms]
         self._restore = observation_restorers(simulator)
         return self._end(Outcome.SURVIVED) if spec.max_steps < 1 else None
 
@@ -474,7 +474,7 @@ def _require_reseeding(simulator: Simulator) -> None:
     Raises:
         InvalidEpisodeError: the generators cannot get another seed.
     """
-    if not supports(simulator, Reseeds):
+    if not supports(simulator, SupportsReseeding):
         raise InvalidEpisodeError("its simulator offers no way to re-seed its random generators")
     if simulator.why_no_reseeding:
         raise InvalidEpisodeError(simulator.why_no_reseeding)

@@ -50,7 +50,7 @@ __all__ = [
 # The text of an exception. An agent's exception may be of any class and any size.
 
 _MIN_RECURSION_LIMIT: Final = 1000
-_KINDS: tuple[tuple[type[BaseException], str], ...] = (
+_PARTY_BY_ERROR: tuple[tuple[type[BaseException], str], ...] = (
     (ActionError, "bad action"),
     (InvalidEpisodeError, "invalid"),
     (SimulatorError, "simulator error"),
@@ -72,7 +72,7 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str 
         text = "" if issubclass(type(error), InvalidEpisodeError) else format_error(error)
         words = message_of_error(error)
         # A class of a user's may have a metaclass of any kind, so nothing is looked up by it.
-        kind = next((kind for one, kind in _KINDS if type(error) is one), None) or class_name(error)
+        kind = next((kind for one, kind in _PARTY_BY_ERROR if type(error) is one), None) or class_name(error)
     message = words if issubclass(type(error), EpisodeError) else " ".join(words.split())
     if limit := limit_behind(error):
         message = f"{message} ({limit})" if message else limit
@@ -128,14 +128,14 @@ def close_agent(agent: Agent) -> None:
 # Code of an agent runs at such times too: in a signal handler, a finalizer, a callback, or in place of a function that
 # the agent has replaced.
 
-_TRIES: Final = 3
+_MAX_ATTRIBUTION_ATTEMPTS: Final = 3
 _MAX_FRAMES: Final = 2_000  # of a traceback, from its outer end; the rest repeats
 _MAX_CAUSES: Final = 8
 _MAX_MODULES: Final = 2_000  # of a user's, that refer to each other
 _MAX_HELD: Final = 200  # objects that a simulator or an agent consists of
-_DEPTH_OF_HELD: Final = 3
-_WATCHED: Final = frozenset({"builtins", "math", "random", "time"})  # of Python's own modules
-_USED: Final = frozenset(
+_MAX_ATTRIBUTE_DEPTH: Final = 3
+_WATCHED_MODULES: Final = frozenset({"builtins", "math", "random", "time"})  # of Python's own modules
+_USED_FUNCTIONS: Final = frozenset(
     {"collections", "contextlib", "dataclasses", "functools", "hashlib", "io", "json", "json.decoder", "json.encoder",
      "logging", "mmap", "os", "pathlib", "re", "resource", "signal", "struct", "sys", "threading", "traceback"}
 )  # fmt: skip
@@ -186,7 +186,9 @@ def record_originals() -> None:
     functions: dict[str, dict[str, object]] = {}
     classes: dict[type, dict[str, object]] = {}
     for name, module in list(sys.modules.items()):
-        if not isinstance(module, ModuleType) or (name not in _WATCHED and name.partition(".")[0] not in packages):
+        if not isinstance(module, ModuleType) or (
+            name not in _WATCHED_MODULES and name.partition(".")[0] not in packages
+        ):
             continue
         functions[name] = held = _callables(module)
         for value in held.values():
@@ -198,7 +200,7 @@ def record_originals() -> None:
             packages=packages,
             functions=functions,
             classes=classes,
-            used={name: _callables(sys.modules[name]) for name in _USED if name in sys.modules},
+            used={name: _callables(sys.modules[name]) for name in _USED_FUNCTIONS if name in sys.modules},
             recursion_limit=sys.getrecursionlimit(),
             limits=limits,
         )
@@ -267,7 +269,7 @@ def attribute_error(
         simulator: the simulator.
         observing: oracles and observers of the episode.
     """
-    for _ in range(_TRIES):
+    for _ in range(_MAX_ATTRIBUTION_ATTEMPTS):
         try:
             with blocked_signals():
                 return _attribute(error, agents, simulator, observing)
@@ -357,7 +359,7 @@ def _classes_of(thing: object) -> Iterator[tuple[str, str]]:
             module = base.__dict__.get("__module__")
             if isinstance(module, str) and module != "builtins" and not module.startswith("crashhunt."):
                 yield module, base.__qualname__
-        if depth < _DEPTH_OF_HELD:
+        if depth < _MAX_ATTRIBUTE_DEPTH:
             left += ((value, depth + 1) for value in _attributes(one).values() if _is_instance(value))
 
 
@@ -424,7 +426,7 @@ def _replaced_function(frames: list[FrameType], others: set[str]) -> str:
 
     def is_foreign(value: object, original: object) -> bool:
         module = "" if value is None else _module_of_value(value)
-        known = module in others or module in _WATCHED or module.partition(".")[0] in _originals[0].packages
+        known = module in others or module in _WATCHED_MODULES or module.partition(".")[0] in _originals[0].packages
         return value is not original and (not known or module == "builtins")
 
     replaced: dict[str, str] = {}

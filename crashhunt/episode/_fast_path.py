@@ -22,7 +22,7 @@ from crashhunt.episode._episode import ASK_ALL, Episode
 from crashhunt.episode._observers import Nearness, Recorder, overrides_hook
 from crashhunt.native import ANSWERED, ASK, DONE, REFUSED, SIMULATED
 from crashhunt.oracles import (
-    HARDEST,
+    MAX_BRAKING_MPS2,
     OffRoad,
     OffRoute,
     Overlap,
@@ -32,7 +32,7 @@ from crashhunt.oracles import (
     TrafficEvents,
     WrongWay,
 )
-from crashhunt.simulators import FlattensObservations, StepsAtOnce
+from crashhunt.simulators import FlattensObservations, SupportsFastSteps
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from crashhunt.agents import Agent
     from crashhunt.episode._observers import Observer
     from crashhunt.oracles import Oracle
-    from crashhunt.simulators import AtOnce, Observations, Simulator
+    from crashhunt.simulators import FastStepper, Observations, Simulator
     from crashhunt.trial import TrialResult
     from crashhunt.world import Scene
 
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 __all__ = ["FastEpisode", "FastPath", "make_fast_path"]
 
 
-_FIND_NOTHING = (ReportedCollision, OffRoad, TrafficEvents, RedLight, WrongWay, OffRoute, Teleport)
+_EVENT_ORACLES = (ReportedCollision, OffRoad, TrafficEvents, RedLight, WrongWay, OffRoute, Teleport)
 """Oracles that find nothing in steps without a simulator event; subclasses of these do not count."""
 
 
@@ -72,7 +72,7 @@ class FastPath:
     """
 
     def __init__(
-        self, at_once: AtOnce, recorder: Recorder, agent: str, encode: Callable[[object], NDArray[np.generic]]
+        self, at_once: FastStepper, recorder: Recorder, agent: str, encode: Callable[[object], NDArray[np.generic]]
     ) -> None:
         self.at_once = at_once
         self._recorder, self._agent, self._encode = recorder, agent, encode
@@ -135,7 +135,7 @@ def make_fast_path(
         encoders: agent id to the function that encodes its actions.
     """
     first = observers[0] if observers else None
-    if not isinstance(first, Recorder) or type(first) is not Recorder or not supports(simulator, StepsAtOnce):
+    if not isinstance(first, Recorder) or type(first) is not Recorder or not supports(simulator, SupportsFastSteps):
         return None
     if simulator.at_once is None or not simulator.at_once.is_unpatched(simulator):
         return None
@@ -145,9 +145,9 @@ def make_fast_path(
     if any(overrides_hook(one, "observation") or overrides_hook(one, "action") for one in rest):
         return None
     always = any(overrides_hook(one, "scene") for one in rest)
-    always = always or any(type(one) is not Overlap and type(one) not in _FIND_NOTHING for one in oracles)
+    always = always or any(type(one) is not Overlap and type(one) not in _EVENT_ORACLES for one in oracles)
     overlaps = any(type(one) is Overlap for one in oracles)
-    simulator.at_once.core.judge(overlaps, HARDEST, always, max_steps, Nearness.EVERY)
+    simulator.at_once.core.judge(overlaps, MAX_BRAKING_MPS2, always, max_steps, Nearness.EVERY)
     return FastPath(simulator.at_once, first, simulator.agents[0], encoders[0])
 
 
@@ -267,6 +267,6 @@ class FastEpisode(Episode):
         self._take = None
         return super()._add(result)
 
-    def _look_away(self) -> None:
+    def _detach_observers(self) -> None:
         self._take = None
-        super()._look_away()
+        super()._detach_observers()

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = ["OnsetForcer"]
 
-_PATIENCE_WITH_SECONDS: Final = 2 + SECONDS_PER_COPY  # such a copy waits for as many others, on average
+_WAIT_FACTOR_WITH_SECONDS: Final = 2 + SECONDS_PER_COPY  # such a copy waits for as many others, on average
 
 
 class OnsetForcer:
@@ -131,7 +131,7 @@ class OnsetForcer:
         """Run a copy to the end of its trial, with further copies for second onsets, and record how they ended."""
         assert self._onsets is not None
         seconds = self._onsets.following(onset)
-        patience_s = self._patience_s * (1 if seconds is None else _PATIENCE_WITH_SECONDS)
+        patience_s = self._patience_s * (1 if seconds is None else _WAIT_FACTOR_WITH_SECONDS)
 
         def run(copy: Episode) -> Plain:
             if seconds is None:

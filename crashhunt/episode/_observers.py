@@ -32,14 +32,14 @@ from crashhunt.recording import (
 )
 from crashhunt.simulators import (
     FlattensObservations,
-    LeavesOut,
-    NamesCrashCell,
-    NamesDanger,
     NamesObservations,
     OfAnyLength,
-    PlaysPaths,
+    ReportsCrashCell,
+    ReportsDanger,
+    ReportsEvents,
     RestoresObservations,
-    TellsEvents,
+    SupportsExclusion,
+    SupportsScripts,
 )
 from crashhunt.trial import Outcome
 from crashhunt.world import ApproachMeter, DangerMeter, DrivenMeter
@@ -143,11 +143,11 @@ def options_of(spec: TrialSpec, simulator: Simulator) -> Options:
     """
     options: Options = {"arguments": spec.scenario_arguments}
     if spec.only is not None:
-        if not supports(simulator, LeavesOut):
+        if not supports(simulator, SupportsExclusion):
             raise InvalidEpisodeError("the simulator cannot remove actors")
         options["only"] = spec.only
     if spec.script is not None:
-        if not supports(simulator, PlaysPaths):
+        if not supports(simulator, SupportsScripts):
             raise InvalidEpisodeError("the simulator cannot move actors along recorded paths")
         options["script"] = spec.script
     return options
@@ -181,7 +181,7 @@ def overrides_hook(observer: Observer, name: str) -> bool:
 
 # The observer that measures how near to a crash an episode comes.
 
-_AT_ONCE = 2048  # scenes
+_SCENES_PER_BATCH = 2048  # scenes
 
 
 class Nearness(Observer):
@@ -205,7 +205,7 @@ class Nearness(Observer):
     @property
     def closest(self) -> ClosestApproach:
         """The closest approach so far, up to the last complete step."""
-        self._take_in()
+        self._measure_frames()
         self._measure()
         return self._meter.closest
 
@@ -219,8 +219,8 @@ class Nearness(Observer):
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Measure the new scenes from time to time."""
         if step and step % self.EVERY == 0:
-            self._take_in()
-            if sum(len(frame.columns) for frame in self._waiting) >= _AT_ONCE:
+            self._measure_frames()
+            if sum(len(frame.columns) for frame in self._waiting) >= _SCENES_PER_BATCH:
                 self._measure()
 
     def end(self, result: TrialResult) -> TrialResult:
@@ -233,11 +233,11 @@ class Nearness(Observer):
         touched = result.outcome.is_traffic_crash or closest.gap_m <= 0.0
         danger = 1.0 if touched else self._dangers.danger
         # Asked at the end: before the first step it names none, which counts as one that never does.
-        if danger is None and supports(self._simulator, NamesDanger):
+        if danger is None and supports(self._simulator, ReportsDanger):
             named = self._simulator.named_danger
             danger = None if named is None or math.isnan(named) else min(max(named, 0.0), 1.0)
         collision = result.collision
-        if collision is not None and supports(self._simulator, NamesCrashCell):
+        if collision is not None and supports(self._simulator, ReportsCrashCell):
             result = replace(result, collision=replace(collision, cell=self._simulator.crash_cell))
         driven = self._driven
         return replace(
@@ -245,7 +245,7 @@ class Nearness(Observer):
             step_length_s=driven.step_length_s,
         )  # fmt: skip
 
-    def _take_in(self) -> None:
+    def _measure_frames(self) -> None:
         frames = self._take_frames()
         self._waiting += frames
         self._dangers.add(frames)
@@ -276,7 +276,7 @@ class Recorder(Observer):
         self._kept: list[Actor] = []
         self._roster: Roster | None = None
         # Without detection of events, a count of 0 would be misleading.
-        self._events: Counter[str] | None = Counter() if supports(simulator, TellsEvents) else None
+        self._events: Counter[str] | None = Counter() if supports(simulator, ReportsEvents) else None
         # Called in every step: without a call in between.
         self.observation = box.observation  # type: ignore[assignment, method-assign]
         self.action = box.action  # type: ignore[assignment, method-assign]

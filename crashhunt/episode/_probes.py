@@ -14,7 +14,7 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode._questions import Questions
 from crashhunt.simulators import SupportsDisturbances
-from crashhunt.trial import KINDS, OF_AGENT, Disturbance, Outcome, Stress, steps_of
+from crashhunt.trial import KINDS, SENSOR_KINDS, Disturbance, Outcome, Stress, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,13 +30,13 @@ BUDGET: Final = 4
 """Steps that copies may take for each step of their trial."""
 BUDGET_BESIDE: Final = 1
 """The same where the trial branches as well, which finds crashes in fewer steps."""
-_DIGITS = 9
-_NOTHING = 1e-9
+_STRENGTH_DIGITS = 9
+_MIN_STRENGTH = 1e-9
 _HORIZON_S = 5.0  # of simulation time, for which a copy is followed
-_SHARES = 16  # of the worst, to which the mildest is found
-_HALF = 0.5
+_STRENGTH_LEVELS = 16  # of the worst, to which the mildest is found
+_HALF_STRENGTH = 0.5
 _PATIENCE_S = 30.0  # of wall time, for a copy
-_BEGINS = 2  # steps on: what an agent sees late is noticed a step before
+_STEPS_TO_ONSET = 2  # steps on: what an agent sees late is noticed a step before
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,15 +67,15 @@ class Probed:
             of a second late. The maximum itself counts as a sixteenth less.
         """
         if self.grade == "whether":
-            return (_HALF,)
-        sixteenths = tuple(number / _SHARES for number in range(1, _SHARES))
+            return (_HALF_STRENGTH,)
+        sixteenths = tuple(number / _STRENGTH_LEVELS for number in range(1, _STRENGTH_LEVELS))
         is_time = self.grade == "length" or KINDS[self.what].unit == "s"
         if not is_time:
             return sixteenths
         worst = self.how_long if self.grade == "length" else self.most
         steps = dict.fromkeys(steps_of(share * worst, step_length_s) for share in sixteenths)
         shares = (one * step_length_s / worst for one in steps)
-        return tuple(min(share, sixteenths[-1]) for share in shares if share <= 1 + _NOTHING)
+        return tuple(min(share, sixteenths[-1]) for share in shares if share <= 1 + _MIN_STRENGTH)
 
     def disturbance(self, share: float, who: str, agent: str, step: int) -> Disturbance:
         """Return a disturbance of this kind.
@@ -88,11 +88,11 @@ class Probed:
         """
         strong = self.least + share * (self.most - self.least) if self.grade == "strength" else self.most
         long = share * self.how_long if self.grade == "length" else self.how_long
-        strong, long = round(strong, _DIGITS), round(long, _DIGITS)  # of 3 steps of 0.1 s, 0.3 s
+        strong, long = round(strong, _STRENGTH_DIGITS), round(long, _STRENGTH_DIGITS)  # of 3 steps of 0.1 s, 0.3 s
         return Disturbance(step=step, who=who, what=self.what, how_strong=strong, how_long=long, agent=agent)
 
 
-_ANY_SIDE = ("left ahead", "right ahead", "left", "right")
+_SIDE_PLACES = ("left ahead", "right ahead", "left", "right")
 
 PROBED: Final = (
     Probed(what="brake", who=("ahead",), most=6.0, how_long=3.0),
@@ -100,10 +100,10 @@ PROBED: Final = (
     Probed(what="late_action", who=("itself",), most=1.0, how_long=3.0),
     Probed(what="late_observation", who=("itself",), most=1.0, how_long=3.0),
     Probed(what="noisy_observation", who=("itself",), most=0.2, how_long=3.0),
-    Probed(what="cut_in", who=_ANY_SIDE, most=0.0, how_long=4.0, grade="whether"),
-    Probed(what="unseen", who=("ahead", *_ANY_SIDE), most=1.0, how_long=4.0, grade="length"),
-    Probed(what="ignore_priority", who=_ANY_SIDE, most=1.0, how_long=5.0, grade="length"),
-    Probed(what="late_merge", who=_ANY_SIDE, most=5.0, how_long=10.0, least=50.0),
+    Probed(what="cut_in", who=_SIDE_PLACES, most=0.0, how_long=4.0, grade="whether"),
+    Probed(what="unseen", who=("ahead", *_SIDE_PLACES), most=1.0, how_long=4.0, grade="length"),
+    Probed(what="ignore_priority", who=_SIDE_PLACES, most=1.0, how_long=5.0, grade="length"),
+    Probed(what="late_merge", who=_SIDE_PLACES, most=5.0, how_long=10.0, least=50.0),
     Probed(what="step_out", who=("right ahead", "left ahead"), most=1.4, how_long=6.0, grade="whether"),
     Probed(what="dawdle", who=("ahead",), most=0.5, how_long=10.0),
     Probed(what="speed", who=("behind",), most=0.5, how_long=10.0),
@@ -169,7 +169,7 @@ class Prober:
 
     def _ask(self, episode: Episode) -> None:
         self._goes_on = False
-        if self._least <= 1 / _SHARES:
+        if self._find_mildest <= 1 / _STRENGTH_LEVELS:
             return
         if self._questions.is_over:
             self._questions.skip()
@@ -190,7 +190,7 @@ class Prober:
             self._questions.skip()
 
     @property
-    def _least(self) -> float:
+    def _find_mildest(self) -> float:
         """Return the least share that has made a probe crash so far; 1 if no probe has crashed."""
         assert self._stress.margin is not None
         return self._stress.margin
@@ -205,11 +205,11 @@ class Prober:
         every = [
             _Question(kind, who, episode.names[number])
             for kind in PROBED
-            if kind.what in kinds or kind.what in OF_AGENT
+            if kind.what in kinds or kind.what in SENSOR_KINDS
             for who in kind.who
             for number in episode.acting
         ]
-        others = [] if self._is_spent(episode) else [one for one in every if one.kind.what not in OF_AGENT]
+        others = [] if self._is_spent(episode) else [one for one in every if one.kind.what not in SENSOR_KINDS]
 
         def look(copy: Episode) -> Plain:
             who = [one.kind.disturbance(1.0, one.who, one.agent, copy.steps + 1) for one in others]
@@ -246,9 +246,9 @@ class Prober:
 
     def _mildest(self, episode: Episode, question: _Question) -> bool:
         """Search the mildest strength of one kind; return whether other kinds need to be tried."""
-        kind, step = question.kind, episode.steps + _BEGINS
+        kind, step = question.kind, episode.steps + _STEPS_TO_ONSET
         every = kind.shares(episode.simulator.step_length_s)
-        shares = [share for share in every if share < self._least - _NOTHING]
+        shares = [share for share in every if share < self._find_mildest - _MIN_STRENGTH]
         low, high = -1, len(shares)  # so many of them do no harm, and from here on they do
         at = high - 1
         while at > low:
@@ -270,11 +270,11 @@ class Prober:
             if low == high - 1:
                 break
             at = (low + high) // 2
-        return self._least > 1 / _SHARES
+        return self._find_mildest > 1 / _STRENGTH_LEVELS
 
     def _copy(self, episode: Episode, disturbance: Disturbance | None) -> tuple[str, int]:
         """Return the outcome and the step of a crashed probe; empty if it did not crash or has no result."""
-        horizon = _BEGINS + steps_of(_HORIZON_S, episode.simulator.step_length_s)
+        horizon = _STEPS_TO_ONSET + steps_of(_HORIZON_S, episode.simulator.step_length_s)
 
         def follow(copy: Episode) -> Plain:
             began = copy.steps

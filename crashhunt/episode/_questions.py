@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 __all__ = ["FirstCopy", "Questions"]
 
 
-_ATTEMPTS: Final = 3  # copies per question, as long as something outside ends them
+_MAX_ATTEMPTS: Final = 3  # copies per question, as long as something outside ends them
 _PAUSES_S: Final = (0.05, 0.5)  # wall time before the second and the third, in which memory may become free
-_FAILURES_IN_TURN: Final = 3  # questions in turn that no copy answers
+_MAX_CONSECUTIVE_FAILURES: Final = 3  # questions in turn that no copy answers
 _MAX_REASON_LENGTH: Final = 200  # characters; an agent's exception may say anything
 
 
@@ -79,7 +79,7 @@ class Questions:
             can_retry: whether another copy of the same moment can be made.
         """
         reason = NoAnswer("")
-        for number in range(_ATTEMPTS):
+        for number in range(_MAX_ATTEMPTS):
             if number:
                 time.sleep(_PAUSES_S[number - 1])
             try:
@@ -105,13 +105,13 @@ class Questions:
         why = f"a copy {reason.why}"
         if reason.is_from_outside:
             self._killed += 1
-            if self._killed >= _FAILURES_IN_TURN:
+            if self._killed >= _MAX_CONSECUTIVE_FAILURES:
                 self._paused_because = why
         else:
             self._tell(f"{self._what}: {why}; what it was asked has no answer")
             self._failures += 1
-            if self._failures >= _FAILURES_IN_TURN:
-                self.stop(f"{_FAILURES_IN_TURN} copies in turn failed; the last {reason.why}")
+            if self._failures >= _MAX_CONSECUTIVE_FAILURES:
+                self.stop(f"{_MAX_CONSECUTIVE_FAILURES} copies in turn failed; the last {reason.why}")
         self.skip(why, is_from_outside=reason.is_from_outside)
 
     def skip(self, why: str = "", *, is_from_outside: bool = False) -> None:

@@ -162,7 +162,7 @@ def set_generators(state: tuple[Any, ...]) -> None:
         sys.modules["torch"].set_rng_state(state[2])
 
 
-_CONSTRUCTOR: Final = Boundary(Party.AGENT, "constructor")
+_CONSTRUCTOR_BOUNDARY: Final = Boundary(Party.AGENT, "constructor")
 
 
 # A bound on how deep Python may recurse in a process that runs agents.
@@ -266,7 +266,7 @@ class Parts:
             raise
         except Exception as error:
             raise internal_error(error) from error
-        with _CONSTRUCTOR:
+        with _CONSTRUCTOR_BOUNDARY:
             made: Agent = factory(**given)
         return made
 

@@ -34,7 +34,7 @@ __all__ = ["WorkerSettings", "answer_file", "scratch_of"]
 
 
 _TIMEOUT_S = 60.0  # what leaving it out means, whatever the default of the option is some day
-_AUDIT = 1  # apart from what draws the trial itself
+_AUDIT_STREAM = 1  # apart from what draws the trial itself
 
 
 _SCHEMA = 1  # a replay starts the crashhunt of a snapshot, which may be another one
@@ -94,7 +94,9 @@ class WorkerSettings(Serializable):
         """Return whether a trial belongs to the audited sample; its number and the hunt's seed determine this."""
         if self.audit <= 0.0 or result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
             return False
-        draw = np.random.SeedSequence(self.hunt_seed, spawn_key=(result.spec.number, _AUDIT)).generate_state(1)[0]
+        draw = np.random.SeedSequence(self.hunt_seed, spawn_key=(result.spec.number, _AUDIT_STREAM)).generate_state(1)[
+            0
+        ]
         return bool(draw < self.audit * 2**32)
 
     def to_json(self) -> JsonObject:

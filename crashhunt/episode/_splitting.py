@@ -32,7 +32,7 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.forks import NoAnswer
 from crashhunt.episode._questions import Questions
-from crashhunt.simulators import Reseeds
+from crashhunt.simulators import SupportsReseeding
 from crashhunt.trial import Forced, ForcedCopy, Outcome, Reseeding
 from crashhunt.world import closing_rate
 
@@ -315,6 +315,6 @@ class _EpisodePath:
 def _why_no_noise(episode: Episode) -> str:
     """Return why copies of an episode cannot get other random numbers; empty if they can."""
     simulator = episode.simulator
-    if not supports(simulator, Reseeds):
+    if not supports(simulator, SupportsReseeding):
         return "its simulator offers no way to re-seed its random generators"
     return simulator.why_no_reseeding

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["GateCase", "GateReport", "PairedHunts", "ScenarioCounts"]
 
-_FAILED = ("no_valid_trial", "error")
+_FAILED_STATES = ("no_valid_trial", "error")
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +202,7 @@ class PairedHunts:
         Raises:
             HuntDirectoryError: the two hunts are not of the same traffic, or a ledger is damaged.
         """
-        sequence = self._sequence = self._sequence or self._begun()
+        sequence = self._sequence = self._sequence or self._pair_sequence()
         if sequence is None:
             return
         if self._held_out.is_empty:
@@ -260,11 +260,11 @@ class PairedHunts:
                 with closing(Ledger(folder / layout.LEDGER)) as ledger:
                     entered = [event for event in ledger.events() if event[1] != "remark"]
                 when, state, why = entered[-1] if entered else (0.0, "", "")
-                if state in _FAILED and when >= self._began:
+                if state in _FAILED_STATES and when >= self._began:
                     return side, state, why or "no trial is valid"
         return None
 
-    def _begun(self) -> PairSequence | None:
+    def _pair_sequence(self) -> PairSequence | None:
         """Return the sequence of the pairs once both hunts have begun, and see that they are of the same traffic."""
         if not all((folder / layout.HUNT).exists() and has_begun(folder / layout.LEDGER) for folder in self.folders):
             return None

@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
 __all__ = ["counts_suffice", "measure_rates", "rate_of_counts", "rate_of_trials"]
 
-_BINS = 4
+_DEFAULT_BINS = 4
 _MAX_BINS = 50
-_OF_CRASHES = ("kind", "fault", "disturbance")
+_CRASH_PROPERTIES = ("kind", "fault", "disturbance")
 _UNDISTURBED, _DISTURBED, _UNKNOWN = "undisturbed", "disturbed", "not known"
 
 
@@ -265,16 +265,18 @@ def _by_argument(by: str, settings: HuntSettings) -> _Division:
     names = {f"{agent or 'scenario'}.{name}": (agent, name) for agent, name in space}
     short = {name: key for key, (_, name) in names.items() if sum(name == other for _, other in space) == 1}
     word, colon, count = by.partition(":")
-    if word in _OF_CRASHES:
+    if word in _CRASH_PROPERTIES:
         raise UsageError(f"--by {by}: {word} has no bins", fix=f"give --by {word}")
     key = word if word in names else short.get(word, "")
     if not key:
-        raise UsageError(f"--by: there is no argument {word!r}", fix=one_of(word, [*_OF_CRASHES, *short, *names]))
+        raise UsageError(f"--by: there is no argument {word!r}", fix=one_of(word, [*_CRASH_PROPERTIES, *short, *names]))
     if colon and not (count.isdecimal() and 1 <= int(count) <= _MAX_BINS):
-        raise UsageError(f"--by {by}: {count!r} bins", fix=f"give 1 to {_MAX_BINS} bins, such as {word}:{_BINS}")
+        raise UsageError(
+            f"--by {by}: {count!r} bins", fix=f"give 1 to {_MAX_BINS} bins, such as {word}:{_DEFAULT_BINS}"
+        )
     agent, name = names[key]
     distribution = space[agent, name]
-    labels, place = _bins(distribution, int(count) if colon else _BINS)
+    labels, place = _bins(distribution, int(count) if colon else _DEFAULT_BINS)
 
     def tag(data: JsonObject) -> str:
         spec = data["spec"]

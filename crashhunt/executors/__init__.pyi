@@ -8,15 +8,15 @@ from ._fresh import (
 from ._pool import PoolExecutor as PoolExecutor
 from ._postmortem import read_map as read_map
 from ._protocol import (
+    ChoosesParallelism as ChoosesParallelism,
     Executor as Executor,
     ExecutorFactory as ExecutorFactory,
     HasNodes as HasNodes,
     NodeFigures as NodeFigures,
-    SizesItself as SizesItself,
     make_executor as make_executor,
     run_trials as run_trials,
     snapshot_environment as snapshot_environment,
     worker_environment as worker_environment,
 )
 from ._supervisor import Supervisor as Supervisor
-from ._trial_process import LEFT_OUT as LEFT_OUT
+from ._trial_process import EXCLUDED_WORDS as EXCLUDED_WORDS

@@ -40,11 +40,11 @@ if TYPE_CHECKING:
 
 __all__ = ["fork_zygote", "main"]
 
-_MESSAGE = 1 << 16  # bytes; an order to start a supervisor is some hundred
+_MAX_MESSAGE_BYTES = 1 << 16  # bytes; an order to start a supervisor is some hundred
 _ORPHANS_EVERY_S = 0.5  # looking for what dead trials left behind walks all of /proc
 _LOOK_EVERY_S = 0.02  # where the kernel does not report when a process ends
 # These signals are meant for the hunt; the process of a trial dies of them as any process does.
-_NOT_OURS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+_IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
 def main() -> None:
@@ -101,10 +101,10 @@ class _Server:
             wait_s = _LOOK_EVERY_S if len(self._ends) < len(self._slots) else _ORPHANS_EVERY_S
             watched = [self._control.fileno(), self._orders.fileno(), *self._ends.values()]
             ready, _, _ = select.select(watched, [], [], wait_s)
-            if self._control.fileno() in ready and not self._obey():
+            if self._control.fileno() in ready and not self._handle_request():
                 return  # the keeper ends every process
-            if self._orders.fileno() in ready and not self._hear_template():
-                self._leave_as(os.waitstatus_to_exitcode(os.waitpid(self._template, 0)[1]))
+            if self._orders.fileno() in ready and not self._forward_template_messages():
+                self._exit_as(os.waitstatus_to_exitcode(os.waitpid(self._template, 0)[1]))
             if self._watch.has_hung:
                 _send(self._control, self._watch.hung().to_json())
                 kill(self._template)
@@ -116,27 +116,27 @@ class _Server:
             # Other children were left behind by a template or a supervisor that died.
             end_descendants(frozenset(self._slots) | {self._template})
 
-    def _hear_template(self) -> bool:
+    def _forward_template_messages(self) -> bool:
         """Pass on the messages of the template; return whether the template is still running."""
         while True:
             try:
-                data = self._orders.recv(_MESSAGE, socket.MSG_DONTWAIT)
+                data = self._orders.recv(_MAX_MESSAGE_BYTES, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 return True
             except OSError:
                 data = b""
             if not data:
                 return False
-            said = _understood(data)
+            said = _parse_request(data)
             if "importing" in said:
                 self._watch.begin(said["importing"])
             else:
                 self._watch.begin("")
                 _send(self._control, said)
 
-    def _obey(self) -> bool:
+    def _handle_request(self) -> bool:
         """Carry out a request of the pool; return whether the pool is still connected."""
-        data, descriptors, _, _ = socket.recv_fds(self._control, _MESSAGE, 1)
+        data, descriptors, _, _ = socket.recv_fds(self._control, _MAX_MESSAGE_BYTES, 1)
         if not data:
             return False
         message: ToForkServer = json.loads(data)
@@ -150,8 +150,8 @@ class _Server:
             try:
                 socket.send_fds(self._orders, [b"zygote"], [theirs.fileno()])
             except ConnectionError:  # a supervisor without a zygote would lose its trial
-                self._hear_template()  # what it said before it ended
-                self._leave_as(os.waitstatus_to_exitcode(os.waitpid(self._template, 0)[1]))
+                self._forward_template_messages()  # what it said before it ended
+                self._exit_as(os.waitstatus_to_exitcode(os.waitpid(self._template, 0)[1]))
             server, pid = os.getpid(), os.fork()
             if pid == 0:
                 for descriptor in self._ends.values():
@@ -159,7 +159,7 @@ class _Server:
                 self._control.close()
                 self._orders.close()
                 theirs.close()
-                for number in _NOT_OURS:
+                for number in _IGNORED_SIGNALS:
                     signal.signal(number, signal.SIG_DFL)
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
                 be_supervisor(pool, zygote, self._settings, server)
@@ -183,10 +183,10 @@ class _Server:
             if pid in self._slots:
                 _send(self._control, {"slot": self._slots.pop(pid), "pid": pid, "exit_code": code})
             elif pid == self._template:
-                self._hear_template()  # what it said before it ended
-                self._leave_as(code)
+                self._forward_template_messages()  # what it said before it ended
+                self._exit_as(code)
 
-    def _leave_as(self, code: int) -> NoReturn:
+    def _exit_as(self, code: int) -> NoReturn:
         """End with the exit status of the template; the parent process interprets it."""
         if self._watch.importing and is_sent_from_outside(code):
             _send(self._control, {"importing": self._watch.importing})
@@ -218,7 +218,7 @@ def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool)
     while True:
         ready, _, _ = select.select([orders], [], [], _ORPHANS_EVERY_S)
         if ready:
-            data, descriptors, _, _ = socket.recv_fds(orders, _MESSAGE, 1)
+            data, descriptors, _, _ = socket.recv_fds(orders, _MAX_MESSAGE_BYTES, 1)
             if not data:
                 os._exit(0)
             control = socket.socket(fileno=descriptors[0])
@@ -226,7 +226,7 @@ def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool)
             if pid == 0:
                 orders.close()
                 die_with(template)
-                for number in _NOT_OURS:
+                for number in _IGNORED_SIGNALS:
                     signal.signal(number, signal.SIG_DFL)
                 os.setsid()
                 be_zygote(control, settings, imported)
@@ -238,7 +238,7 @@ def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool)
         end_descendants(frozenset(zygotes))
 
 
-def _understood(data: bytes) -> FromForkServer:
+def _parse_request(data: bytes) -> FromForkServer:
     """Return the message of the template; None if an imported agent has written other data to the connection."""
     said: FromForkServer = {}
     with suppress(ValueError, KeyError, TypeError):
@@ -308,7 +308,7 @@ def _import_for_zygote(
 
 
 def _ignore_signals() -> None:
-    for number in _NOT_OURS:
+    for number in _IGNORED_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 

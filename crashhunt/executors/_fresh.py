@@ -25,7 +25,7 @@ from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
 from crashhunt.executors._fork_server import fork_zygote
 from crashhunt.executors._pool import PoolExecutor
-from crashhunt.executors._postmortem import Attempt, damaged, hung, result_of_death, where_it_is
+from crashhunt.executors._postmortem import TrialAttempt, damaged, hung, result_of_death, where_it_is
 from crashhunt.executors._protocol import Notes, has_fork_server, run_trials, snapshot_environment
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError, with_escape
 from crashhunt.executors._time_limits import START_UP_S, ImportKilledError, has_hung, import_died
@@ -42,13 +42,13 @@ __all__ = ["FreshProcessExecutor", "SharedExecutors", "run_alone", "snapshot_exe
 
 
 _LOOK_EVERY_S = 0.01  # starting one takes thirty times as long
-_DAMAGED = 79  # the exit code of a process of crashhunt 0.2 and before whose trial damaged it
+_DAMAGED_EXIT_CODE = 79  # the exit code of a process of crashhunt 0.2 and before whose trial damaged it
 _ESCAPE_S = 60.0  # for what is found out about a crash after its own trial has ended
 
 
 @dataclass(slots=True)
 class _Running:
-    attempt: Attempt
+    attempt: TrialAttempt
     kept: Kept
     answer: Path
     began: float
@@ -68,20 +68,20 @@ class FreshProcessExecutor:
         self._settings = settings
         self.capacity = parallel
         self._notes = Notes(settings.scratch)
-        self._waiting: deque[Attempt] = deque()
+        self._waiting: deque[TrialAttempt] = deque()
         self._running: dict[int, _Running] = {}
         self._has_supervisor = has_fork_server(settings)
 
     def submit(self, spec: TrialSpec) -> None:
         """Queue a trial."""
-        self._waiting.append(Attempt(spec))
+        self._waiting.append(TrialAttempt(spec))
         self._start()
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
         """Yield the trials that have ended; wait at most this long for the first one."""
         deadline = time.monotonic() + timeout_s
         while True:
-            found = [result for number in list(self._running) if (result := self._look(number)) is not None]
+            found = [result for number in list(self._running) if (result := self._poll_process(number)) is not None]
             self._start()
             yield from found
             if found or time.monotonic() >= deadline:
@@ -135,7 +135,7 @@ class FreshProcessExecutor:
                 )
             self._running[number] = _Running(attempt=attempt, kept=kept, answer=answer, began=time.monotonic())
 
-    def _look(self, number: int) -> TrialResult | None:
+    def _poll_process(self, number: int) -> TrialResult | None:
         running = self._running[number]
         exit_code = running.kept.process.poll()
         if exit_code is not None:
@@ -172,9 +172,9 @@ class FreshProcessExecutor:
                     fix="read its log",
                     where=str(log),
                 ) from None
-            if exit_code == _DAMAGED:
+            if exit_code == _DAMAGED_EXIT_CODE:
                 return damaged(spec, scratch, "the process could not report the result, as it is damaged")
-            return self._again(running, exit_code)
+            return self._account_for_end(running, exit_code)
         # The answer is there, so that what was killed is the search for the escape: without it the answer is half.
         why_no_escape = ""
         if self._settings.find_escapes and not running.killed and is_sent_from_outside(exit_code):
@@ -188,11 +188,11 @@ class FreshProcessExecutor:
         if "error" in answer:
             raise WorkerError.from_json(answer)  # or an InternalError
         if "lost" in answer:
-            return self._again(running, answer["lost"], answer.get("importing", ""))
+            return self._account_for_end(running, answer["lost"], answer.get("importing", ""))
         result = TrialResult.from_json(answer["result"])
         return replace(result, why_no_escape=why_no_escape) if why_no_escape and result.escape is None else result
 
-    def _again(self, running: _Running, exit_code: int, importing: str = "") -> TrialResult | None:
+    def _account_for_end(self, running: _Running, exit_code: int, importing: str = "") -> TrialResult | None:
         """Account for a trial whose process is gone, or run it again.
 
         Raises:

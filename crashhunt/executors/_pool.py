@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.reaper import Kept
-from crashhunt.executors._postmortem import Attempt, result_of_death, signal_name, where_it_is
+from crashhunt.executors._postmortem import TrialAttempt, result_of_death, signal_name, where_it_is
 from crashhunt.executors._protocol import Notes, snapshot_environment, worker_environment
 from crashhunt.executors._time_limits import import_died
 from crashhunt.trial import TrialResult
@@ -38,10 +38,10 @@ __all__ = ["ForkServerLink", "PoolExecutor"]
 
 # The pool's end of its fork server: how it is started, asked for supervisors, and listened to.
 
-_MESSAGE = 1 << 16  # bytes, as in _fork_server
-_DEATHS = 3  # in a row, without a trial between them, before the pool stops
+_MAX_MESSAGE_BYTES = 1 << 16  # bytes, as in _fork_server
+_MAX_CONSECUTIVE_DEATHS = 3  # in a row, without a trial between them, before the pool stops
 _END_S = 5.0  # for the template to say why it ended
-_FROM_OUTSIDE = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL)
+_OUTSIDE_SIGNALS = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL)
 _numbers = itertools.count()
 
 
@@ -109,7 +109,7 @@ class ForkServerLink:
         ended: list[FromForkServer] = []
         while True:
             try:
-                data = self.control.recv(_MESSAGE)
+                data = self.control.recv(_MAX_MESSAGE_BYTES)
             except BlockingIOError:
                 return ended
             except OSError:
@@ -138,13 +138,13 @@ class ForkServerLink:
         self.end()
         if self.unfit:
             return ForkServerLink(self._settings, late=True, deaths=self.deaths, snapshot=self._snapshot)
-        if -code not in _FROM_OUTSIDE or self.deaths + 1 >= _DEATHS:
+        if -code not in _OUTSIDE_SIGNALS or self.deaths + 1 >= _MAX_CONSECUTIVE_DEATHS:
             if self._importing:
                 raise import_died(self._importing, code, times=self.deaths + 1)
             lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             how = f"was killed by {signal_name(code)}" if code < 0 else f"exited with {code}"
             said = f": {lines[-1]}" if lines else ""
-            again = f", {_DEATHS} times" if -code in _FROM_OUTSIDE else ""
+            again = f", {_MAX_CONSECUTIVE_DEATHS} times" if -code in _OUTSIDE_SIGNALS else ""
             raise CrashhuntError(
                 f"the process that starts the workers {how}{again}{said}",
                 fix="raise the limits on memory (ulimit -v) and processes (ulimit -u), and run the same command again",
@@ -158,7 +158,7 @@ class ForkServerLink:
 
 
 _LOOK_EVERY_S = 0.5  # whether the pool is closing, should nothing wake it up
-_RECEIVED = 1 << 16  # bytes at a time; a result is a few hundred
+_CHUNK_BYTES = 1 << 16  # bytes at a time; a result is a few hundred
 
 
 @dataclass(slots=True, eq=False)
@@ -167,7 +167,7 @@ class _Worker:
 
     slot: int
     socket: socket.socket
-    attempt: Attempt | None = None
+    attempt: TrialAttempt | None = None
     received: bytearray = field(default_factory=bytearray)
     retired: bool = False  # it is not given any more trials
 
@@ -195,7 +195,7 @@ class PoolExecutor:
         self._settings = settings
         self._parallel = parallel
         self._lock = threading.RLock()
-        self._waiting: deque[Attempt] = deque()
+        self._waiting: deque[TrialAttempt] = deque()
         self._workers: dict[int, _Worker] = {}
         self._slots = 0
         self._done: queue.SimpleQueue[TrialResult | Exception] = queue.SimpleQueue()
@@ -215,7 +215,7 @@ class PoolExecutor:
     def submit(self, spec: TrialSpec) -> None:
         """Queue a trial."""
         with self._lock:
-            self._waiting.append(Attempt(spec))
+            self._waiting.append(TrialAttempt(spec))
             if self._thread is None:
                 self._thread = threading.Thread(target=self._serve, name="crashhunt-pool", daemon=True)
                 self._thread.start()
@@ -242,7 +242,7 @@ class PoolExecutor:
             for worker in self._workers.values():
                 if worker.attempt is not None and worker.attempt.spec.number > above:
                     worker.attempt = None
-                    self._retire(worker)
+                    self._stop_worker(worker)
                     if self._link is not None:
                         self._link.kill(worker.slot)
             kept = []
@@ -293,17 +293,17 @@ class PoolExecutor:
                         return
                     for key, _ in ready:
                         if key.fileobj is self._woken:
-                            self._woken.recv(_RECEIVED)
+                            self._woken.recv(_CHUNK_BYTES)
                         elif isinstance(key.data, _Worker):
                             if key.data.slot in self._workers:  # which its end, heard of just now, has changed
-                                self._hear(key.data)
+                                self._read_messages(key.data)
                         else:
-                            self._hear_fork_server()
-                    self._hand_out()
+                            self._read_fork_server()
+                    self._assign_trials()
         except Exception as error:
             self._done.put(error)
 
-    def _hand_out(self) -> None:
+    def _assign_trials(self) -> None:
         """Give trials to free slots, in the order of the queue."""
         while self._waiting:
             running = [worker.attempt for worker in self._workers.values() if worker.attempt is not None]
@@ -321,10 +321,10 @@ class PoolExecutor:
                     or sum(not worker.retired for worker in self._workers.values()) >= self._parallel
                 ):
                     return
-                free = self._hire(self._link)
-            self._give(free, self._waiting.popleft())
+                free = self._start_worker(self._link)
+            self._send_trial(free, self._waiting.popleft())
 
-    def _hire(self, link: ForkServerLink) -> _Worker:
+    def _start_worker(self, link: ForkServerLink) -> _Worker:
         ours, theirs = socket.socketpair()
         with theirs:
             self._slots += 1
@@ -334,7 +334,7 @@ class PoolExecutor:
         self._selector.register(ours, selectors.EVENT_READ, worker)
         return worker
 
-    def _give(self, worker: _Worker, attempt: Attempt) -> None:
+    def _send_trial(self, worker: _Worker, attempt: TrialAttempt) -> None:
         worker.attempt = attempt
         text = json.dumps(attempt.spec.to_json()).encode() + b"\n"
         worker.socket.setblocking(True)
@@ -342,11 +342,11 @@ class PoolExecutor:
             worker.socket.sendall(text)
         worker.socket.setblocking(False)
 
-    def _hear(self, worker: _Worker) -> None:
+    def _read_messages(self, worker: _Worker) -> None:
         """Read the messages that a worker has sent completely."""
         over = False
         try:
-            data = worker.socket.recv(_RECEIVED)
+            data = worker.socket.recv(_CHUNK_BYTES)
             over = not data
             worker.received += data
         except BlockingIOError:
@@ -359,9 +359,9 @@ class PoolExecutor:
         while b"\n" in worker.received:
             line, _, rest = bytes(worker.received).partition(b"\n")
             worker.received = bytearray(rest)
-            self._take(worker, line)
+            self._handle_message(worker, line)
 
-    def _take(self, worker: _Worker, line: bytes) -> None:
+    def _handle_message(self, worker: _Worker, line: bytes) -> None:
         """Process the message of a supervisor about its trial."""
         attempt = worker.attempt
         if attempt is None:
@@ -372,7 +372,7 @@ class PoolExecutor:
         worker.attempt = None
         if "lost" in answer:
             self._end_attempt(attempt, answer["lost"])
-            self._retire(worker)
+            self._stop_worker(worker)
             return
         for notice in answer.get("notices", ()):
             self._notes.add(notice)
@@ -380,15 +380,15 @@ class PoolExecutor:
         if self._link is not None:
             self._link.deaths = 0
         if answer.get("retires"):
-            self._retire(worker)
+            self._stop_worker(worker)
 
-    def _retire(self, worker: _Worker) -> None:
+    def _stop_worker(self, worker: _Worker) -> None:
         """Give a supervisor no more trials; when it has none, it ends."""
         worker.retired = True
         with suppress(OSError):
             worker.socket.shutdown(socket.SHUT_WR)
 
-    def _hear_fork_server(self) -> None:
+    def _read_fork_server(self) -> None:
         """Process the messages of the fork server about ended supervisors, and its own end."""
         assert self._link is not None
         messages = self._link.receive()
@@ -415,12 +415,12 @@ class PoolExecutor:
         worker = self._workers.get(slot)
         if worker is None:
             return
-        self._hear(worker)  # what it said before it ended
+        self._read_messages(worker)  # what it said before it ended
         self._discard(worker)
         if worker.attempt is not None:  # an agent or another process has killed it
             self._end_attempt(worker.attempt, exit_code if exit_code < 0 else -signal.SIGKILL)
 
-    def _end_attempt(self, attempt: Attempt, exit_code: int) -> None:
+    def _end_attempt(self, attempt: TrialAttempt, exit_code: int) -> None:
         """Account for a trial whose process is gone, or run it again."""
         scratch = self._settings.scratch
         if why := attempt.again(scratch, exit_code):

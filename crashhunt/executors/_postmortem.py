@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "KEY_BYTES",
-    "Attempt",
     "FaultReport",
     "Report",
+    "TrialAttempt",
     "agent_in_stack",
     "check_report",
     "damaged",
@@ -51,13 +51,13 @@ __all__ = [
 ]
 
 
-_TAIL = 4000  # bytes
-_FRAME = re.compile(r'  File "(.*)", line \d+ in ')  # of a stack that faulthandler wrote
-_ATTEMPTS = 3  # of a trial whose process is killed from outside
+_TAIL_BYTES = 4000  # bytes
+_FRAME_LINE = re.compile(r'  File "(.*)", line \d+ in ')  # of a stack that faulthandler wrote
+_MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside
 
 
 @dataclass(slots=True)
-class Attempt:
+class TrialAttempt:
     """A trial to run, and the ends of its processes so far.
 
     A process that ends by certain signals may have been ended from outside: by an administrator, a batch system, the
@@ -81,7 +81,7 @@ class Attempt:
     @property
     def is_killed_from_outside(self) -> bool:
         """Whether every allowed attempt was killed, each at another step: no attempt shows how the trial ends."""
-        return len(self.ends) >= _ATTEMPTS and len(set(self.ends)) == len(self.ends)
+        return len(self.ends) >= _MAX_ATTEMPTS and len(set(self.ends)) == len(self.ends)
 
     def again(self, scratch: Path, exit_code: int) -> str:
         """Return why the trial must run again, in words; empty if its outcome is known."""
@@ -92,7 +92,7 @@ class Attempt:
         has_begun = header is not None and header.phase != Phase.SETUP
         seen = end in self.ends and has_begun
         self.ends.append(end)
-        if seen or len(self.ends) >= _ATTEMPTS:
+        if seen or len(self.ends) >= _MAX_ATTEMPTS:
             return ""
         return f"trial {self.spec.number} was ended by {signal_name(exit_code)} from outside, and is run again"
 
@@ -122,13 +122,13 @@ def died(spec: TrialSpec, scratch: Path, exit_code: int, agents: Mapping[str, st
     return _result(spec, scratch, header, Outcome.PROCESS_DIED, kind, message, exit_code, agents=agents)
 
 
-def result_of_death(attempt: Attempt, scratch: Path, exit_code: int) -> TrialResult:
+def result_of_death(attempt: TrialAttempt, scratch: Path, exit_code: int) -> TrialResult:
     """Return the result of a trial whose process died and that is not run again.
 
     The trial is invalid where its processes were killed from outside at different steps, and else as of `died`.
 
     Args:
-        attempt: the trial; `Attempt.again` has been called with this death.
+        attempt: the trial; `TrialAttempt.again` has been called with this death.
         scratch: the folder in which the trial records.
         exit_code: exit code of the process; negative for a signal.
     """
@@ -262,7 +262,7 @@ def agent_in_stack(stack: str, agents: Mapping[str, str]) -> str:
     """
     _, _, frames = stack.rpartition("\nCurrent thread ")
     for line in frames.split("\n\n", 1)[0].splitlines():
-        found = _FRAME.match(line)
+        found = _FRAME_LINE.match(line)
         if found is None:
             continue
         if found[1].startswith(str(layout.PACKAGE)):
@@ -292,7 +292,7 @@ def read_tail(path: Path) -> str:
     try:
         with path.open("rb") as file:
             file.seek(0, os.SEEK_END)
-            file.seek(max(0, file.tell() - _TAIL))
+            file.seek(max(0, file.tell() - _TAIL_BYTES))
             return file.read().decode("utf-8", "replace")
     except OSError:
         return ""
@@ -316,12 +316,12 @@ def signal_name(exit_code: int) -> str:
 
 KEY_BYTES = 16
 _HASH_BYTES = 16
-_HEAD = struct.Struct("<BxHI")  # of a record: tag, aux, length of its payload
+_RECORD_HEAD = struct.Struct("<BxHI")  # of a record: tag, aux, length of its payload
 _STEP_HEAD = struct.Struct("<qd")  # of the payload of a step: its number, and the simulation time in s
 _FIRST_ASIDE, _NOTES = 128, int(Tag.NOTES)
 _PROLOGUE, _STEP = int(Tag.PROLOGUE), int(Tag.STEP)
-_FAULTS = (Outcome.AGENT_ERROR, Outcome.SIMULATOR_ERROR, Outcome.INVALID)
-_SUPERVISED = (Outcome.PROCESS_DIED, Outcome.HANG)
+_REPORTED_FAULTS = (Outcome.AGENT_ERROR, Outcome.SIMULATOR_ERROR, Outcome.INVALID)
+_SUPERVISOR_OUTCOMES = (Outcome.PROCESS_DIED, Outcome.HANG)
 """Outcomes that the supervisor alone can see."""
 
 
@@ -412,21 +412,21 @@ def _fault_of(data: ErrorData) -> CrashhuntError:
 def _contradiction(result: TrialResult, spec: TrialSpec, steps: int, time_s: float, digest: str) -> str:
     """Return the first contradiction between a result and its recording; empty if there is none."""
     outcome = result.outcome
-    if outcome in _SUPERVISED:
+    if outcome in _SUPERVISOR_OUTCOMES:
         return f"a process cannot report {outcome} of itself"
-    if outcome in _FAULTS and result.failure is None:
+    if outcome in _REPORTED_FAULTS and result.failure is None:
         return f"it reports {outcome} and no reason"
     if outcome is Outcome.INVALID:
         return ""
     # An episode that broke off while its observers were called has no digest in its result.
-    if result.digest != digest and (result.digest or outcome not in _FAULTS):
+    if result.digest != digest and (result.digest or outcome not in _REPORTED_FAULTS):
         return f"it reports the digest {result.digest or 'none'}, and its recording has {digest}"
     if not max(result.steps, 0) <= steps <= result.steps + 1:
         return f"it reports {result.steps} steps, and its recording has {steps}"
     if result.steps > spec.max_steps or (outcome is Outcome.SURVIVED and result.steps != spec.max_steps):
         return f"it reports {outcome} after {result.steps} of {spec.max_steps} steps"
     same_time = result.sim_time_s == time_s or math.isnan(time_s)
-    if steps == result.steps and not same_time and outcome not in _FAULTS:
+    if steps == result.steps and not same_time and outcome not in _REPORTED_FAULTS:
         return f"it reports a simulation time of {result.sim_time_s} s, and its recording has {time_s} s"
     return ""
 
@@ -439,7 +439,7 @@ def _walk(records: bytes) -> tuple[int, float, list[memoryview]] | str:
     while offset < end:
         if offset + 8 > end:
             return "its recording is cut off"
-        tag, _, length = _HEAD.unpack_from(records, offset)
+        tag, _, length = _RECORD_HEAD.unpack_from(records, offset)
         start = offset + 8
         following = start + length + (-length & 7)
         if following > end:

@@ -13,7 +13,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.json_types import ErrorData, ErrorWords
-from crashhunt.plans import SizesItself, executor_of
+from crashhunt.plans import ChoosesParallelism, executor_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Answer",
+    "ChoosesParallelism",
     "Done",
     "Executor",
     "ExecutorFactory",
@@ -38,7 +39,6 @@ __all__ = [
     "Lost",
     "NodeFigures",
     "Notes",
-    "SizesItself",
     "ToForkServer",
     "has_fork_server",
     "make_executor",
@@ -120,7 +120,7 @@ class ExecutorFactory(Protocol):
 
     With ``--executor NAME:ARG``, it is called with ``argument=ARG`` as well; a factory without this argument need not
     accept it. If no trial can run, it raises a `CrashhuntError` with the fix before it has started anything. See also
-    `SizesItself`.
+    `ChoosesParallelism`.
     """
 
     def __call__(self, settings: WorkerSettings, *, parallel: int, recycle_after: int) -> Executor:
@@ -318,7 +318,7 @@ def run_trials(
 
 # The environment variables of every process that runs trials: fixed hashes, one thread a library, whose code.
 
-_KEPT_SNAPSHOTS = 16  # of which compiled code is kept; some 3 MB each
+_MAX_COMPILED_SNAPSHOTS = 16  # of which compiled code is kept; some 3 MB each
 
 
 def worker_environment() -> dict[str, str]:
@@ -373,7 +373,7 @@ def _compiled(settings: WorkerSettings) -> Path | None:
         others = sorted(cache.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
     except (OSError, RuntimeError, IndexError):  # a user without a home
         return None
-    for old in others[_KEPT_SNAPSHOTS:]:
+    for old in others[_MAX_COMPILED_SNAPSHOTS:]:
         with suppress(OSError):
             shutil.rmtree(old)
     return found

@@ -42,12 +42,12 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["Ended", "LostTrialError", "Supervisor", "UnfitZygoteError", "be_supervisor", "with_escape"]
+__all__ = ["EndedTrial", "LostTrialError", "Supervisor", "UnfitZygoteError", "be_supervisor", "with_escape"]
 
 
 _LOOK_EVERY_S = 0.1  # whether a trial hangs
-_RECEIVED = 1 << 16  # bytes at a time
-_LARGEST_OUTPUT = 64 << 20  # bytes of a run.log that are written again where an agent has removed the file
+_CHUNK_BYTES = 1 << 16  # bytes at a time
+_MAX_RESTORED_OUTPUT_BYTES = 64 << 20  # bytes of a run.log that are written again where an agent has removed the file
 
 
 class LostTrialError(Exception):
@@ -67,7 +67,7 @@ class UnfitZygoteError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class EndedTrial:
     """A trial that has ended.
 
     Args:
@@ -103,7 +103,7 @@ class Supervisor:
         self._folder: Path | None = None
         self._made = self._trials = 0
 
-    def run(self, spec: TrialSpec) -> Ended:
+    def run(self, spec: TrialSpec) -> EndedTrial:
         """Run a trial. Its scratch folder stays if the result says that it is kept.
 
         Raises:
@@ -135,7 +135,9 @@ class Supervisor:
             self._folder = None  # it belongs to the hunt now; the next trial gets another one
         return replace(ended, result=result, notices=notices)
 
-    def _judge(self, spec: TrialSpec, box: BlackBoxFile, key: bytes, said: FromZygote, *, was_killed: bool) -> Ended:
+    def _judge(
+        self, spec: TrialSpec, box: BlackBoxFile, key: bytes, said: FromZygote, *, was_killed: bool
+    ) -> EndedTrial:
         """Determine the result of a trial whose process has ended."""
         scratch, code, pid = self._settings.scratch, said["ended"], said["pid"]
         is_there = self._is_ours(scratch_of(scratch, spec.number))
@@ -144,25 +146,25 @@ class Supervisor:
         report = box.read_report(header) if header is not None else b""
         is_whole = box.is_reusable()
         if was_killed and not (code == 0 and report):
-            return Ended(hung(spec, scratch, self._settings.timeout_s))
+            return EndedTrial(hung(spec, scratch, self._settings.timeout_s))
         if not is_whole:
-            return Ended(self._damaged(spec, "its recording was truncated", recorded=False))
+            return EndedTrial(self._damaged(spec, "its recording was truncated", recorded=False))
         if header is None or header.trial != spec.number or not box.has(header):
-            return Ended(self._damaged(spec, "its recording was overwritten", recorded=False))
+            return EndedTrial(self._damaged(spec, "its recording was overwritten", recorded=False))
         if code == 0 and box.had_no_room:
             box.require_room()
             raise LostTrialError(-signal.SIGKILL)  # there is room again
         if not is_there and header.pid == os.getpid():  # another trial has deleted the folder before this one began
             raise LostTrialError(-signal.SIGKILL)
         if report is None:
-            return Ended(self._damaged(spec, "the process could not report the result, as it is damaged"))
+            return EndedTrial(self._damaged(spec, "the process could not report the result, as it is damaged"))
         if code != 0 or not report:
             if is_sent_from_outside(code):
                 raise LostTrialError(code)
-            return Ended(died(spec, scratch, code, self._modules()))
+            return EndedTrial(died(spec, scratch, code, self._modules()))
         found = check_report(report, key=key, spec=spec, header=header, records=box.read_records(header), pid=pid)
         if isinstance(found, str):
-            return Ended(self._damaged(spec, f"the process may not be believed: {found}"))
+            return EndedTrial(self._damaged(spec, f"the process may not be believed: {found}"))
         return self._keep(*found)
 
     def _modules(self) -> dict[str, str]:
@@ -178,7 +180,7 @@ class Supervisor:
         agent = agents[0] if len(agents) == 1 else ""
         return damaged(spec, self._settings.scratch, message, agent=agent, recorded=recorded)
 
-    def _keep(self, result: TrialResult, report: Report) -> Ended:
+    def _keep(self, result: TrialResult, report: Report) -> EndedTrial:
         """Write the files that a trial leaves for the hunt."""
         settings, folder = self._settings, scratch_of(self._settings.scratch, result.spec.number)
         kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
@@ -195,7 +197,7 @@ class Supervisor:
             if (responses := report.get("responses")) is not None:
                 (folder / layout.RESPONSES).write_text(json.dumps(responses), encoding="utf-8")
         result = replace(result, kept=kept, failure=failure)
-        return Ended(result, tuple(map(str, report["notices"])), report.get("braking"))
+        return EndedTrial(result, tuple(map(str, report["notices"])), report.get("braking"))
 
     def _write_map(self, text: str | None, kept: Path | None) -> None:
         """Write the map once for all trials; if an argument changes the map, write it for each kept trial."""
@@ -260,7 +262,7 @@ class Supervisor:
             if not ready:
                 return None
             try:
-                data = self._zygote.recv(_RECEIVED)
+                data = self._zygote.recv(_CHUNK_BYTES)
             except OSError:
                 data = b""
             if not data:
@@ -334,7 +336,7 @@ class Supervisor:
         assert self._box is not None
         self._box.copy_to(folder / layout.BLACK_BOX)
         for name, descriptor in ((layout.RUN_LOG, self._output), (layout.STACK, self._stack)):
-            (folder / name).write_bytes(os.pread(descriptor, _LARGEST_OUTPUT, 0))
+            (folder / name).write_bytes(os.pread(descriptor, _MAX_RESTORED_OUTPUT_BYTES, 0))
 
 
 def _remove(path: Path) -> None:
@@ -396,11 +398,11 @@ def _answer(supervisor: Supervisor, settings: WorkerSettings, spec: TrialSpec) -
 
 # Until when braking would have avoided a crash, found out by further trials in the same slot.
 
-_ATTEMPTS = 3  # of a trial whose process is killed from outside
-_FIRST_NUMBER = 1 << 40  # beyond the numbers of a hunt's trials: each trial has a folder by its number
+_MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside
+_FIRST_EXTRA_NUMBER = 1 << 40  # beyond the numbers of a hunt's trials: each trial has a folder by its number
 
 
-def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) -> TrialResult:
+def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: EndedTrial) -> TrialResult:
     """Return the result of a trial with its last escape, if the settings request it and it can be determined.
 
     Args:
@@ -417,13 +419,13 @@ def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) 
     if ended.braking is not None:
         how, deceleration = ended.braking["how"], ended.braking["deceleration"]
         braking = FullBraking(None, str(how), float(deceleration) if isinstance(deceleration, int | float) else None)
-    numbers = itertools.count(_FIRST_NUMBER + (os.getpid() << 16))
+    numbers = itertools.count(_FIRST_EXTRA_NUMBER + (os.getpid() << 16))
 
     def recording(number: int) -> Recording:
         return Recording(read_black_box(scratch_of(settings.scratch, number) / layout.BLACK_BOX))
 
     def run(spec: TrialSpec) -> tuple[TrialResult, Recording]:
-        for left in reversed(range(_ATTEMPTS)):
+        for left in reversed(range(_MAX_ATTEMPTS)):
             number = next(numbers)
             try:
                 done = supervisor.run(replace(spec, number=number)).result
@@ -445,5 +447,5 @@ def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) 
     except BundleError as error:
         return replace(result, escape=Escape(why_not=error.message))
     except LostTrialError as error:
-        why = f"the process that searched {describe_death(error.exit_code)}, {_ATTEMPTS} times"
+        why = f"the process that searched {describe_death(error.exit_code)}, {_MAX_ATTEMPTS} times"
         return replace(result, why_no_escape=why)

@@ -55,10 +55,10 @@ def has_hung(
 # A process imports the agents, and reports each module before it begins. Another process, without foreign code, keeps
 # an `ImportWatch`, as only that one is left to report when a module hangs or ends its process.
 
-_LONGEST = 200  # characters of a message; foreign code may write its own
-_MESSAGE = 1 << 12  # bytes
+_MAX_MESSAGE_CHARACTERS = 200  # characters of a message; foreign code may write its own
+_MAX_MESSAGE_BYTES = 1 << 12  # bytes
 _LOOK_EVERY_S = 0.02  # whether the process has died
-_LOOK = "see what the module does when it is imported"
+_IMPORT_FIX = "see what the module does when it is imported"
 
 
 class ImportKilledError(Exception):
@@ -92,7 +92,7 @@ class ImportWatch:
 
     def begin(self, importing: object) -> None:
         """Record the import that the process begins."""
-        self.importing = str(importing)[:_LONGEST]
+        self.importing = str(importing)[:_MAX_MESSAGE_CHARACTERS]
 
     @property
     def has_hung(self) -> bool:
@@ -103,7 +103,7 @@ class ImportWatch:
         """Return the error of an import that takes too long."""
         return CrashhuntError(
             f"{self.importing}: it takes more than {self._limit_s:g} s",
-            fix=f"{_LOOK}, or give it more time with --timeout",
+            fix=f"{_IMPORT_FIX}, or give it more time with --timeout",
         )
 
 
@@ -118,7 +118,7 @@ def import_died(importing: str, exit_code: int, *, times: int = 1) -> CrashhuntE
     again = f", {times} times" if times > 1 else ""
     return CrashhuntError(
         f"{importing}: its process {describe_death(exit_code)} meanwhile{again}",
-        fix=f"{_LOOK}, or raise the limits on memory (ulimit -v) and processes (ulimit -u)",
+        fix=f"{_IMPORT_FIX}, or raise the limits on memory (ulimit -v) and processes (ulimit -u)",
     )
 
 
@@ -136,7 +136,7 @@ def await_imports(reports: socket.socket, pid: int, timeout_s: float) -> None:
     """
     watch = ImportWatch(timeout_s)
     while watch.importing:
-        if select.select([reports], [], [], _LOOK_EVERY_S)[0] and (data := reports.recv(_MESSAGE)):
+        if select.select([reports], [], [], _LOOK_EVERY_S)[0] and (data := reports.recv(_MAX_MESSAGE_BYTES)):
             with suppress(ValueError):  # foreign code may write there as well
                 watch.begin(json.loads(data))
         elif os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:

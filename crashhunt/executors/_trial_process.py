@@ -26,12 +26,12 @@ from crashhunt.episode import (
     BUDGET_BESIDE,
     Brancher,
     FirstCopy,
+    HandedOver,
     OnsetForcer,
     Parts,
     Prober,
     ReferenceDriver,
     Splitter,
-    TakingOver,
     has_users_code,
     internal_error,
     is_tampered,
@@ -41,7 +41,14 @@ from crashhunt.episode import (
 )
 from crashhunt.executors._postmortem import encode_report
 from crashhunt.recording import BlackBox
-from crashhunt.simulators import BrakesFully, HasMap, LeavesOut, ReadiesProcess, TellsNotices, Tidies
+from crashhunt.simulators import (
+    HasMap,
+    PreparesProcess,
+    ReportsNotices,
+    RestoresState,
+    SupportsExclusion,
+    SupportsFullBraking,
+)
 from crashhunt.trial import Outcome, TrialSpec
 
 if TYPE_CHECKING:
@@ -54,11 +61,11 @@ if TYPE_CHECKING:
     from crashhunt.simulators import Simulator
     from crashhunt.trial import TrialResult, Value
 
-__all__ = ["LEFT_OUT", "Job", "TrialProcess", "loaded"]
+__all__ = ["EXCLUDED_WORDS", "Job", "TrialProcess", "loaded"]
 
-LEFT_OUT = " are left out: "
+EXCLUDED_WORDS = " are left out: "
 """Text of a notice between "probes" or "branches" and the reason why they are disabled."""
-_FROM_HERE_ON = " are left out from here on: "
+_EXCLUDED_FROM_HERE_WORDS = " are left out from here on: "
 
 # Bound here, before any agent is imported that could replace them.
 _dumps, _leave, _open, _dup2, _close = json.dumps, os._exit, os.open, os.dup2, os.close
@@ -122,9 +129,9 @@ class TrialProcess:
             self._parts = loaded(self._settings)
         if self._simulator is None:
             self._simulator = self._parts.simulator()
-            if supports(self._simulator, Tidies):
+            if supports(self._simulator, RestoresState):
                 self._simulator.tidy()
-            if supports(self._simulator, ReadiesProcess):
+            if supports(self._simulator, PreparesProcess):
                 self._simulator.ready_process()
                 ready_recorder(self._simulator)
         return self._simulator
@@ -210,7 +217,7 @@ class TrialProcess:
         block_signals()  # whose handlers are those of agents, and the episode is over
         for asks, what in self._asking:
             if asks.why_not:
-                self._notices.append(f"{what}{_FROM_HERE_ON}{asks.why_not}")
+                self._notices.append(f"{what}{_EXCLUDED_FROM_HERE_WORDS}{asks.why_not}")
         wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
         report = self._report(replace(result, wall_s=wall_s, setup_s=setup_s), simulator, job)
         box.report(encode_report(report, bytes.fromhex(job["key"]), result.digest, dumps=_dumps))
@@ -249,17 +256,17 @@ class TrialProcess:
         data: dict[str, object] = {**result.to_json()}
         del data["spec"]  # which the supervisor knows
         report: Report = {"result": data, "notices": self._notices}
-        report["notices"] += simulator.notices if supports(simulator, TellsNotices) else ()
+        report["notices"] += simulator.notices if supports(simulator, ReportsNotices) else ()
         kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
         kept = kept or settings.is_audited(result)
         wants_map = (kept or job["wants_map"]) and result.outcome is not Outcome.INVALID
         if wants_map and supports(simulator, HasMap):
             report["map"] = _dumps([[lane.id, lane.width, lane.shape] for lane in simulator.lanes()])
-        if kept and result.spec.only is not None and supports(simulator, LeavesOut):
+        if kept and result.spec.only is not None and supports(simulator, SupportsExclusion):
             report["entered"] = list(simulator.entered)
         if kept and self._reference is not None:
             report["responses"] = self._reference.responses
-        if settings.find_escapes and result.collision is not None and supports(simulator, BrakesFully):
+        if settings.find_escapes and result.collision is not None and supports(simulator, SupportsFullBraking):
             braking = simulator.full_braking(result.collision.agent)
             said: dict[str, object] | None = None
             if braking is not None:
@@ -290,7 +297,7 @@ class TrialProcess:
     def _cannot_copy(self, why_not: str) -> None:
         for asks, what in self._asking:
             asks.stop(why_not)
-            self._notices.append(f"{what}{LEFT_OUT}{why_not}")
+            self._notices.append(f"{what}{EXCLUDED_WORDS}{why_not}")
         self._asking = ()
 
     def _delay(self, wall_s: float) -> None:
@@ -308,7 +315,7 @@ class TrialProcess:
         assert self._parts is not None
         made = self._parts.agent(agent, simulator, arguments)
         if spec.handover is not None and spec.handover.agent == agent:
-            made = TakingOver(made, spec.handover)
+            made = HandedOver(made, spec.handover)
         if spec.overruled is not None and spec.overruled.agent == agent:
             made = overruled_agent(made, simulator, spec.overruled)
             self._reference = made if isinstance(made, ReferenceDriver) else None

@@ -47,15 +47,15 @@ __all__ = ["Imported", "WarmTraffics", "be_zygote", "import_nothing", "import_pa
 # The zygote of a slot keeps some such processes suspended. A trial with the same seed and scenario arguments runs in a
 # fork of one of them, with the random generators as the reset left them: nothing in its digest shows the difference.
 
-_RECEIVED = 1 << 16  # bytes at a time
-_WORTH_S = 0.02  # a fork of a fork costs some ten milliseconds, half of them for its end
-_STALE = 8  # a copy makes room after this many trials per copy without one in its traffic
+_CHUNK_BYTES = 1 << 16  # bytes at a time
+_MIN_WARM_UP_S = 0.02  # a fork of a fork costs some ten milliseconds, half of them for its end
+_TRIALS_UNTIL_STALE = 8  # a copy makes room after this many trials per copy without one in its traffic
 
 # Bound here, before any agent is imported that could replace them.
 _dumps, _loads, _write = json.dumps, json.loads, os.write
 
 
-class _Said(TypedDict, total=False):
+class _Answer(TypedDict, total=False):
     """A report of a suspended process: the duration of its reset, its failure, or the end of a trial's process."""
 
     took_s: float
@@ -73,7 +73,7 @@ class WarmTraffics:
         worth_s: least wall time of a warm-up for which a process is kept, in s.
     """
 
-    def __init__(self, limit: int, notify: Callable[[str], None], *, worth_s: float = _WORTH_S) -> None:
+    def __init__(self, limit: int, notify: Callable[[str], None], *, worth_s: float = _MIN_WARM_UP_S) -> None:
         self._worth_s = worth_s
         self._limit = limit
         self._notify = notify
@@ -111,7 +111,7 @@ class WarmTraffics:
             return None
         self._trials += 1
         spec = TrialSpec.from_json(job["spec"])
-        key = _key(spec)
+        key = _traffic_key(spec)
         found = self._suspended.get(key) or self._make(key, spec, wait)
         if found is None:
             return None
@@ -171,7 +171,7 @@ class WarmTraffics:
             return True
         key, oldest = next(iter(self._suspended.items()))
         # Where trials take turns in more traffics than there are copies, the oldest one is the next to be used.
-        if self._trials - oldest.used < _STALE * self._limit:
+        if self._trials - oldest.used < _TRIALS_UNTIL_STALE * self._limit:
             return False
         self._drop(key)
         return True
@@ -193,7 +193,7 @@ class _Suspended:
     says: int
     used: int
 
-    def ask(self, text: bytes, wait: Wait) -> _Said | None:
+    def ask(self, text: bytes, wait: Wait) -> _Answer | None:
         """Return the answer of the process; None if it has ended."""
         try:
             while text:
@@ -203,11 +203,11 @@ class _Suspended:
         received = bytearray()
         while not received.endswith(b"\n"):
             wait(self.says, self._kill)
-            data = os.read(self.says, _RECEIVED)
+            data = os.read(self.says, _CHUNK_BYTES)
             if not data:
                 return None
             received += data
-        said: _Said = _loads(received)
+        said: _Answer = _loads(received)
         return said
 
     def _kill(self) -> None:
@@ -238,9 +238,9 @@ def _be_suspended(wakes: int, says: int, trial: TrialProcess, simulator: Simulat
         seed_everything(spec.seed)
         begun = simulator.reset(seed=spec.seed, options=options_of(spec, simulator))
     except BaseException:  # the trial itself will report it
-        _say(says, {})
+        _report(says, {})
         return
-    _say(says, {"took_s": time.monotonic() - began})
+    _report(says, {"took_s": time.monotonic() - began})
     drawn = generators()
 
     def again(**_given: object) -> tuple[Observations, Info]:
@@ -252,27 +252,27 @@ def _be_suspended(wakes: int, says: int, trial: TrialProcess, simulator: Simulat
             try:
                 pid = forks.fork(partial(_run, trial, line, again), forks.held())
             except forks.CannotForkError as error:
-                _say(says, {"unfit": error.message})
+                _report(says, {"unfit": error.message})
                 continue
             code = forks.ended(pid)
             end_descendants()
             if supports(simulator, CountsSetUp):
                 simulator.setup_steps = 0  # they have been counted, with the first trial
-            _say(says, {"pid": pid, "ended": code})
+            _report(says, {"pid": pid, "ended": code})
 
 
 def _run(trial: TrialProcess, line: bytes, again: Callable[..., tuple[Observations, Info]]) -> None:
     trial.run(_loads(line), again)
 
 
-def _say(says: int, said: _Said) -> None:
+def _report(says: int, said: _Answer) -> None:
     text = _dumps(said).encode() + b"\n"
     with suppress(BrokenPipeError):
         while text:
             text = text[_write(says, text) :]
 
 
-def _key(spec: TrialSpec) -> str:
+def _traffic_key(spec: TrialSpec) -> str:
     """Return the key of a trial's traffic: its seed and the scenario's arguments."""
     script = None if spec.script is None else spec.script.to_json()
     return json.dumps([spec.seed, dict(spec.scenario_arguments), spec.only, script], sort_keys=True)
@@ -294,7 +294,7 @@ class Imported:
     makes_simulator: bool
 
 
-_EACH_ITSELF: Final = Imported(None, makes_simulator=False)
+_NOTHING_IMPORTED: Final = Imported(None, makes_simulator=False)
 
 
 def import_parts(settings: WorkerSettings, report: Callable[[str], None]) -> Imported | None:
@@ -327,7 +327,7 @@ def import_nothing(settings: WorkerSettings) -> Imported:
     """
     if settings.scenario.simulator in registered("simulators"):
         locate("simulators", settings.scenario.simulator)
-    return _EACH_ITSELF
+    return _NOTHING_IMPORTED
 
 
 def _is_forkable_with(parts: Parts) -> bool:
@@ -394,13 +394,13 @@ class _Zygote:
                 if self._warm is not None:
                     self._warm.prepare(self._trial, simulator)
         except BaseException as error:
-            self._say(_why_not(error))
+            self._report(_why_not(error))
             return
         self._staged = self._changed_at()
         if remaining := self._trial.record_shared_state(self._control.fileno()):
             self._notices.append(f"trials are not wholly apart: a module shares {remaining} with every one of them")
         gc.freeze()  # a collection in a fork would copy the page of every object
-        self._say({"ready": os.getpid()})
+        self._report({"ready": os.getpid()})
         while (message := self._next()) is not None:
             if "spec" in message:  # else it is about a trial that has ended meanwhile
                 pid, code = self._run(cast("Job", message))
@@ -408,7 +408,7 @@ class _Zygote:
                 if self._notices:
                     said["notices"] = self._notices[:]
                     self._notices.clear()
-                self._say(said)
+                self._report(said)
 
     def _changed_at(self) -> int:
         """When a file of the simulator was last added or removed, in ns; 0 if its folder is gone."""
@@ -469,7 +469,7 @@ class _Zygote:
         """Return the next message; None if the supervisor has ended."""
         while b"\n" not in self._received:
             try:
-                data = self._control.recv(_RECEIVED)
+                data = self._control.recv(_CHUNK_BYTES)
             except OSError:
                 data = b""
             if not data:
@@ -480,7 +480,7 @@ class _Zygote:
         message: Job | KillTrial = self._loads(line)
         return message
 
-    def _say(self, message: FromZygote) -> None:
+    def _report(self, message: FromZygote) -> None:
         with suppress(OSError):  # the supervisor is gone, which the next call sees
             self._control.sendall(self._dumps(message).encode() + b"\n")
 

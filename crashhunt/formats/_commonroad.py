@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.crashes import Bundle
-    from crashhunt.formats._recorded import Pose, Recorded, Road, Way
+    from crashhunt.formats._recorded import Pose, RecordedCrash, RecordedPath, Road
 
 __all__ = ["write_commonroad"]
 
@@ -26,7 +26,7 @@ _TYPES = {
     "tram": "train", "rail": "train", "rail_urban": "train", "rail_electric": "train", "rail_fast": "train",
     "subway": "train", "passenger": "car", "private": "car", "evehicle": "car", "hov": "car", "delivery": "car",
 }  # fmt: skip
-_NOWHERE = {"geoNameId": "-999", "gpsLatitude": "999", "gpsLongitude": "999"}  # how the format says "unknown"
+_UNKNOWN_LOCATION = {"geoNameId": "-999", "gpsLatitude": "999", "gpsLongitude": "999"}  # how the format says "unknown"
 
 
 def write_commonroad(bundle: Bundle, target: Path, *, with_agents: bool = False) -> dict[str, list[int]]:
@@ -71,7 +71,7 @@ def write_commonroad(bundle: Bundle, target: Path, *, with_agents: bool = False)
     return numbers
 
 
-def _root(recorded: Recorded) -> ET.Element:
+def _root(recorded: RecordedCrash) -> ET.Element:
     together = "C-" if len({way.path.actor.id for way in recorded.agents}) > 1 else ""
     root = ET.Element(
         "commonRoad",
@@ -86,7 +86,7 @@ def _root(recorded: Recorded) -> ET.Element:
         },
     )
     location = add(root, "location")
-    for tag, text in _NOWHERE.items():
+    for tag, text in _UNKNOWN_LOCATION.items():
         add(location, tag, text)
     tags = add(root, "scenarioTags")
     for tag in ("critical", "simulated"):
@@ -106,7 +106,7 @@ def _add_lanelet(root: ET.Element, index: int, road: Road) -> None:
     add(lanelet, "laneletType", "unknown")
 
 
-def _add_obstacle(root: ET.Element, index: int, way: Way) -> None:
+def _add_obstacle(root: ET.Element, index: int, way: RecordedPath) -> None:
     obstacle = add(root, "dynamicObstacle", id=str(index))
     actor = way.path.actor
     add(obstacle, "type", "pedestrian" if is_person(actor.id) else _type(actor.kind))
@@ -121,7 +121,7 @@ def _add_obstacle(root: ET.Element, index: int, way: Way) -> None:
             _add_state(trajectory, "state", pose)
 
 
-def _add_problem(root: ET.Element, index: int, way: Way, recorded: Recorded) -> None:
+def _add_problem(root: ET.Element, index: int, way: RecordedPath, recorded: RecordedCrash) -> None:
     problem = add(root, "planningProblem", id=str(index))
     first, *rest = way.poses
     state = _add_state(problem, "initialState", first)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.crashes import Bundle
-    from crashhunt.formats._recorded import Pose, Recorded, Road, Way
+    from crashhunt.formats._recorded import Pose, RecordedCrash, RecordedPath, Road
 
 
 __all__ = ["opendrive_of", "write_openscenario"]
@@ -25,10 +25,10 @@ __all__ = ["opendrive_of", "write_openscenario"]
 
 # The lanes of a crash as a road network in OpenDRIVE 1.6.
 
-_FLAT = {"b": "0", "c": "0", "d": "0"}  # of a polynomial that is a constant
+_CONSTANT_POLYNOMIAL = {"b": "0", "c": "0", "d": "0"}  # of a polynomial that is a constant
 
 
-def opendrive_of(recorded: Recorded) -> ET.Element:
+def opendrive_of(recorded: RecordedCrash) -> ET.Element:
     """Return the road network: each lane as a road with one lane, along its centre line, of straight pieces.
 
     Lengths are in m, headings in rad. A road is linked with its only successor, if that has no other
@@ -71,7 +71,7 @@ def _add_road(root: ET.Element, index: int, roads: tuple[Road, ...]) -> None:
 
 def _add_lane(lanes: ET.Element, road: Road, *, before: bool, after: bool) -> None:
     """Add the one lane, which lies to the right of a line half its width to the left."""
-    add(lanes, "laneOffset", s="0", a=number(road.width / 2), **_FLAT)
+    add(lanes, "laneOffset", s="0", a=number(road.width / 2), **_CONSTANT_POLYNOMIAL)
     section = add(lanes, "laneSection", s="0")
     add(add(section, "center"), "lane", id="0", type="none", level="false")
     lane = add(add(section, "right"), "lane", id="-1", type="driving", level="false")
@@ -79,7 +79,7 @@ def _add_lane(lanes: ET.Element, road: Road, *, before: bool, after: bool) -> No
     for tag, there in (("predecessor", before), ("successor", after)):
         if there:
             add(link, tag, id="-1")
-    add(lane, "width", sOffset="0", a=number(road.width), **_FLAT)
+    add(lane, "width", sOffset="0", a=number(road.width), **_CONSTANT_POLYNOMIAL)
 
 
 _CATEGORIES = {
@@ -89,7 +89,7 @@ _CATEGORIES = {
 }  # fmt: skip
 _NO_LIMIT = "100"  # of speed and acceleration, which the format wants: no limit may slow an actor on its recorded way
 _HEIGHT_M = 1.5  # where none was recorded
-_AXLES = 0.6  # of the length, from one axle to the other
+_AXLE_DISTANCE_SHARE = 0.6  # of the length, from one axle to the other
 
 
 def write_openscenario(bundle: Bundle, target: Path, *, with_agents: bool = False) -> dict[str, list[str]]:
@@ -147,7 +147,7 @@ def write_openscenario(bundle: Bundle, target: Path, *, with_agents: bool = Fals
     return names
 
 
-def _root(recorded: Recorded, roads: str) -> ET.Element:
+def _root(recorded: RecordedCrash, roads: str) -> ET.Element:
     root = ET.Element("OpenSCENARIO")
     add(
         root, "FileHeader", revMajor="1", revMinor="0", date=time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime()),
@@ -159,7 +159,7 @@ def _root(recorded: Recorded, roads: str) -> ET.Element:
     return root
 
 
-def _add_entity(entities: ET.Element, way: Way) -> None:
+def _add_entity(entities: ET.Element, way: RecordedPath) -> None:
     entity, actor = add(entities, "ScenarioObject", name=way.name), way.path.actor
     if is_person(actor.id) or actor.kind == "pedestrian":
         thing = add(entity, "Pedestrian", name=way.name, model=way.name, mass="80", pedestrianCategory="pedestrian")
@@ -173,7 +173,7 @@ def _add_entity(entities: ET.Element, way: Way) -> None:
         add(thing, "Performance", maxSpeed=_NO_LIMIT, maxAcceleration=_NO_LIMIT, maxDeceleration=_NO_LIMIT)
         axles = add(thing, "Axles")
         for tag, ahead in (
-            ("FrontAxle", _AXLES),
+            ("FrontAxle", _AXLE_DISTANCE_SHARE),
             ("RearAxle", 0.0),
         ):  # readers use the rear axle as the middle
             add(
@@ -183,7 +183,7 @@ def _add_entity(entities: ET.Element, way: Way) -> None:
     add(thing, "Properties")
 
 
-def _add_start(actions: ET.Element, way: Way) -> None:
+def _add_start(actions: ET.Element, way: RecordedPath) -> None:
     first = way.poses[0]
     if way.path.first:  # an actor that appears later is absent at first
         add(add(add(actions, "GlobalAction"), "EntityAction", entityRef=way.name), "DeleteEntityAction")
@@ -193,7 +193,7 @@ def _add_start(actions: ET.Element, way: Way) -> None:
     _add_speed(add(private, "PrivateAction"), first.speed)
 
 
-def _add_story(act: ET.Element, way: Way, recorded: Recorded, *, drives: bool) -> None:
+def _add_story(act: ET.Element, way: RecordedPath, recorded: RecordedCrash, *, drives: bool) -> None:
     group = add(act, "ManeuverGroup", name=way.name, maximumExecutionCount="1")
     add(add(group, "Actors", selectTriggeringEntities="false"), "EntityRef", entityRef=way.name)
     dt, path, poses = recorded.step_length_s, way.path, way.poses
@@ -214,7 +214,7 @@ def _add_story(act: ET.Element, way: Way, recorded: Recorded, *, drives: bool) -
         group.append(maneuver)
 
 
-def _add_of_entity(action: ET.Element, way: Way) -> ET.Element:
+def _add_of_entity(action: ET.Element, way: RecordedPath) -> ET.Element:
     return add(add(action, "GlobalAction"), "EntityAction", entityRef=way.name)
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.world import Path
 
-__all__ = ["Pose", "Recorded", "Road", "Way", "recorded_of"]
+__all__ = ["Pose", "RecordedCrash", "RecordedPath", "Road", "recorded_of"]
 
 _SAME_PLACE_M = 1e-3  # a lane continues where another begins: maps give such points to the centimetre, or better
 _SAME_WAY_RAD = math.pi / 3  # and in about its direction; a lane that only crosses there is another's
@@ -48,7 +48,7 @@ class Pose(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class RecordedPath:
     """The way of an actor while it was in sight; of one who came back, there are several.
 
     Args:
@@ -104,7 +104,7 @@ class Road:
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class RecordedCrash:
     """A crash for the export.
 
     Args:
@@ -121,12 +121,12 @@ class Recorded:
     number: int
     step_length_s: float
     steps: int
-    agents: tuple[Way, ...]
-    others: tuple[Way, ...]
+    agents: tuple[RecordedPath, ...]
+    others: tuple[RecordedPath, ...]
     roads: tuple[Road, ...]
 
 
-def recorded_of(bundle: Bundle) -> Recorded:
+def recorded_of(bundle: Bundle) -> RecordedCrash:
     """Return what of a crash can be handed on.
 
     Raises:
@@ -153,9 +153,9 @@ def recorded_of(bundle: Bundle) -> Recorded:
                     fix="export it without --as, because no other format can represent that",
                 )
     names = _names([*paths.agents, *paths.others])
-    ways = [Way(path, name) for path, name in zip((*paths.agents, *paths.others), names, strict=True)]
+    ways = [RecordedPath(path, name) for path, name in zip((*paths.agents, *paths.others), names, strict=True)]
     spec, count = bundle.result.spec, len(paths.agents)
-    return Recorded(
+    return RecordedCrash(
         title=f"{bundle.id}, trial {spec.number} with seed {spec.seed}: {bundle.result.outcome}",
         number=spec.number,
         step_length_s=recording.prologue.step_length_s,
@@ -180,7 +180,7 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 def _roads(lanes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> tuple[Road, ...]:
-    borders = [pair for pair in map(_without_doubles, lanes) if len(pair[0]) > 1]
+    borders = [pair for pair in map(_without_duplicates, lanes) if len(pair[0]) > 1]
     lines = [(right + left) / 2 for right, left in borders]
     starts = np.array([line[0] for line in lines]).reshape(-1, 2)
     into = [_direction(line[0], line[1]) for line in lines]
@@ -194,7 +194,7 @@ def _roads(lanes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> 
     return tuple(Road(*pair, *ends) for pair, *ends in zip(borders, after, before, strict=True))
 
 
-def _without_doubles(
+def _without_duplicates(
     lane: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the borders without points that are where the one before was: they have no direction."""

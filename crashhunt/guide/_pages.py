@@ -27,7 +27,7 @@ SECTIONS = {
 }
 """The folders of the guide with their titles, in reading order."""
 
-_ORDER = [
+_PAGE_ORDER = [
     "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed", "how-often-does-it-crash",
     "which-version-is-better", "cluster", "your-town", "from-a-map", "highway-env", "gymnasium", "learn-from-crashes",
     "ci", "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
@@ -41,10 +41,10 @@ _ORDER = [
 ]  # fmt: skip
 """Topics in reading order; all other topics follow them."""
 
-_FORMER = {"first-hunt": "find-a-crash"}
+_FORMER_PAGES = {"first-hunt": "find-a-crash"}
 """Topics that were renamed, and their present names: `crashhunt guide` still takes them."""
 
-_MADE = re.compile(r"^<!-- made from the code: (\w+) -->\n", re.MULTILINE)
+_GENERATED_MARK = re.compile(r"^<!-- made from the code: (\w+) -->\n", re.MULTILINE)
 _COMMENT = re.compile(r"<!--.*?-->\n*", re.DOTALL)
 _PICTURE = re.compile(r"!\[([^\]]*)\]\([^)]*\)")
 _LINK = re.compile(r"\[([^\]]+)\]\((?!\w+:)([^)#]*)(?:#[^)]*)?\)")
@@ -87,7 +87,8 @@ def list_pages() -> list[Page]:
     for section in SECTIONS:
         files = [file for file in (pages_folder() / section).glob("*.md") if file.stem != "index"]
         found += [
-            Page(topic=file.stem, section=section, title=_title(file), file=file) for file in sorted(files, key=_place)
+            Page(topic=file.stem, section=section, title=_title(file), file=file)
+            for file in sorted(files, key=_section_of)
         ]
     return found
 
@@ -99,7 +100,7 @@ def find_page(topic: str) -> Page:
         UsageError: there is none.
     """
     pages = {page.topic: page for page in list_pages()}
-    topic = _FORMER.get(topic, topic)
+    topic = _FORMER_PAGES.get(topic, topic)
     if topic not in pages:
         raise UsageError(f"the guide has no topic {topic!r}", fix=one_of(topic, pages))
     return pages[topic]
@@ -120,7 +121,7 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
         "modules": describe_modules,
     }
     # Remove the text that follows a placeholder for readers of the raw file, up to the next blank line.
-    return re.sub(_MADE.pattern + r"(?:.+\n)*", lambda found: makers[found[1]](), text, flags=re.MULTILINE)
+    return re.sub(_GENERATED_MARK.pattern + r"(?:.+\n)*", lambda found: makers[found[1]](), text, flags=re.MULTILINE)
 
 
 def for_terminal(text: str) -> str:
@@ -128,17 +129,17 @@ def for_terminal(text: str) -> str:
     parts = _FENCED.split(text)
     for number in range(0, len(parts), 2):  # what is between the fences is shown as it is
         prose = _PICTURE.sub(lambda found: f"(picture: {' '.join(found[1].split())})", parts[number])
-        parts[number] = _LINK.sub(_said, _COMMENT.sub("", prose))
+        parts[number] = _LINK.sub(_description_of, _COMMENT.sub("", prose))
     return "".join(parts)
 
 
-def _said(found: re.Match[str]) -> str:
+def _description_of(found: re.Match[str]) -> str:
     file = Path(found[2])
     return f"{found[1]} (`crashhunt guide {file.stem}`)" if file.suffix == ".md" else found[1]
 
 
-def _place(file: Path) -> tuple[int, str]:
-    return (_ORDER.index(file.stem) if file.stem in _ORDER else len(_ORDER)), file.stem
+def _section_of(file: Path) -> tuple[int, str]:
+    return (_PAGE_ORDER.index(file.stem) if file.stem in _PAGE_ORDER else len(_PAGE_ORDER)), file.stem
 
 
 def _title(file: Path) -> str:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["as_markdown", "definition", "describe_api", "describe_commands", "describe_keys", "describe_modules"]
 
 
-_OFFERED = {
+_PUBLIC_MODULES = {
     "crashhunt": "",
     "crashhunt.hunts": "HuntReport HuntResults SuiteResults",
     "crashhunt.crashes": "Bundle",
@@ -47,19 +47,19 @@ _OFFERED = {
 """The modules that users import, and what of each is for them; empty for everything."""
 
 _SECTION = re.compile(r"^(Args|Attributes|Example|Returns|Yields|Raises):$")
-_WORDS = {name: name for name in ("Attributes", "Returns", "Yields", "Raises")} | {"Args": "Arguments"}
+_SECTION_TITLES = {name: name for name in ("Attributes", "Returns", "Yields", "Raises")} | {"Args": "Arguments"}
 _Definition = ast.ClassDef | ast.FunctionDef
 
 
 def describe_api() -> str:
     """Return what users import, with signatures and docstrings, as Markdown."""
-    return "\n".join(line for module, names in _OFFERED.items() for line in _module(module, names.split()))
+    return "\n".join(line for module, names in _PUBLIC_MODULES.items() for line in _module(module, names.split()))
 
 
 def _module(name: str, names: list[str]) -> Iterator[str]:
     yield f"## {name}\n"
     yield from _docstring(ast.get_docstring(_parsed(name)))
-    for public in names or sorted(_door(name), key=str.lower):
+    for public in names or sorted(_public_names(name), key=str.lower):
         found = definition(name, public)
         if found is not None:
             yield from _described(f"{name}.{public}", found)
@@ -70,9 +70,9 @@ def _module(name: str, names: list[str]) -> Iterator[str]:
 def _described(name: str, found: _Definition) -> Iterator[str]:
     yield f"### {name}\n"
     if any("called_with" in ast.unparse(decorator) for decorator in found.decorator_list):
-        made, text = _asked(name)
+        made, text = _signature_and_docstring(name)
     else:
-        made = _signature(found) if isinstance(found, ast.FunctionDef) else _made_with(found)
+        made = _signature(found) if isinstance(found, ast.FunctionDef) else _constructor(found)
         text = ast.get_docstring(found)
     if made:
         yield f"```python\n{found.name}{made}\n```\n"
@@ -83,7 +83,7 @@ def _described(name: str, found: _Definition) -> Iterator[str]:
         yield from _methods(found)
 
 
-def _asked(name: str) -> tuple[str, str | None]:
+def _signature_and_docstring(name: str) -> tuple[str, str | None]:
     """Signature and docstring as the function itself has them."""
     module, _, attribute = name.rpartition(".")
     function = getattr(importlib.import_module(module), attribute)
@@ -92,7 +92,7 @@ def _asked(name: str) -> tuple[str, str | None]:
     for parameter in known.parameters.values():
         if parameter.kind is parameter.KEYWORD_ONLY and "*" not in parts:
             parts.append("*")
-        default = "" if parameter.default is parameter.empty else f" = {_value(parameter.default)}"
+        default = "" if parameter.default is parameter.empty else f" = {_default_text(parameter.default)}"
         parts.append(f"{parameter.name}: {_type(parameter.annotation)}{default}")
     return f"{_call(parts)} -> {_type(known.return_annotation)}", inspect.getdoc(function)
 
@@ -102,7 +102,7 @@ def _type(annotation: object) -> str:
     return re.sub(r"\b(collections\.abc|pathlib|typing)\.", "", said)
 
 
-def _value(value: object) -> str:
+def _default_text(value: object) -> str:
     """Return a default value as source text; members of an enumeration become their values."""
     return re.sub(r"<\w+\.\w+: ('\w+')>", r"\1", repr(value))
 
@@ -128,7 +128,7 @@ def _methods(found: ast.ClassDef) -> Iterator[str]:
             yield from _docstring(ast.get_docstring(method))
 
 
-def _made_with(found: ast.ClassDef) -> str:
+def _constructor(found: ast.ClassDef) -> str:
     """Return the signature of the constructor; empty for protocols, errors and enumerations."""
     for method in found.body:
         if isinstance(method, ast.FunctionDef) and method.name == "__init__":
@@ -155,12 +155,12 @@ def _signature(function: ast.FunctionDef, *, bound: bool = False) -> str:
     given = function.args
     if bound:
         given = ast.arguments(**{name: getattr(given, name) for name in given._fields} | {"args": given.args[1:]})
-    parts = _parts(given)
+    parts = _parameters(given)
     answer = f" -> {ast.unparse(function.returns)}" if function.returns else ""
     return _call(parts) + answer
 
 
-def _parts(given: ast.arguments) -> list[str]:
+def _parameters(given: ast.arguments) -> list[str]:
     """The parameters, as they are written."""
     plain = [*given.posonlyargs, *given.args]
     defaults = [None] * (len(plain) - len(given.defaults)) + list(given.defaults)
@@ -199,7 +199,7 @@ def _docstring(text: str | None) -> Iterator[str]:
                 yield "```\n"
             section = begun[1] if begun else ""
         if begun:
-            yield "```python" if section == "Example" else f"*{_WORDS[section]}*:\n"
+            yield "```python" if section == "Example" else f"*{_SECTION_TITLES[section]}*:\n"
         elif section == "Example":
             yield line[4:]
         elif section:
@@ -220,7 +220,7 @@ def _prose(line: str) -> str:
     return re.sub(r"``([^`]+)``", r"`\1`", re.sub(r"^::$|:(?=:$)", "", line))
 
 
-def _door(module: str) -> dict[str, tuple[str, str]]:
+def _public_names(module: str) -> dict[str, tuple[str, str]]:
     """Return the public names of a module, each with the module and the name of its definition."""
     stub = _file(module).with_suffix(".pyi")
     tree = ast.parse(stub.read_text(encoding="utf-8")) if stub.is_file() else _parsed(module)
@@ -230,7 +230,7 @@ def _door(module: str) -> dict[str, tuple[str, str]]:
             origin = f"{module}.{node.module}" if node.level else str(node.module)
             for alias in node.names:
                 if alias.name == "*":
-                    found |= _door(origin)
+                    found |= _public_names(origin)
                 elif origin.startswith("crashhunt"):
                     found[alias.asname or alias.name] = origin, alias.name
     found |= {node.name: (module, node.name) for node in tree.body if isinstance(node, _Definition)}
@@ -248,7 +248,7 @@ def _listed(tree: ast.Module) -> list[str] | None:
 
 def definition(module: str, name: str) -> _Definition | None:
     """The class or function behind a name, wherever it is defined; None for anything else."""
-    origin, known = _door(module).get(name, (module, name))
+    origin, known = _public_names(module).get(name, (module, name))
     if (origin, known) != (module, name):
         return definition(origin, known)
     return next((node for node in _parsed(module).body if isinstance(node, _Definition) and node.name == name), None)
@@ -338,7 +338,7 @@ def _commands(parser: argparse.ArgumentParser) -> Iterator[tuple[argparse.Argume
 
 
 def _command(command: argparse.ArgumentParser) -> Iterator[str]:
-    places = " ".join(_place(action) for action in command._actions if not action.option_strings)
+    places = " ".join(_group_of(action) for action in command._actions if not action.option_strings)
     yield f"## {command.prog}\n"
     yield f"`{command.prog}{' ' if places else ''}{places}`\n"
     yield f"{_plain(command.description)}\n"
@@ -348,18 +348,18 @@ def _command(command: argparse.ArgumentParser) -> Iterator[str]:
             continue
         if group.title not in ("positional arguments", "options"):
             yield f"*{_plain(group.title)}*" + (f": {_plain(group.description)}" if group.description else "") + "\n"
-        yield from (f"- `{_written(action)}`: {_plain(_expanded(command, action))}" for action in actions)
+        yield from (f"- `{_option_text(action)}`: {_plain(_expanded(command, action))}" for action in actions)
         yield ""
     if command.epilog:
         yield f"```text\n{command.epilog.strip()}\n```\n"
 
 
-def _place(action: argparse.Action) -> str:
+def _group_of(action: argparse.Action) -> str:
     name = str(action.metavar or action.dest)
     return {"?": f"[{name}]", "+": f"{name} [{name} ...]", "*": f"[{name} ...]"}.get(str(action.nargs), name)
 
 
-def _written(action: argparse.Action) -> str:
+def _option_text(action: argparse.Action) -> str:
     if not action.option_strings:
         return str(action.metavar or action.dest)
     value = ""
@@ -381,8 +381,8 @@ def _plain(text: str | None) -> str:
 
 # The list of all modules with what each is about, made from what it says first of itself.
 
-_ROOT = Path(__file__).parents[1]
-_SAID = {
+_PACKAGE_FOLDER = Path(__file__).parents[1]
+_SUBJECTS = {
     ".py": re.compile(r'\A"""(.+?)(?:\n\n|""")', re.DOTALL),
     ".cpp": re.compile(r"\A// (.+?)\n"),
     ".hpp": re.compile(r"\A// (.+?)\n"),
@@ -400,24 +400,24 @@ def describe_modules() -> str:
 
 def _lines() -> Iterator[str]:
     yield "## crashhunt\n"
-    yield from _members(_ROOT)
-    for door in sorted(_ROOT.rglob("*/__init__.py")):
+    yield from _members(_PACKAGE_FOLDER)
+    for door in sorted(_PACKAGE_FOLDER.rglob("*/__init__.py")):
         folder = door.parent
-        yield f"\n## {folder.relative_to(_ROOT.parent).as_posix()}\n"
-        yield f"{_said(door)}\n"
+        yield f"\n## {folder.relative_to(_PACKAGE_FOLDER.parent).as_posix()}\n"
+        yield f"{_subject_of(door)}\n"
         yield from _members(folder)
 
 
 def _members(folder: Path) -> Iterator[str]:
     for file in sorted(folder.iterdir()):
-        if file.suffix in _SAID and file.name != "__init__.py":
-            yield f"- `{file.name}`: {_said(file)}"
+        if file.suffix in _SUBJECTS and file.name != "__init__.py":
+            yield f"- `{file.name}`: {_subject_of(file)}"
         elif file.is_dir() and not (file / "__init__.py").exists():  # pages and scripts, which are no package
             yield from (line.replace("- `", f"- `{file.name}/", 1) for line in _members(file))
 
 
-def _said(file: Path) -> str:
-    found = _SAID[file.suffix].match(file.read_text(encoding="utf-8"))
+def _subject_of(file: Path) -> str:
+    found = _SUBJECTS[file.suffix].match(file.read_text(encoding="utf-8"))
     if found is None:
         raise LookupError(f"{file} does not begin with a docstring")
     return " ".join(found[1].replace("``", "`").split())

@@ -12,7 +12,7 @@ from crashhunt.base.codec import JsonObject
 from crashhunt.base.json_types import ErrorData, Plain
 from crashhunt.base.schemas import json_schema
 from crashhunt.crashes import CrashSummary, Ending, JudgementVerdict, Reference, Verdict as FaultVerdict, Why
-from crashhunt.hunts import AuditReport, Finding, HuntState, StoppedBecause
+from crashhunt.hunts import AuditReport, CheckFinding, HuntState, StoppedBecause
 from crashhunt.ledger import KindData
 from crashhunt.rates import PairVerdict
 from crashhunt.replays import Code, Verdict
@@ -22,7 +22,7 @@ from crashhunt.whatif import Counts
 
 __all__ = ["SCHEMAS", "describe_schemas"]
 
-_NAMES = {
+_PUBLIC_NAMES = {
     "Code": Code,
     "Verdict": Verdict,
     "Kind": Kind,
@@ -213,7 +213,7 @@ class CheckedHunt(TypedDict):
     damaged_trials: list[int]
     crashes: list[str]
     damaged_crashes: list[str]
-    findings: list[Finding]
+    findings: list[CheckFinding]
 
 
 class Salvaged(TypedDict):
@@ -748,6 +748,7 @@ SCHEMAS: dict[str, Any] = {
 def describe_schemas() -> dict[str, str]:
     """Return the text of each schema file, by its name without the suffix."""
     return {
-        name: json.dumps(json_schema(kind, f"crashhunt {name.replace('-', ' ')} --json", _NAMES), indent=1) + "\n"
+        name: json.dumps(json_schema(kind, f"crashhunt {name.replace('-', ' ')} --json", _PUBLIC_NAMES), indent=1)
+        + "\n"
         for name, kind in SCHEMAS.items()
     }

@@ -1,4 +1,4 @@
-from ._check import Checked as Checked, Finding as Finding, check as check, salvage as salvage
+from ._check import Checked as Checked, CheckFinding as CheckFinding, check as check, salvage as salvage
 from ._crashes import (
     CrashTally as CrashTally,
     FoundCrashes as FoundCrashes,
@@ -25,9 +25,9 @@ from ._results import (
     FACTS as FACTS,
     Cell as Cell,
     HuntResults as HuntResults,
+    IncompleteHuntWarning as IncompleteHuntWarning,
     SuiteResults as SuiteResults,
     TrialRow as TrialRow,
-    UnfinishedWarning as UnfinishedWarning,
     columns_of as columns_of,
     load as load,
     write_parquet as write_parquet,

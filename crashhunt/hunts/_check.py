@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Row
 
 
-__all__ = ["Checked", "Finding", "check", "intact_snapshots", "salvage"]
+__all__ = ["CheckFinding", "Checked", "check", "intact_snapshots", "salvage"]
 
 
-_SHOWN = 5
+_MAX_SHOWN = 5
 _SCRATCH = ".scratch"  # of a hunt, which does not run where its leftovers are looked for
 
 
 @dataclass(frozen=True, slots=True)
-class Finding(Serializable):
+class CheckFinding(Serializable):
     """A problem that the check has found.
 
     Args:
@@ -76,7 +76,7 @@ class Checked:
     damaged_trials: set[int] = field(default_factory=set)
     crashes: list[str] = field(default_factory=list)
     damaged_crashes: list[str] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
+    findings: list[CheckFinding] = field(default_factory=list)
     dropped: set[int] = field(default_factory=set)
 
     @property
@@ -138,10 +138,12 @@ def _check_file(path: Path) -> Checked:
             found.findings += inside.findings
             if not inside.crashes and not inside.damaged_crashes:
                 found.findings.append(
-                    Finding(where=str(path), what="there is no crash in it", lost="the crash", fix="export it again")
+                    CheckFinding(
+                        where=str(path), what="there is no crash in it", lost="the crash", fix="export it again"
+                    )
                 )
     except BundleError as error:
-        found.findings.append(Finding(where=str(path), what=error.message, lost="the crash", fix=error.fix))
+        found.findings.append(CheckFinding(where=str(path), what=error.message, lost="the crash", fix=error.fix))
     return found
 
 
@@ -162,7 +164,7 @@ def _check_settings(found: Checked, hunt: Path) -> HuntSettings | None:
     except HuntDirectoryError as error:
         lost = "what the hunt was asked"
         fix = "copy the hunt.toml of a snapshot there"
-        found.findings.append(Finding(where=str(hunt / layout.HUNT), what=error.message, lost=lost, fix=fix))
+        found.findings.append(CheckFinding(where=str(hunt / layout.HUNT), what=error.message, lost=lost, fix=fix))
     for snapshot in intact_snapshots(hunt):
         with suppress(CrashhuntError):
             return snapshot.settings()
@@ -179,7 +181,7 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
     if not has_begun(path):
         if (hunt / layout.CRASHES).is_dir() and not (hunt / layout.CASE).is_file():
             found.findings.append(
-                Finding(where=str(path), what="is missing", lost="all trials but the crashes", fix=_GO_ON)
+                CheckFinding(where=str(path), what="is missing", lost="all trials but the crashes", fix=_RESUME_FIX)
             )
         return None
     try:
@@ -187,10 +189,10 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
             found.protected = ledger.protected
             if not ledger.protected:
                 note = "an earlier crashhunt wrote it, and its rows have no digests: not every change would be seen"
-                found.findings.append(Finding(str(path), note, damaged=False))
+                found.findings.append(CheckFinding(str(path), note, damaged=False))
             elif not ledger.sealed and hunt_state(hunt).state != "running":
                 note = "its writer was killed; a missing trial would not be detected"
-                found.findings.append(Finding(str(path), note, damaged=False))
+                found.findings.append(CheckFinding(str(path), note, damaged=False))
             try:
                 _read_everything(ledger)
                 found.trials = ledger.finished()
@@ -205,12 +207,12 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
             return {number: TrialResult.from_json(json.loads(text)) for number, text in crashes.items()}
     except HuntDirectoryError as error:
         found.findings.append(
-            Finding(where=str(path), what=error.message, lost="all trials but the crashes", fix=_GO_ON)
+            CheckFinding(where=str(path), what=error.message, lost="all trials but the crashes", fix=_RESUME_FIX)
         )
         return None
 
 
-_GO_ON = "crashhunt check --salvage TO copies the intact part, and the same hunt resumes there"
+_RESUME_FIX = "crashhunt check --salvage TO copies the intact part, and the same hunt resumes there"
 
 
 def _read_everything(ledger: Ledger) -> None:
@@ -228,11 +230,13 @@ def _count_rows(found: Checked, ledger: Ledger, settings: HuntSettings | None, e
         most = max(most, 1 + max(ledger.finished(), default=-1))
     for number, row in ledger.intact_rows(range(most)):
         (found.trials if row is not None else found.damaged_trials).add(number)
-    shown = ", ".join(str(number) for number in sorted(found.damaged_trials)[:_SHOWN])
-    more = len(found.damaged_trials) - _SHOWN
+    shown = ", ".join(str(number) for number in sorted(found.damaged_trials)[:_MAX_SHOWN])
+    more = len(found.damaged_trials) - _MAX_SHOWN
     lost = f"trials {shown}{f' and {more} more' if more > 0 else ''}" if shown else ""
     found.findings.append(
-        Finding(where=error.where, what=error.message.removeprefix("the ledger is damaged: "), lost=lost, fix=_GO_ON)
+        CheckFinding(
+            where=error.where, what=error.message.removeprefix("the ledger is damaged: "), lost=lost, fix=_RESUME_FIX
+        )
     )
 
 
@@ -250,7 +254,7 @@ def _check_parts(found: Checked, hunt: Path) -> dict[str, Bundle]:
         _check_snapshot(found, hunt / layout.SNAPSHOTS / name, needed.get(name, ""))
     for folder in sorted((hunt / layout.TRIALS).glob(layout.SHOWN)):
         for fault in read_params(folder):
-            found.findings.append(Finding(str(folder), fault, "what the trial printed"))
+            found.findings.append(CheckFinding(str(folder), fault, "what the trial printed"))
     return bundles
 
 
@@ -261,16 +265,18 @@ def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
         bundle.recording()
     except CrashhuntError as error:
         found.findings.append(
-            Finding(where=error.where or str(folder), what=error.message, lost=f"the crash {folder.name}", fix=_AGAIN)
+            CheckFinding(
+                where=error.where or str(folder), what=error.message, lost=f"the crash {folder.name}", fix=_RERUN_FIX
+            )
         )
         found.damaged_crashes.append(folder.name)
         return None
     if not bundle.files:
         note = "an earlier crashhunt wrote it, without digests: not every change would be seen"
-        found.findings.append(Finding(str(folder / layout.CRASH), note, damaged=False))
+        found.findings.append(CheckFinding(str(folder / layout.CRASH), note, damaged=False))
     for fault in faults:
         added = fault.endswith("was not there")
-        found.findings.append(Finding(str(folder), fault, "" if added else "that file", damaged=not added))
+        found.findings.append(CheckFinding(str(folder), fault, "" if added else "that file", damaged=not added))
     if any(not fault.endswith("was not there") for fault in faults):
         found.damaged_crashes.append(folder.name)
     else:
@@ -295,7 +301,7 @@ def _check_other_bundles(found: Checked, hunt: Path) -> list[Bundle]:
     return whole
 
 
-_AGAIN = "crashhunt check --salvage TO leaves it out, and the same hunt runs its trial again there"
+_RERUN_FIX = "crashhunt check --salvage TO leaves it out, and the same hunt runs its trial again there"
 
 
 def _snapshot_faults(snapshot: Snapshot) -> list[str]:
@@ -312,7 +318,7 @@ def _check_snapshot(found: Checked, path: Path, crash: str) -> None:
     fix = "get a copy of it from elsewhere; replay --from-log and --code current may do without"
     if not path.is_dir():
         found.findings.append(
-            Finding(where=str(path), what="is missing", lost=lost, fix="get a copy of it from elsewhere")
+            CheckFinding(where=str(path), what="is missing", lost=lost, fix="get a copy of it from elsewhere")
         )
         return
     snapshot = Snapshot(path)
@@ -320,14 +326,14 @@ def _check_snapshot(found: Checked, path: Path, crash: str) -> None:
         faults = _snapshot_faults(snapshot)
         for name in snapshot.additions():
             note = f"{name} was added; it is no module, so it never runs"
-            found.findings.append(Finding(str(path), note, damaged=False))
+            found.findings.append(CheckFinding(str(path), note, damaged=False))
     except CrashhuntError as error:
         faults = [error.message]
-    for fault in faults[:_SHOWN]:
-        found.findings.append(Finding(where=str(path), what=fault, lost=lost, fix=fix))
-    if len(faults) > _SHOWN:
+    for fault in faults[:_MAX_SHOWN]:
+        found.findings.append(CheckFinding(where=str(path), what=fault, lost=lost, fix=fix))
+    if len(faults) > _MAX_SHOWN:
         found.findings.append(
-            Finding(where=str(path), what=f"and {len(faults) - _SHOWN} more of its files", lost=lost, fix=fix)
+            CheckFinding(where=str(path), what=f"and {len(faults) - _MAX_SHOWN} more of its files", lost=lost, fix=fix)
         )
 
 
@@ -343,22 +349,28 @@ def _compare(
         where = str(bundle.path)
         if settings is not None and bundle.hunt_seed != settings.seed:
             what = f"it is of a hunt with seed {bundle.hunt_seed}, and this one has {settings.seed}"
-            found.findings.append(Finding(where=where, what=what, lost="", fix="put it back to where it is from"))
+            found.findings.append(CheckFinding(where=where, what=what, lost="", fix="put it back to where it is from"))
         elif number not in rows:
             if number not in found.damaged_trials:
                 what = "the ledger has no crash of its trial"
                 found.findings.append(
-                    Finding(where=where, what=what, lost="", fix="run the same command again: the hunt resumes with it")
+                    CheckFinding(
+                        where=where, what=what, lost="", fix="run the same command again: the hunt resumes with it"
+                    )
                 )
         elif rows[number].digest != bundle.result.digest or rows[number].outcome is not bundle.result.outcome:
             found.findings.append(
-                Finding(where=where, what="the ledger says something else about its trial", lost="", fix=_AGAIN)
+                CheckFinding(
+                    where=where, what="the ledger says something else about its trial", lost="", fix=_RERUN_FIX
+                )
             )
     for number in sorted(rows.keys() - by_trial.keys() - damaged - found.dropped):
         if hunt_state(found.dir).state != "running":
             what = f"trial {number} crashed, and its bundle is missing"
             found.findings.append(
-                Finding(where=str(found.dir / layout.CRASHES), what=what, lost="its log and evidence", fix=_AGAIN)
+                CheckFinding(
+                    where=str(found.dir / layout.CRASHES), what=what, lost="its log and evidence", fix=_RERUN_FIX
+                )
             )
 
 
@@ -379,7 +391,7 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
         remembers = path.name.endswith(f"{layout.SMALL}.jsonl")
         why = "shrink resumes from it" if remembers else "its writer was killed"
         what = f"{why}; it may be removed"
-        found.findings.append(Finding(str(path), what, damaged=False))
+        found.findings.append(CheckFinding(str(path), what, damaged=False))
 
 
 # What can be saved of a hunt that is damaged, in a directory of its own.
@@ -407,7 +419,7 @@ def salvage(found: Checked, to: Path) -> dict[str, int]:
         if to.exists() and not is_empty_folder(to):
             if not _is_same(found, settings, to):
                 raise HuntDirectoryError("the directory exists already", fix="give a new directory", where=str(to))
-            return {"trials": len(_numbers(found, settings)), "crashes": len(found.crashes)}
+            return {"trials": len(_copied_trials(found, settings)), "crashes": len(found.crashes)}
         with temporary_beside(to) as building:
             building.mkdir()
             trials = _copy(found, settings, building, to)
@@ -445,7 +457,7 @@ def _is_same(found: Checked, settings: HuntSettings, to: Path) -> bool:
         return (
             (to / layout.HUNT).is_file()
             and (facts.get("state"), facts.get("detail")) == ("interrupted", _detail(found))
-            and ledger.finished() == _numbers(found, settings)
+            and ledger.finished() == _copied_trials(found, settings)
             and {path.name for path in (to / layout.CRASHES).glob(layout.SHOWN)} == set(found.crashes)
         )
     return False
@@ -472,14 +484,14 @@ def _copy_rows(found: Checked, settings: HuntSettings, to: Path) -> int:
         if found.trials and has_begun(source):
             with closing(Ledger(source)) as old:
                 ledger.propose(old.intact_turns())
-                for _, row in _rows(found, settings, old):
+                for _, row in _copied_rows(found, settings, old):
                     ledger.copy(row)
                     count += 1
         ledger.enter("interrupted", _detail(found), planned=settings.trials, hunt_seed=settings.seed)
     return count
 
 
-def _rows(found: Checked, settings: HuntSettings, ledger: Ledger) -> Iterator[tuple[int, Row]]:
+def _copied_rows(found: Checked, settings: HuntSettings, ledger: Ledger) -> Iterator[tuple[int, Row]]:
     """Yield the numbers and rows of trials that are copied."""
     bundles = {int(name.partition("-")[0]) for name in found.crashes if name.partition("-")[0].isdecimal()}
     for number, row in ledger.intact_rows(sorted(found.trials)):
@@ -487,10 +499,10 @@ def _rows(found: Checked, settings: HuntSettings, ledger: Ledger) -> Iterator[tu
             yield number, row
 
 
-def _numbers(found: Checked, settings: HuntSettings) -> set[int]:
+def _copied_trials(found: Checked, settings: HuntSettings) -> set[int]:
     """Return the numbers of the trials that are copied."""
     source = found.dir / layout.LEDGER
     if not found.trials or not has_begun(source):
         return set()
     with closing(Ledger(source)) as ledger:
-        return {number for number, _ in _rows(found, settings, ledger)}
+        return {number for number, _ in _copied_rows(found, settings, ledger)}

@@ -50,8 +50,8 @@ __all__ = [
     "tally_crashes",
 ]
 
-_SHARE_OF_TIME = 0.05  # that grouping crashes for a screen may take
-_MOST_LOGS = 200  # of crashes that are read for their types; a log takes 0.05 s
+_MAX_SHARE_OF_TIME = 0.05  # that grouping crashes for a screen may take
+_MAX_READ_LOGS = 200  # of crashes that are read for their types; a log takes 0.05 s
 
 
 @dataclass(slots=True)
@@ -153,7 +153,7 @@ def find_crashes(directory: Path, limit: int) -> FoundCrashes:
             types=types,
             shortest=shortest,
             untyped=len(bundles) - sum(types.values()),
-            shown=_shown(folders, _by_steps(bundles), shortest, limit),
+            shown=_listed_crashes(folders, _by_steps(bundles), shortest, limit),
         )
     with closing(Ledger(directory / layout.LEDGER)) as ledger:
         facts = ledger.facts()
@@ -163,7 +163,7 @@ def find_crashes(directory: Path, limit: int) -> FoundCrashes:
         tally.found = max(tally.found, len(folders) + sum(dropped.values()))  # a bundle is written before its row
         steps = {number: steps for number, _, name, steps, _ in ledger.table() if name in crash_on}
     noted = _noted_types(facts)
-    if noted is None or (sum(kind["count"] for kind in noted) != tally.found and len(folders) <= _MOST_LOGS):
+    if noted is None or (sum(kind["count"] for kind in noted) != tally.found and len(folders) <= _MAX_READ_LOGS):
         types, shortest = _types_of(list_bundles(directory), dropped)
     else:
         types = {kind["words"]: kind["count"] for kind in noted}
@@ -175,7 +175,7 @@ def find_crashes(directory: Path, limit: int) -> FoundCrashes:
         types=types,
         shortest=shortest,
         untyped=max(0, tally.found - sum(types.values())),
-        shown=_shown(folders, names, shortest, limit),
+        shown=_listed_crashes(folders, names, shortest, limit),
     )
 
 
@@ -202,7 +202,7 @@ def _number(name: str) -> int:
     return int(digits) if digits.isdecimal() else -1
 
 
-def _shown(
+def _listed_crashes(
     folders: Mapping[str, Path], by_steps: Sequence[str], shortest: Mapping[str, str], limit: int
 ) -> tuple[Bundle, ...]:
     examples = [name for name in shortest.values() if name in folders][:limit]
@@ -263,7 +263,7 @@ class Kinds:
         self._seen: set[Signature] = set()
         self._first: dict[tuple[Signature, Cause | None], int] = {}  # of what counts, its trial of the least number
         self._groups: tuple[Group, ...] | None = None
-        self._shown: tuple[Group, ...] = ()
+        self._listed_crashes: tuple[Group, ...] = ()
         self._due = 0.0
         self.newest = newest
         self.newest_trial: int | None = None
@@ -273,7 +273,7 @@ class Kinds:
         }
         self._dropped_at_fault = {number for number in dropped_at_fault if number not in there}
         for bundle in crashes:
-            self._sign(bundle)
+            self._add_signature(bundle)
 
     def add(self, bundle: Bundle, ended: int) -> None:
         """Add a saved crash.
@@ -282,7 +282,7 @@ class Kinds:
             bundle: the crash.
             ended: number of trials that have ended.
         """
-        if self._sign(bundle):
+        if self._add_signature(bundle):
             self.newest, self.newest_trial = time.time(), ended
 
     def groups(self, *, running: bool = False) -> tuple[Group, ...]:
@@ -294,12 +294,12 @@ class Kinds:
         """
         began = time.monotonic()
         if running and self._groups is None and began < self._due:
-            return self._shown
+            return self._listed_crashes
         if self._groups is None:
             dropped = {words: len(numbers) for words, numbers in self.dropped.items()}
             self._groups = groups_of((self._signed[number] for number in sorted(self._signed)), dropped)
             ended = time.monotonic()
-            self._shown, self._due = self._groups, ended + (ended - began) / _SHARE_OF_TIME
+            self._listed_crashes, self._due = self._groups, ended + (ended - began) / _MAX_SHARE_OF_TIME
         return self._groups
 
     def drop_excess(self, keep: int, *, final: bool = False) -> list[Bundle]:
@@ -314,7 +314,7 @@ class Kinds:
         found = []
         for group in groups_of(self._signed.values()):
             for bundles in self._parts(group, final=final):
-                ordered = sorted(bundles, key=self._worth)
+                ordered = sorted(bundles, key=self._priority)
                 judged = self._divisions[group.signature].judged if group.signature in self._divisions else frozenset()
                 # The runs that show the cause are in the bundle of a judged crash, so one of them stays.
                 shown = next((place for place, one in enumerate(ordered) if one.result.spec.number in judged), 0)
@@ -386,7 +386,7 @@ class Kinds:
             number for (signature, cause), number in self._first.items() if cause is not None or signature not in caused
         )
 
-    def _worth(self, bundle: Bundle) -> tuple[bool, int, int]:
+    def _priority(self, bundle: Bundle) -> tuple[bool, int, int]:
         """Return the sort key of crashes to keep: wanted crashes first, and among them the shortest."""
         result = bundle.result
         return self._only_at_fault and result.spec.number not in self._at_fault, result.steps, result.spec.number
@@ -415,7 +415,7 @@ class Kinds:
                 self._signed[number] = self._signed[number][0], bundle
         self._groups = None
 
-    def _sign(self, bundle: Bundle) -> bool:
+    def _add_signature(self, bundle: Bundle) -> bool:
         """Add a crash; return whether its crash type is new."""
         number = bundle.result.spec.number
         collided = bundle.result.collision is not None

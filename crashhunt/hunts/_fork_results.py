@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "CopiedCrashes",
+    "ForkCrashes",
     "keep_near_misses",
     "likeliest",
     "mildest",
@@ -43,7 +43,7 @@ __all__ = [
 ]
 
 
-_LIKELIEST = 10  # trials; each takes two processes of its own
+_MAX_VERIFIED_BRANCHES = 10  # trials; each takes two processes of its own
 
 
 def verify_branches(copies: VerificationRuns) -> BranchReport | None:
@@ -76,11 +76,13 @@ def verify_branches(copies: VerificationRuns) -> BranchReport | None:
         )
         why_unanswered = why_unanswered or one.why_unanswered
         if one.crashes:
-            found.append((plain["spec"]["number"], max(one.crashes, key=_likely)))
+            found.append((plain["spec"]["number"], max(one.crashes, key=_log_likelihood)))
     kept = copies.kept.get(layout.BRANCHES, {})
     specs = [
         _specification(result, branch)
-        for number, branch in sorted(found, key=lambda pair: (pair[0] not in kept, -_likely(pair[1])))[:_LIKELIEST]
+        for number, branch in sorted(found, key=lambda pair: (pair[0] not in kept, -_log_likelihood(pair[1])))[
+            :_MAX_VERIFIED_BRANCHES
+        ]
         if (result := ledger.result(number)) is not None
     ]
     crashes, not_finished = copies.crashes(specs, layout.BRANCHES, "branches")
@@ -104,7 +106,7 @@ def likeliest(result: TrialResult) -> Found | None:
     """Return the likeliest crashed branch of a trial, as a specification from the start; None if no branch crashed."""
     if result.branches is None or not result.branches.crashes:
         return None
-    return _specification(result, max(result.branches.crashes, key=_likely))
+    return _specification(result, max(result.branches.crashes, key=_log_likelihood))
 
 
 def _specification(result: TrialResult, branch: Branch) -> Found:
@@ -112,13 +114,13 @@ def _specification(result: TrialResult, branch: Branch) -> Found:
     return Found(spec, branch.outcome, branch.step)
 
 
-def _likely(branch: Branch) -> float:
+def _log_likelihood(branch: Branch) -> float:
     return -math.inf if branch.log_likelihood is None else branch.log_likelihood
 
 
 # What probes have found in a hunt, and the mildest of it run from the start: only that is a crash.
 
-_MILDEST = 3  # trials; each takes two processes of its own
+_MAX_VERIFIED_PROBES = 3  # trials; each takes two processes of its own
 
 
 def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
@@ -152,7 +154,7 @@ def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
     kept = copies.kept.get(layout.PROBES, {})
     results = [
         result
-        for _, number in sorted(found, key=lambda pair: (pair[1] not in kept, pair[0]))[:_MILDEST]
+        for _, number in sorted(found, key=lambda pair: (pair[1] not in kept, pair[0]))[:_MAX_VERIFIED_PROBES]
         if (result := ledger.result(number)) is not None
     ]
     specs = [one for result in results if (one := mildest(result)) is not None]
@@ -193,7 +195,7 @@ def mildest(result: TrialResult) -> Found | None:
 # A crash that a copy of a trial has found, and that comes again from the start, ends a hunt as any other does.
 
 
-class CopiedCrashes:
+class ForkCrashes:
     """Runs crashes of copies from the start, if such a crash may end the hunt.
 
     Only crashes by the hunt's own kinds of disturbances may end it. Probes also try all other kinds, and with the
@@ -230,7 +232,7 @@ class CopiedCrashes:
 
     def add(self, result: TrialResult) -> None:
         """Add a trial that has ended without a crash."""
-        if self._ends and self._found(result):
+        if self._ends and self._crashes_of_copies(result):
             self._waiting.append(result)
 
     def look(self, tell: Callable[[], None] = lambda: None) -> bool:
@@ -247,7 +249,7 @@ class CopiedCrashes:
             if least is not None and (number > least or not self._deterministic):
                 continue
             tell()
-            for folder, found in self._found(result):
+            for folder, found in self._crashes_of_copies(result):
                 bundle = self._copies.crash(found, folder)
                 if bundle is not None:
                     self._progress.copied[number] = bundle
@@ -260,7 +262,7 @@ class CopiedCrashes:
         upcoming = self._trials.upcoming
         return self._deterministic and upcoming is not None and upcoming < number
 
-    def _found(self, result: TrialResult) -> list[tuple[str, Found]]:
+    def _crashes_of_copies(self, result: TrialResult) -> list[tuple[str, Found]]:
         """Return the crash of a copy by the hunt's own kinds of disturbances: the likeliest branch, or a probe."""
         every = ((layout.BRANCHES, likeliest(result)), (layout.PROBES, mildest(result)))
         return [(folder, one) for folder, one in every if one is not None and self._is_of_the_hunt(one)]

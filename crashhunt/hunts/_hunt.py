@@ -17,9 +17,9 @@ from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import internal_error, scratch_of
 from crashhunt.executors import SharedExecutors, make_executor, read_map
 from crashhunt.hunts._crashes import prune_bundles, tally_crashes
-from crashhunt.hunts._fork_results import CopiedCrashes, keep_near_misses, verify_fork_results, verify_rare
+from crashhunt.hunts._fork_results import ForkCrashes, keep_near_misses, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import GREATEST_LAG, Trials, Unanswered, settings_of_workers
-from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
+from crashhunt.hunts._preflight import Preflight, WorkerNotices, is_hopeless, why_invalid
 from crashhunt.hunts._progress import HuntStatus, PhaseClock, PhaseStatus, Progress, RemainingTime
 from crashhunt.hunts._rates import bar_watch, forcings_of, rare_watch, rate_watch, refuse_training_traffic
 from crashhunt.hunts._reports import HuntReport, StoppedBecause
@@ -32,7 +32,7 @@ from crashhunt.hunts._state import (
     sums_of_branches,
     sums_of_probes,
 )
-from crashhunt.hunts._verification import Audit, AuditsLeft, Confirmation, TrialReruns, VerificationRuns, is_settled
+from crashhunt.hunts._verification import Audit, Confirmation, PendingAudits, TrialReruns, VerificationRuns, is_settled
 from crashhunt.ledger import Ledger
 from crashhunt.plans import core_of, disturber_apart, parallel_here, sampler_of
 from crashhunt.rates import make_rate
@@ -169,9 +169,9 @@ class Hunt:
         held_out = held_out_traffics(settings, [self.directory])
         refuse_training_traffic(settings, held_out)
         progress.rate = bar_watch(settings, ledger, held_out)
-        (lag, lag_grows), alike = self._lag(before), not finished or draws_independently(before, settings)
+        (lag, lag_grows), alike = self._result_lag(before), not finished or draws_independently(before, settings)
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
-        self._audits_left = AuditsLeft(ledger, before, worker_settings)
+        self._audits_left = PendingAudits(ledger, before, worker_settings)
         again = self._unanswered.specs
         trials = Trials(
             settings,
@@ -248,7 +248,7 @@ class Hunt:
     ) -> HuntReport:
         settings = self.settings
         copies = VerificationRuns(runs_again, self._disturber)
-        self._copied = CopiedCrashes(copies, progress, trials)
+        self._copied = ForkCrashes(copies, progress, trials)
         self._copied.resume()
         stopped: StoppedBecause = progress.why_stopped(keep_going=settings.run.keep_going)
         if not progress.is_done:
@@ -346,7 +346,7 @@ class Hunt:
         planned = settings.most_trials - len(finished) + len(self._unanswered)
         parallel = min(run.parallel, max(1, planned))
         executor = make_executor(run.executor, worker_settings, parallel=parallel, recycle_after=run.recycle_after)
-        audit, self._heard = Audit(worker_settings, progress.failed), Heard(settings, progress.outcomes)
+        audit, self._heard = Audit(worker_settings, progress.failed), WorkerNotices(settings, progress.outcomes)
         preflight = Preflight(
             settings, planned, files=snapshot.argument_files, code=snapshot.code,
             listen=lambda: self._heard.hear(executor),
@@ -371,7 +371,7 @@ class Hunt:
                     for result in executor.completed(_TICK_S):
                         in_flight.discard(result.spec.number)
                         for known in preflight.filter_setup_failures(audit.add(result)):
-                            self._take(known, ledger, snapshot, trials, progress)
+                            self._record_trial(known, ledger, snapshot, trials, progress)
                         if progress.last_wanted is not None:
                             in_flight = self._cancelled(executor, in_flight, progress.last_wanted)
                             if not run.deterministic:
@@ -382,7 +382,7 @@ class Hunt:
                     break
                 if not finished and is_hopeless(settings, progress.outcomes):
                     return "no_valid_trial"
-                self._listen(executor, audit, ledger, progress)
+                self._receive_results(executor, audit, ledger, progress)
                 confirmation.look(progress)
                 self._expect_end(progress, executor.capacity)
                 if time.monotonic() - heartbeat > HEARTBEAT_S:
@@ -433,7 +433,7 @@ class Hunt:
         executor.cancel(above=above)
         return {number for number in in_flight if number <= above}
 
-    def _lag(self, before: Facts) -> tuple[int, bool]:
+    def _result_lag(self, before: Facts) -> tuple[int, bool]:
         """Return the delay of results for the sampler, in trials, and whether the delay is smaller at first."""
         under_way = _under_way(self.settings.run.parallel or self._parallel_here)
         if not self.settings.run.deterministic:
@@ -442,7 +442,7 @@ class Hunt:
             return lag, bool(before.get("lag_grows"))
         return max(GREATEST_LAG, under_way), True
 
-    def _listen(
+    def _receive_results(
         self, executor: Executor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0
     ) -> None:
         """Record notices about how the trials were run, and the results of the audit."""
@@ -463,7 +463,7 @@ class Hunt:
         if (total := audit.waiting) and not self._stops:
             phases.begin("auditing", total)
         while (waiting := audit.waiting) and not bool(self._stops):
-            self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
+            self._receive_results(executor, audit, ledger, progress, wait_s=_TICK_S)
             for _ in range(waiting - audit.waiting):
                 phases.advance()
             phases.tick()
@@ -479,7 +479,7 @@ class Hunt:
             ledger.remark(note)
             progress.notes.append(note)
 
-    def _take(
+    def _record_trial(
         self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, trials: Trials, progress: Progress
     ) -> None:
         """Write the row of a trial that has ended, after the files that belong to it; then count the trial."""

@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 
-_TRAFFIC = 0x74726166  # apart from what else is drawn of the hunt's seed
+_TRAFFIC_STREAM = 0x74726166  # apart from what else is drawn of the hunt's seed
 GREATEST_LAG = 32
 """Greatest delay of results for a sampler in a deterministic hunt, in trials. It does not depend on the workers, so
 that 1 and 16 of them run the same trials."""
@@ -153,7 +153,7 @@ class Trials:
                 if self._must_wait(self._next):
                     break
                 self._refuse_other_version()
-                told = self._tell(self._next - self._lag_of(self._next))
+                told = self._report_to_sampler(self._next - self._lag_of(self._next))
                 spec = spec_of(self._next, self._settings, self._sampler, self._disturber)
                 turns.append(Turn(told, spec))
             elif spec is None:
@@ -201,7 +201,7 @@ class Trials:
     def _lag_of(self, number: int) -> int:
         return growing_lag(number, self._lag) if self._lag_grows else self._lag
 
-    def _tell(self, last: int) -> tuple[int, ...]:
+    def _report_to_sampler(self, last: int) -> tuple[int, ...]:
         """Pass finished results up to a number to the sampler; return their numbers."""
         told = []
         while self._untold and self._untold[0] <= last:
@@ -250,7 +250,7 @@ def spec_of(
     values = dict(proposal.arguments)
     if settings.seeds:
         turn = number % settings.seeds
-        rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(turn, _TRAFFIC)))
+        rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(turn, _TRAFFIC_STREAM)))
         seed = int(rng.integers(2**31))
         if sampler.independent:
             values |= {key: value for key, value in sampler.ask(turn, rng).arguments.items() if not key[0]}
@@ -322,8 +322,8 @@ def _settings(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> Work
 # Trials that a resumed hunt runs again: something outside of them, such as a kill, kept answers from it.
 
 # Searching the text of a row takes a tenth of the time of parsing it. A few rows too many do no harm.
-_KILLED = f"""(outcome = 'invalid' AND instr(result, '"kind": "{KILLED}"') > 0)"""
-_UNASKED = """instr(result, '"may_be_asked_again": true') > 0"""
+_WAS_KILLED_SQL = f"""(outcome = 'invalid' AND instr(result, '"kind": "{KILLED}"') > 0)"""
+_UNANSWERED_SQL = """instr(result, '"may_be_asked_again": true') > 0"""
 
 
 def find_unanswered(ledger: Ledger) -> list[TrialResult]:
@@ -332,7 +332,9 @@ def find_unanswered(ledger: Ledger) -> list[TrialResult]:
     Raises:
         HuntDirectoryError: a row of the ledger has changed.
     """
-    where = _KILLED if not ledger.facts().get("copies") else f"{_KILLED} OR {_UNASKED}"  # the latter reads every row
+    where = (
+        _WAS_KILLED_SQL if not ledger.facts().get("copies") else f"{_WAS_KILLED_SQL} OR {_UNANSWERED_SQL}"
+    )  # the latter reads every row
     return [result for result in ledger.results_where(where) if result.is_to_be_run_again]
 
 

@@ -19,7 +19,7 @@ from crashhunt.base.errors import ArgumentError, CrashhuntError, SimulatorError,
 from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import is_sent_from_outside, stop_requests
 from crashhunt.base.temporary import temporary_folder
-from crashhunt.executors import LEFT_OUT, worker_environment
+from crashhunt.executors import EXCLUDED_WORDS, worker_environment
 from crashhunt.plans import read_settings
 from crashhunt.scenario import as_plain_data, scenario_digest
 from crashhunt.snapshots import latest_snapshot
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["Heard", "Preflight", "TrafficSurveyor", "is_hopeless", "why_invalid"]
+__all__ = ["Preflight", "TrafficSurveyor", "WorkerNotices", "is_hopeless", "why_invalid"]
 
 
-_INVALID_BEFORE_GIVING_UP = 10  # trials; if none of so many could begin, the setup is wrong, not the seed
-_ENOUGH = 4
+_MAX_INVALID_AT_START = 10  # trials; if none of so many could begin, the setup is wrong, not the seed
+_ENOUGH_CANDIDATES = 4
 """Trials; one that fails by chance would do so as often as this only rarely."""
 
 
@@ -63,7 +63,7 @@ class Preflight:
     ) -> None:  # fmt: skip
         self._settings = settings
         self._names = {there: here for here, there in files.items()} | {f"{folder}/": "" for folder in code}
-        self._enough = min(_ENOUGH, planned)
+        self._enough = min(_ENOUGH_CANDIDATES, planned)
         self._held: list[TrialResult] = []
         self._passed = False
         self._listen = listen
@@ -104,7 +104,7 @@ class Preflight:
     def _refusal(self, result: TrialResult) -> ArgumentError:
         failure = result.failure
         assert failure is not None
-        message, trace = self._as_asked(failure.message), self._as_asked(failure.traceback)
+        message, trace = self._refusal_as_requested(failure.message), self._refusal_as_requested(failure.traceback)
         kind = "" if failure.kind in ("ValueError", "invalid") else f"{failure.kind}: "
         given = result.spec.arguments.get(failure.agent, {})
         names = ", ".join(f"--arg {name}={value}" for name, value in given.items() if isinstance(value, str))
@@ -120,14 +120,14 @@ class Preflight:
             where=":".join(places[-1]) if kind and places else f"agent {failure.agent}",
         )
 
-    def _as_asked(self, text: str) -> str:
+    def _refusal_as_requested(self, text: str) -> str:
         """Return the result with the file names that the user gave, instead of the files in the snapshot."""
         for there, here in self._names.items():
             text = text.replace(there, here)
         return text
 
 
-class Heard:
+class WorkerNotices:
     """Notices of workers; they are read before the first result is recorded, because they may refuse the hunt.
 
     Args:
@@ -148,7 +148,7 @@ class Heard:
                 ended, the hunt continues without copies.
         """
         for note in executor.notes():
-            what, left_out, why = note.partition(LEFT_OUT)
+            what, left_out, why = note.partition(EXCLUDED_WORDS)
             if left_out and what in ("probes", "branches", "rare") and not sum(self._outcomes.values()):
                 raise self._refusal(why)
             self._notes.append(note)
@@ -182,7 +182,7 @@ def is_hopeless(settings: HuntSettings, outcomes: Mapping[str, int]) -> bool:
         settings: settings of the hunt.
         outcomes: outcome to the number of its trials.
     """
-    enough = min(settings.most_trials, max(_INVALID_BEFORE_GIVING_UP, 2 * settings.run.parallel))
+    enough = min(settings.most_trials, max(_MAX_INVALID_AT_START, 2 * settings.run.parallel))
     invalid = outcomes.get(str(Outcome.INVALID), 0)
     return invalid >= enough and invalid == sum(outcomes.values())
 
@@ -212,7 +212,7 @@ MAX_ATTEMPTS = 3
 """As many processes as simulate the plain traffic while each is killed from outside. The kernel may kill each of them
 where memory is short, so the number is bounded."""
 POLL_S = 0.02
-OUTPUT = "output.log"
+SURVEY_OUTPUT = "output.log"
 
 
 class TrafficSurveyor:
@@ -245,7 +245,7 @@ class TrafficSurveyor:
         if drawn & {name.removeprefix("scenario.") for name in request.scenario_arguments}:
             return scenario  # the user has chosen
         if not self._overwrite and (self._directory / layout.HUNT).exists():
-            kept = self._kept()
+            kept = self._stored_survey()
             restored = survey.restore(scenario, kept) if kept is not None else None
             if restored is not None:
                 return restored
@@ -269,7 +269,7 @@ class TrafficSurveyor:
             return read_settings(self._directory / layout.HUNT).scenario_digest == settings.scenario_digest
         return False
 
-    def _kept(self) -> Scenario | None:
+    def _stored_survey(self) -> Scenario | None:
         with suppress(CrashhuntError, OSError):
             snapshot = latest_snapshot(self._directory)
             return snapshot.scenario() if snapshot is not None else None
@@ -329,7 +329,7 @@ def _survey(scenario: Scenario, runs: list[RunToSurvey]) -> Json:
             "runs": runs,
         }
         (folder / layout.JOB).write_text(json.dumps(job), encoding="utf-8")
-        with (folder / OUTPUT).open("wb") as log:
+        with (folder / SURVEY_OUTPUT).open("wb") as log:
             kept = Kept(
                 survey.module,
                 [str(folder / layout.JOB)],
@@ -352,8 +352,10 @@ def _survey(scenario: Scenario, runs: list[RunToSurvey]) -> Json:
         elif time.monotonic() >= deadline:
             raise SimulatorError(f"simulating the plain traffic took over {MAX_WALL_TIME_S:g} s of wall time")
         else:
-            said = (folder / OUTPUT).read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            errors = [line for line in said if line.startswith("Error")] or said or [_ending(kept.process.returncode)]
+            said = (folder / SURVEY_OUTPUT).read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            errors = (
+                [line for line in said if line.startswith("Error")] or said or [_describe_end(kept.process.returncode)]
+            )
             kind = _SurveyKilledError if is_sent_from_outside(kept.process.returncode) else SimulatorError
             raise kind(f"simulating the plain traffic failed: {errors[-1].strip()}")
     # The process and its folder are gone: the signal goes to the handler that was there before.
@@ -361,5 +363,5 @@ def _survey(scenario: Scenario, runs: list[RunToSurvey]) -> Json:
     raise KeyboardInterrupt
 
 
-def _ending(code: int) -> str:
+def _describe_end(code: int) -> str:
     return f"signal {-code}" if code < 0 else f"exit code {code}"

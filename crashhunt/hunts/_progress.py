@@ -44,8 +44,8 @@ __all__ = [
     "Progress",
     "RemainingTime",
     "SearchStatus",
-    "Searching",
     "StrategyStatus",
+    "StrategyTally",
 ]
 
 
@@ -95,7 +95,7 @@ class _Tally:
 
 
 @dataclass(slots=True)
-class Searching:
+class StrategyTally:
     """Counts the trials of each strategy, also those of earlier runs of the hunt."""
 
     ended: int = 0
@@ -248,7 +248,7 @@ class Progress:
     audits_left: list[int] = field(default_factory=list)
     nodes: tuple[NodeFigures, ...] | None = None
     kinds: Kinds | None = None
-    searching: Searching = field(default_factory=Searching)
+    searching: StrategyTally = field(default_factory=StrategyTally)
     rate: BarWatch | None = None
     counted: RateWatch | None = None  # the same where there is a bar
     counted_before: set[int] = field(default_factory=set)  # trials that run again, and that the rate has already

@@ -157,7 +157,7 @@ def rate_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics
 # ``--until-error`` ends the hunt at the first full block at which the interval is narrow enough. Roots above that block
 # may have ended by then. They do not count, because that they have ended depends on the number of workers.
 
-_WEIGHTIEST = 5  # roots; a crash of a copy is a crash only where it comes again from the start
+_MAX_VERIFIED_ROOTS = 5  # roots; a crash of a copy is a crash only where it comes again from the start
 
 
 class Forcings:
@@ -268,7 +268,7 @@ class RareWatch:
             if any(crashed_copies(first)):
                 self.weightiest.append(first)
                 self.weightiest.sort(key=greatest_weight, reverse=True)
-                del self.weightiest[_WEIGHTIEST:]
+                del self.weightiest[_MAX_VERIFIED_ROOTS:]
         if self._until and self.roots % BLOCK == 0:
             self.is_met = self.estimate().relative_error <= self._until
 

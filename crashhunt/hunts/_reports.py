@@ -225,9 +225,9 @@ class RareReport:
             f"{cell} {part:.2g} ({part / found.disturbed:.0%})" for cell, part in found.parts.items() if found.disturbed
         ]
         undisturbed = f"undisturbed {found.undisturbed_crashes} of {found.roots + found.plain} trials"
-        lines.append("  " + "; ".join([undisturbed, *shares[:_CELLS_SHOWN]]))
-        if len(shares) > _CELLS_SHOWN:
-            lines.append(f"  {_CELLS_SHOWN} of {len(shares)} parts shown; run --json has all of them")
+        lines.append("  " + "; ".join([undisturbed, *shares[:_MAX_SHOWN_CELLS]]))
+        if len(shares) > _MAX_SHOWN_CELLS:
+            lines.append(f"  {_MAX_SHOWN_CELLS} of {len(shares)} parts shown; run --json has all of them")
         if found.plain_equivalent_steps is not None:
             spent = f"{found.steps} steps, {found.plain_steps} of them in plain trials"
             lines.append(f"  {spent}; plain trials alone need about {found.plain_equivalent_steps:.2g} steps")
@@ -247,7 +247,7 @@ class RareReport:
         return [f"  certain: at least {low:.2g}, at most {high:.2g} ({found.confidence:.0%}; {crashed})"]
 
 
-_CELLS_SHOWN = 5  # parts of the estimate of rare mode
+_MAX_SHOWN_CELLS = 5  # parts of the estimate of rare mode
 
 
 def kind_data(group: Group) -> KindData:

@@ -48,9 +48,9 @@ __all__ = [
     "STRESS",
     "Cell",
     "HuntResults",
+    "IncompleteHuntWarning",
     "SuiteResults",
     "TrialRow",
-    "UnfinishedWarning",
     "columns_of",
     "load",
     "write_parquet",
@@ -204,7 +204,7 @@ def _closest(data: JsonObject) -> JsonObject:
     return data.get("closest") or {}
 
 
-class UnfinishedWarning(UserWarning):
+class IncompleteHuntWarning(UserWarning):
     """The loaded hunt or suite has not finished."""
 
 
@@ -409,7 +409,7 @@ def load(directory: Path | str) -> HuntResults | SuiteResults:
         if hunt.state.state not in ("finished", "crashed"):
             detail = f": {hunt.state.detail}" if hunt.state.detail else ""
             # The second frame is of what checks the call.
-            warnings.warn(f"{hunt!r} is not finished{detail}", UnfinishedWarning, stacklevel=3)
+            warnings.warn(f"{hunt!r} is not finished{detail}", IncompleteHuntWarning, stacklevel=3)
     return found
 
 
@@ -433,7 +433,7 @@ def _column(values: list[Cell]) -> NDArray[np.generic]:
 
 # Trials as tables in files: CSV, JSON, JSON lines and Parquet, written row by row.
 
-_LOOKED_AT = 1000  # rows, to infer the type of an argument without a declared type
+_MAX_INSPECTED_ROWS = 1000  # rows, to infer the type of an argument without a declared type
 
 
 def write_text(hunt: HuntResults, out: IO[str], form: str, *, outcomes: Sequence[str] = ()) -> int:
@@ -474,7 +474,7 @@ def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()
         import polars as pl
     except ImportError:
         raise UsageError("Parquet needs polars", fix="pip install 'crashhunt[parquet]', or give csv") from None
-    kinds = _kinds(hunt, list(islice(hunt.rows(outcomes=outcomes), _LOOKED_AT)))
+    kinds = _kinds(hunt, list(islice(hunt.rows(outcomes=outcomes), _MAX_INSPECTED_ROWS)))
     schema = {name: getattr(pl, kind) for name, kind in kinds.items()}
     with (
         whole_file(path) as temporary,

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from crashhunt.base.integrity import FileEntry
-    from crashhunt.ledger import Facts, Owner
+    from crashhunt.ledger import Facts, HuntOwner
 
 
 __all__ = [
@@ -135,7 +135,7 @@ def sums_of_probes(ledger: Ledger, facts: Facts) -> ProbeSums | None:
         "{stress.left_out} AS left_out, {stress.disturbance} IS NOT NULL AS crashed",
     )
     trials, least, trial, probes, steps, left_out, crashed, asked = row
-    again, confirmed = _confirmed(facts, PROBES)
+    again, confirmed = _verified_counts(facts, PROBES)
     return {
         "trials": trials, "not_fully_asked": asked - trials, "least": least, "trial": trial if trials else None,
         "probes": int(probes), "steps": int(steps), "left_out": int(left_out), "crashed_trials": int(crashed),
@@ -155,7 +155,7 @@ def sums_of_branches(ledger: Ledger, facts: Facts) -> BranchSums | None:
         "json_array_length(data, '$.branches.crashes') AS crashed",
     )
     trials, moments, branches, steps, left_out, crashed, crashed_trials, not_fully_asked = map(int, row)
-    again, confirmed = _confirmed(facts, BRANCHES)
+    again, confirmed = _verified_counts(facts, BRANCHES)
     return {
         "trials": trials, "moments": moments, "branches": branches, "steps": steps, "left_out": left_out,
         "crashed": crashed, "crashed_trials": crashed_trials, "not_fully_asked": not_fully_asked,
@@ -163,7 +163,7 @@ def sums_of_branches(ledger: Ledger, facts: Facts) -> BranchSums | None:
     }  # fmt: skip
 
 
-def _confirmed(facts: Facts, name: str) -> tuple[int | None, int | None]:
+def _verified_counts(facts: Facts, name: str) -> tuple[int | None, int | None]:
     """Return the number of runs from the start, and how many of them crashed."""
     found = None if facts.get("state") == "running" else (facts.get("confirmed") or {}).get(name)  # of an earlier run
     return (found[0], found[1]) if found else (None, None)
@@ -171,11 +171,11 @@ def _confirmed(facts: Facts, name: str) -> tuple[int | None, int | None]:
 
 State = Literal["queued", "running", "finished", "crashed", "error", "interrupted", "killed"]
 
-_SIGNS = (layout.LEDGER, layout.REQUEST, layout.HUNT)  # of a hunt, or of one that is planned
-_DEPTH = 2  # of hunts below the directory of a suite
+_HUNT_FILES = (layout.LEDGER, layout.REQUEST, layout.HUNT)  # of a hunt, or of one that is planned
+_MAX_DEPTH = 2  # of hunts below the directory of a suite
 HEARTBEAT_S = 1.0  # every so often a hunt says in its ledger that it is alive
 _SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
-_ENDED: dict[str, State] = {
+_STATE_BY_REASON: dict[str, State] = {
     "crash": "crashed", "distinct": "crashed", "all_trials": "finished", "no_valid_trial": "error",
     "rate": "finished", "interrupted": "interrupted", "time": "finished", "precise": "finished", "refused": "finished",
     "error": "error", "queued": "queued",
@@ -247,7 +247,7 @@ class HuntState(Serializable):
 
 def is_hunt(directory: Path) -> bool:
     """Whether a directory is that of a hunt, or of one that is planned."""
-    return any((directory / name).exists() for name in _SIGNS)
+    return any((directory / name).exists() for name in _HUNT_FILES)
 
 
 def _explain_missing(directory: Path, what: str) -> HuntDirectoryError:
@@ -268,8 +268,8 @@ def find_hunts(directory: Path) -> list[Path]:
     if is_hunt(directory):
         return [directory]
     found: set[Path] = set()
-    for depth in range(1, _DEPTH + 1):
-        for name in _SIGNS:
+    for depth in range(1, _MAX_DEPTH + 1):
+        for name in _HUNT_FILES:
             for sign in directory.glob(f"{'*/' * depth}{name}"):
                 parts = sign.relative_to(directory).parts
                 if not any(part.startswith(".") or layout.REPLACED in part for part in parts):
@@ -278,7 +278,7 @@ def find_hunts(directory: Path) -> list[Path]:
         raise HuntDirectoryError(
             f"there is no hunt in {str(directory)!r}", fix="give a directory that crashhunt run or suite run made"
         )
-    return sorted(found, key=_in_order)
+    return sorted(found, key=_ordered_states)
 
 
 def hunt_state(directory: Path) -> HuntState:
@@ -321,7 +321,7 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
     said = facts.get("state", "queued")
     owner = facts.get("owner")
     alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))
-    state: State = ("running" if alive else "killed") if said == "running" else _ENDED.get(said, "error")
+    state: State = ("running" if alive else "killed") if said == "running" else _STATE_BY_REASON.get(said, "error")
     run = sum(outcomes.values())
     planned, began = int(facts.get("planned", 0)), float(facts.get("began", 0.0))
     until = time.time() if state == "running" and not facts.get("phase") else (last or began)
@@ -398,7 +398,7 @@ def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
     return bool(facts.get("independent", settings.sampler == "random")) and not settings.seeds
 
 
-def ledger_owner() -> Owner:
+def ledger_owner() -> HuntOwner:
     """Return a description that identifies this process, to check later whether it still runs."""
     return {"host": socket.gethostname(), "pid": os.getpid(), "started": _started(os.getpid())}
 
@@ -410,7 +410,7 @@ def _planned(request: Path) -> int:
         return 0
 
 
-def _is_alive(owner: Owner, heartbeat: float) -> bool:
+def _is_alive(owner: HuntOwner, heartbeat: float) -> bool:
     if owner["host"] != socket.gethostname():
         return time.time() - heartbeat < _SILENCE_S
     return bool(_started(owner["pid"]) == owner["started"])  # a process id is given to another one some day
@@ -433,7 +433,7 @@ def _started(pid: int) -> int:
     return 0 if stat[0] == "Z" else int(stat[19])
 
 
-def _in_order(path: Path) -> tuple[tuple[int, int, str], ...]:
+def _ordered_states(path: Path) -> tuple[tuple[int, int, str], ...]:
     """Return the sort key of runs by number: 2 before 10."""
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in path.parts)
 
@@ -442,7 +442,7 @@ def _in_order(path: Path) -> tuple[tuple[int, int, str], ...]:
 
 _DIFFERENCES_SHOWN = 4
 # What a hunt writes, `hunt.toml` last: without it the folder is not a hunt's.
-_OWN = (
+_OWN_FILES = (
     "snapshots",
     "crashes",
     *layout.BESIDE,
@@ -453,7 +453,7 @@ _OWN = (
     layout.HUNT,
 )
 _SCRATCH = ".scratch"
-_BEFORE = (".lock", _SCRATCH, ".hunt.")  # what may be there before: of a hunt that could not begin
+_PERMITTED_FILES = (".lock", _SCRATCH, ".hunt.")  # what may be there before: of a hunt that could not begin
 
 
 class HuntDirectory:
@@ -526,7 +526,7 @@ class HuntDirectory:
         return True
 
     def _remove_own(self, *more: str) -> None:
-        for name in (*_OWN, *more):
+        for name in (*_OWN_FILES, *more):
             if (self.path / name).is_dir():
                 shutil.rmtree(self.path / name, ignore_errors=True)
             else:
@@ -573,7 +573,7 @@ class HuntDirectory:
 
     def _refuse_foreign(self) -> None:
         try:
-            foreign = sorted(path.name for path in self.path.iterdir() if not path.name.startswith(_BEFORE))
+            foreign = sorted(path.name for path in self.path.iterdir() if not path.name.startswith(_PERMITTED_FILES))
         except OSError as error:
             raise self._unusable(error) from error
         if foreign and not is_hunt(self.path):
@@ -597,7 +597,7 @@ class HuntDirectory:
 
 LogKind = Literal["run", "error", "state"]
 
-_MOST = 1_000_000  # bytes of one file, from its end
+_MAX_LOG_BYTES = 1_000_000  # bytes of one file, from its end
 
 
 class LogReader:
@@ -653,7 +653,7 @@ class LogReader:
             try:
                 with path.open("rb") as file:
                     size = file.seek(0, os.SEEK_END)
-                    begin = self._read.get(path, max(0, size - _MOST))
+                    begin = self._read.get(path, max(0, size - _MAX_LOG_BYTES))
                     if size <= begin:
                         continue
                     file.seek(begin)

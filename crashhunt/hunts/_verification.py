@@ -48,9 +48,9 @@ if TYPE_CHECKING:
 __all__ = [
     "Again",
     "Audit",
-    "AuditsLeft",
     "Confirmation",
     "Found",
+    "PendingAudits",
     "TrialReruns",
     "VerificationRuns",
     "is_settled",
@@ -88,7 +88,7 @@ class Confirmation:
         for bundle in progress.crashes:
             if bundle.confirmed is None and bundle.id not in self._known:
                 self._known.add(bundle.id)
-                self._ask(_CONFIRM, bundle)
+                self._request_run(_CONFIRM, bundle)
         with suppress(queue.Empty):
             while True:
                 found = self._confirmed.get_nowait()
@@ -99,23 +99,23 @@ class Confirmation:
             progress.kinds.settle(judged)
         if not self._is_judging and not self._over.is_set() and (wanted := progress.kinds.next_to_judge()) is not None:
             self._is_judging = True
-            self._ask(_JUDGE, wanted)
+            self._request_run(_JUDGE, wanted)
 
     def close(self, progress: Progress) -> None:
         """Cancel the running confirmation, so that no stop waits for it."""
         self._over.set()
         if self._thread is not None:
-            self._ask(_END, None)
+            self._request_run(_END, None)
             self._thread.join()
         self.look(progress)
 
-    def _ask(self, what: int, bundle: Bundle | None) -> None:
+    def _request_run(self, what: int, bundle: Bundle | None) -> None:
         self._asked.put((what, next(self._order), bundle))
         if self._thread is None:
-            self._thread = threading.Thread(target=self._work, name="crashhunt-confirmation", daemon=True)
+            self._thread = threading.Thread(target=self._run_requests, name="crashhunt-confirmation", daemon=True)
             self._thread.start()
 
-    def _work(self) -> None:
+    def _run_requests(self) -> None:
         latest: dict[str, Bundle] = {}  # with what this thread has found
         while True:
             what, _, bundle = self._asked.get()
@@ -204,7 +204,9 @@ class TrialReruns:
             try:
                 again = settings_again(self.settings, snapshot, scratch)
                 with closing(snapshot_executor(again, parallel=self.parallel)) as executor:
-                    for _, result in run_trials(executor, group, stopped=self._look, check_every_s=_STOP_CHECK_S):
+                    for _, result in run_trials(
+                        executor, group, stopped=self._show_progress, check_every_s=_STOP_CHECK_S
+                    ):
                         yield Again(result=result, runs=self, snapshot=digest, scratch=scratch, folder=folder)
             finally:
                 remove_scratch(scratch)
@@ -218,7 +220,7 @@ class TrialReruns:
         found = {bundle.id: bundle for bundle in self.phases.run(self.confirm_one, left, counts=is_settled)}
         return [found.get(bundle.id, bundle) for bundle in crashes]
 
-    def _look(self) -> bool:
+    def _show_progress(self) -> bool:
         """Show the progress; return whether a stop is requested."""
         self.phases.tick()
         return bool(len(self.stops))
@@ -563,10 +565,10 @@ class Audit:
 #
 # The recordings are gone by then, so that digests are compared: they tell that a trial differs, and not where.
 
-_FOLDER = "audits"  # of the scratch folder
+_AUDIT_FOLDER = "audits"  # of the scratch folder
 
 
-class AuditsLeft:
+class PendingAudits:
     """The sampled trials that earlier runs of a hunt have not run again.
 
     Args:
@@ -614,7 +616,7 @@ def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, li
     if wanted:
         again.phases.begin("auditing", len(wanted))
     try:
-        for one in again.run([result.spec for result in wanted.values()], _FOLDER):
+        for one in again.run([result.spec for result in wanted.values()], _AUDIT_FOLDER):
             now, was = one.result, wanted[one.result.spec.number]
             shutil.rmtree(scratch_of(one.scratch, now.spec.number), ignore_errors=True)
             if now.was_killed_from_outside:

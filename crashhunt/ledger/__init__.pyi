@@ -1,9 +1,9 @@
 from ._reader import (
-    Bounds as Bounds,
     Facts as Facts,
+    HuntOwner as HuntOwner,
     KindData as KindData,
     Noted as Noted,
-    Owner as Owner,
+    RateBounds as RateBounds,
     RunningRate as RunningRate,
     Turn as Turn,
     UntilRate as UntilRate,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from crashhunt.ledger._schema import Shape
 
 
-__all__ = ["Facts", "KindData", "LedgerReader", "Noted", "Owner", "Seal", "Turn", "UntilRate"]
+__all__ = ["Facts", "HuntOwner", "KindData", "LedgerReader", "Noted", "Seal", "Turn", "UntilRate"]
 
 
 # The shapes of what a ledger says besides trials.
@@ -38,7 +38,7 @@ class KindData(TypedDict):
     shortest: str
 
 
-class Owner(TypedDict):
+class HuntOwner(TypedDict):
     """Identifies a process: ``started`` is in ticks since the start of its machine."""
 
     host: str
@@ -54,7 +54,7 @@ class UntilRate(TypedDict):
     verdict: str
 
 
-class Bounds(TypedDict):
+class RateBounds(TypedDict):
     """An interval.
 
     Args:
@@ -94,9 +94,9 @@ class RunningRate(TypedDict):
     trials: int
     crashes: int
     origin: str
-    certain: Bounds | None
+    certain: RateBounds | None
     estimate: float | None
-    estimated: Bounds | None
+    estimated: RateBounds | None
     why_not: str
     bar: float | None
     verdict: str
@@ -147,7 +147,7 @@ class Noted(TypedDict, total=False):
         running_rate: the crash rate so far: None if no rate is known.
     """
 
-    owner: Owner | None
+    owner: HuntOwner | None
     began: float
     heartbeat: float
     done_before: int
@@ -206,7 +206,7 @@ class Seal(TypedDict):
     facts: int
 
 
-_CHUNK = 4096
+_CHUNK_ROWS = 4096
 _BY_TIME = (
     "SELECT number, seed, outcome, steps, time_to_collision_s FROM trials INDEXED BY trials_by_outcome "
     "ORDER BY outcome, time_to_collision_s, number"
@@ -687,7 +687,7 @@ class LedgerReader:
     def _chunks(self, query: str = _BY_TIME) -> Iterator[list[Row]]:
         try:
             cursor = self._database.execute(query)
-            while rows := cursor.fetchmany(_CHUNK):
+            while rows := cursor.fetchmany(_CHUNK_ROWS):
                 yield rows
         except sqlite3.Error as error:
             raise explained(self._path, error) from error

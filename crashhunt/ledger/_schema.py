@@ -53,9 +53,9 @@ __all__ = [
 ]
 
 VERSION = 5  # of the tables, as PRAGMA user_version
-_READER = 3  # the least version of a crashhunt that reads what this one writes
-_PROTECTED = 2  # the first version in which every row has a digest of its content
-_PROPOSING = 3  # the first version that has proposals
+_MIN_READER_VERSION = 3  # the least version of a crashhunt that reads what this one writes
+_FIRST_VERSION_WITH_DIGESTS = 2  # the first version in which every row has a digest of its content
+_FIRST_VERSION_WITH_PROPOSALS = 3  # the first version that has proposals
 SEAL, _READER_FACT = "seal", "reader"
 OWN_FACTS = (SEAL, _READER_FACT)  # on the ledger itself, in addition to the facts of the hunt
 
@@ -116,8 +116,8 @@ FIRST = {
     "hunt": ("key", "value"),
 }  # fmt: skip
 # Columns that came later stand after the digest, where a migration puts them.
-_ADDED = {"trials": {"danger": 4, "other_steps": 5}}  # table to column to the first version that has it
-_LATER = {"proposals": ("turn", "number", "told", "spec")}
+_ADDED_COLUMNS = {"trials": {"danger": 4, "other_steps": 5}}  # table to column to the first version that has it
+_LATER_TABLES = {"proposals": ("turn", "number", "told", "spec")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ class Shape:
     @property
     def protected(self) -> bool:
         """Whether every row has a digest; the earliest ledgers had none."""
-        return self.version >= _PROTECTED
+        return self.version >= _FIRST_VERSION_WITH_DIGESTS
 
     def select(self, table: str) -> str:
         """Return the beginning of a query for whole rows, the digest last."""
@@ -145,7 +145,7 @@ class Shape:
 
 def columns_of_trials() -> tuple[str, ...]:
     """Return the columns of a trial's row in this version, without its digest, in the order of which that is made."""
-    return (*FIRST["trials"], *_ADDED["trials"])
+    return (*FIRST["trials"], *_ADDED_COLUMNS["trials"])
 
 
 def create(path: Path) -> None:
@@ -159,7 +159,7 @@ def create(path: Path) -> None:
 
 def note_reader(database: sqlite3.Connection) -> None:
     """Record the oldest crashhunt that can read the ledger."""
-    row = (_READER_FACT, json.dumps(_READER))
+    row = (_READER_FACT, json.dumps(_MIN_READER_VERSION))
     database.execute("INSERT OR REPLACE INTO hunt VALUES (?, ?, ?)", (*row, digest_of_row(row)))
 
 
@@ -180,8 +180,8 @@ def shape_of(database: sqlite3.Connection, path: Path) -> Shape:
         raise damaged(path, f"its version is {version}")
     if version > VERSION:
         _refuse_unreadable(database, path, version)
-    expected = {**FIRST, **(_LATER if version >= _PROPOSING else {})}
-    for table in names & _LATER.keys() - expected.keys():
+    expected = {**FIRST, **(_LATER_TABLES if version >= _FIRST_VERSION_WITH_PROPOSALS else {})}
+    for table in names & _LATER_TABLES.keys() - expected.keys():
         raise damaged(path, f"it is not as version {version} is: with the table {table}")
     return Shape(version, {table: _columns(database, path, version, table, expected[table]) for table in expected})
 
@@ -190,8 +190,8 @@ def _columns(
     database: sqlite3.Connection, path: Path, version: int, table: str, known: tuple[str, ...]
 ) -> tuple[str, ...]:
     there = tuple(name for _, name, *_ in database.execute(f"PRAGMA table_info({table})"))
-    added = tuple(name for name, since in _ADDED.get(table, {}).items() if version >= since)
-    expected = known if version < _PROTECTED else (*known, "digest", *added)
+    added = tuple(name for name, since in _ADDED_COLUMNS.get(table, {}).items() if version >= since)
+    expected = known if version < _FIRST_VERSION_WITH_DIGESTS else (*known, "digest", *added)
     known = (*known, *added)
     if version > VERSION and "digest" in there:
         columns = tuple(name for name in there if name != "digest")
@@ -291,7 +291,7 @@ def migrate(database: sqlite3.Connection, version: int) -> None:
 Row: TypeAlias = tuple[Any, ...]
 """A row as SQLite returns it. The caller's query names its columns."""
 
-_CHECK = "crashhunt check {} says what can be saved"
+_CHECK_FIX = "crashhunt check {} says what can be saved"
 
 
 def checked(row: Row, what: str, path: Path) -> Row:
@@ -326,7 +326,7 @@ def plain_trial(row: Row, path: Path, *, trusted: bool) -> JsonObject:
 
 def damaged(path: Path, message: str) -> HuntDirectoryError:
     """Return the error for a ledger that is not as it was written."""
-    return HuntDirectoryError(f"the ledger is damaged: {message}", fix=_CHECK.format(path.parent), where=str(path))
+    return HuntDirectoryError(f"the ledger is damaged: {message}", fix=_CHECK_FIX.format(path.parent), where=str(path))
 
 
 def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:

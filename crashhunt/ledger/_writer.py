@@ -45,8 +45,8 @@ __all__ = ["Ledger", "Turn", "has_begun"]
 
 
 _COLUMNS = columns_of_trials()
-_MARKS = ", ".join("?" * (len(_COLUMNS) + 1))
-_INSERT = f"INSERT OR REPLACE INTO trials ({', '.join(_COLUMNS)}, digest) VALUES ({_MARKS})"
+_PLACEHOLDERS = ", ".join("?" * (len(_COLUMNS) + 1))
+_INSERT = f"INSERT OR REPLACE INTO trials ({', '.join(_COLUMNS)}, digest) VALUES ({_PLACEHOLDERS})"
 _TOGETHER_S = 0.5  # a kill loses no more than this of what was recorded together
 
 

@@ -6,7 +6,7 @@ from ._make import (
     describe_place as describe_place,
     make_scenario as make_scenario,
 )
-from ._network import Network as Network, read_network as read_network
+from ._network import RoadNetwork as RoadNetwork, read_network as read_network
 from ._source import (
     ENDINGS as ENDINGS,
     MapSource as MapSource,

@@ -21,8 +21,8 @@ __all__ = ["cached_scenario"]
 
 _FORMAT = 1
 """Raised where the same map becomes another scenario."""
-_PROOF = "made.json"
-_KEPT = 20
+_COMPLETION_MARK = "made.json"
+_MAX_KEPT = 20
 """Maps; a town takes up to 20 MB."""
 
 
@@ -47,7 +47,7 @@ def cached_scenario(path: Path) -> Path:
         return folder
     with temporary_beside(folder) as building:
         make_scenario(source, MapOptions(picture=False), building)
-        (building / _PROOF).write_text(json.dumps(describe_files(building)), encoding="utf-8")
+        (building / _COMPLETION_MARK).write_text(json.dumps(describe_files(building)), encoding="utf-8")
         _keep(building, folder)
     _remove_old(cache, folder)
     return folder
@@ -76,7 +76,7 @@ def _cache_folder() -> Path:
 def _is_whole(folder: Path) -> bool:
     """Return whether a kept scenario is as it was made."""
     try:
-        proof = json.loads((folder / _PROOF).read_text(encoding="utf-8"))
+        proof = json.loads((folder / _COMPLETION_MARK).read_text(encoding="utf-8"))
         return bool(proof) and not any(changed_file(folder / name, entry) for name, entry in proof.items())
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ScenarioError):
         return False
@@ -101,6 +101,6 @@ def _remove_old(cache: Path, newest: Path) -> None:
         kept = sorted(
             (one for one in cache.iterdir() if not one.name.startswith(".")), key=lambda one: -one.stat().st_mtime
         )
-        for old in kept[_KEPT:]:
+        for old in kept[_MAX_KEPT:]:
             if old != newest:
                 remove_tree(old)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
-from crashhunt.maps._network import BICYCLE, CAR, PERSON, Network, read_network
+from crashhunt.maps._network import BICYCLE, CAR, PERSON, RoadNetwork, read_network
 from crashhunt.maps._tools import first_error
 
 if TYPE_CHECKING:
@@ -34,13 +34,13 @@ _HEAD_BYTES = 1 << 20
 
 # From SUMO's own recommendations for imports (osmWebWizard.py): junctions of several nodes become one, ramps get
 # their acceleration lanes, and lights of one junction switch together.
-_OSM = (
+_OSM_OPTIONS = (
     "--geometry.remove", "--ramps.guess", "--junctions.join", "--tls.guess-signals", "--tls.discard-simple",
     "--tls.join", "--output.street-names",
 )  # fmt: skip
-_GENERATED = ("--default.lanenumber", "2", "--default.speed", "13.89", "--tls.guess", "--no-turnarounds")
+_GENERATOR_OPTIONS = ("--default.lanenumber", "2", "--default.speed", "13.89", "--tls.guess", "--no-turnarounds")
 _BLOCK_M = "150"
-_IGNORING = ("--ignore-errors", "--ignore-errors.connections")
+_IGNORE_ERROR_OPTIONS = ("--ignore-errors", "--ignore-errors.connections")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +69,7 @@ class Converted:
         notes: what the user should know of how it was made.
     """
 
-    network: Network
+    network: RoadNetwork
     notes: tuple[str, ...]
 
 
@@ -87,7 +87,7 @@ def convert(source: MapSource, options: ConvertOptions, tools: Tools, folder: Pa
     """
     notes: list[str] = []
     if source.path is not None:
-        _bring(source, folder)
+        _copy_map(source, folder)
         if source.kind == "opendrive":
             _check_lengths(source.path)
         if source.kind == "opendrive" and not options.left_hand and _keeps_left(source.path):
@@ -96,21 +96,23 @@ def convert(source: MapSource, options: ConvertOptions, tools: Tools, folder: Pa
     elif options.left_hand:
         notes.append("traffic keeps to the left")
     if source.kind == "net" and options == ConvertOptions():
-        (folder / _given(source)).rename(folder / f"{NET}.gz" if _is_packed(folder / _given(source)) else folder / NET)
+        (folder / _safe_name(source)).rename(
+            folder / f"{NET}.gz" if _is_packed(folder / _safe_name(source)) else folder / NET
+        )
         _unpack(folder)
     else:
-        notes += _make(source, options, tools, folder)
+        notes += _run_converter(source, options, tools, folder)
         _strip_comment(folder / NET)
     try:
         network = read_network(folder / NET)
     except ScenarioError as error:
-        raise ScenarioError(error.message, fix=error.fix, where=_where(source)) from None
+        raise ScenarioError(error.message, fix=error.fix, where=_place_in_error(source)) from None
     if not network.drivable():
         raise _no_road(source, options, tools, folder)
     return Converted(network, tuple(notes))
 
 
-def _given(source: MapSource) -> str:
+def _safe_name(source: MapSource) -> str:
     """The name of the map in the folder: SUMO splits names at commas and blanks, and a user's may have any."""
     assert source.path is not None
     lower = source.path.name.lower()
@@ -120,10 +122,10 @@ def _given(source: MapSource) -> str:
     return f"{stem}.gz" if lower.endswith(".gz") else stem
 
 
-def _bring(source: MapSource, folder: Path) -> None:
+def _copy_map(source: MapSource, folder: Path) -> None:
     """Copy the map into the folder, as XML."""
     assert source.path is not None
-    target = folder / _given(source)
+    target = folder / _safe_name(source)
     if source.path.name.lower().endswith(".pbf"):
         _unpack_pbf(source.path, target)
     else:
@@ -193,16 +195,16 @@ def _unpack(folder: Path) -> None:
         packed.unlink()
 
 
-def _make(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> Iterator[str]:
+def _run_converter(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> Iterator[str]:
     """Run the program, and yield notes on what it omitted."""
     program = "netconvert" if source.path is not None else "netgenerate"
-    words = [*_words(source, options, tools), "--output-file", NET, "--xml-validation", "never"]
+    words = [*_command_arguments(source, options, tools), "--output-file", NET, "--xml-validation", "never"]
     done = tools.run(program, words, folder)
     if done.code == 0:
         return
     error = first_error(done.output) or "it says no more than that"
     if source.path is not None:
-        again = tools.run(program, [*words, *_IGNORING], folder)
+        again = tools.run(program, [*words, *_IGNORE_ERROR_OPTIONS], folder)
         if again.code == 0 and (folder / NET).is_file() and read_network(folder / NET).drivable():
             count = sum(line.startswith("Error:") for line in done.output.splitlines())
             yield (
@@ -215,14 +217,16 @@ def _make(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path
     fix = "correct the map, or choose a part of it with --bbox W,S,E,N" if source.kind == "osm" else "correct the map"
     if _AT_LINE.search(done.output):
         fix = "download or export the map again: it is incomplete, or not valid XML"
-    raise ScenarioError(f"{program} cannot read the map: {error}", fix=fix, where=_where(source))
+    raise ScenarioError(f"{program} cannot read the map: {error}", fix=fix, where=_place_in_error(source))
 
 
-def _where(source: MapSource) -> str:
+def _place_in_error(source: MapSource) -> str:
     return str(source.path) if source.path is not None else f"--{source.kind}"
 
 
-def _words(source: MapSource, options: ConvertOptions, tools: Tools, *, everything: bool = False) -> list[str]:
+def _command_arguments(
+    source: MapSource, options: ConvertOptions, tools: Tools, *, everything: bool = False
+) -> list[str]:
     """Return the arguments for a map, apart from the file to write."""
     words = _input(source, options, tools)
     classes = [CAR, *([BICYCLE] if options.bicycles else []), *([PERSON] if options.people else [])]
@@ -248,19 +252,27 @@ def _input(source: MapSource, options: ConvertOptions, tools: Tools) -> list[str
     first, second = (str(number) for number in source.shape)
     if source.kind == "grid":
         sizes = ["--grid.x-number", first, "--grid.y-number", second]
-        return ["--grid", *sizes, "--grid.length", _BLOCK_M, "--grid.attach-length", _BLOCK_M, *_GENERATED]
+        return ["--grid", *sizes, "--grid.length", _BLOCK_M, "--grid.attach-length", _BLOCK_M, *_GENERATOR_OPTIONS]
     if source.kind == "spider":
         sizes = ["--spider.arm-number", first, "--spider.circle-number", second]
-        return ["--spider", *sizes, "--spider.space-radius", _BLOCK_M, "--spider.attach-length", _BLOCK_M, *_GENERATED]
+        return [
+            "--spider",
+            *sizes,
+            "--spider.space-radius",
+            _BLOCK_M,
+            "--spider.attach-length",
+            _BLOCK_M,
+            *_GENERATOR_OPTIONS,
+        ]
     if source.kind == "net":
-        return ["--sumo-net-file", _given(source)]
+        return ["--sumo-net-file", _safe_name(source)]
     types = [f"{source.kind}Netconvert"]
     types += [f"{types[0]}Bicycle"] * options.bicycles + [f"{types[0]}Pedestrians"] * options.people
     files = ",".join(str(tools.home / "data" / "typemap" / f"{name}.typ.xml") for name in types)
     if source.kind == "opendrive":
-        return ["--opendrive-files", _given(source), "--type-files", files, "--geometry.remove"]
+        return ["--opendrive-files", _safe_name(source), "--type-files", files, "--geometry.remove"]
     more = ["--osm.sidewalks", "--osm.crossings"] * options.people + ["--osm.bike-access"] * options.bicycles
-    return ["--osm-files", _given(source), "--type-files", files, *_OSM, *more]
+    return ["--osm-files", _safe_name(source), "--type-files", files, *_OSM_OPTIONS, *more]
 
 
 def _strip_comment(path: Path) -> None:
@@ -272,14 +284,19 @@ def _strip_comment(path: Path) -> None:
 
 def _no_road(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> ScenarioError:
     """Return the error about a map without a road for cars, with what the map has instead."""
-    words = [*_words(source, options, tools, everything=True), *_IGNORING, "--xml-validation", "never"]
+    words = [
+        *_command_arguments(source, options, tools, everything=True),
+        *_IGNORE_ERROR_OPTIONS,
+        "--xml-validation",
+        "never",
+    ]
     (folder / NET).unlink(missing_ok=True)
     if source.path is not None:
         tools.run("netconvert", [*words, "--output-file", NET], folder)
-    held = read_network(folder / NET) if (folder / NET).is_file() else Network()
+    held = read_network(folder / NET) if (folder / NET).is_file() else RoadNetwork()
     lanes = [lane for edge in held.edges.values() for lane in edge.lanes]
     fix = "choose a map or a --bbox with streets"
-    if not lanes and source.kind == "osm" and _is_lanelet(folder / _given(source)):
+    if not lanes and source.kind == "osm" and _is_lanelet(folder / _safe_name(source)):
         what = "the map is in the format Lanelet2, not OpenStreetMap's"
         fix = "export it as OpenDRIVE, or as a network of SUMO"
     elif not lanes:
@@ -291,4 +308,4 @@ def _no_road(source: MapSource, options: ConvertOptions, tools: Tools, folder: P
     else:
         classes = sorted({name for lane in lanes for name in lane.allowed or ()})
         what = f"the map has no road for cars; its {len(held.edges)} ways are for {', '.join(classes[:5])}"
-    return ScenarioError(what, fix=fix, where=_where(source))
+    return ScenarioError(what, fix=fix, where=_place_in_error(source))

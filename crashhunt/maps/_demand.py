@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from crashhunt.maps._network import Network
+    from crashhunt.maps._network import RoadNetwork
     from crashhunt.maps._tools import Tools
 
 __all__ = ["ROUTES", "Demand", "Route", "find_demand", "route_file"]
@@ -83,7 +83,7 @@ class Demand:
             yield route, self.vehicles_per_hour * route.weight / total
 
 
-def find_demand(network: Network, tools: Tools, folder: Path, *, net: str, people: bool) -> Demand:
+def find_demand(network: RoadNetwork, tools: Tools, folder: Path, *, net: str, people: bool) -> Demand:
     """Return traffic for a network.
 
     Trips are drawn by SUMO's randomTrips.py, mostly from the ends of the network through it, and routed by duarouter,
@@ -115,7 +115,7 @@ def find_demand(network: Network, tools: Tools, folder: Path, *, net: str, peopl
     return Demand(routes=routes, vehicles_per_hour=per_hour, walks=walks, ego_routes=_ego_routes(routes))
 
 
-def _entry_capacity(network: Network, routes: Sequence[Route], weight: int) -> float:
+def _entry_capacity(network: RoadNetwork, routes: Sequence[Route], weight: int) -> float:
     """Return how many vehicles an hour all routes together may have, so that none has too many for its first road."""
     first: dict[str, int] = {}
     for route in routes:
@@ -127,7 +127,7 @@ def _entry_capacity(network: Network, routes: Sequence[Route], weight: int) -> f
     return min(limits)
 
 
-def _routes(network: Network, tools: Tools, folder: Path, net: str) -> tuple[Route, ...]:
+def _routes(network: RoadNetwork, tools: Tools, folder: Path, net: str) -> tuple[Route, ...]:
     words = [
         "--net-file", net, "--output-trip-file", "trips.xml", "--route-file", "routes.xml", "--end", str(_MAX_ROUTES),
         "--period", "1", "--seed", _SEED, "--vehicle-class", CAR, "--fringe-factor", "10", "--lanes", "--length",
@@ -189,7 +189,7 @@ def _ego_routes(routes: Sequence[Route]) -> tuple[str, ...]:
     return tuple([*chosen.values(), *rest][:_EGO_ROUTES])
 
 
-def route_file(demand: Demand, network: Network, *, bicycles: bool) -> str:
+def route_file(demand: Demand, network: RoadNetwork, *, bicycles: bool) -> str:
     """Return the content of the route file, with ``${NAME}`` for each argument of the scenario."""
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',

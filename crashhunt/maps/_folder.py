@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AGENT",
     "WORKFLOW",
-    "Argument",
+    "MapArgument",
     "agent_module",
     "arguments_of",
     "next_commands",
@@ -31,7 +31,7 @@ _DEFAULT_AGENT = "crashhunt.agents:CarFollowing"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Argument:
+class MapArgument:
     """An argument of the scenario, as ``scenario.toml`` has it."""
 
     name: str
@@ -42,7 +42,7 @@ class Argument:
     option: str = ""
 
 
-def arguments_of(demand: Demand, scales: tuple[float, float], *, bicycles: bool) -> list[Argument]:
+def arguments_of(demand: Demand, scales: tuple[float, float], *, bicycles: bool) -> list[MapArgument]:
     """Return the arguments of a scenario.
 
     Args:
@@ -52,38 +52,38 @@ def arguments_of(demand: Demand, scales: tuple[float, float], *, bicycles: bool)
     """
     low, high = scales
     found = [
-        Argument(
+        MapArgument(
             name="demand", default=min(max(1.0, low), high), range=f"{low:g}:{high:g}", option="scale",
             help=f"factor on the traffic; 1 is {demand.vehicles_per_hour:.0f} vehicles/h on the whole map",
         ),
-        Argument(
+        MapArgument(
             name="imperfection", default=0.5, range="0:1", help="sigma of the drivers' car-following model"
         ),
-        Argument(
+        MapArgument(
             name="speed_spread", default=0.1, range="0:0.2", help="standard deviation of the speed factor"
         ),
-        Argument(
+        MapArgument(
             name="trucks_per_100_cars", default=10, range="0:30", unit="trucks",
             help="to every 100 cars, where trucks may drive",
         ),
     ]  # fmt: skip
     if bicycles:
         found.append(
-            Argument(
+            MapArgument(
                 name="cyclists_per_100_cars", default=15, range="0:50", unit="cyclists",
                 help="to every 100 cars, where bicycles may ride",
             )
         )  # fmt: skip
     if demand.walks:
         found.append(
-            Argument(
+            MapArgument(
                 name="persons_per_path", default=30, range="10:120", unit="persons/h",
                 help=f"on each of {len(demand.walks)} ways on foot",
             )
         )  # fmt: skip
     routes = demand.ego_routes
     found.append(
-        Argument(
+        MapArgument(
             name="ego_route", default=routes[0], range="|".join(routes) if len(routes) > 1 else "",
             help="of the controlled vehicle, in traffic.rou.xml",
         )
@@ -113,7 +113,7 @@ help = "on a free road"
 
 
 def scenario_toml(
-    title: str, arguments: list[Argument], *, warmup_s: float, speed_limit_mps: float, agent: str = ""
+    title: str, arguments: list[MapArgument], *, warmup_s: float, speed_limit_mps: float, agent: str = ""
 ) -> str:
     """Return ``scenario.toml``.
 

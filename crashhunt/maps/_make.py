@@ -23,7 +23,7 @@ from crashhunt.maps._folder import (
     scenario_toml,
     workflow,
 )
-from crashhunt.maps._network import CAR, Network
+from crashhunt.maps._network import CAR, RoadNetwork
 from crashhunt.maps._picture import draw_map
 from crashhunt.maps._plain_run import RUN_S, PlainRun, calibrate
 from crashhunt.maps._source import check_source
@@ -45,7 +45,7 @@ _WARMUP_S = (20.0, 90.0)
 _STEPS = (300, 3000)
 _STEPS_ROUNDED = 100
 _STEP_S = 0.1
-_BUSIEST = 5
+_MAX_LISTED_ROADS = 5
 _THIN_PER_KM = 1.0
 _KMH = 3.6
 
@@ -108,7 +108,7 @@ class MadeScenario:
 
     folder: Path
     source: MapSource
-    network: Network
+    network: RoadNetwork
     demand: Demand
     plain: PlainRun
     busy: PlainRun
@@ -345,16 +345,16 @@ def _busiest(found: MadeScenario) -> list[tuple[str, float]]:
         edge = found.network.edges.get(name)
         if edge is not None and count:
             chosen.setdefault(edge.name or name, (name, count * 3600 / RUN_S))
-        if len(chosen) == _BUSIEST:
+        if len(chosen) == _MAX_LISTED_ROADS:
             break
     return list(chosen.values())
 
 
-def _lanes_km(network: Network) -> float:
+def _lanes_km(network: RoadNetwork) -> float:
     return sum(lane.length_m for edge in network.drivable() for lane in edge.open_lanes(CAR)) / 1000
 
 
-def _lights(network: Network) -> int:
+def _lights(network: RoadNetwork) -> int:
     return sum(count for kind, count in network.junctions.items() if kind.startswith("traffic_light"))
 
 

@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-__all__ = ["BICYCLE", "CAR", "PERSON", "TRUCK", "Edge", "Lane", "Network", "read_network"]
+__all__ = ["BICYCLE", "CAR", "PERSON", "TRUCK", "Edge", "NetworkLane", "RoadNetwork", "read_network"]
 
 Point = tuple[float, float]
 CAR, TRUCK, BICYCLE, PERSON = "passenger", "truck", "bicycle", "pedestrian"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Lane:
+class NetworkLane:
     """One lane.
 
     Args:
@@ -57,13 +57,13 @@ class Edge:
 
     id: str
     name: str
-    lanes: tuple[Lane, ...]
+    lanes: tuple[NetworkLane, ...]
 
     def admits(self, vehicle_class: str) -> bool:
         """Return whether vehicles of a class may use one of its lanes."""
         return any(lane.admits(vehicle_class) for lane in self.lanes)
 
-    def open_lanes(self, vehicle_class: str) -> tuple[Lane, ...]:
+    def open_lanes(self, vehicle_class: str) -> tuple[NetworkLane, ...]:
         """Return the lanes that vehicles of a class may use."""
         return tuple(lane for lane in self.lanes if lane.admits(vehicle_class))
 
@@ -74,7 +74,7 @@ class Edge:
 
 
 @dataclass(slots=True)
-class Network:
+class RoadNetwork:
     """A network, without what is inside junctions.
 
     Args:
@@ -96,16 +96,16 @@ class Network:
         return [edge for edge in self.edges.values() if edge.admits(CAR)]
 
 
-_ENDS = {"dead_end", "unregulated", "district"}
+_DEAD_END_TYPES = {"dead_end", "unregulated", "district"}
 
 
-def read_network(path: Path) -> Network:
+def read_network(path: Path) -> RoadNetwork:
     """Return what a network file holds.
 
     Raises:
         ScenarioError: it is not a network of SUMO.
     """
-    found = Network()
+    found = RoadNetwork()
     try:
         with path.open("rb") as file:
             packed = file.read(2) == b"\x1f\x8b"
@@ -117,7 +117,7 @@ def read_network(path: Path) -> Network:
     return found
 
 
-def _read(events: Iterator[tuple[str, ET.Element]], found: Network) -> None:
+def _read(events: Iterator[tuple[str, ET.Element]], found: RoadNetwork) -> None:
     root: ET.Element | None = None
     for event, element in events:
         if event == "start":
@@ -134,7 +134,7 @@ def _read(events: Iterator[tuple[str, ET.Element]], found: Network) -> None:
                 if edge.lanes:
                     found.edges[edge.id] = edge
         elif element.tag == "junction" and element.get("type") != "internal":
-            if element.get("type", "") not in _ENDS:
+            if element.get("type", "") not in _DEAD_END_TYPES:
                 found.junctions[element.get("type", "")] += 1
             area = tuple(_point(word) for word in element.get("shape", "").split())
             found.areas += [area] if len(area) > 2 else []
@@ -148,7 +148,7 @@ def _edge(element: ET.Element) -> Edge:
         allow = lane.get("allow")
         shape = tuple(_point(word) for word in lane.get("shape", "").split())
         lanes.append(
-            Lane(
+            NetworkLane(
                 length_m=float(lane.get("length", "0")),
                 speed_mps=float(lane.get("speed", "13.89")),
                 allowed=frozenset(allow.split()) if allow is not None else None,

@@ -11,23 +11,23 @@ if TYPE_CHECKING:
 
     from PIL import ImageDraw
 
-    from crashhunt.maps._network import Edge, Network
+    from crashhunt.maps._network import Edge, RoadNetwork
 
 __all__ = ["draw_map"]
 
 _SIZE, _MARGIN, _HEAD = 1200, 40, 70  # pixels
-_FINE = 2  # drawn so many times larger, for smooth edges
+_OVERSAMPLING = 2  # drawn so many times larger, for smooth edges
 _GROUND, _ROAD, _WAY = (246, 247, 249), (200, 206, 214), (222, 226, 232)
-_RAMP = ((146, 180, 214), (224, 138, 0), (198, 40, 40))
+_COLOR_RAMP = ((146, 180, 214), (224, 138, 0), (198, 40, 40))
 """From little traffic to the most."""
-_LABELS = 5
+_MAX_LABELS = 5
 _LETTERS = str.maketrans({"ß": "ss", "Ł": "L", "ł": "l", "Ø": "O", "ø": "o", "Đ": "D", "đ": "d", "Æ": "Ae", "æ": "ae"})
 _BAR_PIXELS = 220
 _LANE_M = 3.2
 
 
 def draw_map(
-    network: Network,
+    network: RoadNetwork,
     vehicles: Mapping[str, float],
     path: Path,
     *,
@@ -62,21 +62,21 @@ def draw_map(
     def place(point: tuple[float, float]) -> tuple[float, float]:
         return left + (point[0] - low[0]) * scale, top + (high[1] - point[1]) * scale
 
-    image = Image.new("RGB", (width * _FINE, height * _FINE), _GROUND)
+    image = Image.new("RGB", (width * _OVERSAMPLING, height * _OVERSAMPLING), _GROUND)
     draw = ImageDraw.Draw(image)
     most = max(vehicles.values(), default=0.0)
     lane_px = max(1.2, _LANE_M * scale * 0.85)
     for area in network.areas:
-        draw.polygon([tuple(number * _FINE for number in place(point)) for point in area], fill=_ROAD)
+        draw.polygon([tuple(number * _OVERSAMPLING for number in place(point)) for point in area], fill=_ROAD)
     for edge in sorted(network.edges.values(), key=lambda edge: vehicles.get(edge.id, 0.0)):
         count = vehicles.get(edge.id, 0.0)
         for lane in edge.lanes:
             is_road = lane.admits("passenger")
             color = _color(count / most) if count and is_road else (_ROAD if is_road else _WAY)
             pixels = lane_px * (1.0 + (count / most if most and is_road else 0.0))
-            line = [tuple(number * _FINE for number in place(point)) for point in lane.shape]
-            draw.line(line, fill=color, width=max(1, round(pixels * _FINE)), joint="curve")
-    smooth = image.reduce(_FINE)
+            line = [tuple(number * _OVERSAMPLING for number in place(point)) for point in lane.shape]
+            draw.line(line, fill=color, width=max(1, round(pixels * _OVERSAMPLING)), joint="curve")
+    smooth = image.reduce(_OVERSAMPLING)
     draw = ImageDraw.Draw(smooth)
     draw.text((_MARGIN, 18), drawable(title), fill=INK, font=font(22))
     _draw_ramp(draw, width, most / hours, font(14), INK)
@@ -86,10 +86,10 @@ def draw_map(
 
 
 def _color(share: float) -> tuple[int, int, int]:
-    share = min(max(share, 0.0), 1.0) * (len(_RAMP) - 1)
-    index = min(int(share), len(_RAMP) - 2)
+    share = min(max(share, 0.0), 1.0) * (len(_COLOR_RAMP) - 1)
+    index = min(int(share), len(_COLOR_RAMP) - 2)
     part = share - index
-    first, second = _RAMP[index], _RAMP[index + 1]
+    first, second = _COLOR_RAMP[index], _COLOR_RAMP[index + 1]
     red, green, blue = (round(a + (b - a) * part) for a, b in zip(first, second, strict=True))
     return red, green, blue
 
@@ -105,14 +105,18 @@ def _draw_ramp(draw: ImageDraw.ImageDraw, width: int, most: float, letters: obje
 
 
 def _draw_labels(
-    draw: ImageDraw.ImageDraw, network: Network, busiest: list[tuple[str, float]], place: object, size: tuple[int, int]
+    draw: ImageDraw.ImageDraw,
+    network: RoadNetwork,
+    busiest: list[tuple[str, float]],
+    place: object,
+    size: tuple[int, int],
 ) -> None:
     from crashhunt.panels import INK, font
 
     taken: list[tuple[float, float, float, float]] = []
-    for name, rate in busiest[:_LABELS]:
+    for name, rate in busiest[:_MAX_LABELS]:
         edge = network.edges[name]
-        x, y = place(_middle(edge))  # type: ignore[operator]
+        x, y = place(_midpoint(edge))  # type: ignore[operator]
         text = f"{drawable(edge.name) or edge.id}: {rate:,.0f}/h"
         long = draw.textlength(text, font=font(14))
         x = min(max(x + 8, 4), size[0] - long - 8)
@@ -145,7 +149,7 @@ def drawable(text: str) -> str:
     return found if len(found) >= len(text) / 2 else ""
 
 
-def _middle(edge: Edge) -> tuple[float, float]:
+def _midpoint(edge: Edge) -> tuple[float, float]:
     shape = edge.lanes[0].shape
     if len(shape) == 2:
         (x, y), (u, v) = shape

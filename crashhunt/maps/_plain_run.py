@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.maps._demand import Demand
-    from crashhunt.maps._network import Network
+    from crashhunt.maps._network import RoadNetwork
     from crashhunt.maps._tools import Tools
 
 __all__ = ["RUN_S", "PlainRun", "calibrate", "run_plain_traffic"]
@@ -26,10 +26,10 @@ RUN_S = 600
 _STEP_S = 0.1  # as in trials
 _ROUGH_STEP_S = 0.5
 """Of the search for a demand that flows: five times as fast, and the result is verified with the step of trials."""
-_FILLED = "filled.rou.xml"
-_PROBES = "probes.rou.xml"
-_TRIES = 6
-_LESS = 1.6
+_FILLED_ROUTES = "filled.rou.xml"
+_PROBE_ROUTES = "probes.rou.xml"
+_MAX_CALIBRATIONS = 6
+_DEMAND_DIVISOR = 1.6
 """By how much the traffic is reduced from one try to the next."""
 # A place flows if most vehicles that want to enter do, few are moved on after standing for 300 s, and most drive.
 _MAX_WAITING_SHARE = 0.15
@@ -88,7 +88,7 @@ class PlainRun:
 
 
 def run_plain_traffic(
-    demand: Demand, network: Network, tools: Tools, folder: Path, values: Mapping[str, object], *, net: str,
+    demand: Demand, network: RoadNetwork, tools: Tools, folder: Path, values: Mapping[str, object], *, net: str,
     scale: float, probes_at_s: float, bicycles: bool, step_s: float = _STEP_S,
 ) -> PlainRun:  # fmt: skip
     """Simulate the traffic with a probe vehicle on each route that the agent may get.
@@ -112,15 +112,16 @@ def run_plain_traffic(
     scaled = replace(demand, vehicles_per_hour=demand.vehicles_per_hour * scale)
     text = route_file(scaled, network, bicycles=bicycles)
     filled = {name: str(value) for name, value in {**values, "ego_route": demand.ego_routes[0]}.items()}
-    (folder / _FILLED).write_text(string.Template(text).substitute(filled), encoding="utf-8")
+    (folder / _FILLED_ROUTES).write_text(string.Template(text).substitute(filled), encoding="utf-8")
     probes = "".join(
         f'<vehicle id="probe.{route}" type="ego" route="{route}" depart="{probes_at_s:g}" departLane="best" '
         'departSpeed="max"/>\n'
         for route in demand.ego_routes
     )
-    (folder / _PROBES).write_text(f"<routes>\n{probes}</routes>\n", encoding="utf-8")
+    (folder / _PROBE_ROUTES).write_text(f"<routes>\n{probes}</routes>\n", encoding="utf-8")
     words = [
-        "--net-file", net, "--route-files", f"{_FILLED},{_PROBES}", "--step-length", f"{step_s:g}", "--end", f"{RUN_S}",
+        "--net-file", net, "--route-files", f"{_FILLED_ROUTES},{_PROBE_ROUTES}",
+        "--step-length", f"{step_s:g}", "--end", f"{RUN_S}",
         "--seed", "42", "--collision.action", "warn", "--collision.check-junctions", "true",
         "--collision.mingap-factor", "0", "--time-to-teleport", "300", "--no-step-log", "true", "--xml-validation",
         "never", "--statistic-output", "statistics.xml", "--summary-output", "summary.xml", "--summary-output.period",
@@ -174,7 +175,7 @@ def _measured(folder: Path, scale: float, probes: int) -> PlainRun:
 
 
 def calibrate(
-    demand: Demand, network: Network, tools: Tools, folder: Path, values: Mapping[str, object], *, net: str,
+    demand: Demand, network: RoadNetwork, tools: Tools, folder: Path, values: Mapping[str, object], *, net: str,
     scales: tuple[float, float], probes_at_s: float, bicycles: bool,
 ) -> tuple[Demand, PlainRun, PlainRun]:  # fmt: skip
     """Return the demand with which the traffic flows at both scales, and the two runs that show it.
@@ -202,10 +203,10 @@ def calibrate(
         )  # fmt: skip
 
     busy = run(demand, most)
-    for _ in range(_TRIES - 1):
+    for _ in range(_MAX_CALIBRATIONS - 1):
         if not busy.jam:
             break
-        demand = replace(demand, vehicles_per_hour=demand.vehicles_per_hour / _LESS)
+        demand = replace(demand, vehicles_per_hour=demand.vehicles_per_hour / _DEMAND_DIVISOR)
         busy = run(demand, most, _ROUGH_STEP_S)
         if not busy.jam:
             busy = run(demand, most)

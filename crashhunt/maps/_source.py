@@ -28,7 +28,7 @@ ENDINGS: dict[str, tuple[str, ...]] = {
     "net": (".net.xml", ".net.xml.gz"),
 }
 """Kind of a map to the endings of its files."""
-_AGAIN = "download or export the map again"
+_DOWNLOAD_FIX = "download or export the map again"
 _GZIP = b"\x1f\x8b"
 _TITLES = {"osm": "OpenStreetMap", "opendrive": "OpenDRIVE", "net": "a SUMO network"}
 _ROOTS = {"osm": "osm", "OpenDRIVE": "opendrive", "net": "net"}
@@ -154,7 +154,7 @@ def check_source(source: MapSource) -> None:
     except OSError as error:
         raise ScenarioError(f"cannot be read: {error.strerror}", fix="check its permissions", where=where) from None
     if size == 0:
-        raise ScenarioError("the file is empty", fix=_AGAIN, where=where)
+        raise ScenarioError("the file is empty", fix=_DOWNLOAD_FIX, where=where)
     most = _MAX_PBF_BYTES if path.name.lower().endswith(".pbf") else _MAX_BYTES
     if size > most:
         raise _too_large(source, f"the map has {size / 1e6:,.0f} MB (allowed: up to {most / 1e6:,.0f} MB)")
@@ -188,7 +188,7 @@ def _check_unpacked(source: MapSource, path: Path) -> None:
 
 
 def _not_unpacked(path: Path, error: Exception) -> ScenarioError:
-    return ScenarioError(f"cannot be unpacked: {error}", fix=_AGAIN, where=str(path))
+    return ScenarioError(f"cannot be unpacked: {error}", fix=_DOWNLOAD_FIX, where=str(path))
 
 
 def _check_root(source: MapSource, head: bytes) -> None:
@@ -199,13 +199,13 @@ def _check_root(source: MapSource, head: bytes) -> None:
             root = next(element.tag for _, element in ET.iterparse(file, events=("start",)))
     except (ET.ParseError, UnicodeDecodeError, LookupError, ValueError, StopIteration) as error:
         detail = f": {error}" if str(error) else ""
-        raise ScenarioError(f"not valid XML{detail}", fix=_AGAIN, where=str(path)) from None
+        raise ScenarioError(f"not valid XML{detail}", fix=_DOWNLOAD_FIX, where=str(path)) from None
     except (OSError, EOFError, zlib.error) as error:
         raise _not_unpacked(path, error) from None
     root = root.rpartition("}")[2]  # some tools write a name space
     kind = _ROOTS.get(root)
     if kind != source.kind:
-        known = f"give it with --{kind}" if kind else _AGAIN
+        known = f"give it with --{kind}" if kind else _DOWNLOAD_FIX
         raise ScenarioError(
             f"the file begins with <{root[:40]}>, so it is not {_TITLES[source.kind]}", fix=known, where=str(path)
         )

@@ -21,7 +21,7 @@ from crashhunt.base.signals import blocked_signals
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["Outcome", "Tools", "find_tools", "first_error"]
+__all__ = ["ToolResult", "Tools", "find_tools", "first_error"]
 
 _TIME_LIMIT_S = 1800.0
 """Of one program. netconvert takes 3 s for a town of 6,000 roads; a whole country is no place to hunt in."""
@@ -31,7 +31,7 @@ _LEAST_FREE_BYTES = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ToolResult:
     """The exit code and the output of a program.
 
     Args:
@@ -55,7 +55,7 @@ class Tools:
     home: Path
     version: str
 
-    def run(self, program: str, words: Sequence[str], folder: Path) -> Outcome:
+    def run(self, program: str, words: Sequence[str], folder: Path) -> ToolResult:
         """Run a program to its end.
 
         Args:
@@ -100,7 +100,7 @@ class Tools:
         if code < 0:
             fix = "free memory and disk space, or choose a smaller map"
             raise ScenarioError(f"{program} was ended by signal {-code}", fix=fix)
-        return Outcome(code, log.read_text(encoding="utf-8", errors="replace"))
+        return ToolResult(code, log.read_text(encoding="utf-8", errors="replace"))
 
 
 def _begin(parent: int, mask: set[signal.Signals | int]) -> None:

@@ -28,7 +28,7 @@ __all__ = [
 _MODULE = "_crashhunt_core"
 _INTERFACE = 9
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
-_CHECKED = ("1.28.0",)
+_CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
 
 DONE, ASK, REFUSED, ANSWERED, SIMULATED = range(5)
@@ -322,7 +322,7 @@ class Core(Protocol):
 
 
 @cache
-def _installed() -> Core | None:
+def _load_module() -> Core | None:
     try:
         core: Core = importlib.import_module(_MODULE)
     except ImportError:  # not built, or for another Python
@@ -332,13 +332,13 @@ def _installed() -> Core | None:
 
 def why_not(libsumo: str) -> str:
     """Return why the core is not used with a version of libsumo; empty if it is used."""
-    core = _installed()
+    core = _load_module()
     if core is None:
         return "it is not built"
     if core.INTERFACE != _INTERFACE:
         return f"it is of another version of crashhunt ({core.INTERFACE} instead of {_INTERFACE})"
-    if libsumo not in _CHECKED:
-        return f"it was checked with libsumo {', '.join(_CHECKED)}, and this is {libsumo}"
+    if libsumo not in _CHECKED_VERSIONS:
+        return f"it was checked with libsumo {', '.join(_CHECKED_VERSIONS)}, and this is {libsumo}"
     return ""
 
 
@@ -349,7 +349,7 @@ def core_for(libsumo: str, library: str) -> Core | None:
         libsumo: The version of libsumo.
         library: The path of libsumo's loaded library.
     """
-    core = _installed()
+    core = _load_module()
     if core is None or why_not(libsumo):
         return None
     try:

@@ -15,19 +15,21 @@ import numpy as np
 
 __all__ = ["reseed_generators", "why_no_reseeding"]
 
-_CHECKED = ("1.28.0",)
+_CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo in which the generators were found as they are described here."""
 _GENERATOR_BYTES = 5048  # a SumoRNG: its name, its count, and the 624 words of a Mersenne Twister
-_LANES = "_ZN6MSLane6myRNGsE"  # std::vector<SumoRNG>: noise of the drivers, by the lane on which a vehicle departs
-_SINGLE = (
+_LANE_GENERATORS_SYMBOL = (
+    "_ZN6MSLane6myRNGsE"  # std::vector<SumoRNG>: noise of the drivers, by the lane on which a vehicle departs
+)
+_SINGLE_GENERATOR_SYMBOLS = (
     "_ZN10RandHelper23myRandomNumberGeneratorE",  # everything that has no generator of its own
     "_ZN16SUMORouteHandler12myParsingRNGE",  # what is drawn where routes are read, such as types from distributions
     "_ZN8MSDevice14myEquipmentRNGE",  # which vehicles get a device
     "_ZN9OUProcess5myRNGE",  # errors of perception of drivers with a driver state
     "_ZN12MSDevice_ToC17myResponseTimeRNGE",  # response times of drivers who take over
 )
-_SEED = "_ZN10RandHelper8initRandEP7SumoRNGbi"  # RandHelper::initRand(SumoRNG*, bool random, int seed)
-_READ = "_ZN10RandHelper7getSeedEP7SumoRNG"  # RandHelper::getSeed(SumoRNG*)
+_SEED_SYMBOL = "_ZN10RandHelper8initRandEP7SumoRNGbi"  # RandHelper::initRand(SumoRNG*, bool random, int seed)
+_READ_SYMBOL = "_ZN10RandHelper7getSeedEP7SumoRNG"  # RandHelper::getSeed(SumoRNG*)
 
 
 @cache
@@ -38,11 +40,11 @@ def why_no_reseeding(libsumo: str, library: str) -> str:
         libsumo: The version of libsumo.
         library: The path of libsumo's loaded library.
     """
-    if libsumo not in _CHECKED:
-        return f"libsumo {libsumo} was not checked for re-seeding (checked: {', '.join(_CHECKED)})"
+    if libsumo not in _CHECKED_VERSIONS:
+        return f"libsumo {libsumo} was not checked for re-seeding (checked: {', '.join(_CHECKED_VERSIONS)})"
     try:
         loaded = ctypes.CDLL(library)
-        for name in (_LANES, *_SINGLE, _SEED, _READ):
+        for name in (_LANE_GENERATORS_SYMBOL, *_SINGLE_GENERATOR_SYMBOLS, _SEED_SYMBOL, _READ_SYMBOL):
             getattr(loaded, name)
     except (OSError, AttributeError) as error:
         return f"libsumo's generators cannot be re-seeded: {error}"
@@ -63,13 +65,15 @@ def reseed_generators(library: str, seed: int) -> int:
         RuntimeError: The generators have an unknown layout; discard the simulation then.
     """
     loaded = ctypes.CDLL(library)
-    first, last, _ = (ctypes.c_void_p * 3).in_dll(loaded, _LANES)
+    first, last, _ = (ctypes.c_void_p * 3).in_dll(loaded, _LANE_GENERATORS_SYMBOL)
     size = (last or 0) - (first or 0)
     if first is None or size <= 0 or size % _GENERATOR_BYTES:
         raise RuntimeError(f"the random generators in libsumo's lanes have an unknown memory layout ({size} bytes)")
     places = [first + offset for offset in range(0, size, _GENERATOR_BYTES)]
-    places += [ctypes.addressof((ctypes.c_char * _GENERATOR_BYTES).in_dll(loaded, name)) for name in _SINGLE]
-    set_seed, get_seed = loaded[_SEED], loaded[_READ]
+    places += [
+        ctypes.addressof((ctypes.c_char * _GENERATOR_BYTES).in_dll(loaded, name)) for name in _SINGLE_GENERATOR_SYMBOLS
+    ]
+    set_seed, get_seed = loaded[_SEED_SYMBOL], loaded[_READ_SYMBOL]
     set_seed.argtypes, set_seed.restype = (ctypes.c_void_p, ctypes.c_bool, ctypes.c_int), None
     get_seed.argtypes, get_seed.restype = (ctypes.c_void_p,), ctypes.c_int
     # SUMO gives all generators the same seed. A SeedSequence gives each its own seed, also for successive seeds.

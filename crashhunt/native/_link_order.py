@@ -17,7 +17,7 @@ __all__ = ["LinkOrder", "link_order", "why_no_link_order"]
 _LIBRARY = "_crashhunt_link_order"
 _INTERFACE = 1
 """Raised whenever a function of the library changes; scripts/build_core.py reads it."""
-_CHECKED = ("1.23.0", "1.23.1", "1.24.0", "1.25.0", "1.26.0", "1.27.0", "1.27.1", "1.28.0")
+_CHECKED_VERSIONS = ("1.23.0", "1.23.1", "1.24.0", "1.25.0", "1.26.0", "1.27.0", "1.27.1", "1.28.0")
 """The versions of libsumo with which the library was checked."""
 _NOT_CALLED = "libsumo does not call the library"
 _UNKNOWN_LINKS = "libsumo constructs links in another way"
@@ -33,7 +33,7 @@ class LinkOrder:
 
     def __init__(self, library: ctypes.CDLL | None, reason: str) -> None:
         self._library, self.reason = library, reason
-        self._loads = self._counted()
+        self._loads = self._count_calls()
 
     def use(self, use: bool) -> None:
         """Order the links of the next loads; otherwise keep libsumo's own order."""
@@ -45,13 +45,13 @@ class LinkOrder:
 
         Call this method once per load.
         """
-        ordered, unordered = self._counted()
+        ordered, unordered = self._count_calls()
         before, self._loads = self._loads, (ordered, unordered)
         if self.reason or ordered > before[0]:
             return self.reason
         return _UNKNOWN_LINKS if unordered > before[1] else _NOT_CALLED
 
-    def _counted(self) -> tuple[int, int]:
+    def _count_calls(self) -> tuple[int, int]:
         if self._library is None:
             return 0, 0
         return (
@@ -62,11 +62,11 @@ class LinkOrder:
 
 def why_no_link_order(libsumo: str) -> str:
     """Return why the order is not fixed with a version of libsumo; empty if it is fixed."""
-    path = _installed()
+    path = _load_library()
     if path is None:
         return "the library is not built"
-    if libsumo not in _CHECKED:
-        return f"the library was checked with libsumo {', '.join(_CHECKED)}, and this is {libsumo}"
+    if libsumo not in _CHECKED_VERSIONS:
+        return f"the library was checked with libsumo {', '.join(_CHECKED_VERSIONS)}, and this is {libsumo}"
     found = _interface()
     if found != _INTERFACE:
         return f"the library is of another version of crashhunt ({found} instead of {_INTERFACE})"
@@ -83,7 +83,7 @@ def link_order(libsumo: str, library: str) -> LinkOrder:
     """
     if reason := why_no_link_order(libsumo):
         return LinkOrder(None, reason)
-    loaded = ctypes.CDLL(str(_installed()))
+    loaded = ctypes.CDLL(str(_load_library()))
     loaded.crashhunt_link_order_bind.restype = ctypes.c_char_p
     for name in ("ordered", "unordered"):
         getattr(loaded, f"crashhunt_link_order_{name}_loads").restype = ctypes.c_longlong
@@ -92,7 +92,7 @@ def link_order(libsumo: str, library: str) -> LinkOrder:
 
 
 @cache
-def _installed() -> str | None:
+def _load_library() -> str | None:
     """Return the path of the library; None if it is not installed."""
     found = importlib.util.find_spec(_LIBRARY)
     return found.origin if found is not None else None
@@ -102,6 +102,6 @@ def _installed() -> str | None:
 def _interface() -> int:
     """Return the interface version of the installed library; 0 if it has none."""
     try:
-        return int(ctypes.CDLL(str(_installed())).crashhunt_link_order_interface())
+        return int(ctypes.CDLL(str(_load_library())).crashhunt_link_order_interface())
     except (OSError, AttributeError):  # a damaged file, or a foreign library
         return 0

@@ -1,4 +1,9 @@
-from ._crashes import HARDEST as HARDEST, OffRoad as OffRoad, Overlap as Overlap, ReportedCollision as ReportedCollision
+from ._crashes import (
+    MAX_BRAKING_MPS2 as MAX_BRAKING_MPS2,
+    OffRoad as OffRoad,
+    Overlap as Overlap,
+    ReportedCollision as ReportedCollision,
+)
 from ._protocol import (
     DEFAULT_ORACLES as DEFAULT_ORACLES,
     BringsOutcomes as BringsOutcomes,

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
     from crashhunt.world import Contact, Rectangle, Scene, Touch
 
-__all__ = ["HARDEST", "OffRoad", "Overlap", "ReportedCollision"]
+__all__ = ["MAX_BRAKING_MPS2", "OffRoad", "Overlap", "ReportedCollision"]
 
-HARDEST = 10.0
+MAX_BRAKING_MPS2 = 10.0
 """Upper bound of braking, in m/s²: it bounds the speed of an actor in the previous scene."""
 
 
@@ -48,7 +48,7 @@ class ReportedCollision:
             if touch.gap_m < MAX_CONTACT_GAP_M:
                 lane = _lane_at(scene, agent, touch) or contact.lane
                 return _touching(self.name, agent, other, touch, contact.kind, lane)
-        x, y, lane = _where(scene, agent)
+        x, y, lane = _place_of(scene, agent)
         return Collision(
             agent=agent,
             role="alone" if not contact.victim else "collider" if agent == contact.collider else "victim",
@@ -102,7 +102,7 @@ class OffRoad:
         findings = []
         for agent in scene.off_road:
             if agent in agents:
-                x, y, lane = _where(scene, agent)
+                x, y, lane = _place_of(scene, agent)
                 row = scene.roster.index.get(agent)
                 speed = scene.speeds[row] if row is not None else float("nan")
                 collision = Collision(
@@ -137,10 +137,10 @@ def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
             if previous.roster is not roster:
                 index = previous.roster.index
                 before = [index.get(actor.id, -1) for actor in roster.actors]
-            rows = scene.core.within_reach(scene.columns, previous.columns, row, step_s, HARDEST, before)
+            rows = scene.core.within_reach(scene.columns, previous.columns, row, step_s, MAX_BRAKING_MPS2, before)
             if rows is not None:
                 return rows
-        further = 2 * reachable_m(max(scene.speeds) + HARDEST * step_s, step_s)
+        further = 2 * reachable_m(max(scene.speeds) + MAX_BRAKING_MPS2 * step_s, step_s)
     limit = (roster.touch_distance + further) ** 2
     moved, found = None, []
     reaches = roster.reaches
@@ -153,8 +153,8 @@ def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
             continue
         if previous is not None:
             if moved is None:
-                moved = _moved(previous, scene, row)
-            theirs = _moved(previous, scene, other)
+                moved = _displacement(previous, scene, row)
+            theirs = _displacement(previous, scene, other)
             rx, ry = moved[0] - theirs[0], moved[1] - theirs[1]
             margin = sqrt(rx * rx + ry * ry) + moved[2] + theirs[2]
         if squared < (reach + margin) * (reach + margin) and _may_touch(scene, previous, row, other, margin):
@@ -192,7 +192,7 @@ def _were_near(previous: Scene, scene: Scene, row: int, other: int, margin: floa
     return outlines_overlap(_rectangle(previous, row), _rectangle(previous, other), margin=margin)
 
 
-def _moved(previous: Scene, scene: Scene, row: int) -> tuple[float, float, float]:
+def _displacement(previous: Scene, scene: Scene, row: int) -> tuple[float, float, float]:
     """Return the displacement of an actor (x, y), and how much further one of its corners may have moved on the way."""
     was = row
     if previous.roster is not scene.roster:
@@ -231,10 +231,10 @@ def _lane_at(scene: Scene, agent: str, touch: Touch) -> str:
     previous = scene.previous
     if touch.share < 1.0 and previous is not None and lane_jump(previous, scene, agent):
         return previous.agent_lanes.get(agent, "")  # it changed lanes after the contact
-    return _where(scene, agent)[2]
+    return _place_of(scene, agent)[2]
 
 
-def _where(scene: Scene, agent: str) -> tuple[float, float, str]:
+def _place_of(scene: Scene, agent: str) -> tuple[float, float, str]:
     row = scene.roster.index.get(agent)
     if row is None:
         return float("nan"), float("nan"), ""

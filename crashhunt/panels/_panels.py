@@ -262,8 +262,8 @@ class Picture(Panel):
 PAPER, INK, FAINT, GRID = (255, 255, 255), (27, 36, 48), (93, 107, 125), (217, 223, 231)
 # Okabe and Ito's palette, which the colour-blind can tell apart.
 COLORS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (90, 90, 90))
-_LONGEST = 80  # characters of a name
-_NEAREST = 1e-100  # what is closer is one place
+_MAX_NAME_CHARACTERS = 80  # characters of a name
+_MIN_DISTANCE = 1e-100  # what is closer is one place
 # Nine points of viridis (S. van der Walt, N. Smith), between which is interpolated.
 _VIRIDIS = (
     (68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141), (39, 173, 129), (92, 200, 99),
@@ -298,7 +298,7 @@ def map_colors(values: NDArray[np.float64], low: float, high: float) -> NDArray[
 
 def span_of(low: float, high: float) -> float:
     """Return the distance of two limits; 1 if they are equal."""
-    return high - low if high - low > _NEAREST else 1.0
+    return high - low if high - low > _MIN_DISTANCE else 1.0
 
 
 def number(value: float) -> str:
@@ -309,7 +309,7 @@ def number(value: float) -> str:
 @lru_cache(maxsize=256)
 def ticks(low: float, high: float, most: int = 4) -> tuple[float, ...]:
     """Return round numbers between two limits."""
-    if not high - low > max(_NEAREST, abs(low) * 1e-12, abs(high) * 1e-12):  # as far as floats can tell
+    if not high - low > max(_MIN_DISTANCE, abs(low) * 1e-12, abs(high) * 1e-12):  # as far as floats can tell
         return (low,)
     raw = (high - low) / most
     power = 10.0 ** math.floor(math.log10(raw))
@@ -346,14 +346,14 @@ class Canvas:
         from PIL import ImageDraw
 
         self.width, self.height = width, height
-        self.image = _background(width, height, _line(title)).copy()
+        self.image = _background(width, height, _one_line(title)).copy()
         self.draw = ImageDraw.Draw(self.image)
 
     def text(
         self, at: tuple[float, float], text: str, color: tuple[int, int, int], size: int, anchor: str = "la"
     ) -> None:
         """Write one line."""
-        self.draw.text(at, _line(text), color, font(size), anchor=anchor)
+        self.draw.text(at, _one_line(text), color, font(size), anchor=anchor)
 
     def pixels(self) -> NDArray[np.uint8]:
         """Return it as uint8, shape (height, width, 3)."""
@@ -365,14 +365,14 @@ def as_array(image: Image.Image) -> NDArray[np.uint8]:
     return np.asarray(image.convert("RGB") if image.mode != "RGB" else image)
 
 
-def _line(text: object) -> str:
+def _one_line(text: object) -> str:
     """Return a name as one line of limited length."""
-    return " ".join(str(text)[:_LONGEST].split())
+    return " ".join(str(text)[:_MAX_NAME_CHARACTERS].split())
 
 
 _TOP, _LEFT, _BOTTOM, _RIGHT = 20, 38, 18, 10  # room for title and labels, in pixels
-_SHORT = 12  # characters of a name that are written large
-_HUGE = 1e100  # beyond it, the difference of two numbers may overflow; drawn as missing
+_LARGE_NAME_CHARACTERS = 12  # characters of a name that are written large
+_MAX_DRAWN_VALUE = 1e100  # beyond it, the difference of two numbers may overflow; drawn as missing
 
 
 def painted(panel: Panel, width: int, height: int, label: str) -> NDArray[np.uint8]:
@@ -439,7 +439,7 @@ def _paint_curve(panel: Curve, canvas: Canvas) -> None:
         count = min(len(x), len(values))
         for part in _finite_runs(x[:count], values[:count]):
             frame.line(part, COLORS[place % len(COLORS)])
-        _key(canvas, place, name)
+        _draw_legend(canvas, place, name)
     if panel.cursor is not None:
         at = frame.x(panel.cursor)
         canvas.draw.line((at, _TOP, at, canvas.height - _BOTTOM), FAINT)
@@ -493,7 +493,7 @@ def _paint_action(panel: Action, canvas: Canvas) -> None:
     values = np.asarray(panel.value)
     if values.ndim == 0 and np.issubdtype(values.dtype, np.integer):
         name = panel.names[int(values)] if 0 <= int(values) < len(panel.names) else ""
-        middle, size = (canvas.width / 2, canvas.height / 2), 26 if len(name) <= _SHORT else 14
+        middle, size = (canvas.width / 2, canvas.height / 2), 26 if len(name) <= _LARGE_NAME_CHARACTERS else 14
         canvas.text(middle, name or str(int(values)), COLORS[0], size if name else 36, anchor="mm")
         if name:
             canvas.text((middle[0], middle[1] + 32), f"action {int(values)}", INK, 12, anchor="mm")
@@ -535,7 +535,7 @@ def _paint_distribution(panel: ActionDistribution, canvas: Canvas) -> None:
     for place, curve in enumerate(density):
         if there[place]:
             frame.line(np.stack((x, curve), 1), COLORS[place % len(COLORS)])
-        _key(canvas, place, _name(panel.names, place))
+        _draw_legend(canvas, place, _name(panel.names, place))
 
 
 @_paint.register(Picture)
@@ -621,7 +621,7 @@ def _limits(values: NDArray[np.generic], low: float | None, high: float | None) 
 def _numbers(values: ArrayLike) -> NDArray[np.float64]:
     """Return values as floats; values that are too large to draw become NaN."""
     found = np.array(values, float)
-    found[~(np.abs(found) < _HUGE)] = np.nan
+    found[~(np.abs(found) < _MAX_DRAWN_VALUE)] = np.nan
     return found
 
 
@@ -664,7 +664,7 @@ def _color_bar(canvas: Canvas, low: float, high: float) -> None:
     canvas.text((canvas.width - 37, canvas.height - 8), number(low), FAINT, 10, anchor="ls")
 
 
-def _key(canvas: Canvas, place: int, name: str) -> None:
+def _draw_legend(canvas: Canvas, place: int, name: str) -> None:
     canvas.text((canvas.width - _RIGHT - 3, _TOP + 2 + 12 * place), name, COLORS[place % len(COLORS)], 10, anchor="rt")
 
 

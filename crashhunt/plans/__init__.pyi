@@ -39,10 +39,10 @@ from ._plan import (
 from ._settings import (
     AgentSettings as AgentSettings,
     ArgumentSpec as ArgumentSpec,
+    ChoosesParallelism as ChoosesParallelism,
     HuntSettings as HuntSettings,
     Request as Request,
     RunSettings as RunSettings,
-    SizesItself as SizesItself,
     executor_of as executor_of,
     fields_of as fields_of,
     parallel_here as parallel_here,

@@ -45,7 +45,7 @@ Check = Callable[[Any], str]  # what to give instead; empty where the value is f
 Given: TypeAlias = Mapping[str, Any]
 """Options by name, as the user gives them. The list defines their types, and `HuntOption.checked` checks them."""
 
-_ABOUT = "crashhunt"  # the key of a field's metadata
+_METADATA_KEY = "crashhunt"  # the key of a field's metadata
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +83,7 @@ class About:
 
 def option(default: T, meaning: str, **about: Any) -> T:
     """Declare an option: a field of a dataclass. For ``about``, see `About`."""
-    metadata = {_ABOUT: About(meaning=meaning, **about)}
+    metadata = {_METADATA_KEY: About(meaning=meaning, **about)}
     if isinstance(default, dict):
         return cast(T, field(default_factory=dict, metadata=metadata))
     return field(default=default, metadata=metadata)
@@ -151,11 +151,11 @@ class HuntOption:
         """
         if value is None and self.default is None:
             return None
-        kinds, fix = _FORMS[self.form]
+        kinds, fix = _TYPES_BY_FORM[self.form]
         stranger = isinstance(value, bool) != (self.form == "flag") or (self.form == "list" and isinstance(value, str))
         if stranger or not isinstance(value, kinds):
             raise UsageError(f"{self.shown} is {value!r}", fix=fix)
-        plain = _plain(value, self.form)
+        plain = _converted(value, self.form)
         fix = self.about.check(plain) if self.about.check is not None else ""
         if fix:
             said = f"{plain:g}" if self.form == "number" else str(plain)
@@ -163,7 +163,7 @@ class HuntOption:
         return plain
 
 
-def _plain(value: Any, form: Form) -> object:
+def _converted(value: Any, form: Form) -> object:
     if form == "list":
         return tuple(value)
     if form == "integer":
@@ -172,7 +172,7 @@ def _plain(value: Any, form: Form) -> object:
 
 
 # What a value of a form may be, and what to give instead.
-_FORMS: Mapping[Form, tuple[tuple[type, ...], str]] = {
+_TYPES_BY_FORM: Mapping[Form, tuple[tuple[type, ...], str]] = {
     "flag": ((bool,), "give True or False"),
     "integer": ((Integral,), "give a whole number"),
     "number": ((Real,), "give a number"),
@@ -184,16 +184,18 @@ _FORMS: Mapping[Form, tuple[tuple[type, ...], str]] = {
 
 def declared(kind: type) -> frozenset[str]:
     """Return the names of the options that a dataclass declares, or has from one that does."""
-    return frozenset(item.name for item in fields(kind) if _ABOUT in item.metadata)
+    return frozenset(item.name for item in fields(kind) if _METADATA_KEY in item.metadata)
 
 
 def declared_options(kind: type) -> tuple[HuntOption, ...]:
     """Return the options that a dataclass declares, in its order."""
     hints = get_type_hints(kind)
     return tuple(
-        HuntOption(name=item.name, form=_form(hints[item.name]), default=_default(item), about=item.metadata[_ABOUT])
+        HuntOption(
+            name=item.name, form=_form(hints[item.name]), default=_default(item), about=item.metadata[_METADATA_KEY]
+        )
         for item in fields(kind)
-        if _ABOUT in item.metadata
+        if _METADATA_KEY in item.metadata
     )
 
 
@@ -203,19 +205,19 @@ def _default(item: Field[object]) -> object:
 
 def _form(hint: object) -> Form:
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    forms = {_FORM_OF.get(get_origin(kind) or kind, "text") for kind in kinds if kind is not NoneType}
+    forms = {_FORM_BY_TYPE.get(get_origin(kind) or kind, "text") for kind in kinds if kind is not NoneType}
     return forms.pop() if len(forms) == 1 else "text"
 
 
-_FORM_OF: Mapping[object, Form] = {
+_FORM_BY_TYPE: Mapping[object, Form] = {
     bool: "flag", int: "integer", float: "number", Sequence: "list", tuple: "list", Mapping: "table", dict: "table",
 }  # fmt: skip
 
 
 # ``--for TIME`` and ``--probe TIME``: time limits and intervals.
 
-_UNITS = (86400.0, 3600.0, 60.0, 1.0)  # days, hours, minutes, seconds
-_TIME = re.compile(r"(?:(\d+(?:\.\d+)?)d)?(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?")
+_UNITS_S = (86400.0, 3600.0, 60.0, 1.0)  # days, hours, minutes, seconds
+_DURATION = re.compile(r"(?:(\d+(?:\.\d+)?)d)?(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?")
 
 
 def seconds_of(text: str) -> float:
@@ -229,9 +231,9 @@ def seconds_of(text: str) -> float:
     """
     if not text:
         return math.inf
-    found = _TIME.fullmatch(text)
+    found = _DURATION.fullmatch(text)
     parts = found.groups() if found else ()
-    seconds = sum(float(part or 0) * unit for part, unit in zip(parts, _UNITS, strict=bool(parts)))
+    seconds = sum(float(part or 0) * unit for part, unit in zip(parts, _UNITS_S, strict=bool(parts)))
     if not 0 < seconds < math.inf:
         raise ValueError(f"{text!r} is not a time")
     return seconds

@@ -101,9 +101,9 @@ def load_order_change(scenario: Scenario, recorded: str | None) -> str:
 # ``NAME`` and ``AGENT.NAME``: the owner of an argument, resolved in the same way in every option and file.
 
 SCENARIO = "scenario"  # before a name that is the scenario's, where an agent has it too
-_ASK_S = 60.0
+_SIGNATURE_TIMEOUT_S = 60.0
 # Whatever the module prints when it is imported is not the answer. No crashhunt is needed: it may be an older one.
-_ASK = """
+_SIGNATURE_SCRIPT = """
 import importlib, inspect, json, os, sys
 answer = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)
@@ -248,8 +248,8 @@ def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None)
     environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
     try:
         done = subprocess.run(
-            [sys.executable, "-P", "-c", _ASK, target], env=environment, cwd=home, stdin=subprocess.DEVNULL,
-            capture_output=True, timeout=_ASK_S, check=True,
+            [sys.executable, "-P", "-c", _SIGNATURE_SCRIPT, target], env=environment, cwd=home,
+            stdin=subprocess.DEVNULL, capture_output=True, timeout=_SIGNATURE_TIMEOUT_S, check=True,
         )  # fmt: skip
         names, is_open, defaults = json.loads(done.stdout)
     except (OSError, ValueError, subprocess.SubprocessError):
@@ -283,10 +283,10 @@ def plan_with_code(request: Request, *, survey: Surveyor | None = None) -> tuple
 
 def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tuple[Scenario, HuntSettings, CodeFacts]:
     """Resolve a request in a scenario, with facts about its code where they are known."""
-    scenario = _acting(
+    scenario = _agents_in(
         scenario.with_agents(_locators(request, scenario)), dict.fromkeys(scenario.agents, request.action)
     )
-    with _said_by(request, scenario):
+    with _name_scenario_in_errors(request, scenario):
         disturb = _disturb(request, scenario)
     if code is None or any(setup.agent not in code.signatures for setup in scenario.agents.values()):
         code = describe_code(
@@ -321,9 +321,9 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     if request.action:
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
-    scenario = _with_untold(_noted(scenario, request.run), crash_on)
+    scenario = _with_defaults(_with_notes(scenario, request.run), crash_on)
     find = partial(_model_apart, code, request.run.timeout_s)
-    with _said_by(request, scenario):
+    with _name_scenario_in_errors(request, scenario):
         disturber(scenario, settings.disturb, tuple(settings.agents), find=find)  # it refuses what cannot be meant
     _check_branch(settings)
     _check_rare(settings, scenario, find)
@@ -333,7 +333,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     return scenario, replace(settings, run=sized(run)), code
 
 
-def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
+def _with_notes(scenario: Scenario, run: RunSettings) -> Scenario:
     """Return the scenario with notes on the accelerator or compiled core, and on the reason if it is not used."""
     accelerator, core = scenario.backend.accelerator, core_of(scenario, run)
     notes = [accelerator.note(scenario) if accelerator is not None and run.accelerate else ""]
@@ -368,11 +368,11 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
     if settings.events:
         scenario = replace(scenario, events={**scenario.events, **settings.events})
     if scenario.backend.actions:  # elsewhere than it was hunted, it may be another simulator's
-        scenario = _acting(scenario, {agent: chosen.action or "" for agent, chosen in settings.agents.items()})
+        scenario = _agents_in(scenario, {agent: chosen.action or "" for agent, chosen in settings.agents.items()})
     return scenario.with_agents({agent: chosen.agent for agent, chosen in settings.agents.items()})
 
 
-def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
+def _agents_in(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
     """Return the scenario with the requested forms of action; an empty form keeps that of the scenario."""
     for agent, action in actions.items():
         if action and not scenario.backend.actions:
@@ -445,7 +445,7 @@ def sampler_of(settings: HuntSettings) -> NamedSampler:
 
 
 @contextmanager
-def _said_by(request: Request, scenario: Scenario) -> Iterator[None]:
+def _name_scenario_in_errors(request: Request, scenario: Scenario) -> Iterator[None]:
     """Name the scenario in errors of disturbances that the scenario defines."""
     try:
         yield
@@ -519,7 +519,7 @@ def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str]
         raise UsageError("--rare forks processes, which needs Linux", fix="omit it")
 
 
-def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
+def _with_defaults(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
     """Add a note on events that this simulator never reports; refuse a hunt for such events alone."""
     backend = backend_of(scenario.simulator)
     told = backend.reported_events if backend is not None else None

@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 __all__ = [
     "AgentSettings",
     "ArgumentSpec",
+    "ChoosesParallelism",
     "HuntSettings",
     "Request",
     "RunSettings",
-    "SizesItself",
     "executor_name",
     "executor_of",
     "fields_of",
@@ -50,7 +50,7 @@ __all__ = [
 ]
 
 # What hunt.toml has had from the beginning, in the order in which it is written.
-_KEYS = (
+_FIRST_KEYS = (
     "scenario", "scenario_digest", "trials", "max_steps", "seed", "sampler", "points", "crash_on", "oracles", "agents",
     "scenario_arguments", "events", "run", "schema",
 )  # fmt: skip
@@ -162,8 +162,9 @@ class HuntSettings(TrialOptions):
     def differences(self, other: HuntSettings) -> list[str]:
         """Say in words what makes the trials of two hunts different; how they are run does not."""
         mine, theirs = _flat(asdict(self)), _flat(asdict(other))
+        missing = "(not there)"
         return [
-            f"{key} was {_shown(mine.get(key, '(not there)'))} and is now {_shown(theirs.get(key, '(not there)'))}"
+            f"{key} was {_toml_value(mine.get(key, missing))} and is now {_toml_value(theirs.get(key, missing))}"
             for key in sorted(mine.keys() | theirs.keys(), key=lambda key: (key.count("."), key))
             if mine.get(key) != theirs.get(key)
             and not key.startswith("run.")
@@ -198,8 +199,8 @@ def write_settings(path: Path, settings: HuntSettings, command: list[str], *, li
     data = _without_none(asdict(settings))
     if not settings.events:
         del data["events"]
-    data = {**_in_order(data, settings, _KEYS), "run": _in_order(data["run"], settings.run, _RUN_KEYS)}
-    data = merged(data, _added_to(like or path))
+    data = {**_in_order(data, settings, _FIRST_KEYS), "run": _in_order(data["run"], settings.run, _RUN_KEYS)}
+    data = merged(data, _changed_settings(like or path))
     # No line break of an argument may end the comment.
     line = shlex.join(command).replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
     text = f"# {line}\n{tomli_w.dumps(data)}"
@@ -246,7 +247,7 @@ def read_settings(path: Path) -> HuntSettings:
     return validate(HuntSettings, {**known, **wrong}, where=str(path), error=HuntDirectoryError)
 
 
-def _added_to(path: Path) -> Plain:
+def _changed_settings(path: Path) -> Plain:
     """Return the keys that a later version has added to an existing file."""
     try:
         later: Plain = known_part(HuntSettings, tomllib.loads(path.read_text(encoding="utf-8")))[1]
@@ -255,7 +256,7 @@ def _added_to(path: Path) -> Plain:
     return later
 
 
-def _shown(value: object) -> object:
+def _toml_value(value: object) -> object:
     return "none" if value == "" else value
 
 
@@ -275,7 +276,7 @@ def _without_none(data: object) -> Any:
 
 
 @runtime_checkable
-class SizesItself(Protocol):
+class ChoosesParallelism(Protocol):
     """An executor that decides how many trials PARALLEL 0 means, such as one on many machines.
 
     Elsewhere 0 is one per core of this machine.
@@ -294,7 +295,7 @@ def executor_of(word: str) -> Callable[..., Any]:
         PluginError: there is no such executor.
         UsageError: it takes no argument.
     """
-    name, argument = _parts(word)
+    name, argument = _name_and_argument(word)
     factory: Callable[..., Any] = locate("executors", name)
     if argument is None:
         return factory
@@ -313,13 +314,13 @@ def executor_of(word: str) -> Callable[..., Any]:
 
 def executor_name(word: str) -> str:
     """Return the registered name or ``module:attribute`` in a choice of an executor; nothing is imported."""
-    return _parts(word)[0]
+    return _name_and_argument(word)[0]
 
 
 def sizes_itself(word: str) -> bool:
     """Whether the named executor decides what PARALLEL 0 means."""
     factory = locate("executors", executor_name(word))
-    return isinstance(factory, SizesItself) and factory.sizes_itself
+    return isinstance(factory, ChoosesParallelism) and factory.sizes_itself
 
 
 def parallel_here(word: str, parallel: int) -> int:
@@ -333,7 +334,7 @@ def parallel_here(word: str, parallel: int) -> int:
     return min(parallel or cores, cores) if sizes_itself(word) else parallel or cores
 
 
-def _parts(word: str) -> tuple[str, str | None]:
+def _name_and_argument(word: str) -> tuple[str, str | None]:
     first, colon, rest = word.partition(":")
     if first in registered("executors") or not colon:
         return first, rest if colon else None
@@ -341,7 +342,7 @@ def _parts(word: str) -> tuple[str, str | None]:
     return f"{first}:{attribute}", argument if colon else None
 
 
-_BOUNDS = {  # the numbers of a hunt that are no options: everybody has to give them
+_REQUIRED_NUMBERS = {  # the numbers of a hunt that are no options: everybody has to give them
     "TRIALS": at_least(0),
     "MAX_STEPS": at_least(1),
     "PARALLEL": at_least(0, zero="one per core"),
@@ -375,7 +376,9 @@ class Request(TrialOptions, Subject):
         Raises:
             UsageError: a value cannot be meant.
         """
-        for (name, check), value in zip(_BOUNDS.items(), (self.trials, self.max_steps, self.run.parallel), strict=True):
+        for (name, check), value in zip(
+            _REQUIRED_NUMBERS.items(), (self.trials, self.max_steps, self.run.parallel), strict=True
+        ):
             if not isinstance(value, int) or isinstance(value, bool):
                 raise UsageError(f"{name} is {value!r}", fix="give a whole number")
             if fix := check(value):

@@ -57,9 +57,9 @@ _WEIGHTS = (0.6, 1.0, 6.0, 6.0, 2.0, 2.0, 0.5)
 _SHARE_AT_STAKE = 0.999  # of the capital in one bet, at most
 _PRECISION = 1e-9  # relative, of both ends
 _BIASED_COIN = 0.75  # share of one side in discordant pairs: between rates of 0.02 and 0.005 it is 0.8
-_MOST_EXPOSURES = 512  # different ones; more are spread over the grid
-_MOST_EVENTS = 8  # different numbers of events where exposures are spread
-_GRID = 256  # parts of the greatest exposure
+_MAX_EXPOSURES = 512  # different ones; more are spread over the grid
+_MAX_EVENTS = 8  # different numbers of events where exposures are spread
+_GRID_PARTS = 256  # parts of the greatest exposure
 
 
 class Interval(NamedTuple):
@@ -160,7 +160,7 @@ class RateTest:
             self.exposure += exposure * times
             self._as_arrays = None
             self._count(float(events), float(exposure), times)
-            if not self._spreads and len(self._units) > _MOST_EXPOSURES and self._has_few_events():
+            if not self._spreads and len(self._units) > _MAX_EXPOSURES and self._has_few_events():
                 self._spreads = True
                 units, self._units = self._units, defaultdict(float)
                 for (some, over), count in units.items():
@@ -168,15 +168,15 @@ class RateTest:
 
     def _has_few_events(self) -> bool:
         """Whether units differ by their exposures, and not by their events."""
-        return len({events for events, _ in self._units}) <= _MOST_EVENTS
+        return len({events for events, _ in self._units}) <= _MAX_EVENTS
 
     def _count(self, events: float, exposure: float, times: float) -> None:
         """Count units, or spread them over the two grid points around their exposure."""
         if not self._spreads:
             self._units[events, exposure] += times
             return
-        part = self.bets.most_exposure / _GRID
-        place = min(int(exposure / part), _GRID - 1)
+        part = self.bets.most_exposure / _GRID_PARTS
+        place = min(int(exposure / part), _GRID_PARTS - 1)
         upper = min(1.0, exposure / part - place)
         for point, share in ((place, 1.0 - upper), (place + 1, upper)):
             if share > 0:

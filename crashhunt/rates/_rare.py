@@ -69,12 +69,12 @@ MAX_SHARE_UNFORCED: Final = 0.05
 """Share of the crashes that may come after a second onset which is not forced. Such crashes are few with large weights,
 so an estimate that has not met one is too low by this share, and looks precise."""
 _PILOT_ROOTS: Final = 128  # after so many without such a cell, no copy has forced second onsets any more
-_MOST_MORE_SECONDS: Final = 8  # times as many as the first forcing would have: a copy may be long, and others short
+_MAX_SECONDS_FACTOR: Final = 8  # times as many as the first forcing would have: a copy may be long, and others short
 MIN_EFFECTIVE: Final = 20.0
 MIN_ROOTS_WITH_CRASH: Final = 20
 MAX_SHARE: Final = 0.2
 _RISK_OF_COPIES: Final = 0.25  # share of the risk that the certain lower end by copies alone takes
-_ONLY_RUNNING: Final = ("origin", "bar", "verdict")  # which an estimate does not have
+_RUNNING_KEYS: Final = ("origin", "bar", "verdict")  # which an estimate does not have
 MAX_EXCLUDED: Final = 0.05
 """Share of roots without a complete result above which nothing is estimated."""
 
@@ -195,7 +195,7 @@ class RareEstimate:
 
     def to_json(self) -> JsonObject:
         """Return plain data without NaN."""
-        shared = {key: value for key, value in self.running().items() if key not in _ONLY_RUNNING}
+        shared = {key: value for key, value in self.running().items() if key not in _RUNNING_KEYS}
         return {
             **shared,
             "estimated": _plain(self.estimated),
@@ -349,7 +349,7 @@ def learn_forcing(earlier: Iterable[Forced], start: Forcing) -> Forcing:
     mean = math.fsum(masses[cell] / total * spread for cell, spread in spreads.items())
     ratios = {cell: PLAIN_SHARE + (1.0 - PLAIN_SHARE) * spread / mean for cell, spread in spreads.items()}
     second = learned.cells_with_seconds()
-    least = start.second_spacing / _MOST_MORE_SECONDS
+    least = start.second_spacing / _MAX_SECONDS_FACTOR
     second_spacing = max(least, learned.second_mass / SECONDS_PER_COPY) if learned.second_mass else start.second_spacing
     if not second and roots >= _PILOT_ROOTS:
         second_spacing = 0.0

@@ -22,10 +22,12 @@ if TYPE_CHECKING:
 
 __all__ = ["BarWatch", "Paced", "RateWatch"]
 
-_SHARE_OF_TIME = 0.05  # that running intervals may take
+_MAX_SHARE_OF_TIME = 0.05  # that running intervals may take
 _LONGEST_PAUSE_S = 10.0  # the first interval takes long, because it imports SciPy
-_MOST_FACTORS = 64  # per trial there are two different units
-_EQUAL = 0.2  # relative difference from a bar that counts as none; it takes some 300 crashes to be certain of it
+_MAX_FACTORS = 64  # per trial there are two different units
+_EQUAL_TOLERANCE = (
+    0.2  # relative difference from a bar that counts as none; it takes some 300 crashes to be certain of it
+)
 
 T = TypeVar("T")
 
@@ -55,7 +57,7 @@ class Paced(Generic[T]):
         found = self._make()
         ended = time.monotonic()
         self._made = version, found
-        self._due = ended + min((ended - began) / _SHARE_OF_TIME, _LONGEST_PAUSE_S)
+        self._due = ended + min((ended - began) / _MAX_SHARE_OF_TIME, _LONGEST_PAUSE_S)
         return found
 
 
@@ -151,7 +153,7 @@ class BarWatch(RateWatch):
         super().__init__(rule, per, crash_on, alpha)
         self.bar = bar
         # Against the bar, and against the ends of what counts as equal to it.
-        self._rates = (bar, bar * (1 - _EQUAL), bar * (1 + _EQUAL))
+        self._rates = (bar, bar * (1 - _EQUAL_TOLERANCE), bar * (1 + _EQUAL_TOLERANCE))
         self._log_capitals: list[Any] = [0.0, 0.0, 0.0]
         self._log_factors: dict[tuple[float, float], list[Any]] = {}  # of the units so far
         self.verdict: Literal["below", "above", "undecided"] = "undecided"
@@ -187,7 +189,9 @@ class BarWatch(RateWatch):
             self.decided_at = unit[-1].number
         elif self._is_at_bar(test):
             self.decided_at = unit[-1].number
-            self.why_undecided = f"the rate certainly is within {_EQUAL:.0%} of the bar, so more trials do not help"
+            self.why_undecided = (
+                f"the rate certainly is within {_EQUAL_TOLERANCE:.0%} of the bar, so more trials do not help"
+            )
         return found
 
     def _factors(self, found: tuple[float, float], test: RateTest) -> list[Any]:
@@ -198,7 +202,7 @@ class BarWatch(RateWatch):
         if factors is None:
             events, exposure = found
             factors = [np.log1p(test.bets.stakes(rate) * (events - rate * exposure)) for rate in self._rates]
-            if len(self._log_factors) < _MOST_FACTORS:
+            if len(self._log_factors) < _MAX_FACTORS:
                 self._log_factors[found] = factors
         return factors
 

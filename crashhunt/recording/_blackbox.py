@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CHUNK",
     "FIRST",
-    "FIRST_ASIDE",
+    "FIRST_NON_EVIDENCE_TAG",
     "HEADER",
     "MAGIC",
     "MAPPED",
@@ -68,14 +68,14 @@ __all__ = [
 
 # The digest of a trial: what belongs to it, and how it is computed.
 
-FIRST_ASIDE = 128
+FIRST_NON_EVIDENCE_TAG = 128
 """Tags from here on are of records that are no evidence, so a reader need not know a type to compute the digest."""
-_NOTES = 11  # the only type of the first eleven that is no evidence, from before there was that rule
+_NOTES_TAG = 11  # the only type of the first eleven that is no evidence, from before there was that rule
 
 
 def is_evidence(tag: int) -> bool:
     """Whether records with this tag belong to the digest of the trial."""
-    return tag < FIRST_ASIDE and tag != _NOTES
+    return tag < FIRST_NON_EVIDENCE_TAG and tag != _NOTES_TAG
 
 
 def digest_of(*records: bytes | memoryview) -> str:
@@ -88,15 +88,15 @@ def digest_of(*records: bytes | memoryview) -> str:
 
 MAGIC = b"CRASHBB1"
 HEADER = struct.Struct("<8sIIQdQqiI")  # magic, pid, set-up, trial, started, committed, step, phase, agent
-_WHERE = struct.Struct("<QqiI")  # the last four of them
-_WHERE_OFFSET = HEADER.size - _WHERE.size
+_PROGRESS = struct.Struct("<QqiI")  # the last four of them
+_PROGRESS_OFFSET = HEADER.size - _PROGRESS.size
 _SETUP, _SETUP_OFFSET = struct.Struct("<I"), 12
 REPORT, REPORT_OFFSET = struct.Struct("<Q"), HEADER.size  # length of the report in bytes; 0 for none
 UNREPORTABLE = 2**64 - 1  # in place of that length: the process is damaged and cannot report
 NO_ROOM = 2**64 - 2  # the same: the disk had no room for the recording
 FIRST = 64  # where records begin; the header has room to grow
 _DAMAGE_ANNOUNCED = REPORT.pack(UNREPORTABLE)
-_HEAD = struct.Struct("<BxHI")
+_RECORD_HEAD = struct.Struct("<BxHI")
 CHUNK = 1 << 20  # bytes that the file grows by: each time asks the disk whether there is room
 MAPPED = 64 << 20  # bytes of addresses, not of memory: mapping again moves every view
 
@@ -112,7 +112,7 @@ class Phase(IntEnum):
 
 # Attributes of modules, and members of an enum, are looked up at every use; these are used in every step.
 _STEP, _OBSERVATION, _ACTION = STEP.tag, OBSERVATION.tag, ACTION.tag
-_LENT = _OBSERVATION, _ACTION, _STEP, LANES.tag  # records of another writer
+_CORE_TAGS = _OBSERVATION, _ACTION, _STEP, LANES.tag  # records of another writer
 _ACT, _SIMULATE = int(Phase.ACT), int(Phase.SIMULATE)
 
 
@@ -125,7 +125,7 @@ class Record(NamedTuple):
 
     def encode(self) -> bytes:
         """Return the bytes of the record in the black box; the trace digest is computed over these bytes."""
-        return _HEAD.pack(self.tag, self.aux, len(self.payload)) + self.payload + bytes(-len(self.payload) % 8)
+        return _RECORD_HEAD.pack(self.tag, self.aux, len(self.payload)) + self.payload + bytes(-len(self.payload) % 8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +181,7 @@ class BlackBox:
 
     def begin(self, *, pid: int, trial: int, started: float) -> None:
         """Forget the previous trial and open the next."""
-        self._take_back()
+        self._stop_core()
         HEADER.pack_into(self._map, 0, MAGIC, pid, 0, trial, started, FIRST, 0, Phase.SETUP, 0)
         REPORT.pack_into(self._map, REPORT_OFFSET, 0)
         self._offset = FIRST
@@ -202,11 +202,11 @@ class BlackBox:
 
     def append(self, tag: int, aux: int, payload: bytes) -> None:
         """Record rare data of any type."""
-        self._take_back()
+        self._stop_core()
         offset, length = self._offset, len(payload)
         if offset + length + 16 > self._reserved:
             self._reserve(offset + length + 16)
-        _HEAD.pack_into(self._map, offset, tag, aux, length)
+        _RECORD_HEAD.pack_into(self._map, offset, tag, aux, length)
         start = offset + 8
         self._map[start : start + length] = payload
         self._finish(start + length)
@@ -216,7 +216,7 @@ class BlackBox:
 
     def report(self, report: bytes) -> None:
         """Write a report behind the records; after that, nothing can be recorded."""
-        self._take_back()
+        self._stop_core()
         end = self._offset + len(report)
         if end > self._reserved:
             self._reserve(end)
@@ -250,12 +250,12 @@ class BlackBox:
             steps: steps of the core.
             roster: the actors of these steps, which must have been recorded.
         """
-        self._take_back()
+        self._stop_core()
         self._roster = roster
-        steps.borrow(self._map, self._offset, self._reserved, _LENT)
+        steps.borrow(self._map, self._offset, self._reserved, _CORE_TAGS)
         self._lent = steps
 
-    def _take_back(self) -> None:
+    def _stop_core(self) -> None:
         if self._lent is not None:
             self._offset, step, places = self._lent.give_back()
             self._lent = None
@@ -265,7 +265,7 @@ class BlackBox:
 
     def _raw(self, tag: int, agent: int, array: NDArray[np.generic], phase: int) -> None:
         if self._lent is not None:
-            self._take_back()
+            self._stop_core()
         offset, length = self._offset, array.nbytes
         if offset + length + 16 > self._reserved:
             self._reserve(offset + length + 16)
@@ -275,7 +275,7 @@ class BlackBox:
             if written is not None:
                 self._offset = written
                 return
-        _HEAD.pack_into(mapped, offset, tag, agent, length)
+        _RECORD_HEAD.pack_into(mapped, offset, tag, agent, length)
         start = offset + 8
         end = start + length
         mapped[start:end] = array.tobytes()
@@ -283,12 +283,12 @@ class BlackBox:
             mapped[end : end + (-length & 7)] = bytes(-length & 7)
             end += -length & 7
         self._offset = end
-        _WHERE.pack_into(mapped, _WHERE_OFFSET, end, self._step, phase, agent)
+        _PROGRESS.pack_into(mapped, _PROGRESS_OFFSET, end, self._step, phase, agent)
 
     def step(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Record a completed step; the roster of the scene must have been recorded."""
         if self._lent is not None:
-            self._take_back()
+            self._stop_core()
         offset, count = self._offset, len(scene.roster)
         packer = self._steps.get(count)
         if packer is None:
@@ -314,7 +314,7 @@ class BlackBox:
                 *scene.speeds,
             )
             end = offset + packer.size
-            _WHERE.pack_into(self._map, _WHERE_OFFSET, end, step, _SIMULATE, 0)
+            _PROGRESS.pack_into(self._map, _PROGRESS_OFFSET, end, step, _SIMULATE, 0)
         self._roster, self._core = scene.roster, core
         rest = scene if scene.heights or scene.spines else None
         self._trail.append((scene.roster, end - 32 * count, rest))
@@ -322,12 +322,12 @@ class BlackBox:
 
     def mark(self, phase: int, agent: int = 0) -> None:
         """Write the position of the process, and commit."""
-        self._take_back()
-        _WHERE.pack_into(self._map, _WHERE_OFFSET, self._offset, self._step, phase, agent)
+        self._stop_core()
+        _PROGRESS.pack_into(self._map, _PROGRESS_OFFSET, self._offset, self._step, phase, agent)
 
     def take_frames(self) -> list[Frame]:
         """Return the scenes recorded since the last call, as bare columns."""
-        self._take_back()
+        self._stop_core()
         frames: list[Frame] = []
         for roster, group in groupby(self._trail, key=itemgetter(0)):
             run = list(group)
@@ -340,19 +340,19 @@ class BlackBox:
 
     def committed(self) -> memoryview:
         """The bytes of all records so far."""
-        self._take_back()
+        self._stop_core()
         return memoryview(self._map)[FIRST : self._offset]
 
     def evidence(self) -> list[memoryview]:
         """The bytes of all records so far that belong to the digest."""
-        self._take_back()
+        self._stop_core()
         whole = memoryview(self._map)
         edges = [FIRST, *chain.from_iterable(self._aside), self._offset]
         return [whole[begins:ends] for begins, ends in zip(edges[::2], edges[1::2], strict=True)]
 
     def detach(self) -> None:
         """Discard all further records, because this process is a copy of the recording process."""
-        self._take_back()
+        self._stop_core()
         self._map = mmap.mmap(-1, self._mapped)
         self._file = os.open(os.devnull, os.O_RDWR)
 
@@ -363,7 +363,7 @@ class BlackBox:
 
     def copy(self) -> None:
         """Continue in private memory: this process is a fork of the recording one, and continues to record."""
-        self._take_back()
+        self._stop_core()
         data = bytes(memoryview(self._map)[: self._offset])
         self._file = os.memfd_create(MEMORY)
         self._reserved = self._mapped = 0
@@ -372,7 +372,7 @@ class BlackBox:
 
     def close(self) -> None:
         """Unmap and close the file."""
-        self._take_back()
+        self._stop_core()
         self._map.close()
         os.close(self._file)
 
@@ -463,9 +463,9 @@ def readable_bytes(found: os.stat_result) -> int:
 def decode_records(data: bytes | memoryview) -> Iterator[Record]:
     """Yield the records in ``data``; an incomplete last one is skipped."""
     offset = 0
-    while offset + _HEAD.size <= len(data):
-        tag, aux, length = _HEAD.unpack_from(data, offset)
-        start = offset + _HEAD.size
+    while offset + _RECORD_HEAD.size <= len(data):
+        tag, aux, length = _RECORD_HEAD.unpack_from(data, offset)
+        start = offset + _RECORD_HEAD.size
         if tag == 0 or start + length > len(data):
             return
         yield Record(tag, aux, bytes(data[start : start + length]))

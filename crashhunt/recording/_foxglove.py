@@ -346,9 +346,9 @@ def _varint(value: int) -> bytes:
 # Topics and protobuf messages of an MCAP file, at simulation time; the file itself is written in `_log`.
 
 
-_RECORD = struct.Struct("<BQ")  # type and size of a record
-_HEAD = struct.Struct("<HIQQ")  # channel, sequence number and two times of a message
-_MESSAGE = 5  # type of a record that is a message
+_RECORD_HEAD = struct.Struct("<BQ")  # type and size of a record
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence number and two times of a message
+_MESSAGE_RECORD = 5  # type of a record that is a message
 
 
 def messages_of(
@@ -377,20 +377,20 @@ def messages_of(
     for index in sorted(summary.chunk_indexes, key=attrgetter("chunk_start_offset")):
         if index.message_index_offsets and wanted.isdisjoint(index.message_index_offsets):
             continue
-        file.seek(index.chunk_start_offset + _RECORD.size)
+        file.seek(index.chunk_start_offset + _RECORD_HEAD.size)
         stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(file)), validate_crc=validate_crcs)
         chunk, at = stream.read(size), 0
         while at < size:
-            kind, length = _RECORD.unpack_from(chunk, at)
-            start, at = at + _RECORD.size, at + _RECORD.size + length
-            if at > size or (kind == _MESSAGE and length < _HEAD.size):
+            kind, length = _RECORD_HEAD.unpack_from(chunk, at)
+            start, at = at + _RECORD_HEAD.size, at + _RECORD_HEAD.size + length
+            if at > size or (kind == _MESSAGE_RECORD and length < _MESSAGE_HEAD.size):
                 raise McapError(f"a record of {length} bytes does not fit")
-            if kind == _MESSAGE:
-                number, sequence, _, _ = _HEAD.unpack_from(chunk, start)
+            if kind == _MESSAGE_RECORD:
+                number, sequence, _, _ = _MESSAGE_HEAD.unpack_from(chunk, start)
                 channel = summary.channels[number]
                 if number in wanted:
                     schema = summary.schemas[channel.schema_id] if channel.schema_id else None
-                    yield schema, channel, sequence, chunk[start + _HEAD.size : at]
+                    yield schema, channel, sequence, chunk[start + _MESSAGE_HEAD.size : at]
 
 
 class LogWriter:
@@ -459,10 +459,10 @@ _METRICS = {
         "required_deceleration": "double",
     },
 }
-_OF_RECORDS = {name: fields for kind in RECORD_TYPES.values() for name, fields in kind.form.messages.items()}
+_RECORD_MESSAGES = {name: fields for kind in RECORD_TYPES.values() for name, fields in kind.form.messages.items()}
 # A schema in a log has its whole file, so what few logs have is in one of its own.
 _FILES: dict[str, Mapping[str, Mapping[str, str]]] = {
-    "crashhunt/log.proto": {**_OF_RECORDS, **_METRICS},
+    "crashhunt/log.proto": {**_RECORD_MESSAGES, **_METRICS},
     "crashhunt/bytes.proto": BytesForm.messages,
 }
 

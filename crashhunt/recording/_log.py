@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 __all__ = ["read_log", "write_log"]
 
 SCHEMA = "1"
-_COMPACT = "crashhunt_compact"  # key of the metadata that says what a compact recording lacks
+_COMPACT_KEY = "crashhunt_compact"  # key of the metadata that says what a compact recording lacks
 _KNOWN_BY_TOPIC = 11
 """The last tag of the types that have been there from the beginning: a channel of any other says its tag."""
 
@@ -68,7 +68,7 @@ def write_log(
     with whole_file(path, lasting=False, noted=False) as temporary, temporary.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="crashhunt")
-        compact = {} if recording.compact is None else {_COMPACT: _compact_to_text(recording.compact)}
+        compact = {} if recording.compact is None else {_COMPACT_KEY: _compact_to_text(recording.compact)}
         writer.add_metadata("crashhunt", {**(metadata or {}), **compact, "crashhunt_log_schema": SCHEMA})
         log = LogWriter(writer)
         _write_evidence(log, recording)
@@ -92,7 +92,7 @@ def read_log(path: Path) -> Recording:
             reader = SeekingReader(file, validate_crcs=True)
             entries = [entry.metadata for entry in reader.iter_metadata()]
             version = next((found for one in entries if (found := one.get("crashhunt_log_schema")) is not None), None)
-            compact = next((_compact_from_text(one[_COMPACT]) for one in entries if _COMPACT in one), None)
+            compact = next((_compact_from_text(one[_COMPACT_KEY]) for one in entries if _COMPACT_KEY in one), None)
             if version is None:
                 raise refuse("this MCAP file was not written by crashhunt", "give a log.mcap of a crash bundle")
             if version != SCHEMA:

@@ -65,12 +65,12 @@ class Prologue:
     @classmethod
     def decode(cls, payload: bytes) -> Prologue:
         """Rebuild what `encode` returned; keys that a later version has added are skipped."""
-        data: _Said = json.loads(payload)
+        data: _PrologueJson = json.loads(payload)
         agents = tuple(AgentChannel(**_columns_prologue(agent)) for agent in data["agents"])
         return cls(agents, data["step_length_s"])
 
 
-class _Said(TypedDict):
+class _PrologueJson(TypedDict):
     agents: list[Plain]
     step_length_s: float
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Compact",
     "Near",
-    "Present",
+    "PresentActors",
     "Recording",
     "compact_records",
     "first_divergence",
@@ -115,7 +115,9 @@ class Recording:
         """Return this recording with only the actors and observations of another one, which may be compact."""
         if other.compact is None or self.compact is not None:
             return self
-        there = Present([step.scene.roster.index.keys() if step.scene is not None else () for step in other.all_steps])
+        there = PresentActors(
+            [step.scene.roster.index.keys() if step.scene is not None else () for step in other.all_steps]
+        )
         records = compact_records(self.records, there, observations=other.compact.observations)
         return Recording(records, replace(other.compact, digest=self.digest))
 
@@ -213,7 +215,7 @@ class Compact:
     observations: bool
 
 
-class Choice(Protocol):
+class ActorSelector(Protocol):
     """Chooses the actors of a step."""
 
     def __call__(self, step: int, actors: Sequence[str], points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -251,7 +253,7 @@ class Near:
 
 
 @dataclass(frozen=True, slots=True)
-class Present:
+class PresentActors:
     """Keeps the actors that another recording has in the same step.
 
     Args:
@@ -266,7 +268,7 @@ class Present:
         return np.array([name in there for name in actors], bool)
 
 
-def compact_records(records: Iterable[Record], choose: Choice, *, observations: bool) -> Iterator[Record]:
+def compact_records(records: Iterable[Record], choose: ActorSelector, *, observations: bool) -> Iterator[Record]:
     """Yield the records of a recording without some actors.
 
     Args:

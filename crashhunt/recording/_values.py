@@ -93,7 +93,7 @@ def describe_value(array: NDArray[np.generic], limit: int = 400) -> str:
         value, _ = decode_value(array)
     except ValueError:
         return "(damaged)"
-    text = " ".join(repr(_shown(value)).split())
+    text = " ".join(repr(_displayed(value)).split())
     return text if len(text) <= limit else f"{text[: limit - 1]}…"
 
 
@@ -104,7 +104,7 @@ class _Shown(str):
         return str(self)
 
 
-def _shown(value: Any) -> object:
+def _displayed(value: Any) -> object:
     if isinstance(value, np.ndarray):
         if value.size <= _MAX_SHOWN_ARRAY:
             return value.tolist()
@@ -112,11 +112,11 @@ def _shown(value: Any) -> object:
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, dict):
-        return {_shown(key): _shown(item) for key, item in value.items()}
+        return {_displayed(key): _displayed(item) for key, item in value.items()}
     if type(value) in (list, tuple):
-        return type(value)(map(_shown, value))
+        return type(value)(map(_displayed, value))
     if _is_graph(value):
-        return _Shown(f"GraphInstance{tuple(map(_shown, value))!r}")
+        return _Shown(f"GraphInstance{tuple(map(_displayed, value))!r}")
     return value
 
 

@@ -50,13 +50,13 @@ __all__ = [
 ]
 
 
-_PANEL = (240, 160)
-_PAPER = 255
+_PANEL_PIXELS = (240, 160)
+_BACKGROUND = 255
 _AROUND_S = 10.0  # of a near miss, half of it before and half after
 _SHOWN_S = 10.0  # of the built-in curves
-_BUILTIN = ("time to collision s", "gap m", "speed m/s", "action")
-_NEAREST = ("least time to collision s", "nearest gap m")  # of a crash that has no other one
-_WITHOUT_SCENE = ("reward", "action")
+_BUILTIN_PANELS = ("time to collision s", "gap m", "speed m/s", "action")
+_NEAREST_PANELS = ("least time to collision s", "nearest gap m")  # of a crash that has no other one
+_PANELS_WITHOUT_SCENE = ("reward", "action")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,7 +127,7 @@ class Layout:
         panel: width and height of one.
     """
 
-    def __init__(self, frame: tuple[int, int], labels: Sequence[str], panel: tuple[int, int] = _PANEL) -> None:
+    def __init__(self, frame: tuple[int, int], labels: Sequence[str], panel: tuple[int, int] = _PANEL_PIXELS) -> None:
         width, height = frame
         count = len(labels)
         rows = max(1, height // panel[1])
@@ -148,7 +148,7 @@ class Layout:
 
     def compose(self, scene: NDArray[np.uint8], panels: Mapping[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
         """Return one picture; a panel that is not there leaves its place white."""
-        picture = np.full((self.size[1], self.size[0], 3), _PAPER, np.uint8)
+        picture = np.full((self.size[1], self.size[0], 3), _BACKGROUND, np.uint8)
         picture[: scene.shape[0], : scene.shape[1]] = scene
         for label, panel in panels.items():
             if label in self.places:
@@ -189,14 +189,14 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
     labels: dict[str, None] = {}
     if options.panels:
         for shot in shots:
-            labels |= dict.fromkeys(_builtin_labels(shot) if shot.recording.actors else _WITHOUT_SCENE)
+            labels |= dict.fromkeys(_builtin_labels(shot) if shot.recording.actors else _PANELS_WITHOUT_SCENE)
         for shot in shots:
             for panels in shot.panels.values():
                 labels |= dict.fromkeys(panels)
     layout = Layout(options.size, list(labels))
     for number, shot in enumerate(shots):
         if number:
-            blank = np.full((layout.size[1], layout.size[0], 3), _PAPER, np.uint8)
+            blank = np.full((layout.size[1], layout.size[0], 3), _BACKGROUND, np.uint8)
             yield from [blank] * options.blank_frames
         view = SceneView(
             shot.recording,
@@ -216,7 +216,7 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
                 drawn: dict[str, NDArray[np.uint8]] = {}
                 if builtin is not None:
                     drawn |= shot.panels.get(step, {})
-                    drawn |= {label: panel.draw(*_PANEL, label) for label, panel in builtin.panels(step)}
+                    drawn |= {label: panel.draw(*_PANEL_PIXELS, label) for label, panel in builtin.panels(step)}
                 last = step, layout.compose(view.draw(step), drawn)
             yield last[1]
         if last is not None:
@@ -309,7 +309,7 @@ def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions, *, w
 
 
 def _builtin_labels(shot: Shot) -> tuple[str, ...]:
-    return _BUILTIN if shot.other else (*_NEAREST, *_BUILTIN[2:])
+    return _BUILTIN_PANELS if shot.other else (*_NEAREST_PANELS, *_BUILTIN_PANELS[2:])
 
 
 class _Builtin:
@@ -351,17 +351,19 @@ class _Builtin:
         found: list[tuple[str, Panel]] = [
             (_builtin_labels(self._shot)[0], Curve(times, x, low=0.0, high=10.0)),
             (_builtin_labels(self._shot)[1], Curve(np.minimum(self._gaps[part], 100.0), x, low=0.0)),
-            (_BUILTIN[2], Curve(self._speeds[part], x, low=0.0)),
+            (_BUILTIN_PANELS[2], Curve(self._speeds[part], x, low=0.0)),
         ]
         if not self._shot.recording.actors:
-            found = [(_WITHOUT_SCENE[0], Curve(self._rewards[part], x))]
+            found = [(_PANELS_WITHOUT_SCENE[0], Curve(self._rewards[part], x))]
         action = self._shot.recording.all_steps[step].actions.get(self._shot.agent)
         if action is not None and self._plots_actions:
             value = action.reshape(-1)
             if value.size == 1 and np.issubdtype(value.dtype, np.integer):
-                found.append((_BUILTIN[3], Action(int(value[0]), names=self._shot.meanings)))
+                found.append((_BUILTIN_PANELS[3], Action(int(value[0]), names=self._shot.meanings)))
             else:
-                found.append((_BUILTIN[3], Action(value=value, low=self._low, high=self._high, names=self._names)))
+                found.append(
+                    (_BUILTIN_PANELS[3], Action(value=value, low=self._low, high=self._high, names=self._names))
+                )
         return found
 
 
@@ -392,13 +394,13 @@ def _steps(shot: Shot, options: FilmOptions) -> list[int]:
 
 # Drawn panels on their way from the process of the agent to the one that makes the film.
 
-_SHAPE = (160, 240, 3)  # what a panel draws unless asked for another size
-_LINE = 34  # characters that fit
+_PANEL_SHAPE = (160, 240, 3)  # what a panel draws unless asked for another size
+_MAX_LINE_CHARACTERS = 34  # characters that fit
 
 
 def explanation(error: Exception) -> Text:
     """Return the panel that replaces a panel that cannot be drawn."""
-    return Text("\n".join(textwrap.wrap(f"cannot be drawn: {type(error).__name__}: {error}", _LINE)[:9]))
+    return Text("\n".join(textwrap.wrap(f"cannot be drawn: {type(error).__name__}: {error}", _MAX_LINE_CHARACTERS)[:9]))
 
 
 def save_panels(folder: Path, step: int, panels: Sequence[tuple[str, Panel]]) -> None:
@@ -410,9 +412,9 @@ def save_panels(folder: Path, step: int, panels: Sequence[tuple[str, Panel]]) ->
             name = f"{step:06d}-{index.tell()}-{number}.png"
             try:
                 picture = panel.draw(label=label)
-                if picture.shape != _SHAPE or picture.dtype != np.uint8:
+                if picture.shape != _PANEL_SHAPE or picture.dtype != np.uint8:
                     raise ValueError(
-                        f"a panel has type {picture.dtype} and shape {picture.shape}, not uint8 and {_SHAPE}"
+                        f"a panel has type {picture.dtype} and shape {picture.shape}, not uint8 and {_PANEL_SHAPE}"
                     )
             except Exception as error:  # an agent may put anything into its panels
                 picture = explanation(error).draw(label=label)

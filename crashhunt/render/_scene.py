@@ -23,11 +23,11 @@ __all__ = ["SceneView"]
 
 _SKY, _ROAD, _MARK = (246, 247, 249), (228, 232, 237), (170, 180, 192)
 _EGO, _CRASH, _AGENT, _OTHER = (224, 138, 0), (198, 40, 40), (46, 158, 91), (125, 139, 156)
-_DISTURBED = (128, 62, 158)
+_DISTURBANCE_COLOR = (128, 62, 158)
 _TRAIL_S = 4.0  # of where the agent has been
 _PERSON_PIXELS = 4  # radius at least; a person is 20 cm long
-_FINE = 2  # drawn so many times larger, for smooth edges
-_LEGEND_STEP = 22  # pixels
+_OVERSAMPLING = 2  # drawn so many times larger, for smooth edges
+_LEGEND_STEP_PIXELS = 22  # pixels
 
 
 class SceneView:
@@ -79,7 +79,7 @@ class SceneView:
         row = scene.roster.index.get(self._agent)
         if row is not None:
             self._center = scene.centers[row]
-        size = self.width * _FINE, self.height * _FINE
+        size = self.width * _OVERSAMPLING, self.height * _OVERSAMPLING
         image = Image.new("RGB", size, _SKY)
         draw = ImageDraw.Draw(image)
         self._draw_road(draw)
@@ -88,13 +88,13 @@ class SceneView:
         order = range(len(scene.roster))
         for other in sorted(order, key=scene.heights.__getitem__) if scene.heights else order:
             self._draw_actor(draw, scene, other, self._color(scene.roster.actors[other].id))
-        for one in self._going(step):
+        for one in self._active_disturbances(step):
             self._ring(draw, scene, one.vehicle)
         if self._marked(step) and row is not None:
-            x, y = self._place(np.array([scene.points[row]]))[0]
+            x, y = self._to_pixels(np.array([scene.points[row]]))[0]
             for radius in (34, 38):
                 draw.ellipse((x - radius, y - radius, x + radius, y + radius), outline=_CRASH, width=3)
-        smooth = image.reduce(_FINE)
+        smooth = image.reduce(_OVERSAMPLING)
         self._label(ImageDraw.Draw(smooth), scene, step, row)
         return as_array(smooth)
 
@@ -106,11 +106,11 @@ class SceneView:
         since = step - self._nearest_step
         return "NEAREST" if self._nearest_step >= 0 and 0 <= since <= self._second else ""
 
-    def _place(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _to_pixels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Metres to pixels of the fine image."""
-        offset = (points - self._center) * (self._scale * _FINE)
+        offset = (points - self._center) * (self._scale * _OVERSAMPLING)
         offset[:, 1] *= -1
-        placed: NDArray[np.float64] = offset + np.array([self.width, self.height]) * (_FINE / 2)
+        placed: NDArray[np.float64] = offset + np.array([self.width, self.height]) * (_OVERSAMPLING / 2)
         return placed
 
     def _draw_road(self, draw: ImageDraw.ImageDraw) -> None:
@@ -118,10 +118,10 @@ class SceneView:
         low, high = self._center - reach, self._center + reach
         seen = [lane for lane in self._lanes if (lane[2][0] <= high).all() and (lane[2][1] >= low).all()]
         for right, left, _ in seen:
-            draw.polygon(self._place(np.concatenate((right, left[::-1]))).ravel().tolist(), fill=_ROAD)
+            draw.polygon(self._to_pixels(np.concatenate((right, left[::-1]))).ravel().tolist(), fill=_ROAD)
         for right, left, _ in seen:
             for border in (right, left):
-                draw.line(self._place(border.copy()).ravel().tolist(), fill=_MARK, width=_FINE)
+                draw.line(self._to_pixels(border.copy()).ravel().tolist(), fill=_MARK, width=_OVERSAMPLING)
 
     def _draw_trail(self, draw: ImageDraw.ImageDraw, name: str, color: tuple[int, int, int], step: int) -> None:
         points = []
@@ -132,16 +132,20 @@ class SceneView:
                 points.append(scene.points[row])
         if len(points) > 1:
             pale = tuple((part + 255) // 2 for part in color)
-            draw.line(self._place(np.array(points)).ravel().tolist(), fill=pale, width=2 * _FINE)
+            draw.line(self._to_pixels(np.array(points)).ravel().tolist(), fill=pale, width=2 * _OVERSAMPLING)
 
     def _draw_actor(self, draw: ImageDraw.ImageDraw, scene: Scene, row: int, color: tuple[int, int, int]) -> None:
-        outline = self._place(corners(scene, row))
+        outline = self._to_pixels(corners(scene, row))
         dark = tuple(part // 2 for part in color)
-        if not ((outline > -50) & (outline < np.array([self.width, self.height]) * _FINE + 50)).all(axis=1).any():
+        if (
+            not ((outline > -50) & (outline < np.array([self.width, self.height]) * _OVERSAMPLING + 50))
+            .all(axis=1)
+            .any()
+        ):
             return
         if is_person(scene.roster.actors[row].id):
             x, y = outline.mean(axis=0)
-            radius = max(_PERSON_PIXELS * _FINE, float(np.ptp(outline, axis=0).max()) / 2)
+            radius = max(_PERSON_PIXELS * _OVERSAMPLING, float(np.ptp(outline, axis=0).max()) / 2)
             draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=color, outline=dark)
             return
         draw.polygon(outline.ravel().tolist(), fill=color, outline=dark)
@@ -151,7 +155,7 @@ class SceneView:
                  for share, side in ((0.22, 0.38), (0.34, 0.42), (0.34, -0.42), (0.22, -0.38))]  # fmt: skip
         draw.polygon(np.array(glass).ravel().tolist(), fill=dark)
 
-    def _going(self, step: int) -> list[Disturbance]:
+    def _active_disturbances(self, step: int) -> list[Disturbance]:
         """Return the active disturbances that affect an actor."""
         step_length_s = self._recording.prologue.step_length_s
         return [one for one in self._recording.disturbances if one.vehicle and one.is_active(step, step_length_s)]
@@ -161,10 +165,12 @@ class SceneView:
         row = scene.roster.index.get(name)
         if row is None:
             return
-        outline = self._place(corners(scene, row))
+        outline = self._to_pixels(corners(scene, row))
         x, y = (outline.min(axis=0) + outline.max(axis=0)) / 2
-        radius = max(_PERSON_PIXELS * _FINE, float(np.ptp(outline, axis=0).max()) / 2) + 5 * _FINE
-        draw.ellipse((x - radius, y - radius, x + radius, y + radius), outline=_DISTURBED, width=2 * _FINE)
+        radius = max(_PERSON_PIXELS * _OVERSAMPLING, float(np.ptp(outline, axis=0).max()) / 2) + 5 * _OVERSAMPLING
+        draw.ellipse(
+            (x - radius, y - radius, x + radius, y + radius), outline=_DISTURBANCE_COLOR, width=2 * _OVERSAMPLING
+        )
 
     def _color(self, name: str) -> tuple[int, int, int]:
         if name == self._agent:
@@ -179,12 +185,12 @@ class SceneView:
         names = [(self._agent, _EGO), (self._other, _CRASH)]
         names += [(name, _AGENT) for name in sorted(self._agents - {self._agent, self._other})]
         for place, (name, color) in enumerate((name, color) for name, color in names if name):
-            top = 36 + _LEGEND_STEP * place
+            top = 36 + _LEGEND_STEP_PIXELS * place
             draw.rectangle((13, top + 3, 25, top + 15), fill=color)
             draw.text((32, top), name, INK, font(13))
-        for place, one in enumerate(self._going(step)):
-            top = 40 + _LEGEND_STEP * (len([name for name, _ in names if name]) + place)
-            draw.text((12, top), one.words.replace("²", "^2"), _DISTURBED, font(13))  # the font has no ²
+        for place, one in enumerate(self._active_disturbances(step)):
+            top = 40 + _LEGEND_STEP_PIXELS * (len([name for name, _ in names if name]) + place)
+            draw.text((12, top), one.words.replace("²", "^2"), _DISTURBANCE_COLOR, font(13))  # the font has no ²
         if mark := self._marked(step):
             draw.text((self.width / 2, 14), mark, _CRASH, font(26), anchor="ma")
         if not self._recording.actors:

@@ -4,7 +4,7 @@ from ._prepare import (
     Look as Look,
     ReplayOptions as ReplayOptions,
     Rerun as Rerun,
-    is_todays as is_todays,
+    is_current_code as is_current_code,
     prepare as prepare,
 )
 from ._replay import (

@@ -31,7 +31,7 @@ from crashhunt.executors import snapshot_environment
 from crashhunt.panels import labelled, scope
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.render import explanation, save_meanings, save_panels
-from crashhunt.simulators import HasMeanings, HasWindow
+from crashhunt.simulators import HasWindow, NamesMetaActions
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ __all__ = ["Backwards", "OneLine", "debug", "main"]
 # The debugger continues in a fork while the process waits for its end. If the fork ends in order to go back, the
 # process gets the terminal again. So the user finds the exact earlier state, without effects of later steps.
 
-_MOST = 50  # steps; what has changed since is kept for each
-_BACK = 78  # exit code
+_MAX_STEPS_BACK = 50  # steps; what has changed since is kept for each
+_BACK_EXIT_CODE = 78  # exit code
 _TARGET = "back"
 
 
@@ -79,7 +79,7 @@ class Backwards(Observer):
         self._first = 0  # the earliest step to which the user may go back; 0 for none
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
-        if max(1, self._last - _MOST) <= step + 1 < self._last:
+        if max(1, self._last - _MAX_STEPS_BACK) <= step + 1 < self._last:
             self._leave_behind(step + 1)
 
     def go(self, step: int) -> str:
@@ -89,7 +89,7 @@ class Backwards(Observer):
             return f"it goes back {how}"
         self._file.write_text(str(step), encoding="ascii")
         sys.stdout.flush()
-        os._exit(_BACK)
+        os._exit(_BACK_EXIT_CODE)
 
     def _leave_behind(self, step: int) -> None:
         """Continue in a copy of this process; return in this process only if the user goes back to this step."""
@@ -97,7 +97,7 @@ class Backwards(Observer):
         if len(threads()) > 1 or (torch is not None and torch.cuda.is_initialized()):
             self._first = 0  # they have no copy, and what was left behind before is not missed by anybody
             return
-        places, drawn, here = _places(), random.getstate(), os.getpid()
+        places, drawn, here = _file_positions(), random.getstate(), os.getpid()
         sys.stdout.flush()
         pid = os.fork()
         if pid == 0:
@@ -108,11 +108,11 @@ class Backwards(Observer):
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C must reach only the process with the terminal
         code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         signal.signal(signal.SIGINT, before)
-        if code != _BACK:
-            _end_with(code)
+        if code != _BACK_EXIT_CODE:
+            _exit_with(code)
         target = int(self._file.read_text(encoding="ascii"))
         if target != step:
-            os._exit(_BACK)
+            os._exit(_BACK_EXIT_CODE)
         for descriptor, place in places.items():  # which the copy has read further
             with suppress(OSError):
                 os.lseek(descriptor, place, os.SEEK_SET)
@@ -133,7 +133,7 @@ class OneLine:
         return line.decode("utf-8", "replace")
 
 
-def _places() -> dict[int, int]:
+def _file_positions() -> dict[int, int]:
     """Return the positions of this process in the files that it reads."""
     found = {}
     for name in os.listdir("/proc/self/fd") if sys.platform == "linux" else ():  # noqa: PTH208 - names are enough
@@ -144,7 +144,7 @@ def _places() -> dict[int, int]:
     return found
 
 
-def _end_with(code: int) -> NoReturn:
+def _exit_with(code: int) -> NoReturn:
     """End as the copy did."""
     if code < 0:
         with suppress(OSError, ValueError):
@@ -153,7 +153,7 @@ def _end_with(code: int) -> NoReturn:
     os._exit(code)
 
 
-_LEFT = 77  # exit code
+_LEFT_EXIT_CODE = 77  # exit code
 _MAX_ATTEMPTS = 3  # of a replay that is killed from outside
 
 
@@ -221,7 +221,7 @@ def _run_once(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
             code = kept.process.wait()
         finally:
             kept.end()
-        if code == _LEFT:
+        if code == _LEFT_EXIT_CODE:
             raise KeyboardInterrupt
         if look.window is not None and code < 0:
             # sumo-gui does not always survive being closed in the middle of a step.
@@ -320,7 +320,7 @@ class _Panels(Observer):
         self._episode = episode
         for name in episode.names:
             space = episode.simulator.actions[name].space
-            save_meanings(self._folder, name, space.meanings if supports(space, HasMeanings) else ())
+            save_meanings(self._folder, name, space.meanings if supports(space, NamesMetaActions) else ())
 
     def action(self, number: int, action: NDArray[np.generic]) -> None:
         name, step = self._episode.names[number], self._episode.steps + 1
@@ -407,7 +407,7 @@ class _Window(Observer):
 
     def _closed(self) -> None:
         print("the window was closed", file=sys.stderr, flush=True)
-        os._exit(_LEFT)
+        os._exit(_LEFT_EXIT_CODE)
 
     def _pause(self, prompt: str) -> None:
         print(prompt, end="", flush=True)
@@ -432,7 +432,7 @@ class _Debugger(pdb.Pdb):
     def set_quit(self) -> None:
         """End the process without a verdict."""
         print(flush=True)
-        os._exit(_LEFT)
+        os._exit(_LEFT_EXIT_CODE)
 
 
 def _module_in(code: Sequence[str]) -> str:
@@ -459,7 +459,7 @@ def main() -> None:
             sys.stdin = cast("TextIO", OneLine())
         if job["panels"] is not None:
             observers.append(_Panels(job["panels"][0], Path(job["panels"][1])))
-        window = _opened(simulator, job) if job["window"] is not None else None
+        window = _open_window(simulator, job) if job["window"] is not None else None
         if window is not None:
             observers.append(window)
         box = BlackBox(folder / layout.BLACK_BOX)
@@ -481,7 +481,7 @@ def main() -> None:
     (folder / layout.ANSWER).write_text(json.dumps(answer), encoding="utf-8")
 
 
-def _opened(simulator: Simulator, job: _Job) -> _Window:
+def _open_window(simulator: Simulator, job: _Job) -> _Window:
     if not supports(simulator, HasWindow):
         raise UsageError(f"the simulator {type(simulator).__name__} has no window", fix="make a film with --video")
     return _Window(simulator, job)

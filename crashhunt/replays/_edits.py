@@ -25,7 +25,7 @@ __all__ = ["NAME", "Edits", "edited_disturbances", "edited_spec", "is_about_dist
 # A crash with other disturbances: ``--set disturbances…`` of a replay, and ``disturb`` of ``hunt.toml``.
 
 NAME = "disturbances"
-_FIELDS = ("who", "how_strong", "how_long")
+_EDITABLE_FIELDS = ("who", "how_strong", "how_long")
 _NONE = "none"
 
 
@@ -70,8 +70,8 @@ def edited_disturbances(
         return left, [f"{name} was {_all(meant, agents)} and is none"]
     if not asked.field:
         raise ArgumentError(f"{where}: {text!r} cannot be set", fix=f"write none, or {NAME}.{FORM}")
-    if asked.field not in _FIELDS:
-        fix = one_of(asked.field, _FIELDS, give="write one of")
+    if asked.field not in _EDITABLE_FIELDS:
+        fix = one_of(asked.field, _EDITABLE_FIELDS, give="write one of")
         raise ArgumentError(f"{where}: {asked.field!r} cannot be changed", fix=fix)
     if len(meant) > 1:
         several = [word_of(one, agents).partition("=")[0] for one in meant]
@@ -118,7 +118,7 @@ def with_other_words(
     kept = [one for one in drawn if (left and one.what not in gone) or not rates]
     taken = {_key(one) for one in now}
     found = tuple(sorted([*(one for one in kept if _key(one) not in taken), *now], key=_key))
-    changed = [f"disturb was {_said(before)} and is {_said(after)}"] * (was != now or bool(gone))
+    changed = [f"disturb was {_quoted(before)} and is {_quoted(after)}"] * (was != now or bool(gone))
     others = {name: rate for name, rate in rates.items() if name not in gone}
     ignored = [
         f"disturb was {_rates(others)} and is {_rates(left)} in hunt.toml; a replay keeps what was drawn for the trial"
@@ -189,12 +189,12 @@ def _all(some: Iterable[Disturbance], agents: Sequence[str]) -> str:
     return (word_of(found[0], agents) if len(found) == 1 else str(len(found))) if found else _NONE
 
 
-def _said(words: Sequence[str]) -> str:
+def _quoted(words: Sequence[str]) -> str:
     return ",".join(words) or _NONE
 
 
 def _rates(rates: dict[str, float]) -> str:
-    return _said([f"{name}={rate!r}" for name, rate in rates.items()])
+    return _quoted([f"{name}={rate!r}" for name, rate in rates.items()])
 
 
 Values = dict[tuple[str, str], Value]  # (agent, or empty for the scenario; name) to value

@@ -17,7 +17,7 @@ from crashhunt.plans import load_order_change, read_settings, with_recorded_load
 from crashhunt.replays._edits import edited_spec
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.snapshots import Snapshot, environment_changes, processor
-from crashhunt.trial import OF_AGENT
+from crashhunt.trial import SENSOR_KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,7 +34,7 @@ __all__ = [
     "Look",
     "ReplayOptions",
     "Rerun",
-    "is_todays",
+    "is_current_code",
     "prepare",
 ]
 
@@ -165,8 +165,8 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     runs = None if code == "log" or not trusted else snapshot.code if code == "snapshot" else ()
     spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes, code=runs)
     warnings += edits.ignored
-    if not options.scenario and (odd := _kind_it_cannot_do(scenario, spec)):
-        able = ", ".join((*(scenario.backend.disturbances or ()), *OF_AGENT))
+    if not options.scenario and (odd := _unsupported_kind(scenario, spec)):
+        able = ", ".join((*(scenario.backend.disturbances or ()), *SENSOR_KINDS))
         raise UsageError(
             f"{scenario.backend.title} does not support the disturbance {odd!r}", fix=f"it supports {able}"
         )
@@ -190,7 +190,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         if code == "log":
             message = f"recorded actions belong to the recorded scenario, not to {options.scenario!r}"
             raise UsageError(message, fix="omit --scenario or --from-log")
-        scenario, spec = _elsewhere(options.scenario, settings, spec, recorded.prologue.step_length_s)
+        scenario, spec = _in_scenario(options.scenario, settings, spec, recorded.prologue.step_length_s)
         elsewhere = f"the scenario was {settings.scenario} and is {options.scenario}"
         edits = replace(edits, others=(*edits.others, elsewhere))
     worker = WorkerSettings(
@@ -218,7 +218,9 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     )
 
 
-def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s: float) -> tuple[Scenario, TrialSpec]:
+def _in_scenario(
+    name: str, settings: HuntSettings, spec: TrialSpec, step_length_s: float
+) -> tuple[Scenario, TrialSpec]:
     """Return the trial in another scenario: same agents, arguments, seed and simulation time."""
     other = load_scenario(name)
     if len(other.agents) != len(settings.agents):
@@ -229,7 +231,7 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
     agents = {ids[agent]: chosen for agent, chosen in settings.agents.items()}
     shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}
     there = other.backend.step_length_s(other)
-    odd = _kind_it_cannot_do(other, spec)
+    odd = _unsupported_kind(other, spec)
     if odd:
         message = f"--scenario {name!r}: {other.backend.title} does not support the disturbance {odd!r}"
         raise UsageError(message, fix="replay with --set disturbances=none as well")
@@ -247,14 +249,14 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
     )
 
 
-def _kind_it_cannot_do(scenario: Scenario, spec: TrialSpec) -> str:
+def _unsupported_kind(scenario: Scenario, spec: TrialSpec) -> str:
     """Return the first kind of disturbance that the scenario's simulator does not support; empty if there is none."""
     able = scenario.backend.disturbances
-    odd = (one.what for one in spec.disturbances if able is not None and one.what not in (*able, *OF_AGENT))
+    odd = (one.what for one in spec.disturbances if able is not None and one.what not in (*able, *SENSOR_KINDS))
     return next(odd, "")
 
 
-def is_todays(rerun: Rerun) -> bool:
+def is_current_code(rerun: Rerun) -> bool:
     """Whether the trials run with this crashhunt, and not with the crashhunt of the snapshot."""
     if not rerun.worker.code:
         return True

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["comparison_page", "describe_comparison"]
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5a5a5a")
-_BINS = 10  # more, and most hunts have too few crashes a bin
+_MAX_BINS = 10  # more, and most hunts have too few crashes a bin
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1b2430; --faint: #5d6b7d; --line: #d9dfe7; --paper: #fff; --back: #f6f7f9; }
 @media (prefers-color-scheme: dark) {
@@ -197,7 +197,7 @@ def _argument_plot(
     if numeric:
         low = min(float(values.min()) for values, _ in of.values())
         high = max(float(values.max()) for values, _ in of.values())
-        edges: NDArray[np.float64] = np.linspace(low, high, _BINS + 1)
+        edges: NDArray[np.float64] = np.linspace(low, high, _MAX_BINS + 1)
         labels = [f"{low:.4g}", f"{high:.4g}"]
     else:
         words = sorted({str(value) for values, _ in of.values() for value in values})

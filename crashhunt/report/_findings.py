@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "Finding",
+    "CrashFinding",
     "corpus_annotations",
     "corpus_summary",
     "crash_annotations",
@@ -39,7 +39,7 @@ __all__ = [
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CrashFinding:
     """A crash type, and the line of code to which an annotation belongs.
 
     Args:
@@ -63,7 +63,7 @@ class Finding:
     group: Group
 
 
-def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> list[Finding]:
+def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> list[CrashFinding]:
     """Return the crash types in the order of their groups. Runs no code of the bundles.
 
     Args:
@@ -78,7 +78,7 @@ def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None =
         fault = f" At fault: {group.fault}." if group.fault not in ("", "nobody can tell") else ""
         message = f"{example.result.summary}.{fault} {count}. To look at it: crashhunt show {example.path}"
         found.append(
-            Finding(
+            CrashFinding(
                 rule=group.signature.outcome,
                 title=one_line(str(group.signature)),
                 message=one_line(message),
@@ -145,12 +145,12 @@ def _in_project(file: PurePath) -> str:
 
 # Results of hunts and corpora for CI: a summary in Markdown, and annotations in the syntax of GitHub's runners.
 
-_MOST = 10  # annotations of each level that GitHub shows for one step
-_SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|~])")
+_MAX_ANNOTATIONS = 10  # annotations of each level that GitHub shows for one step
+_MARKDOWN_SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|~])")
 _ICONS = {"still": "💥", "changed": "🔀", "fixed": "✅", "cannot_run": "🚫"}
 
 
-def crashes_summary(findings: Sequence[Finding], *, compared: bool = False) -> str:
+def crashes_summary(findings: Sequence[CrashFinding], *, compared: bool = False) -> str:
     """Return the crash types as Markdown, one row each.
 
     Args:
@@ -175,7 +175,7 @@ def crashes_summary(findings: Sequence[Finding], *, compared: bool = False) -> s
     return "\n".join([*lines, ""])
 
 
-def crash_annotations(findings: Sequence[Finding]) -> list[str]:
+def crash_annotations(findings: Sequence[CrashFinding]) -> list[str]:
     """Return a GitHub annotation command for each new crash type, at its line of code.
 
     Of more than ten, GitHub shows ten; a notice then has both numbers.
@@ -225,11 +225,11 @@ def corpus_annotations(reports: Sequence[CaseReport]) -> list[str]:
 
 def _limited(annotations: Sequence[str], what: str) -> list[str]:
     """Return at most ten annotations, with a notice if there are more."""
-    shown, count = list(annotations[:_MOST]), len(annotations)
-    if count <= _MOST:
+    shown, count = list(annotations[:_MAX_ANNOTATIONS]), len(annotations)
+    if count <= _MAX_ANNOTATIONS:
         return shown
-    said = f"{_MOST} of {count} {what} are annotated. The summary of the job has all of them."
-    return [_command("notice", f"{_MOST} of {count} {what} shown", said, "", 1), *shown]
+    said = f"{_MAX_ANNOTATIONS} of {count} {what} are annotated. The summary of the job has all of them."
+    return [_command("notice", f"{_MAX_ANNOTATIONS} of {count} {what} shown", said, "", 1), *shown]
 
 
 def _count(number: int, one: str, many: str) -> str:
@@ -242,7 +242,7 @@ def _row(cells: Sequence[str]) -> str:
 
 def _plain(text: str) -> str:
     """Return text for Markdown with all special characters escaped."""
-    return _SPECIAL.sub(r"\\\1", one_line(text))
+    return _MARKDOWN_SPECIAL.sub(r"\\\1", one_line(text))
 
 
 def _command(level: str, title: str, message: str, file: str, line: int) -> str:
@@ -260,7 +260,7 @@ def _value(text: str) -> str:
 
 # Crash types as SARIF 2.1.0 (OASIS), which GitHub code scanning and editors read: one alert for each type.
 
-_HOME = "https://github.com/crashhunt/crashhunt"
+_HOME_URL = "https://github.com/crashhunt/crashhunt"
 _RULES = {
     "collision": "A controlled vehicle and another actor touched",
     "off_road": "A controlled vehicle left the road",
@@ -271,7 +271,7 @@ _RULES = {
 }
 
 
-def write_sarif(findings: Sequence[Finding], target: Path) -> None:
+def write_sarif(findings: Sequence[CrashFinding], target: Path) -> None:
     """Write crash types as a SARIF file. A file that exists is replaced; the file is never incomplete.
 
     Each alert belongs to a line of the agent's code. If that line is unknown, the alert belongs to the settings of the
@@ -285,12 +285,12 @@ def write_sarif(findings: Sequence[Finding], target: Path) -> None:
     driver = {
         "name": "crashhunt",
         "version": __version__,
-        "informationUri": _HOME,
+        "informationUri": _HOME_URL,
         "rules": [
             {
                 "id": rule,
                 "shortDescription": {"text": _RULES.get(rule, rule.replace("_", " ").capitalize())},
-                "helpUri": f"{_HOME}/blob/main/crashhunt/guide/reference/outcomes.md",
+                "helpUri": f"{_HOME_URL}/blob/main/crashhunt/guide/reference/outcomes.md",
             }
             for rule in rules
         ],
@@ -305,7 +305,7 @@ def write_sarif(findings: Sequence[Finding], target: Path) -> None:
         temporary.write_text(json.dumps(found, indent=1), encoding="utf-8")
 
 
-def _result(finding: Finding, rule: int) -> dict[str, object]:
+def _result(finding: CrashFinding, rule: int) -> dict[str, object]:
     uri = quote(finding.file) or _settings(finding.group.shortest.hunt)
     place = {"artifactLocation": {"uri": uri}, "region": {"startLine": finding.line}}
     return {

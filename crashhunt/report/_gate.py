@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["describe_gate", "gate_annotations", "gate_summary", "write_gate_junit"]
 
-_SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|~])")
+_MARKDOWN_SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|~])")
 _ICONS = {"better": "✅", "no_difference": "✅", "worse": "❌", "undecided": "❔"}
 
 
@@ -188,4 +188,4 @@ def _row(*cells: str) -> str:
 
 def _plain(text: str) -> str:
     """Return text for Markdown with all special characters escaped."""
-    return _SPECIAL.sub(r"\\\1", one_line(text))
+    return _MARKDOWN_SPECIAL.sub(r"\\\1", one_line(text))

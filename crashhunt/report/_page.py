@@ -68,10 +68,10 @@ UNCHOSEN = ("", "random", "start", "halton")
 """Origins of trials that were chosen without learning, so that they cover the whole space."""
 
 _LEAST, _MOST = 40, 4000  # trials
-_PARTS = 5  # of a range, with as many trials each
-_RESAMPLED = 200
-_INTERVAL = (5.0, 95.0)
-_GENERATIONS = 50  # of a lineage; more are unreadable
+_IMPORTANCE_PARTS = 5  # of a range, with as many trials each
+_BOOTSTRAP_RESAMPLES = 200
+_INTERVAL_PERCENTILES = (5.0, 95.0)
+_MAX_GENERATIONS = 50  # of a lineage; more are unreadable
 
 
 class Importance(TypedDict):
@@ -114,27 +114,27 @@ def importance_of(trials: Sequence[tuple[Mapping[str, Value], float]]) -> list[I
     ranks = np.searchsorted(np.sort(dangers), dangers, "left") + np.searchsorted(np.sort(dangers), dangers, "right")
     names = {name: None for values, _ in trials for name in values}
     rng = np.random.default_rng(0)
-    again = rng.integers(len(trials), size=(_RESAMPLED, len(trials)))
+    again = rng.integers(len(trials), size=(_BOOTSTRAP_RESAMPLES, len(trials)))
     found = []
     for name in names:
-        parts = _parts([values.get(name) for values, _ in trials])
+        parts = _range_parts([values.get(name) for values, _ in trials])
         if parts.max() < 1:
             continue
         share = _explained(ranks, parts)
         shares = np.array([_explained(ranks[drawn], parts[drawn]) for drawn in again])
         shares -= shares.mean() - share  # trials that were drawn twice look as if they explained each other
-        low, high = (float(end) for end in np.clip(np.percentile(shares, _INTERVAL), 0.0, 1.0))
+        low, high = (float(end) for end in np.clip(np.percentile(shares, _INTERVAL_PERCENTILES), 0.0, 1.0))
         found.append(Importance(name=name, share=share, low=min(low, share), high=max(high, share)))
     return sorted(found, key=lambda one: -one["share"])
 
 
-def _parts(values: Sequence[Value | None]) -> NDArray[np.intp]:
+def _range_parts(values: Sequence[Value | None]) -> NDArray[np.intp]:
     """Return in which part of its range each value is, from 0; of words, which one it is."""
     kinds = list(dict.fromkeys(values))
-    if len(kinds) <= _PARTS or not all(isinstance(value, int | float) for value in kinds):
+    if len(kinds) <= _IMPORTANCE_PARTS or not all(isinstance(value, int | float) for value in kinds):
         return np.array([kinds.index(value) for value in values])
     numbers = np.array(values, dtype=float)
-    edges = np.unique(np.quantile(numbers, np.arange(1, _PARTS) / _PARTS))
+    edges = np.unique(np.quantile(numbers, np.arange(1, _IMPORTANCE_PARTS) / _IMPORTANCE_PARTS))
     return np.searchsorted(edges, numbers, "right")
 
 
@@ -159,7 +159,7 @@ def lineage_of(number: int, trial: Callable[[int], TrialResult | None]) -> list[
     """
     found: list[TrialResult] = []
     result = trial(number)
-    while result is not None and result.spec.parent is not None and len(found) < _GENERATIONS:
+    while result is not None and result.spec.parent is not None and len(found) < _MAX_GENERATIONS:
         if result.spec.parent >= result.spec.number:
             break
         result = trial(result.spec.parent)
@@ -168,8 +168,8 @@ def lineage_of(number: int, trial: Callable[[int], TrialResult | None]) -> list[
     return found
 
 
-_DOTS = 4000  # trials in a plot; more cannot be distinguished
-_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+_MAX_PLOTTED_TRIALS = 4000  # trials in a plot; more cannot be distinguished
+_GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 def write_report(
@@ -356,7 +356,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
         outcomes = ledger.outcomes()
         total = sum(outcomes.values())
         crashes = sum(outcomes.get(str(name), 0) for name in settings.crash_on)
-        share, share_of_crashes = _DOTS / max(total - crashes, 1), _DOTS / max(crashes, 1)
+        share, share_of_crashes = _MAX_PLOTTED_TRIALS / max(total - crashes, 1), _MAX_PLOTTED_TRIALS / max(crashes, 1)
         trials, stress, not_fully_asked, unchosen_in_all = [], None, 0, 0
         unchosen: list[tuple[Mapping[str, Value], float]] = []
         for number, row in enumerate(map(TrialRow, ledger.plain_results())):
@@ -392,7 +392,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
             "trials": trials,
             "stress": stress,
             "not_fully_asked": not_fully_asked,
-            "drawn": _drawn(trials, total, crashes, settings) if len(trials) < total else None,
+            "drawn": _plot_counts(trials, total, crashes, settings) if len(trials) < total else None,
             "importance": importance_of(unchosen),
             "rate": _rate(ledger.facts().get("running_rate")),
             "typesByCause": ledger.facts().get("types_by_cause"),
@@ -417,7 +417,9 @@ def _rate(rate: RunningRate | None) -> dict[str, object] | None:
     }
 
 
-def _drawn(trials: Sequence[Mapping[str, object]], total: int, crashes: int, settings: HuntSettings) -> dict[str, int]:
+def _plot_counts(
+    trials: Sequence[Mapping[str, object]], total: int, crashes: int, settings: HuntSettings
+) -> dict[str, int]:
     """Return how many crashes and other trials the plots show, and how many there are."""
     shown = sum(trial["outcome"] in settings.crash_on for trial in trials)
     return {"crashes": shown, "allCrashes": crashes, "others": len(trials) - shown, "allOthers": total - crashes}
@@ -428,7 +430,7 @@ def _is_drawn(number: int, share: float) -> bool:
 
     The choice is not periodic: every fifth trial of a guided hunt is random, so a periodic choice would be biased.
     """
-    return number * _GOLDEN % 1.0 < share
+    return number * _GOLDEN_RATIO % 1.0 < share
 
 
 def _crash(bundle: Bundle, story: Story) -> dict[str, object]:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from crashhunt.ledger import Bounds, RunningRate
+    from crashhunt.ledger import RateBounds, RunningRate
     from crashhunt.rates import CrashRate, RatePart
 
 __all__ = [
@@ -29,7 +29,7 @@ __all__ = [
     "write_rates_csv",
 ]
 
-_PER = {"trial": "per trial", "hour": "per hour", "1000km": "per 1,000 km"}
+_PER_WORDS = {"trial": "per trial", "hour": "per hour", "1000km": "per 1,000 km"}
 _TRAINED_ON = "trained_on"
 _REASONS = {
     "invalid": "invalid",
@@ -79,14 +79,20 @@ def describe_running(rate: RunningRate) -> str:
     """Return the rate of a running hunt in one line: the answer, then the evidence."""
     if rate["method"] == "rare":
         return _describe_rare(rate)
-    bar = f"; bar {format_rate(rate['bar'])} {_PER[rate['per']]}: {rate['verdict']}" if rate["bar"] is not None else ""
+    bar = (
+        f"; bar {format_rate(rate['bar'])} {_PER_WORDS[rate['per']]}: {rate['verdict']}"
+        if rate["bar"] is not None
+        else ""
+    )
     if rate["certain"] is None:
         return f"crash rate: not known yet ({rate['why_not']}){bar}"
     kind = "random trial" if rate["origin"] else "trial"
     trials = f"{_count(rate['crashes'], 'crash', 'crashes')} in {_count(rate['trials'], kind, f'{kind}s')}"
     if trained_on := rate.get("trained_on"):
         bar += f"; {count_training_trials(trained_on)}"
-    return f"crash rate: {_certain(rate['certain'])} {_PER[rate['per']]} ({trials}, {rate['confidence']:g} %){bar}"
+    return (
+        f"crash rate: {_certain(rate['certain'])} {_PER_WORDS[rate['per']]} ({trials}, {rate['confidence']:g} %){bar}"
+    )
 
 
 def _describe_rare(rate: RunningRate) -> str:
@@ -104,7 +110,7 @@ def _describe_rare(rate: RunningRate) -> str:
     return found + certain
 
 
-def _certain(bounds: Bounds) -> str:
+def _certain(bounds: RateBounds) -> str:
     return format_interval(Interval(bounds["low"], math.inf if bounds["high"] is None else bounds["high"]))
 
 
@@ -125,16 +131,18 @@ def _of_hunt(rates: list[CrashRate]) -> list[str]:
     known = [rate for rate in rates if rate.certain is not None]
     lines: list[str]
     if known and not first.crashes:
-        each = [f"{format_rate(rate.certain.high)} {_PER[rate.per]}" for rate in known if rate.certain is not None]
+        each = [
+            f"{format_rate(rate.certain.high)} {_PER_WORDS[rate.per]}" for rate in known if rate.certain is not None
+        ]
         lines = [f"{head}: at most {', '.join(each)} {confidence}"]
     elif known:
-        lines = [f"{head} {confidence}", *(f"  {_PER[rate.per]}: {_answer(rate)}" for rate in known)]
+        lines = [f"{head} {confidence}", *(f"  {_PER_WORDS[rate.per]}: {_answer(rate)}" for rate in known)]
     else:
         lines = [head]
     for why in dict.fromkeys(rate.why_not for rate in rates if rate.why_not):
         concerned = [rate for rate in rates if rate.why_not == why]
         missing = "no rate" if concerned[0].certain is None else "no estimate"
-        which = "" if len(concerned) == len(rates) else f" {' and '.join(_PER[rate.per] for rate in concerned)}"
+        which = "" if len(concerned) == len(rates) else f" {' and '.join(_PER_WORDS[rate.per] for rate in concerned)}"
         lines.append(f"  {missing}{which}: {why}")
     if trained_on := first.excluded.get(_TRAINED_ON):
         lines.append(f"  {count_training_trials(trained_on)}")
@@ -147,7 +155,7 @@ def _of_hunt(rates: list[CrashRate]) -> list[str]:
 
 
 def _verdict(rate: CrashRate, bar: float) -> str:
-    shown = f"the bar of {format_rate(bar)} {_PER[rate.per]}"
+    shown = f"the bar of {format_rate(bar)} {_PER_WORDS[rate.per]}"
     if rate.verdict != "undecided":
         return f"certainly {rate.verdict} {shown}"
     if rate.why_undecided:
@@ -170,7 +178,7 @@ def _part_lines(rate: CrashRate) -> list[str]:
     parts = len(rate.parts)
     together = f"{rate.confidence:g} % for all {parts} intervals together" if parts > 1 else f"{rate.confidence:g} %"
     return [
-        f"  {_PER[rate.per]}, by {rate.parts[0].by} ({together}):",
+        f"  {_PER_WORDS[rate.per]}, by {rate.parts[0].by} ({together}):",
         *(f"    {part.name}: {part.crashes} of {part.trials:,} trials, {_answer(part)}" for part in rate.parts),
     ]
 
@@ -216,10 +224,10 @@ def rates_page(rates: Sequence[CrashRate], path: Path) -> None:
         exposure = f"{rate.trials:,} trials, {rate.driven_s / 3600:,.2f} h, {rate.driven_m / 1000:,.1f} km"
         trained_on = rate.excluded.get(_TRAINED_ON)
         remarks = filter(None, (rate.why_not, count_training_trials(trained_on) if trained_on else ""))
-        rows.append((rate.dir, _PER[rate.per], str(rate.crashes), exposure, *_numbers(rate), "; ".join(remarks)))
+        rows.append((rate.dir, _PER_WORDS[rate.per], str(rate.crashes), exposure, *_numbers(rate), "; ".join(remarks)))
         for part in rate.parts:
             name = f"{part.by} {part.name}" if part.by != part.name else part.name
-            rows.append((rate.dir, f"{_PER[rate.per]}, {name}", str(part.crashes), f"{part.trials:,} trials",
+            rows.append((rate.dir, f"{_PER_WORDS[rate.per]}, {name}", str(part.crashes), f"{part.trials:,} trials",
                          *_numbers(part), ""))  # fmt: skip
     header = ("hunt", "rate", "crashes", "in", "estimate", "at least", "at most", "remarks")
     head = "".join(f"<th>{name}</th>" for name in header)

@@ -22,7 +22,7 @@ from crashhunt.report._table import NEAREST, aligned, stacked, steps_table
 from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import (
     COLUMNS,
-    STANDS,
+    MAX_STANDING_SPEED_MPS,
     about_changes,
     about_danger,
     about_disturbances,
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 __all__ = ["Story"]
 
 _MAX_ACTION_CHARACTERS = 60  # of an action that is no array of numbers
-_ROWS = 20  # of the table; of more steps, the table shows a selection
+_MAX_TABLE_ROWS = 20  # of the table; of more steps, the table shows a selection
 _WIDTH = 80  # characters of a line of the table, as on an ordinary terminal
 
 
@@ -204,7 +204,11 @@ class Story:
     def _steps_shown(self) -> list[StepRecord]:
         """Return the steps of the table, a selection of those that are described."""
         steps, near = self._steps(), self.nearest
-        return _thinned(steps, _ROWS, always=self.escape) if near is None else _around(steps, _ROWS, near.step)
+        return (
+            _thinned(steps, _MAX_TABLE_ROWS, always=self.escape)
+            if near is None
+            else _steps_around(steps, _MAX_TABLE_ROWS, near.step)
+        )
 
     def _mark(self, step: int, moment: Moment | None) -> str:
         """Return the remark at the end of a row of the table."""
@@ -216,7 +220,9 @@ class Story:
         if hit is None or moment is None or step != self.recording.steps:
             return ""
         own, its = self._speeds_at_contact()
-        same = abs(own - moment.speed) < STANDS and abs(its - moment.other_speed) < STANDS
+        same = (
+            abs(own - moment.speed) < MAX_STANDING_SPEED_MPS and abs(its - moment.other_speed) < MAX_STANDING_SPEED_MPS
+        )
         return "" if same or math.isnan(own) or math.isnan(its) else f"<- they touched at {own:.1f} and {its:.1f} m/s"
 
     def _speeds_at_contact(self) -> tuple[float, float]:
@@ -440,7 +446,7 @@ def _thinned(steps: list[StepRecord], rows: int, *, always: int | None) -> list[
     return [*(step for step in earlier if id(step) in kept or step.step == always), *recent]
 
 
-def _around(steps: list[StepRecord], rows: int, middle: int) -> list[StepRecord]:
+def _steps_around(steps: list[StepRecord], rows: int, middle: int) -> list[StepRecord]:
     """Return about `rows` evenly spaced steps that contain the middle one."""
     every = math.ceil(len(steps) / rows)
     return [step for step in steps if (step.step - middle) % every == 0]

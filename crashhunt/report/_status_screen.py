@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 __all__ = ["Watcher", "describe_phase", "format_arguments", "format_inputs", "format_pace", "format_seconds"]
 
 _LINE_EVERY_S = 5.0  # where lines cannot be overwritten, such as in a CI log
-_LOW_SCREEN = 16  # lines; on a lower screen, workers need the space
-_LEAST_BAR = 8  # columns; a shorter bar is unreadable, and the words need the space
+_MIN_SCREEN_LINES = 16  # lines; on a lower screen, workers need the space
+_MIN_BAR_COLUMNS = 8  # columns; a shorter bar is unreadable, and the words need the space
 _STYLES = {
     "traffic crash": "bold red",
     "traffic event": "bold yellow",
@@ -111,13 +111,16 @@ class Watcher:
             left -= len(self._console.render_lines(tried))
             rows.append(tried)
         if status.nearest is not None:
-            near = Text(one_line(f"nearest miss{_grown(status.search)}: {_near(status.nearest)}"), overflow="fold")
+            near = Text(
+                one_line(f"nearest miss{_describe_growth(status.search)}: {_nearest_words(status.nearest)}"),
+                overflow="fold",
+            )
             if len(self._console.render_lines(near)) + len(status.workers) > left:
                 near = Text(near.plain, no_wrap=True, overflow="ellipsis")
             left -= len(self._console.render_lines(near))
             rows.append(near)
         if status.stressed is not None and len(status.workers) < left:
-            rows.append(Text(one_line(_stressed(status.stressed)), no_wrap=True, overflow="ellipsis"))
+            rows.append(Text(one_line(_describe_stress(status.stressed)), no_wrap=True, overflow="ellipsis"))
             left -= 1
         if status.not_fully_asked and len(status.workers) < left:
             count = status.not_fully_asked
@@ -132,7 +135,7 @@ class Watcher:
 
     def _folded(self, text: Text) -> Text:
         """Return a text of at most two lines; a longer one, or one on a low screen, is cut to one line."""
-        folds = self._console.height > _LOW_SCREEN and len(self._console.render_lines(text)) <= 2
+        folds = self._console.height > _MIN_SCREEN_LINES and len(self._console.render_lines(text)) <= 2
         return text if folds else Text(text.plain, no_wrap=True, overflow="ellipsis")
 
     def _head(self, status: HuntStatus, width: int) -> Text:
@@ -151,7 +154,7 @@ def _bar(status: HuntStatus, width: int) -> RenderableType:
     share, phase = status.share_done, status.progress
     if phase is not None:
         said, share = (describe_phase(phase.name, phase.done, phase.total, phase.seconds_left),), _share(phase)
-    elif width - sum(len(part) + 2 for part in said) < _LEAST_BAR:
+    elif width - sum(len(part) + 2 for part in said) < _MIN_BAR_COLUMNS:
         said = (said[0].removesuffix(" trials"), *said[1:])
     table = Table.grid(padding=(0, 2))
     room = width - sum(len(part) + 2 for part in said)
@@ -321,7 +324,7 @@ def _count(status: HuntStatus) -> str:
     return out_of(status.done, status.planned, "/")
 
 
-def _stressed(result: TrialResult) -> str:
+def _describe_stress(result: TrialResult) -> str:
     stress = result.stress
     assert stress is not None
     what = stress.disturbance.words if stress.disturbance is not None else ""
@@ -340,7 +343,7 @@ def _strategies(search: SearchStatus) -> str:
     return f"search: {', '.join(parts)}"
 
 
-def _grown(search: SearchStatus) -> str:
+def _describe_growth(search: SearchStatus) -> str:
     """Return how long ago the greatest criticality rose."""
     if search.grown_trials is None or search.grown_s is None:
         return ""
@@ -348,7 +351,7 @@ def _grown(search: SearchStatus) -> str:
     return f" ({count} {'trial' if count == 1 else 'trials'} / {format_seconds(search.grown_s)} ago)"
 
 
-def _near(result: TrialResult) -> str:
+def _nearest_words(result: TrialResult) -> str:
     closest = result.closest
     if math.isfinite(closest.time_to_collision_s):
         how = f"least TTC {closest.time_to_collision_s:.2f} s"

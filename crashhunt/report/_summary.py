@@ -107,8 +107,8 @@ def _lines(rows: list[list[str]]) -> list[str]:
     ]
 
 
-_SHOWN = 10
-_WITNESSES = {
+_MAX_SHOWN = 10
+_SOURCE_WORDS = {
     ("overlap", "reported"): "the simulator reports it, and the outlines overlap",
     ("overlap",): "the outlines overlap; the simulator does not report it",
     ("reported",): "the simulator reports it; the outlines do not overlap",
@@ -163,11 +163,11 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     if report.kinds and sum(group.count for group in report.kinds) > 1:  # `--keep` leaves fewer bundles than crashes
         lines += ["", *describe_groups(report.kinds, by_cause=report.types_by_cause).splitlines()]
     crashes = by_likelihood(report.crashes)
-    for bundle in crashes[:_SHOWN]:
+    for bundle in crashes[:_MAX_SHOWN]:
         lines += ["", *_describe_crash(bundle)]
-    if len(report.crashes) > _SHOWN:
-        shown = f"{_SHOWN} of {report.tally.found} crashes shown"
-        more = f"{len(report.crashes) - _SHOWN} more in {report.directory / 'crashes'}"
+    if len(report.crashes) > _MAX_SHOWN:
+        shown = f"{_MAX_SHOWN} of {report.tally.found} crashes shown"
+        more = f"{len(report.crashes) - _MAX_SHOWN} more in {report.directory / 'crashes'}"
         lines += ["", f"{shown}; {more}"]
     lines += _near_misses(report, program)
     if report.copied is not None:
@@ -187,11 +187,11 @@ def _near_misses(report: HuntReport, program: str) -> list[str]:
     if not report.near_misses:
         return []
     lines = ["", f"Near misses, saved in {report.directory / layout.NEAR_MISSES}:"]
-    for bundle in report.near_misses[:_SHOWN]:
+    for bundle in report.near_misses[:_MAX_SHOWN]:
         result = bundle.result
         lines.append(f"  {bundle.id}  danger {result.danger or 0.0:.2f}  {format_arguments(result)}")
-    if len(report.near_misses) > _SHOWN:
-        lines.append(f"  {_SHOWN} of {len(report.near_misses)} near misses shown")
+    if len(report.near_misses) > _MAX_SHOWN:
+        lines.append(f"  {_MAX_SHOWN} of {len(report.near_misses)} near misses shown")
     first = report.near_misses[0].id
     return [*lines, f"Replay one:  {shlex.join([program, 'replay', str(report.directory), '--crash', first])}"]
 
@@ -283,9 +283,9 @@ def _describe_audit(report: HuntReport) -> list[str]:
     lines = [f"Audit: {found.trials} replayed in new processes, {same} bit-identical."]
     if found.not_finished:
         lines.append(f"  {found.not_finished} more did not finish. Run the same command to replay them")
-    lines += [f"  {difference}" for difference in found.differences[:_SHOWN]]
-    if len(found.differences) > _SHOWN:
-        lines.append(f"  … and {len(found.differences) - _SHOWN} more; for all of them, run: crashhunt logs")
+    lines += [f"  {difference}" for difference in found.differences[:_MAX_SHOWN]]
+    if len(found.differences) > _MAX_SHOWN:
+        lines.append(f"  … and {len(found.differences) - _MAX_SHOWN} more; for all of them, run: crashhunt logs")
     return lines
 
 
@@ -329,7 +329,7 @@ def _evidence(result: TrialResult) -> list[str]:
         if math.isfinite(hit.x):  # an environment without a scene has no places
             lines.append(f"{where}; {speeds}")
         if hit.victim:
-            lines.append(_WITNESSES.get(hit.seen_by, f"seen by {', '.join(hit.seen_by)}"))
+            lines.append(_SOURCE_WORDS.get(hit.seen_by, f"seen by {', '.join(hit.seen_by)}"))
     if failure is not None:
         frames = failure.traceback.strip().splitlines()
         # Python prints the most recent call last. faulthandler, for dead and hanging processes, prints it first.

@@ -42,11 +42,15 @@ __all__ = [
 
 TableCell: TypeAlias = "bool | int | float | str | None"
 TableRow: TypeAlias = dict[str, TableCell]
-_SCENE = ("x", "y", "heading", "speed")
+_SCENE_FIELDS = ("x", "y", "heading", "speed")
 NEAREST = ("time_to_collision_s", "gap_m", "required_deceleration")
 """Measures relative to the nearest actor, as in every trial."""
 
-_TO_OTHER = {"gap_to_other_m": "gap_m", "time_to_other_s": "time_to_collision_s", "closing_speed": "closing_speed"}
+_PARTNER_FIELDS = {
+    "gap_to_other_m": "gap_m",
+    "time_to_other_s": "time_to_collision_s",
+    "closing_speed": "closing_speed",
+}
 
 
 def check_fields(recording: Recording, fields: Sequence[str], agent: str) -> list[str]:
@@ -57,13 +61,15 @@ def check_fields(recording: Recording, fields: Sequence[str], agent: str) -> lis
     """
     channel = next(found for found in recording.prologue.agents if found.id == agent)
     actions, observed = _actions(channel), _observed(channel)
-    known = [*_SCENE, "reward", *NEAREST, *_TO_OTHER, *actions, *observed]
+    known = [*_SCENE_FIELDS, "reward", *NEAREST, *_PARTNER_FIELDS, *actions, *observed]
     names: list[str] = []
     for field in fields:
         name = field.replace(" ", "")
         if name != "action" and name not in known:
             hint = did_you_mean(name, known)
-            shown = ", ".join([*_SCENE, "reward", *NEAREST, *_TO_OTHER, "action", *actions, *list(observed)[:3]])
+            shown = ", ".join(
+                [*_SCENE_FIELDS, "reward", *NEAREST, *_PARTNER_FIELDS, "action", *actions, *list(observed)[:3]]
+            )
             raise UsageError(f"--print: there is no field {field!r}", fix=f"{hint} there are {shown}, …".lstrip())
         names += actions if name == "action" else (name,)
     return names
@@ -96,8 +102,8 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
     for number, step in enumerate(recording.all_steps):
         row: TableRow = {"step": step.step, "time_s": step.scene.time_s if step.scene is not None else None}
         for name in names:
-            if name in _TO_OTHER:
-                row[name] = getattr(moments.get(step.step), _TO_OTHER[name], None)
+            if name in _PARTNER_FIELDS:
+                row[name] = getattr(moments.get(step.step), _PARTNER_FIELDS[name], None)
             elif name in NEAREST:
                 row[name] = float(measured[name][number]) if step.scene is not None else None
             elif name in actions:
@@ -183,7 +189,7 @@ def _of_scene(step: StepRecord, agent: str, name: str) -> float | None:
         return step.rewards.get(agent)
     scene = step.scene
     row = scene.roster.index.get(agent) if scene is not None else None
-    return None if scene is None or row is None else float(scene.data[row, _SCENE.index(name)])
+    return None if scene is None or row is None else float(scene.data[row, _SCENE_FIELDS.index(name)])
 
 
 def _is_nothing(value: TableCell) -> bool:

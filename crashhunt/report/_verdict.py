@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 __all__ = ["describe_contact", "verdict_of"]
 
 _CHANGE_S = 3.0  # before the contact: the rules of fault call a lane change that began earlier complete
-_STRAIGHT = math.radians(10)  # in a bend, a sideways displacement is no lane change
-_MERGES = math.radians(30)  # between their headings, as in the rules of fault
+_MAX_STRAIGHT_TURN_RAD = math.radians(10)  # in a bend, a sideways displacement is no lane change
+_MAX_MERGE_ANGLE_RAD = math.radians(30)  # between their headings, as in the rules of fault
 _SIDEWAYS_M = 1.0  # less does not say to which side
 _MOVES_MPS = 1.0  # a time gap to a slower vehicle is no useful number
 _SHORT_S = 0.1  # a shorter time gap is given in m
-_MANOEUVRES = {
+_MANEUVER_WORDS = {
     "brake": "brakes",
     "left": "changes to the lane on the left and brakes",
     "right": "changes to the lane on the right and brakes",
@@ -101,7 +101,7 @@ def describe_contact(contact: ContactRecord, omission: Omission | None = None) -
         return _what_touched(contact)
     (changer,) = changers
     partner, since = contact.partner(changer), contact.changed_s(changer)
-    if since is not None and contact.turned(since) > _MERGES:
+    if since is not None and contact.turned(since) > _MAX_MERGE_ANGLE_RAD:
         return _what_touched(contact)  # in a bend or a roundabout, lanes lead apart and together
     is_cause = omission is not None and (omission.instead, omission.actor) == ("changed lanes", partner)
     gap = _gap_of(omission) if omission is not None and is_cause else _gap_at(contact, changer)
@@ -152,7 +152,7 @@ def _side(contact: ContactRecord, changer: str) -> str:
     way = contact.way(changer)
     recent = contact.times <= _CHANGE_S + 1e-6
     headings, points = way.headings[recent], way.centers[recent]
-    if len(headings) < 2 or np.ptp(headings) > _STRAIGHT:
+    if len(headings) < 2 or np.ptp(headings) > _MAX_STRAIGHT_TURN_RAD:
         return ""
     dx, dy = points[-1] - points[0]
     heading = float(headings[0])
@@ -210,7 +210,7 @@ def _avoided(story: CrashFacts, omission: Omission | None) -> str:
             return f"when {story.agent} first observed {story.other}, no run avoided it any more"
         best = judgement.best
         if best is not None and best.last_step is not None:
-            how = _MANOEUVRES.get(best.manoeuvre, best.manoeuvre)
+            how = _MANEUVER_WORDS.get(best.manoeuvre, best.manoeuvre)
             return _if_it(story, how, best.last_step, best.changed)
         return "no run avoids it" if judgement.avoidable is False else ""
     if tried is None or tried.why_not or tried.step is None:

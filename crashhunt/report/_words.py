@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COLUMNS",
-    "STANDS",
+    "MAX_STANDING_SPEED_MPS",
     "about_danger",
     "about_disturbances",
     "about_events",
@@ -55,14 +55,14 @@ __all__ = [
 
 # The positions of two actors relative to each other, in words.
 
-STANDS = 0.05  # m/s; a lower speed is shown as 0
-_PLACES = {
+MAX_STANDING_SPEED_MPS = 0.05  # m/s; a lower speed is shown as 0
+_PLACE_WORDS = {
     "ahead": "ahead of {agent}",
     "behind": "behind {agent}",
     "left": "to the left of {agent}",
     "right": "to the right of {agent}",
 }
-_WAYS = {
+_DIRECTION_WORDS = {
     "same": "going the same way",
     "other": "going the other way",
     "left": "crossing from right to left",
@@ -82,12 +82,12 @@ def about_place(encounter: Encounter, moment: Moment) -> str:
     """Return the position of the other actor relative to the agent, and its direction."""
     position = encounter.position(moment.step)
     assert position is not None
-    going = _WAYS[position.faces] if abs(moment.other_speed) >= STANDS else "standing"
-    return f"{encounter.other} was {_PLACES[position.place].format(agent=encounter.agent)}, {going}"
+    going = _DIRECTION_WORDS[position.faces] if abs(moment.other_speed) >= MAX_STANDING_SPEED_MPS else "standing"
+    return f"{encounter.other} was {_PLACE_WORDS[position.place].format(agent=encounter.agent)}, {going}"
 
 
 def _closing(speed: float) -> str:
-    if abs(speed) < STANDS:
+    if abs(speed) < MAX_STANDING_SPEED_MPS:
         return "keeping their distance"
     return f"{'closing' if speed > 0 else 'parting'} at {abs(speed):.1f} m/s"
 
@@ -214,7 +214,7 @@ def about_disturbances(recording: Recording, result: TrialResult, first_step: in
     earlier = len(result.disturbances) - len(recent)
     sentences = [
         f"{max(0, recording.steps - one.step + 1) * step_length_s:.1f} s before, from step {one.step} on: {one.words}"
-        f"{_where(one)}."
+        f"{_place_words(one)}."
         for one in recent
     ]
     if earlier:
@@ -226,7 +226,7 @@ def list_disturbances(result: TrialResult) -> list[str]:
     """Return one line for each disturbance of a trial, and one line with the log-likelihood of all of them."""
     if not may_be_disturbed(result):
         return []
-    lines = [f"disturbed from step {one.step} on: {one.words}{_where(one)}" for one in result.disturbances]
+    lines = [f"disturbed from step {one.step} on: {one.words}{_place_words(one)}" for one in result.disturbances]
     lines = lines or ["in undisturbed traffic: no planned disturbance had begun"]
     if result.log_likelihood is not None:
         lines.append(f"log-likelihood of exactly these disturbances: {result.log_likelihood:.2f}")
@@ -258,13 +258,13 @@ def traffic_of(bundle: Bundle, likeliest: str) -> str:
         return ""
     if not bundle.result.disturbed:
         return "in undisturbed traffic"
-    likely = f", log-likelihood {_likely(bundle):.1f}" * math.isfinite(_likely(bundle))
+    likely = f", log-likelihood {_likelihood_words(bundle):.1f}" * math.isfinite(_likelihood_words(bundle))
     return f"with disturbances{likely}{': the likeliest' * (bundle.id == likeliest)}"
 
 
 def by_likelihood(crashes: Sequence[Bundle]) -> list[Bundle]:
     """Return crashes in order: those in undisturbed traffic as they are, then the others, the likeliest first."""
-    return sorted(crashes, key=lambda bundle: (1, -_likely(bundle)) if bundle.result.disturbed else (0, 0.0))
+    return sorted(crashes, key=lambda bundle: (1, -_likelihood_words(bundle)) if bundle.result.disturbed else (0, 0.0))
 
 
 def may_be_disturbed(result: TrialResult) -> bool:
@@ -272,18 +272,18 @@ def may_be_disturbed(result: TrialResult) -> bool:
     return result.log_likelihood is not None or bool(result.spec.disturbances)
 
 
-def _likely(bundle: Bundle) -> float:
+def _likelihood_words(bundle: Bundle) -> float:
     found = bundle.result.log_likelihood
     return -math.inf if found is None else found
 
 
-def _where(one: Disturbance) -> str:
+def _place_words(one: Disturbance) -> str:
     return f" ({one.place})" if one.vehicle != one.agent else ""
 
 
 # Traffic events in words, as part of the story of a crash.
 
-_LAST = 5  # a jam has many
+_MAX_LISTED_EVENTS = 5  # a jam has many
 
 
 def about_events(recording: Recording, first_step: int, *, besides: Event | None) -> list[str]:
@@ -304,13 +304,13 @@ def about_events(recording: Recording, first_step: int, *, besides: Event | None
     ]
     return [
         f"{end - step * recording.prologue.step_length_s:.1f} s before, at step {step}: {event.what}."
-        for step, event in found[-_LAST:]
+        for step, event in found[-_MAX_LISTED_EVENTS:]
     ]
 
 
 # Whether a collision could have been avoided, in words. Every sentence reports runs, not calculations.
 
-_BY = {
+_ESCAPE_WORDS = {
     "brake": "by braking",
     "left": "by changing to the lane on the left and braking",
     "right": "by changing to the lane on the right and braking",
@@ -333,7 +333,7 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
         rest = (attempt for attempt in judgement.attempts if attempt is not best and attempt.last_step is not None)
         sentences += [_until(attempt, ago) for attempt in rest]
     elif judgement.avoidable is False:
-        tried = " nor ".join(_BY.get(attempt.manoeuvre, attempt.manoeuvre) for attempt in judgement.attempts)
+        tried = " nor ".join(_ESCAPE_WORDS.get(attempt.manoeuvre, attempt.manoeuvre) for attempt in judgement.attempts)
         sentences = [f"None of {runs} avoided it, from the first step on: neither {tried}."]
         if len(judgement.attempts) == 1:
             sentences = [f"None of {runs} avoided it {tried}, from the first step on."]
@@ -355,7 +355,7 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
     return sentences
 
 
-_FACULTIES = {
+_FACULTY_WORDS = {
     "longitudinal": "controls its speed",
     "lateral": "decides about its lane changes",
     "both": "controls its speed and decides about its lane changes",
@@ -378,8 +378,8 @@ def about_reference(reference: Reference, ago: Callable[[int], str], agent: str)
     changed = sorted({each for run in runs for each in run.changed} if omission.faculty == "longitudinal" else ())
     more = f" In addition, {' and '.join(changed)} in these runs." if changed else ""
     sentences.append(
-        f"With a reference driver that {_FACULTIES[omission.faculty]} from {ago(omission.step)}, on, {count} without a "
-        f"crash.{more}"
+        f"With a reference driver that {_FACULTY_WORDS[omission.faculty]} from {ago(omission.step)}, on, {count} "
+        f"without a crash.{more}"
     )
     return sentences
 
@@ -424,9 +424,8 @@ def about_changes(changed: Sequence[str]) -> str:
 def _until(attempt: Attempt, ago: Callable[[int], str]) -> str:
     assert attempt.last_step is not None
     braking = f" (at up to {attempt.deceleration:.1f} m/s²)" if attempt.deceleration is not None else ""
-    words = (
-        f"It could be avoided until {ago(attempt.last_step)}, {_BY.get(attempt.manoeuvre, attempt.manoeuvre)}{braking}"
-    )
+    escape = _ESCAPE_WORDS.get(attempt.manoeuvre, attempt.manoeuvre)
+    words = f"It could be avoided until {ago(attempt.last_step)}, {escape}{braking}"
     more = about_changes(attempt.changed)
     if attempt.all_later_run and attempt.last_step < attempt.end - 1:
         return f"{words}: a run from this step avoids it, and runs from all later steps crash.{more}"
@@ -437,8 +436,12 @@ def _until(attempt: Attempt, ago: Callable[[int], str]) -> str:
 
 # The causes of a crash, in words. Every sentence reports runs, not calculations.
 
-_LEFT_OUT = {"braked": "it keeps its speed", "sped up": "it keeps its speed", "changed lanes": "it stays in its lane"}
-_NOUNS = {"braked": "braking", "sped up": "speeding up", "changed lanes": "change of lanes"}
+_OMISSION_WORDS = {
+    "braked": "it keeps its speed",
+    "sped up": "it keeps its speed",
+    "changed lanes": "it stays in its lane",
+}
+_MANEUVER_NOUNS = {"braked": "braking", "sped up": "speeding up", "changed lanes": "change of lanes"}
 
 
 def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
@@ -472,10 +475,10 @@ def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
 
 
 def _sentence(factor: Factor, when: Callable[[int], str]) -> str:
-    return f"{_given(factor, when)}: {_outcome(factor)}"
+    return f"{_condition_words(factor, when)}: {_outcome(factor)}"
 
 
-def _given(factor: Factor, when: Callable[[int], str]) -> str:
+def _condition_words(factor: Factor, when: Callable[[int], str]) -> str:
     who, what = factor.name, factor.what
     if factor.kind == "argument" and what == "default":
         return f"{who} at its default {_number(factor.runs[0].given)}"
@@ -488,7 +491,7 @@ def _given(factor: Factor, when: Callable[[int], str]) -> str:
     assert factor.step is not None
     if factor.kind == "disturbance":
         return f"without the disturbance {what} of {who} at {when(factor.step)}"
-    return f"{who} {what} at {when(factor.step)}; without that ({_LEFT_OUT[what]})"
+    return f"{who} {what} at {when(factor.step)}; without that ({_OMISSION_WORDS[what]})"
 
 
 def _steps(factor: Factor) -> str:
@@ -526,7 +529,7 @@ def _short(factor: Factor, runs: int, when: Callable[[int], str]) -> str:
     if what == "there":
         return who
     assert factor.step is not None
-    return f"the {_NOUNS.get(what, what)} of {who} at {when(factor.step)}"
+    return f"the {_MANEUVER_NOUNS.get(what, what)} of {who} at {when(factor.step)}"
 
 
 def _number(value: Value | None) -> str:
@@ -548,10 +551,10 @@ def describe_probes(report: HuntReport) -> list[str]:
         safe = sum(margin == 1.0 for margin in found.margins)
         least, median = min(found.margins), statistics.median(found.margins)
         said = f"{safe} of them crashed under no plausible disturbance"
-        many = _many(len(found.margins), "trial")
+        many = _count_words(len(found.margins), "trial")
         lines = [f"Stress margin of {many}: least {least:.2f}, median {median:.2f}; {said}."]
     lines += _not_fully_asked(found.not_fully_asked, found.why_unasked)
-    lines.append(f"  {_many(found.probes, 'probe')} of copies took {steps}{enough}")
+    lines.append(f"  {_count_words(found.probes, 'probe')} of copies took {steps}{enough}")
     if found.run_again:
         lines.append(
             f"  of the {found.run_again} mildest disturbances that made a trial crash, {len(found.crashes)} reproduce "
@@ -568,8 +571,8 @@ def describe_branches(report: HuntReport) -> list[str]:
     if found is None or not found.trials:
         return []
     enough = f"; {found.skipped} were skipped, because copies had used their share" if found.skipped else ""
-    moments = f"{_many(found.moments, 'moment')} of {_many(found.trials, 'trial')}"
-    crashed = f"{found.crashed} crashed, of {_many(found.crashed_trials, 'trial')}"
+    moments = f"{_count_words(found.moments, 'moment')} of {_count_words(found.trials, 'trial')}"
+    crashed = f"{found.crashed} crashed, of {_count_words(found.crashed_trials, 'trial')}"
     lines = [
         f"Branches: {found.branches} runs of copies with other disturbances, from {moments}; {crashed}.",
         f"  they took {found.steps} steps, in addition to {report.trial_steps} steps of trials{enough}",
@@ -591,12 +594,12 @@ def _not_fully_asked(count: int, why: str) -> list[str]:
     """Return a line on the trials with incomplete answers; an empty list where there is no such trial."""
     if not count:
         return []
-    return [f"  {_many(count, 'trial')} {'was' if count == 1 else 'were'} not fully probed: {why}"]
+    return [f"  {_count_words(count, 'trial')} {'was' if count == 1 else 'were'} not fully probed: {why}"]
 
 
 def _not_finished(count: int) -> str:
     return f", and {count} did not finish" if count else ""
 
 
-def _many(count: int, what: str) -> str:
+def _count_words(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -12,9 +12,9 @@ from ._protocol import (
     OnlyAsked as OnlyAsked,
     PlainStream as PlainStream,
     Proposal as Proposal,
+    ReceivesHuntFacts as ReceivesHuntFacts,
     Sampler as Sampler,
     Space as Space,
-    WantsHunt as WantsHunt,
 )
 from ._space_filling import (
     Cube as Cube,

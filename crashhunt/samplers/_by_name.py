@@ -10,7 +10,15 @@ from crashhunt.base.errors import CrashhuntError, PluginError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.plugins import locate
 from crashhunt.base.processes import exits_refused
-from crashhunt.samplers._protocol import HuntFacts, Independent, OnlyAsked, PlainStream, Proposal, Versioned, WantsHunt
+from crashhunt.samplers._protocol import (
+    HuntFacts,
+    Independent,
+    OnlyAsked,
+    PlainStream,
+    Proposal,
+    ReceivesHuntFacts,
+    Versioned,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,7 +51,7 @@ class NamedSampler:
         self._name = name
         self._keys = space.keys()
         make = _maker(name)
-        more = {"hunt": hunt} if isinstance(make, WantsHunt) and make.wants_hunt else {}
+        more = {"hunt": hunt} if isinstance(make, ReceivesHuntFacts) and make.wants_hunt else {}
         try:
             with exits_refused():
                 self._sampler: Sampler = make(space, points=points, **more)

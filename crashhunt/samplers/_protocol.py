@@ -14,8 +14,16 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 __all__ = [
-    "HuntFacts", "Independent", "Key", "OnlyAsked", "PlainStream", "Proposal", "Sampler", "Space",
-    "Versioned", "WantsHunt",
+    "HuntFacts",
+    "Independent",
+    "Key",
+    "OnlyAsked",
+    "PlainStream",
+    "Proposal",
+    "ReceivesHuntFacts",
+    "Sampler",
+    "Space",
+    "Versioned",
 ]  # fmt: skip
 
 Key = tuple[str, str]
@@ -58,7 +66,7 @@ class Sampler(Protocol):
     """Proposes trials, and may learn from their results.
 
     It is created with the space and, as a keyword, ``points``: the number of values to try of a range without a step.
-    It also receives ``hunt`` if it asks for that (`WantsHunt`).
+    It also receives ``hunt`` if it asks for that (`ReceivesHuntFacts`).
 
     Contract: a proposal depends on the constructor's arguments, the trial's number, its generator, and the reported
     results in their order. It never depends on time, on earlier requests or on anything else. A new sampler that
@@ -105,7 +113,7 @@ class OnlyAsked(Protocol):
 
 
 @runtime_checkable
-class WantsHunt(Protocol):
+class ReceivesHuntFacts(Protocol):
     """A sampler that may be made with one keyword more: ``hunt``, the `HuntFacts`.
 
     Where ``wants_hunt`` is true, it is. The class says so, for it is asked before a sampler is made.

@@ -150,14 +150,14 @@ def _check_keys(scenario: Scenario, heeded: frozenset[str], where: str) -> None:
             value = getattr(setup, item.name)
             common = item.name in ("agent", "arguments") or f"agents.{item.name}" in heeded
             if not common and value != getattr(plain, item.name):
-                refuse(where, f"agents.{agent}.{item.name}", value, _meant_for(f"agents.{item.name}"), "remove it")
+                refuse(where, f"agents.{agent}.{item.name}", value, _suggestion(f"agents.{item.name}"), "remove it")
     for key in ("warmup_s", "insertion_timeout_s"):
         value = getattr(scenario, key)
         if key not in heeded and value != getattr(Scenario, key):
-            refuse(where, key, value, _meant_for(key), "remove it")
+            refuse(where, key, value, _suggestion(key), "remove it")
 
 
-def _meant_for(key: str) -> str:
+def _suggestion(key: str) -> str:
     return f"is for {titles(lambda backend: key in (backend.keys or ()))}"
 
 
@@ -206,7 +206,7 @@ def copy_shipped_scenario(name: str, to: Path) -> None:
         raise cannot_write(to, error) from error
 
 
-_INTERNAL = ("folder", "file", "notes", "added")  # of a Scenario, and not of a file
+_INTERNAL_FIELDS = ("folder", "file", "notes", "added")  # of a Scenario, and not of a file
 
 
 def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Scenario:
@@ -255,7 +255,7 @@ def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool 
     """
     added: dict[str, object] = {}
     if tolerant:
-        data, added = _known(data)
+        data, added = _split_known_keys(data)
     known = {item.name for item in fields(Scenario)} - {"tables"}
     asked = {name: _table_kind(name) for name in data if name not in known}
     kinds = {name: kind for name, kind in asked.items() if kind is not None}
@@ -286,7 +286,7 @@ def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool 
     return replace(scenario, tables=tables, folder=folder, name=name, observation=observation, added=added)
 
 
-def _known(data: Plain) -> tuple[dict[str, object], dict[str, object]]:
+def _split_known_keys(data: Plain) -> tuple[dict[str, object], dict[str, object]]:
     """Return the keys that this version knows, and those that a later version has added."""
     tables = {name: kind for name in data if (kind := _table_kind(name)) is not None}
     rest = {name: value for name, value in data.items() if name not in tables}
@@ -311,7 +311,7 @@ def _is_optional(kind: type) -> bool:
 
 
 def _keys_of_a_file() -> list[str]:
-    keys = [item.name for item in fields(Scenario) if item.name not in ("tables", *_INTERNAL)]
+    keys = [item.name for item in fields(Scenario) if item.name not in ("tables", *_INTERNAL_FIELDS)]
     return [*keys, *(name for name in backend_names() if _table_kind(name) is not None)]
 
 
@@ -356,7 +356,7 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
         raise ScenarioError(f"not valid TOML: {error}", fix="correct the file", where=str(path)) from None
     except OSError as error:
         raise ScenarioError(f"cannot be read: {error.strerror}", where=str(path)) from None
-    for key in _INTERNAL:
+    for key in _INTERNAL_FIELDS:
         if key in data:
             raise ScenarioError(f"unknown key {key!r}", fix="remove it", where=str(path))
     scenario = scenario_from_dict(data, where=str(path), folder=path.resolve().parent, tolerant=kept)

@@ -436,7 +436,7 @@ class LoadOrder:
     why_not: Callable[[Scenario], str]
 
 
-def _nothing(_scenario: Scenario) -> Iterable[str]:
+def _no_notes(_scenario: Scenario) -> Iterable[str]:
     return ()
 
 
@@ -444,11 +444,11 @@ def _accepted(_scenario: Scenario, _where: str) -> None:
     return None
 
 
-def _found(_scenario: Scenario, _ego: str) -> None:
+def _same_scenario(_scenario: Scenario, _ego: str) -> None:
     return None
 
 
-def _its_own(scenario: Scenario) -> float:
+def _own_arguments(scenario: Scenario) -> float:
     return scenario.step_length_s
 
 
@@ -504,16 +504,16 @@ class Backend:
     keys: frozenset[str] | None = None
     shows_itself: bool = False
     check: Callable[[Scenario, str], None] = _accepted
-    check_names: Callable[[Scenario, str], None] = _found
-    files: Callable[[Scenario], Iterable[str]] = _nothing
-    texts: Callable[[Scenario], Iterable[str]] = _nothing
+    check_names: Callable[[Scenario, str], None] = _same_scenario
+    files: Callable[[Scenario], Iterable[str]] = _no_notes
+    texts: Callable[[Scenario], Iterable[str]] = _no_notes
     relocated: Callable[[Path], bytes | None] | None = None
-    modules: Callable[[Scenario], Iterable[str]] = _nothing
-    notes: Callable[[Scenario], Iterable[str]] = _nothing
+    modules: Callable[[Scenario], Iterable[str]] = _no_notes
+    notes: Callable[[Scenario], Iterable[str]] = _no_notes
     versions: tuple[str, ...] = ()
     variables: tuple[str, ...] = ()
     per_processor: bool = False
-    step_length_s: Callable[[Scenario], float] = _its_own
+    step_length_s: Callable[[Scenario], float] = _own_arguments
     reported_events: tuple[str, ...] | None = None
     disturbances: tuple[str, ...] | None = None
     actions: tuple[str, ...] = ()
@@ -539,19 +539,19 @@ class Backend:
 
 
 @cache
-def _own() -> tuple[str, ...]:
+def _own_backends() -> tuple[str, ...]:
     # Crashhunt's own simulators are found by module and not by entry point: a bundle brings a crashhunt of its own
     # along, and what is installed around it may be of a version in which they are elsewhere.
     return tuple(sorted(module.name for module in pkgutil.iter_modules(crashhunt.scenario.backends.__path__)))
 
 
-def _others() -> Mapping[str, EntryPoint]:
+def _plugin_backends() -> Mapping[str, EntryPoint]:
     return registered("backends")
 
 
 def backend_names() -> tuple[str, ...]:
     """Return the simulators that have a descriptor, those that come with crashhunt first; nothing is imported."""
-    return tuple(dict.fromkeys((*_own(), *_others())))
+    return tuple(dict.fromkeys((*_own_backends(), *_plugin_backends())))
 
 
 @cache
@@ -564,10 +564,10 @@ def backend_of(name: str) -> Backend | None:
     Raises:
         PluginError: there is one, and it cannot be imported, or is something else.
     """
-    if name in _own():
+    if name in _own_backends():
         own: Backend = importlib.import_module(f"crashhunt.scenario.backends.{name}").BACKEND
         return own
-    point = _others().get(name)
+    point = _plugin_backends().get(name)
     if point is None:
         return None
     found = load_attribute(point.value, shown=name)

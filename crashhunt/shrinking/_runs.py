@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Signature
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialResult, TrialSpec
-    from crashhunt.whatif import Ended
+    from crashhunt.whatif import EndedRun
 
 __all__ = ["OutOfTimeError", "Ran", "Runs", "is_same"]
 
@@ -167,7 +167,7 @@ class Runs:
     def _bounded(self, spec: TrialSpec) -> TrialSpec:
         return replace(spec, max_steps=min(spec.max_steps, self.most_steps))
 
-    def _judged(self, ended: Ended) -> Ran:
+    def _judged(self, ended: EndedRun) -> Ran:
         """Return whether a candidate crashed with the same type; the slow signature is computed last."""
         was, result = self._rerun.bundle.result, ended.result
         same = result.outcome is was.outcome

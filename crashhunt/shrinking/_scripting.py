@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from crashhunt.trial import OF_AGENT
+from crashhunt.trial import SENSOR_KINDS
 from crashhunt.world import paths_of
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class Scripting:
         """Return the trial of a part, with the arguments that were recorded."""
         paths = self._paths.driven_by(part.agents).only(part.others)
         paths = paths.cut(part.begin, paths.steps, self._step_s).placing()
-        disturbed = (one for one in self._spec.disturbances if one.what in OF_AGENT and one.step > part.begin)
+        disturbed = (one for one in self._spec.disturbances if one.what in SENSOR_KINDS and one.step > part.begin)
         return replace(
             self._spec,
             arguments={agent: given for agent, given in self._spec.arguments.items() if agent in part.agents},

@@ -25,7 +25,7 @@ T = TypeVar("T")
 Tried = Callable[[Sequence[T]], int | None]
 """Tries candidates; returns the place of the first that still crashes in the same manner, None if none does."""
 
-_DIGITS = (1, 2, 3, 4)
+_ROUNDING_DIGITS = (1, 2, 3, 4)
 
 
 def fewest(items: Sequence[T], tried: Tried[tuple[T, ...]], likely: Sequence[Sequence[T]] = ()) -> tuple[T, ...]:
@@ -85,6 +85,6 @@ def _plainer(value: Value, default: Value | None) -> Iterator[Value]:
         yield same
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return
-    for digits in _DIGITS:
+    for digits in _ROUNDING_DIGITS:
         rounded = float(f"{value:.{digits}g}")
         yield round(rounded) if isinstance(value, int) else rounded

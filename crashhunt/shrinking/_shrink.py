@@ -15,7 +15,7 @@ from crashhunt.executors import read_map, run_alone
 from crashhunt.plans import takes_of
 from crashhunt.replays import ReplayOptions, confirm, prepare
 from crashhunt.shrinking._runs import Runs, is_same
-from crashhunt.shrinking._stages import Ended, Form, Search
+from crashhunt.shrinking._stages import Ended, Form, Minimizer
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 __all__ = ["Shrunk", "shrink", "shrunk_name"]
 
 Verdict = Literal["shrunk", "unchanged", "not_reproduced"]
-_TRIES = 3  # of what is left of a flaky crash
-_WRITE_AGAIN = "free some space and run the same command again: what came of the trials is remembered"
+_MAX_CONFIRMATIONS = 3  # of what is left of a flaky crash
+_DISK_FIX = "free some space and run the same command again: what came of the trials is remembered"
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,17 +155,17 @@ def shrink(
             stopped=stopped, watch=watch,
         )  # fmt: skip
         try:
-            search = Search(rerun, runs, form, _constructor_defaults(rerun))
+            search = Minimizer(rerun, runs, form, _constructor_defaults(rerun))
             ended, why = search.run(stopped)
         finally:
             runs.close()
     small = None
     if search.reproduced and search.best != rerun.spec:
         try:
-            small = _written(rerun, search, signature)
+            small = _write_smallest(rerun, search, signature)
         except OSError as error:
             message = f"{shrunk_name(bundle.id)!r} cannot be written: {error.strerror or error}"
-            raise BundleError(message, fix=_WRITE_AGAIN, where=str(bundle.path.parent)) from None
+            raise BundleError(message, fix=_DISK_FIX, where=str(bundle.path.parent)) from None
         if small is None:
             why = "what was left did not do the same in a fresh process"
     if not search.reproduced:
@@ -220,13 +220,13 @@ def _constructor_defaults(rerun: Rerun) -> dict[tuple[str, str], Value]:
     return found
 
 
-def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | None:
+def _write_smallest(rerun: Rerun, search: Minimizer, signature: Signature) -> Bundle | None:
     """Run the smallest in a fresh process, and write its bundle; another process confirms it, as of every crash.
 
     If a result does not reproduce, the next larger one is tried; None if none reproduces.
     """
     bundle = rerun.bundle
-    tries = _TRIES if bundle.confirmed is False else 1
+    tries = _MAX_CONFIRMATIONS if bundle.confirmed is False else 1
     for spec in (spec for spec in reversed(search.smaller) for _ in range(tries)):
         search.best = spec
         small = _run_fresh(rerun, search.best)
@@ -234,12 +234,12 @@ def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | Non
             shrunk: dict[str, object] = {"of": bundle.id, "removed": list(search.removed()), "changed": _plain(search)}
             if search.steps_cut:
                 shrunk["steps_cut"] = search.steps_cut
-            return _kept(replace(small, added={**small.added, "shrunk": shrunk}))
+            return _confirm_smallest(replace(small, added={**small.added, "shrunk": shrunk}))
         remove_at_once(small.path)
     return None
 
 
-def _kept(small: Bundle) -> Bundle:
+def _confirm_smallest(small: Bundle) -> Bundle:
     """Confirm the minimized crash. Its bundle is written before, because this may take a minute."""
     try:
         small.write()
@@ -265,5 +265,5 @@ def _run_fresh(rerun: Rerun, spec: TrialSpec) -> Bundle:
         )  # fmt: skip
 
 
-def _plain(search: Search) -> dict[str, list[Value | None]]:
+def _plain(search: Minimizer) -> dict[str, list[Value | None]]:
     return {name: list(values) for name, values in search.changed().items()}

@@ -11,7 +11,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.shrinking._runs import OutOfTimeError
 from crashhunt.shrinking._scripting import Part, Scripting, can_be_scripted
 from crashhunt.shrinking._search import as_type_of, fewest, plainest
-from crashhunt.trial import EVERYBODY, OF_AGENT
+from crashhunt.trial import ALL_AGENTS, SENSOR_KINDS
 from crashhunt.whatif import StoppedError
 
 if TYPE_CHECKING:
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
     from crashhunt.shrinking._runs import Runs
     from crashhunt.trial import Disturbance, TrialSpec, Value
 
-__all__ = ["Ended", "Form", "Search"]
+__all__ = ["Ended", "Form", "Minimizer"]
 
 Ended = Literal["done", "budget", "time", "interrupted", "error"]
 Form = Literal["either", "traffic", "scripted"]
-_TRIES = 3  # of a crash that does not come again at once
-_FLAKY_TRIES = 10  # of one of which that is known
-_NEAR = 6  # of the others, so many that are nearest in the end are tried together
-_SINGLE = 40  # and so many one by one
-_SINGLE_OR_SCRIPTED = 6  # where there is another way
-_PAIRED = 24  # so many that were near in the end are tried together with the other one
+_MAX_RUNS = 3  # of a crash that does not come again at once
+_MAX_FLAKY_RUNS = 10  # of one of which that is known
+_NEAREST_TOGETHER = 6  # of the others, so many that are nearest in the end are tried together
+_MAX_SINGLE_REMOVALS = 40  # and so many one by one
+_MAX_SINGLE_REMOVALS_WITH_SCRIPT = 6  # where there is another way
+_MAX_PAIRED_REMOVALS = 24  # so many that were near in the end are tried together with the other one
 _LONGER_S = 5.0  # simulation time by which it may become longer, besides twice as long, where fewer take part
-_FEW = 3  # actors; a crash with at most this number keeps the form in which the other actors drive
+_FEW_ACTORS = 3  # actors; a crash with at most this number keeps the form in which the other actors drive
 
 
-class Search:
+class Minimizer:
     """Makes a crash smaller.
 
     Args:
@@ -73,7 +73,7 @@ class Search:
 
     def run(self, stopped: Callable[[], bool]) -> tuple[Ended, str]:
         """Minimize until no stage helps; return why the search ended."""
-        tries = _FLAKY_TRIES if self._rerun.bundle.confirmed is False else _TRIES
+        tries = _MAX_FLAKY_RUNS if self._rerun.bundle.confirmed is False else _MAX_RUNS
         try:
             for _ in range(tries):
                 self.reproduced = self.reproduced or self._runs.first([self.best], again=True) is not None
@@ -100,7 +100,7 @@ class Search:
 
     def _smaller_traffic(self) -> None:
         """Plain arguments first: few trials make a crash that can be read, and leaving out others may take hundreds."""
-        self._everybody = self._runs.entered(replace(self.best, only=(EVERYBODY,)))  # of the crash as it was
+        self._everybody = self._runs.entered(replace(self.best, only=(ALL_AGENTS,)))  # of the crash as it was
         self._left_out = bool(self._everybody)
         if not self._left_out and _actors(self._rerun.recorded) > len(self._rerun.recorded.agents):
             self.notes.append("all others stay: the simulator, or the crashhunt of the snapshot, cannot exclude actors")
@@ -159,11 +159,11 @@ class Search:
         if not self._left_out:
             return
         if not self._everybody:
-            self._everybody = self._runs.entered(replace(best, only=(EVERYBODY,)))
+            self._everybody = self._runs.entered(replace(best, only=(ALL_AGENTS,)))
         if not self._everybody:
             self._left_out = False  # the simulator cannot do it
             return
-        shortest, likely = self._shortest, self._likely()
+        shortest, likely = self._shortest, self._first_groups()
         middle = min(best.max_steps, round(2 * shortest + _LONGER_S / self._rerun.recorded.prologue.step_length_s))
         lengths = dict.fromkeys((shortest, middle, best.max_steps))
         for most in lengths if self._scripting is None else (shortest, middle):
@@ -175,13 +175,13 @@ class Search:
         if self._scripting is None:
             fewest(self._everybody, tried)
 
-    def _likely(self) -> list[tuple[str, ...]]:
+    def _first_groups(self) -> list[tuple[str, ...]]:
         """Return groups of actors to try first: none, the collision partner, the nearest actors, single actors."""
         recording, known = self._rerun.recorded, set(self._everybody)
         near = [name for name in _nearest(recording, self._rerun.bundle.driver) if name in known]
         other = [name for name in self._others_of_the_crash() if name in known]
-        single = near[: _SINGLE if self._scripting is None else _SINGLE_OR_SCRIPTED]
-        groups = [(), tuple(other), tuple(near[:2]), *((name,) for name in single), tuple(near[:_NEAR])]
+        single = near[: _MAX_SINGLE_REMOVALS if self._scripting is None else _MAX_SINGLE_REMOVALS_WITH_SCRIPT]
+        groups = [(), tuple(other), tuple(near[:2]), *((name,) for name in single), tuple(near[:_NEAREST_TOGETHER])]
         return list(dict.fromkeys(groups))
 
     def _others_of_the_crash(self) -> list[str]:
@@ -196,7 +196,7 @@ class Search:
         if self._form == "scripted" or best.only is None or len(agents) > 1:
             return True
         # Without other actors the scripted form loses nothing, and its beginning can be cut off.
-        return not best.only or len(best.only) + len(agents) > _FEW
+        return not best.only or len(best.only) + len(agents) > _FEW_ACTORS
 
     def _script(self, scripting: Scripting) -> None:
         self._runs.most_steps = max(self._runs.most_steps, 2 * scripting.steps + 100)
@@ -207,7 +207,7 @@ class Search:
                 later = [replace(part, begin=begin) for begin in scripting.begins(part.agents)]
                 if (good := self._try([scripting.spec(one) for one in later])) is not None:
                     part = later[good]
-                if part.count > _FEW:
+                if part.count > _FEW_ACTORS:
                     self._fewer_from_later_on(scripting, part)
         finally:  # also where it is interrupted: the first that came again may have everybody in it
             if self.best is not best and not self._is_smaller(best):
@@ -261,7 +261,15 @@ class Search:
         likely: list[Part] = []
         for agents in dict.fromkeys((alone, whole.agents) if alone else (whole.agents,)):
             moved = [name for name in whole.agents if name not in agents]
-            groups = [(), other, tuple(near[:1]), tuple(near[:2]), tuple(moved), tuple(near[:_NEAR]), (*moved, *near)]
+            groups = [
+                (),
+                other,
+                tuple(near[:1]),
+                tuple(near[:2]),
+                tuple(moved),
+                tuple(near[:_NEAREST_TOGETHER]),
+                (*moved, *near),
+            ]
             groups = [tuple(name for name in group if name not in agents) for group in groups]
             likely += [Part(agents, group) for group in dict.fromkeys(groups)]
         likely.append(whole)
@@ -286,11 +294,11 @@ class Search:
         whole = scripting.whole
         everybody = tuple(name for name in (*whole.agents, *whole.others) if name not in part.agents)
         near = _nearest(self._rerun.recorded, self._rerun.bundle.driver)
-        near = [name for name in near if name in everybody][:_PAIRED]
+        near = [name for name in near if name in everybody][:_MAX_PAIRED_REMOVALS]
         other = tuple(name for name in self._others_of_the_crash() if name not in part.agents)
         groups = dict.fromkeys([(), other, *((*other, name) for name in near if name not in other)])
         few = [replace(part, others=group, begin=begin) for begin in begins for group in groups]
-        few = [one for one in few if one.count <= _FEW]
+        few = [one for one in few if one.count <= _FEW_ACTORS]
         if self._try([scripting.spec(one) for one in few]) is not None:
             return
         best = part
@@ -300,7 +308,7 @@ class Search:
             if found is not None and found.count < best.count:
                 best = found
                 self._try([scripting.spec(best)])
-            if best.count <= _FEW:
+            if best.count <= _FEW_ACTORS:
                 break
 
     def _without_any(self, scripting: Scripting, part: Part) -> Part | None:
@@ -373,7 +381,7 @@ class Search:
         others = [name for name in dict.fromkeys(everybody) if name not in stay]
         gone = [one for one in was.disturbances if not self._has(one)]
         if best.script is not None:  # what befell the others is in their ways
-            gone = [one for one in gone if one.what in OF_AGENT]
+            gone = [one for one in gone if one.what in SENSOR_KINDS]
         return (*others, *(one.words for one in gone))
 
     def _has(self, disturbance: Disturbance) -> bool:

@@ -19,7 +19,7 @@ __all__ = ["META_ACTIONS", "MetaAction", "SpaceAction", "SpeedAndLaneChange", "c
 
 MAX_TARGET_SPEED = 100.0  # m/s; a Box space needs a finite bound, and no road vehicle is faster
 _MAX_ACTION_CHARACTERS = 200  # of an action in an error message
-_SPACE = Boundary(Party.ENVIRONMENT, "action conversion")
+_ACTION_BOUNDARY = Boundary(Party.ENVIRONMENT, "action conversion")
 META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 """The meta-actions in the order of highway-env's DiscreteMetaAction."""
 
@@ -91,7 +91,7 @@ class SpaceAction:
         try:
             return bool(self.space.contains(array if self.space.shape or self._is_box else array[()]))
         except BaseException as error:
-            _SPACE.wrap(error)
+            _ACTION_BOUNDARY.wrap(error)
 
 
 class MetaAction(SpaceAction):

@@ -39,11 +39,11 @@ __all__ = [
 ]
 
 
-_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+_ARRAY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _MAX_ORIGINALS: Final = 256  # objects of a user's classes that may be needed again, because an agent sees them late
-_NOT_WHOLE: Final = b'{"opaque":'  # in the text of a value with a part that cannot be restored; texts escape quotes
-_SPACE = Boundary(Party.ENVIRONMENT, "space conversion")
-_ACTION_SPACE = Boundary(Party.ENVIRONMENT, "action conversion")
+_OPAQUE_MARK: Final = b'{"opaque":'  # in the text of a value with a part that cannot be restored; texts escape quotes
+_SPACE_BOUNDARY = Boundary(Party.ENVIRONMENT, "space conversion")
+_ACTION_BOUNDARY = Boundary(Party.ENVIRONMENT, "action conversion")
 
 
 class ObservationForm:
@@ -81,7 +81,7 @@ class ObservationForm:
         """
         if self._values is not None:
             return self._values.encode(observation)
-        with _SPACE:  # the observation is the environment's, of any class
+        with _SPACE_BOUNDARY:  # the observation is the environment's, of any class
             if self.flattened:
                 with _quiet():
                     observation = self._flat(observation)
@@ -101,7 +101,7 @@ class ObservationForm:
             array: Its array.
         """
         if self.structured:
-            with _SPACE, _quiet():
+            with _SPACE_BOUNDARY, _quiet():
                 return bool(self.original.contains(observation))
         return bool(self.space.contains(array))
 
@@ -160,7 +160,7 @@ class _Values:
         """Return the text of a value."""
         array = encode_value(value)
         text = array.tobytes()
-        if _NOT_WHOLE in text:
+        if _OPAQUE_MARK in text:
             self._originals.pop(text, None)
             self._originals[text] = value
             if len(self._originals) > _MAX_ORIGINALS:
@@ -182,7 +182,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _is_array(space: Space[Any]) -> bool:
-    return isinstance(space, _ARRAYS) and _can_be_recorded(np.dtype(space.dtype))
+    return isinstance(space, _ARRAY_SPACES) and _can_be_recorded(np.dtype(space.dtype))
 
 
 def _can_be_recorded(dtype: np.dtype[Any]) -> bool:
@@ -202,7 +202,7 @@ def _leaves(space: Space[Any]) -> Iterator[Space[Any]]:
 def _flattens_exactly(space: Space[Any]) -> bool:
     """Whether flattening a value of a space and unflattening it loses nothing."""
     leaves = list(_leaves(space))
-    if isinstance(space, _ARRAYS) or not leaves or not all(isinstance(leaf, _ARRAYS) for leaf in leaves):
+    if isinstance(space, _ARRAY_SPACES) or not leaves or not all(isinstance(leaf, _ARRAY_SPACES) for leaf in leaves):
         return False
     dtype = np.dtype(spaces.flatten_space(space).dtype)
     return _can_be_recorded(dtype) and all(_fits(leaf, dtype) for leaf in leaves)
@@ -294,7 +294,7 @@ class OpaqueAction:
         return self._values.restore(array)
 
     def _contains(self, action: object) -> bool:
-        with _ACTION_SPACE, _quiet():
+        with _ACTION_BOUNDARY, _quiet():
             return bool(self.space.contains(action))
 
 

@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 __all__ = ["Kinematics", "Unseen"]
 
 
-_SINGLE = np.dtype("<f4")
-_ALL = ("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "kind")
-_USUAL = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
+_FLOAT32 = np.dtype("<f4")
+_ALL_COLUMNS = ("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "kind")
+_DEFAULT_COLUMNS = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
 # As in highway-env: 5 times and 2 times its top speed of 40 m/s, and its lane width of 4 m.
 _RANGE_X, _RANGE_V, _LANE_WIDTH = 200.0, 80.0, 4.0
 
 # The value of `kind` by the simulator's name of the actor's class. An empty row has 0. An unlisted class is a motor
 # vehicle.
 _MOTOR, _TWO_WHEELS, _PERSON, _RAIL, _OBSTACLE = 1.0, 2.0, 3.0, 4.0, 5.0
-_KINDS = {
+_KIND_NUMBERS = {
     **dict.fromkeys(("bicycle", "motorcycle", "moped", "scooter"), _TWO_WHEELS),
     **dict.fromkeys(("pedestrian", "wheelchair"), _PERSON),
     **dict.fromkeys(("rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"), _RAIL),
@@ -71,14 +71,14 @@ class Kinematics:
         self.shape = (setup.vehicles, len(self.features))
         self._others = setup.vehicles - 1
         self._normalize = setup.normalize
-        indices = [_ALL.index(feature) for feature in self.features]
+        indices = [_ALL_COLUMNS.index(feature) for feature in self.features]
         getter = itemgetter(*indices)
         self._select: Callable[[tuple[float, ...]], tuple[float, ...]] = (
             getter if len(indices) > 1 else lambda values: (getter(values),)
         )
         self._pack = struct.Struct(f"<{setup.vehicles * len(self.features)}f").pack
         # With the usual columns, `observe` need not select columns in every row.
-        self._usual = self.features == _USUAL and not setup.normalize
+        self._usual = self.features == _DEFAULT_COLUMNS and not setup.normalize
         self.hidden: set[tuple[str, str]] = set()
         self._blank = (0.0,) * len(self.features)
 
@@ -92,7 +92,7 @@ class Kinematics:
         """The Gymnasium space: as in highway-env, but with finite bounds that no simulation reaches."""
         from gymnasium import spaces
 
-        limits = dict.fromkeys(_ALL, 1.0) | {"heading": float(np.float32(np.pi))}
+        limits = dict.fromkeys(_ALL_COLUMNS, 1.0) | {"heading": float(np.float32(np.pi))}
         if not self._normalize:
             limits |= {"x": 1e6, "y": 1e6, "vx": 1e3, "vy": 1e3, "kind": _OBSTACLE}
         high = np.tile([limits[feature] for feature in self.features], (self.shape[0], 1)).astype(np.float32)
@@ -120,7 +120,7 @@ class Kinematics:
         if scene.core is not None and columns is not None and self._usual and not scene.heights and not self.hidden:
             found = scene.core.observe(columns, row, self._others, distance, from_left, lateral_speed)
             if found is not None:
-                return np.ndarray(self.shape, _SINGLE, found)
+                return np.ndarray(self.shape, _FLOAT32, found)
         points, headings, speeds, actors = scene.points, scene.headings, scene.speeds, scene.roster.actors
         heading, speed = headings[row], speeds[row]
         own_cos, own_sin, half = cos(heading), sin(heading), actors[row].length / 2
@@ -128,7 +128,7 @@ class Kinematics:
         center_x, center_y = x - half * own_cos, y - half * own_sin
         own_vx, own_vy = speed * own_cos, speed * own_sin
         select = self._select if not self._normalize else self._normalized(lanes)
-        kind = _KINDS.get(actors[row].kind, _MOTOR)
+        kind = _KIND_NUMBERS.get(actors[row].kind, _MOTOR)
         own = (1.0, distance, from_left, speed, lateral_speed, atan2(-own_sin, own_cos), own_cos, -own_sin, kind)
         values = [*select(own)]
         usual = self._usual
@@ -154,7 +154,7 @@ class Kinematics:
                 values += (1.0, ahead, right, faster, drift, turn_cos, turn_sin)
             else:
                 turn = atan2(turn_sin, turn_cos)
-                kind = _KINDS.get(actors[other].kind, _MOTOR)
+                kind = _KIND_NUMBERS.get(actors[other].kind, _MOTOR)
                 values += select((1.0, ahead, right, faster, drift, turn, turn_cos, turn_sin, kind))
         values += self._blank * (self._others - len(nearest))
         return np.frombuffer(self._pack(*values), "<f4").reshape(self.shape)

@@ -87,7 +87,9 @@ class OneLearner(gymnasium.Env[Any, Any]):
         """Let all agents act."""
         learner = self._learner
         actions = {
-            name: action if name == learner else self._act(name) for name in self._parallel.agents if name in self._seen
+            name: action if name == learner else self._other_actions(name)
+            for name in self._parallel.agents
+            if name in self._seen
         }
         before = self._seen[learner]
         self._seen, rewards, ended, cut, self._infos = self._parallel.step(actions)
@@ -105,7 +107,7 @@ class OneLearner(gymnasium.Env[Any, Any]):
         """Close the environment."""
         self._parallel.close()
 
-    def _act(self, name: Any) -> object:
+    def _other_actions(self, name: Any) -> object:
         seen, space = self._seen[name], self._parallel.action_space(name)
         mask = self._infos.get(name, {}).get("action_mask")
         if mask is None and isinstance(seen, dict):

@@ -23,35 +23,35 @@ __all__ = [
     "FACULTIES",
     "ActionForm",
     "ActiveDisturbance",
-    "AtOnce",
-    "BrakesFully",
     "CountsSetUp",
+    "FastStepper",
     "FlattensObservations",
     "FullBraking",
     "HasMap",
-    "HasMeanings",
     "HasWindow",
-    "HoldsBack",
     "Info",
-    "LeavesOut",
-    "NamesCrashCell",
-    "NamesDanger",
+    "NamesMetaActions",
     "NamesObservations",
     "Observations",
     "OfAnyLength",
     "Options",
-    "PlaysPaths",
-    "Reseeds",
+    "ReportsCrashCell",
+    "ReportsDanger",
+    "ReportsEvents",
+    "ReportsNotices",
+    "ReportsSurroundings",
     "RestoresObservations",
+    "RestoresState",
     "RunsForeignCode",
-    "SeesSurroundings",
     "Simulator",
     "StepResult",
-    "StepsAtOnce",
     "SupportsDisturbances",
-    "TellsEvents",
-    "TellsNotices",
-    "Tidies",
+    "SupportsExclusion",
+    "SupportsFastSteps",
+    "SupportsFullBraking",
+    "SupportsHolds",
+    "SupportsReseeding",
+    "SupportsScripts",
 ]
 
 
@@ -61,8 +61,8 @@ class Options(TypedDict, total=False):
     Args:
         arguments: The scenario arguments by name.
         only: Identifiers, as in scenes, of the actors that take part in addition to the agents. Without this option all
-            actors take part. Only simulators with `LeavesOut` get this option.
-        script: Recorded paths along which all other actors are moved. Only simulators with `PlaysPaths` get it.
+            actors take part. Only simulators with `SupportsExclusion` get this option.
+        script: Recorded paths along which all other actors are moved. Only simulators with `SupportsScripts` get it.
     """
 
     arguments: Mapping[str, Value]
@@ -124,11 +124,11 @@ class Simulator(Protocol):
     actions. This holds in the same process and in another process, whatever ran before. The simulator never changes an
     array that it has returned.
 
-    Each optional capability is its own protocol: `TellsNotices`, `FlattensObservations`, `RestoresObservations`,
-    `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `SeesSurroundings`,
-    `SupportsDisturbances`, `HoldsBack`, `LeavesOut`, `PlaysPaths`, `Reseeds`, `CountsSetUp`, `RunsForeignCode`,
-    `Tidies` and `ReadiesProcess`. A simulator supports a protocol if it has the methods and attributes of the protocol.
-    It need not register them.
+    Each optional capability is its own protocol: `ReportsNotices`, `FlattensObservations`, `RestoresObservations`,
+    `NamesObservations`, `ReportsEvents`, `HasMap`, `HasWindow`, `SupportsFullBraking`, `ReportsSurroundings`,
+    `SupportsDisturbances`, `SupportsHolds`, `SupportsExclusion`, `SupportsScripts`, `SupportsReseeding`, `CountsSetUp`,
+    `RunsForeignCode`, `RestoresState` and `PreparesProcess`. A simulator supports a protocol if it has the methods and
+    attributes of the protocol. It need not register them.
     """
 
     @property
@@ -179,7 +179,7 @@ class Simulator(Protocol):
         """Release all resources. A second call does nothing."""
 
 
-class TellsNotices(Protocol):
+class ReportsNotices(Protocol):
     """A simulator that reports notices about the scenario to the user."""
 
     @property
@@ -222,7 +222,7 @@ class NamesObservations(Protocol):
         """The names of the columns, which are the last axis of every observation; empty if they are unknown."""
 
 
-class TellsEvents(Protocol):
+class ReportsEvents(Protocol):
     """A simulator that detects traffic events, such as running a red light, and puts them into its scenes."""
 
     @property
@@ -230,7 +230,7 @@ class TellsEvents(Protocol):
         """The types of events that the simulator detects; results count events of these types."""
 
 
-class NamesDanger(Protocol):
+class ReportsDanger(Protocol):
     """A simulator that reports the criticality itself, because its scenes have no actors."""
 
     @property
@@ -238,7 +238,7 @@ class NamesDanger(Protocol):
         """The highest criticality of the episode until now, from 0 (nothing near) to 1 (contact); None if unknown."""
 
 
-class NamesCrashCell(Protocol):
+class ReportsCrashCell(Protocol):
     """A simulator that describes the state after a crash in words, because its scenes have no actors."""
 
     @property
@@ -275,7 +275,7 @@ class HasWindow(Protocol):
         """Whether the window is still open."""
 
 
-class BrakesFully(Protocol):
+class SupportsFullBraking(Protocol):
     """A simulator that knows the action for full braking.
 
     A hunt needs this action to find the last step at which full braking avoids a crash.
@@ -288,7 +288,7 @@ class BrakesFully(Protocol):
         """
 
 
-class SeesSurroundings(Protocol):
+class ReportsSurroundings(Protocol):
     """A simulator that knows what a careful driver of an agent's vehicle would consider.
 
     Counterfactual runs with a reference driver need it. Contract: `surroundings` changes nothing in the simulation.
@@ -343,7 +343,7 @@ class SupportsDisturbances(Protocol):
         """
 
 
-class HoldsBack(Protocol):
+class SupportsHolds(Protocol):
     """A simulator that can hold the speed or lane of a vehicle, or remove the vehicle, for counterfactual runs."""
 
     def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
@@ -356,7 +356,7 @@ class HoldsBack(Protocol):
         """
 
 
-class LeavesOut(Protocol):
+class SupportsExclusion(Protocol):
     """A simulator that can exclude actors other than the agents from an episode."""
 
     @property
@@ -367,7 +367,7 @@ class LeavesOut(Protocol):
         """
 
 
-class PlaysPaths(Protocol):
+class SupportsScripts(Protocol):
     """A simulator that can move all other actors along recorded paths, whatever the agents do."""
 
     @property
@@ -375,7 +375,7 @@ class PlaysPaths(Protocol):
         """Whether the other actors of this episode follow recorded paths."""
 
 
-class Reseeds(Protocol):
+class SupportsReseeding(Protocol):
     """A simulator whose random generators can get another seed between two steps.
 
     Contract: after `reseed`, all later steps depend on the state of the simulation and on this seed only. The numbers
@@ -416,14 +416,14 @@ class RunsForeignCode(Protocol):
     """
 
 
-class Tidies(Protocol):
+class RestoresState(Protocol):
     """A simulator whose episodes change state outside the simulator object, such as class attributes of a library."""
 
     def tidy(self) -> None:
         """Restore that state as it was before the first episode; called before the first episode and after each."""
 
 
-class ReadiesProcess(Protocol):
+class PreparesProcess(Protocol):
     """A simulator that can prepare a process once, such as load tables that every first episode would load.
 
     The simulator's `reset` does not sample from the action spaces.
@@ -433,7 +433,7 @@ class ReadiesProcess(Protocol):
         """Prepare the process; called once, before the first `Simulator.reset`, in the process that forks episodes."""
 
 
-class HasMeanings(Protocol):
+class NamesMetaActions(Protocol):
     """A discrete action space whose numbers have names."""
 
     @property
@@ -441,7 +441,7 @@ class HasMeanings(Protocol):
         """The name of each number, from 0, such as ``SLOWER``."""
 
 
-class AtOnce(Protocol):
+class FastStepper(Protocol):
     """Runs uneventful steps of an episode with one agent in the compiled core, each in one call.
 
     The simulator object then lags behind the core until `catch_up` is called.
@@ -473,35 +473,35 @@ class AtOnce(Protocol):
         """Complete a step that SUMO has simulated and that is not uneventful."""
 
 
-class StepsAtOnce(Protocol):
+class SupportsFastSteps(Protocol):
     """A simulator whose uneventful steps the compiled core can run in one call each."""
 
     @property
-    def at_once(self) -> AtOnce | None:
+    def at_once(self) -> FastStepper | None:
         """The fast path of this episode; None if the episode has no fast path."""
 
 
 FACULTIES: tuple[type, ...] = (
-    TellsNotices,
+    ReportsNotices,
     FlattensObservations,
     RestoresObservations,
-    NamesCrashCell,
-    NamesDanger,
+    ReportsCrashCell,
+    ReportsDanger,
     NamesObservations,
-    TellsEvents,
+    ReportsEvents,
     HasMap,
     HasWindow,
-    BrakesFully,
-    SeesSurroundings,
+    SupportsFullBraking,
+    ReportsSurroundings,
     SupportsDisturbances,
-    HoldsBack,
-    LeavesOut,
-    PlaysPaths,
-    Reseeds,
-    StepsAtOnce,
+    SupportsHolds,
+    SupportsExclusion,
+    SupportsScripts,
+    SupportsReseeding,
+    SupportsFastSteps,
     CountsSetUp,
     RunsForeignCode,
-    Tidies,
-    ReadiesProcess,
+    RestoresState,
+    PreparesProcess,
 )
 """All optional protocols of a simulator."""

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 __all__ = ["GymSimulator"]
 
-_NOBODY = Roster(())
-_KIND = "crash_kind"
+_NO_ACTORS = Roster(())
+_CRASH_KIND_KEY = "crash_kind"
 _MAX_KIND_CHARACTERS = 80
 _CONSTRUCTOR, _RESET, _STEP, _REWARD, _INFO, _CLOSE = (
     Boundary(Party.ENVIRONMENT, place) for place in ("constructor", "reset", "step", "reward", "info", "close")
@@ -97,7 +97,7 @@ class GymSimulator:
         self.crash_cell = ""
         self.named_danger = None
         self._look("")
-        return {self._agent: self._shown(observation)}, {self._agent: info}
+        return {self._agent: self._recorded_observation(observation)}, {self._agent: info}
 
     why_no_reseeding = ""
 
@@ -124,7 +124,7 @@ class GymSimulator:
         over = terminated or truncated or self._crashed
         if over:
             self.agents = []
-        agent, shown = self._agent, self._shown(observation)
+        agent, shown = self._agent, self._recorded_observation(observation)
         return {agent: shown}, {agent: reward}, {agent: over}, {agent: False}, {agent: info}
 
     def restore_observation(self, agent: str, array: NDArray[np.generic]) -> object:
@@ -147,7 +147,7 @@ class GymSimulator:
         except ForeignError as error:
             self._notice(f"the environment {self._setup.id!r} cannot be closed: {in_words(error.error)}")
 
-    def _shown(self, observation: object) -> NDArray[np.generic]:
+    def _recorded_observation(self, observation: object) -> NDArray[np.generic]:
         """Return an observation as it is recorded; report an observation outside the space once per hunt.
 
         The episode continues, because many environments leave their space by a rounding error.
@@ -251,7 +251,7 @@ class GymSimulator:
                     victim_speed=float("nan"),
                 ),
             )
-        self._scene = Scene(self._steps * self.step_length_s, _NOBODY, [], [], [], contacts)
+        self._scene = Scene(self._steps * self.step_length_s, _NO_ACTORS, [], [], [], contacts)
 
 
 class _Rule:
@@ -268,7 +268,7 @@ class _Rule:
         if not found:
             return ""
         given = observation, reward, terminated, truncated, info
-        kind = info.get(_KIND) if self._kind is None else self._kind(*given)
+        kind = info.get(_CRASH_KIND_KEY) if self._kind is None else self._kind(*given)
         text = " ".join(encodable(kind).split()) if isinstance(kind, str) else ""
         self.has_named = bool(text)
         return text[:_MAX_KIND_CHARACTERS] or found

@@ -34,7 +34,7 @@ __all__ = ["ToySimulator"]
 
 _LENGTH_M, _WIDTH_M = 5.0, 1.8
 _ACCELERATION, _BRAKING = 3.0, 8.0
-_LEADER = "leader"
+_LEADER_ID = "leader"
 
 
 class ToySimulator:
@@ -75,14 +75,14 @@ class ToySimulator:
         self._step = 0
         self.agents = list(self._setups)
         spacing = _LENGTH_M + float(self._argument("gap_m", 30.0))
-        names = [*self.agents, _LEADER]
+        names = [*self.agents, _LEADER_ID]
         self._x = {name: spacing * place for place, name in enumerate(names)}
         self._v = dict.fromkeys(names, float(self._argument("leader_speed", 10.0)))
         self._start = dict(self._x)
         self._touched: set[str] = set()
         self._kinematics.hidden.clear()
         self._disturbed: dict[str, float] = {}  # disturbed vehicles: target speed in m/s
-        self._enlist()
+        self._roster_of()
         self._look(())
         return {agent: self._observe(agent) for agent in self.agents}, {}
 
@@ -98,7 +98,7 @@ class ToySimulator:
         self._fail_on_purpose()
         wanted = {agent: self._target(agent, action) for agent, action in actions.items()}
         cruising = float(self._argument("leader_speed", 10.0))
-        wanted[_LEADER] = 0.0 if self._rng.random() < 0.05 else cruising
+        wanted[_LEADER_ID] = 0.0 if self._rng.random() < 0.05 else cruising
         wanted |= self._disturbed
         for name, target in wanted.items():
             change = min(
@@ -116,7 +116,7 @@ class ToySimulator:
         if arrived:
             for agent in arrived:
                 del self._x[agent]
-            self._enlist()
+            self._roster_of()
         self._look(contacts)
         observations = {
             agent: self._observe(agent) if agent in self._x else self._kinematics.blank() for agent in actions
@@ -142,7 +142,7 @@ class ToySimulator:
     def resolve_target(self, disturbance: Disturbance) -> str:
         """Return the leader if it is directly ahead of the agent; all other vehicles are agents."""
         ahead = [name for name, x in self._x.items() if x > self._x.get(disturbance.agent, np.inf)]
-        return _LEADER if disturbance.who == "ahead" and ahead == [_LEADER] else ""
+        return _LEADER_ID if disturbance.who == "ahead" and ahead == [_LEADER_ID] else ""
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance:
         """Make a vehicle brake, at most as hard as vehicles can, or hide it."""
@@ -152,7 +152,7 @@ class ToySimulator:
 
     def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
         """Keep the leader at its speed; the road has one lane, so lanes need no hold."""
-        return _Steady(self, vehicle) if vehicle == _LEADER and what == "keep_speed" else None
+        return _Steady(self, vehicle) if vehicle == _LEADER_ID and what == "keep_speed" else None
 
     def keep_speed(self, vehicle: str) -> None:
         """Make a vehicle keep its speed in the next step."""
@@ -211,7 +211,7 @@ class ToySimulator:
                 )
         return tuple(found)
 
-    def _enlist(self) -> None:
+    def _roster_of(self) -> None:
         self._roster = Roster(
             tuple(Actor(id=name, kind="passenger", length=_LENGTH_M, width=_WIDTH_M) for name in sorted(self._x))
         )

@@ -92,11 +92,11 @@ class Environment(TypedDict):
 
 
 SCHEMA = 2
-_PROTECTED = 2  # the first version with a digest of its manifest and of what describes the rest
-_DESCRIBING = (layout.HUNT, layout.ENVIRONMENT, layout.GIT_DIFF)
-_PARTS = (layout.CODE, layout.FILES, layout.SCENARIO_FILES)
+_FIRST_VERSION_WITH_DIGESTS = 2  # the first version with a digest of its manifest and of what describes the rest
+_DESCRIPTION_FILES = (layout.HUNT, layout.ENVIRONMENT, layout.GIT_DIFF)
+_SNAPSHOT_FOLDERS = (layout.CODE, layout.FILES, layout.SCENARIO_FILES)
 # Suffixes of files that Python may import, or run at its start.
-_IMPORTABLE = {".py", ".pyc", ".pyo", ".so", ".pth", *importlib.machinery.all_suffixes()}
+_IMPORTABLE_SUFFIXES = {".py", ".pyc", ".pyo", ".so", ".pth", *importlib.machinery.all_suffixes()}
 
 
 class Snapshot:
@@ -131,7 +131,7 @@ class Snapshot:
                     fix="use the version that wrote the trial",
                     where=str(file),
                 )
-            if found["schema"] >= _PROTECTED or "integrity" in found:
+            if found["schema"] >= _FIRST_VERSION_WITH_DIGESTS or "integrity" in found:
                 typed(found, {"integrity": str, "described": FILES})
                 said = found.pop("integrity")
                 if digest_of_data(found) != said:
@@ -141,7 +141,9 @@ class Snapshot:
             _check_names(found)
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
-            raise BundleError(f"the snapshot has no manifest: {reason}", fix=_UNDAMAGED, where=str(self.path)) from None
+            raise BundleError(
+                f"the snapshot has no manifest: {reason}", fix=_DAMAGE_FIX, where=str(self.path)
+            ) from None
         return found
 
     @property
@@ -194,7 +196,7 @@ class Snapshot:
             typed_where_there(found, known)
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
-            raise BundleError(f"cannot be read: {reason}", fix=_UNDAMAGED, where=str(file)) from None
+            raise BundleError(f"cannot be read: {reason}", fix=_DAMAGE_FIX, where=str(file)) from None
         return found
 
     @property
@@ -250,11 +252,11 @@ class Snapshot:
                     path.unlink()
 
     def _may_run(self, name: str) -> bool:
-        return (self.path / name).is_symlink() or any(name.endswith(suffix) for suffix in _IMPORTABLE)
+        return (self.path / name).is_symlink() or any(name.endswith(suffix) for suffix in _IMPORTABLE_SUFFIXES)
 
     def _added(self) -> list[str]:
         found = []
-        for part in _PARTS:
+        for part in _SNAPSHOT_FOLDERS:
             for parent, folders, files in os.walk(self.path / part):
                 below = Path(parent).relative_to(self.path).as_posix()
                 links = [name for name in folders if os.path.islink(os.path.join(parent, name))]  # noqa: PTH114, PTH118
@@ -286,7 +288,7 @@ def _authenticated(manifest: Manifest) -> dict[str, object]:
     return {name: value for name, value in manifest.items() if name not in ("authentication_code", "integrity")}
 
 
-_UNDAMAGED = "get an undamaged copy of the hunt's directory"
+_DAMAGE_FIX = "get an undamaged copy of the hunt's directory"
 
 
 def _check_names(manifest: Manifest) -> None:
@@ -294,10 +296,10 @@ def _check_names(manifest: Manifest) -> None:
     names = [*manifest["files"], *manifest["paths"], *manifest["argument_files"].values()]
     for name in names:
         parts = name.split("/")
-        if parts[0] not in _PARTS or not {"", ".", ".."}.isdisjoint(parts) or "\\" in name or "\0" in name:
+        if parts[0] not in _SNAPSHOT_FOLDERS or not {"", ".", ".."}.isdisjoint(parts) or "\\" in name or "\0" in name:
             raise ValueError(f"the path {name!r} leads out of the snapshot")
     for name in manifest.get("described", {}):
-        if name not in _DESCRIBING:
+        if name not in _DESCRIPTION_FILES:
             raise ValueError(f"the snapshot has no file {name!r}")
     for entry in (*manifest["files"].values(), *manifest.get("described", {}).values()):
         typed(entry, {"size": int, "blake2b": str})
@@ -359,7 +361,7 @@ def _of_simulation(found: Environment) -> Environment:
 # The environment of a hunt: Python, the machine, and the installed distributions, on which results may depend.
 
 _VERSIONED = ("crashhunt", "numpy")  # besides those of simulators
-_VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "OMP_NUM_THREADS", "VIRTUAL_ENV")
+_RECORDED_VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "OMP_NUM_THREADS", "VIRTUAL_ENV")
 
 
 def environment(imported: ImportedModules | None = None) -> Environment:
@@ -440,7 +442,7 @@ def versions() -> dict[str, str]:
 
 
 def _variables() -> tuple[str, ...]:
-    return (*_VARIABLES, *(name for _, backend in installed_backends() for name in backend.variables))
+    return (*_RECORDED_VARIABLES, *(name for _, backend in installed_backends() for name in backend.variables))
 
 
 def environment_changes(recorded: Environment) -> dict[str, tuple[str, str]]:

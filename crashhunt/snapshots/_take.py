@@ -38,7 +38,7 @@ __all__ = ["SnapshotOptions", "Sources", "find_sources", "git", "take_snapshot"]
 
 # The code that a hunt runs: the agents' own projects, found through the imported modules.
 
-_GENERATED = {"__pycache__", ".git", ".hg", ".venv", ".mypy_cache", ".ruff_cache", ".pytest_cache"}
+_GENERATED_FOLDERS = {"__pycache__", ".git", ".hg", ".venv", ".mypy_cache", ".ruff_cache", ".pytest_cache"}
 
 
 @dataclass(slots=True)
@@ -161,7 +161,7 @@ def _is_page(place: str) -> bool:
 def _walk(folder: Path) -> Iterator[str]:
     """Yield the names of all files below a folder, without following links to folders."""
     for parent, folders, files in os.walk(folder):
-        folders[:] = sorted(set(folders) - _GENERATED)
+        folders[:] = sorted(set(folders) - _GENERATED_FOLDERS)
         below = Path(parent).relative_to(folder).as_posix()
         for name in sorted(files):
             if os.path.splitext(name)[1] != ".pyc" and os.path.isfile(os.path.join(parent, name)):  # noqa: PTH113, PTH118, PTH122
@@ -193,7 +193,7 @@ def _listed(tree: Path) -> Iterator[str]:
         path = tree / name
         if path.is_dir() and not path.is_symlink():
             yield from (f"{name}/{inner}" for inner in _listed(path) if path.resolve() != tree)
-        elif _GENERATED.isdisjoint(name.split("/")):
+        elif _GENERATED_FOLDERS.isdisjoint(name.split("/")):
             yield name
 
 
@@ -260,7 +260,7 @@ def _take_root(root: Path, imported: ImportedModules, found: Sources, without: P
 
 
 _MEGABYTE = 10**6
-_SMALL = 1 << 20  # bytes
+_MAX_SMALL_FILE_BYTES = 1 << 20  # bytes
 
 
 @clear_constructor
@@ -446,7 +446,7 @@ def _store(path: str, copy: str) -> FileEntry | None:
     try:
         with open(path, "rb", buffering=0) as file:
             status = os.fstat(file.fileno())
-            content = file.readall() if status.st_size < _SMALL else None
+            content = file.readall() if status.st_size < _MAX_SMALL_FILE_BYTES else None
         if content is None:
             shutil.copy(path, copy)
             return {"size": _size(copy), "blake2b": digest_of_file(Path(copy))}

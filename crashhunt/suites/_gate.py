@@ -58,10 +58,10 @@ GATE: Final = "gate.json"
 _LOCK = ".lock"
 BASE, HEAD = "base", "head"
 _BUNDLES_PER_TYPE = 3  # kept of each crash type: a gate counts crashes, and shows some
-_USUAL_CORPUS = "crashes"  # as in the action `corpus`
+_DEFAULT_CORPUS = "crashes"  # as in the action `corpus`
 _BUSY_S, _LOOK_EVERY_S = 15.0, 0.1
-_LEAST_SLOTS = 2  # trials at a time: BASE and HEAD run side by side
-_ORIGIN = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"
+_MIN_SLOTS = 2  # trials at a time: BASE and HEAD run side by side
+_ORIGIN_SCRIPT = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,12 +272,12 @@ class _Run:
             self._corpus = self._run_corpus()
             if any(case.has_come_back for case in self._corpus or ()):
                 self._why = "a crash of the corpus that was fixed has come back"
-                return self._found(verdict="worse")
+                return self._gate_report(verdict="worse")
             self._run_hunts()
         except KeyboardInterrupt:
             self._is_interrupted = True
             self._why = "interrupted"
-        return self._found()
+        return self._gate_report()
 
     # What is compared.
 
@@ -388,7 +388,7 @@ class _Run:
     def _run_corpus(self) -> tuple[GateCase, ...] | None:
         """Run the cases of HEAD with its code, in its own process; None if there is no corpus."""
         gate = self._gate
-        given = gate.corpus or Path(_USUAL_CORPUS)
+        given = gate.corpus or Path(_DEFAULT_CORPUS)
         folder = self._folder_of(HEAD, gate.folder)
         corpus = folder / given
         tree = self._trees.get(HEAD)
@@ -429,10 +429,10 @@ class _Run:
     # The hunts.
 
     def _run_hunts(self) -> None:
-        slots = max(_LEAST_SLOTS, slots_of(self._gate.parallel))
+        slots = max(_MIN_SLOTS, slots_of(self._gate.parallel))
         for number, paired in enumerate(self._hunts):
             is_last = number == len(self._hunts) - 1
-            self._look(paired, is_last=is_last)
+            self._count_pairs(paired, is_last=is_last)
             if not self._is_enough(paired):
                 waiting = [folder for folder in paired.folders if not self._is_done(folder, paired.most)]
                 environments = {
@@ -441,11 +441,11 @@ class _Run:
                     if side in self._trees
                 }
                 run_all(
-                    waiting, slots, watch=lambda: self._look(paired, is_last=is_last),  # noqa: B023 - called here
+                    waiting, slots, watch=lambda: self._count_pairs(paired, is_last=is_last),  # noqa: B023 - called here
                     machine={**(self._gate.machine or {}), "trials": paired.most},
                     is_enough=lambda: self._is_enough(paired), environments=environments,  # noqa: B023
                 )  # fmt: skip
-                self._look(paired, is_last=is_last)
+                self._count_pairs(paired, is_last=is_last)
             if self._refuse_failed(paired) or self._pairs.verdict != "undecided" or time.monotonic() > self._until:
                 break
         if self._pairs.verdict == "undecided" and not self._why:
@@ -457,7 +457,7 @@ class _Run:
         state = hunt_state(folder)
         return state.state in ("finished", "crashed") and state.trials_run >= most
 
-    def _look(self, paired: PairedHunts, *, is_last: bool) -> None:
+    def _count_pairs(self, paired: PairedHunts, *, is_last: bool) -> None:
         paired.take(self._pairs, may_end=is_last)
         if self._watch is not None:
             test = self._pairs.test
@@ -519,7 +519,7 @@ class _Run:
 
     # What came of it.
 
-    def _found(self, *, verdict: PairVerdict | None = None) -> GateReport:
+    def _gate_report(self, *, verdict: PairVerdict | None = None) -> GateReport:
         gate, test = self._gate, self._pairs.test
         found: PairVerdict = verdict or self._pairs.verdict
         why = self._why
@@ -616,7 +616,7 @@ def _modules_of(run: RunRequest) -> set[str]:
 
 def _origin_of(module: str, folder: Path, environment: Mapping[str, str]) -> Path:
     """Return the file of a module as a work tree finds it; the tree's own folder where it cannot be found there."""
-    done = run_to_end([sys.executable, "-c", _ORIGIN, module], folder, environment)
+    done = run_to_end([sys.executable, "-c", _ORIGIN_SCRIPT, module], folder, environment)
     return Path(done.stdout.strip()).resolve() if done.returncode == 0 else folder
 
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["rerun"]
 
-_NUMBERS = ("trials", "max_steps", "seed")  # what --set changes besides arguments
+_NUMBER_OPTIONS = ("trials", "max_steps", "seed")  # what --set changes besides arguments
 
 
 def rerun(
@@ -75,7 +75,7 @@ def rerun(
         refuse_untrusted_hunt(hunt)
     changes = changes or {}
     if to is not None:
-        return _elsewhere(hunts, to, changes, parallel, watch, machine), []
+        return _run_copies(hunts, to, changes, parallel, watch, machine), []
     if changes and not everything:
         raise UsageError(
             f"--set {next(iter(changes))}: a hunt cannot change its settings",
@@ -90,7 +90,7 @@ def rerun(
     for hunt in hunts:
         state = hunt_state(hunt)
         if everything or state.state == "error":
-            replaced.append(set_aside(hunt, partial(_moved, requests[hunt], hunt)))
+            replaced.append(set_aside(hunt, partial(_with_moved_scenario, requests[hunt], hunt)))
         elif state.failed or state.state == "queued" or _replace_invalid(hunt, state):
             write_request(hunt, requests[hunt])
         else:
@@ -139,7 +139,7 @@ def _request(hunt: Path) -> RunRequest:
     return RunRequest(request, str(Path.cwd()))
 
 
-def _moved(asked: RunRequest, hunt: Path, aside: Path) -> RunRequest:
+def _with_moved_scenario(asked: RunRequest, hunt: Path, aside: Path) -> RunRequest:
     """Return the settings with the scenario of the snapshot, which has been moved with all replaced files."""
     scenario = Path(asked.request.scenario)
     if not scenario.is_relative_to(hunt.resolve()):
@@ -153,7 +153,7 @@ def _changed(asked: RunRequest, changes: Mapping[str, str], hunt: Path) -> RunRe
     arguments, scenario_arguments = dict(request.arguments), dict(request.scenario_arguments)
     owners = _Names(asked, hunt) if changes else None
     for name, spec in changes.items():
-        if name in _NUMBERS:
+        if name in _NUMBER_OPTIONS:
             if not spec.isdecimal():
                 raise UsageError(f"--set {name}={spec}", fix="give a whole number")
             number: Given = {name: int(spec)}
@@ -212,7 +212,7 @@ def _replace_invalid(hunt: Path, state: HuntState) -> int:
         return ledger.replace([result.spec.number for result in ledger.results(outcomes=(str(Outcome.INVALID),))])
 
 
-def _elsewhere(
+def _run_copies(
     hunts: Sequence[Path],
     to: Path,
     changes: Mapping[str, str],
@@ -225,7 +225,7 @@ def _elsewhere(
     request = _changed(_request(hunts[0]), changes, hunts[0])
     try:
         if to.exists() and not is_empty_folder(to):
-            _see_that_it_resumes(to, request)
+            _require_same_request(to, request)
         else:
             with temporary_beside(to) as building:  # one that is there has its request
                 building.mkdir()
@@ -239,7 +239,7 @@ def _elsewhere(
     return [hunt_state(to)]
 
 
-def _see_that_it_resumes(to: Path, request: RunRequest) -> None:
+def _require_same_request(to: Path, request: RunRequest) -> None:
     """Check that a directory is that of the same command, which was killed or interrupted.
 
     Raises:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Suite", "SuiteEntry", "default_suite"]
 
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]*")
+_ENTRY_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]*")
 
 
 @clear_constructor
@@ -85,7 +85,7 @@ class Suite:
         self.folder = (folder or Path.cwd()).resolve()
         seen: set[str] = set()
         for place, entry in enumerate(self.entries):
-            if not _ID.fullmatch(entry.id):
+            if not _ENTRY_ID.fullmatch(entry.id):
                 raise UsageError(
                     f"hunts[{place}].id = {entry.id!r} is not a valid folder name", fix="use letters, digits and ._+=-"
                 )

@@ -12,7 +12,7 @@ from crashhunt.crashes import partner
 from crashhunt.executors import FreshProcessExecutor
 from crashhunt.recording import read_log
 from crashhunt.replays import ReplayOptions, prepare
-from crashhunt.simulators import HasMeanings
+from crashhunt.simulators import NamesMetaActions
 
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
@@ -63,7 +63,7 @@ class RecordedThenBrakes:
     def __init__(self, log: str, agent: str, after: int, action_space: Any) -> None:
         self._actions = read_log(Path(log)).actions(agent)
         self._after = after
-        meta = supports(action_space, HasMeanings)
+        meta = supports(action_space, NamesMetaActions)
         self._brake: object = tuple(action_space.meanings).index("SLOWER") if meta else (0.0, 0)
         self._step = 0
 

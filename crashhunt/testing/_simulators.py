@@ -13,19 +13,19 @@ from crashhunt.base.capabilities import members, supports
 from crashhunt.base.errors import ActionError
 from crashhunt.simulators import (
     FACULTIES,
-    BrakesFully,
     CountsSetUp,
     FlattensObservations,
     FullBraking,
     HasMap,
     NamesObservations,
-    Reseeds,
+    ReportsEvents,
+    ReportsNotices,
     RestoresObservations,
+    RestoresState,
     Simulator,
     SupportsDisturbances,
-    TellsEvents,
-    TellsNotices,
-    Tidies,
+    SupportsFullBraking,
+    SupportsReseeding,
 )
 from crashhunt.trial import CELLS, Disturbance, Outcome
 
@@ -67,7 +67,7 @@ class SimulatorContract:
             held[agent] = simulator.actions[agent].encode(simulator.actions[agent].space.sample())
         for step in range(self.steps):
             if reseeded is not None and step == reseeded[0]:
-                assert supports(simulator, Reseeds)
+                assert supports(simulator, SupportsReseeding)
                 simulator.reseed(reseeded[1])
             acting = tuple(simulator.agents)
             if not acting:
@@ -120,7 +120,7 @@ class SimulatorContract:
     def test_another_seed_within_an_episode_changes_only_what_follows(self, make: Make) -> None:
         """With another seed from a step on, the steps before stay equal, and equal seeds give equal episodes."""
         simulator = make()
-        if not supports(simulator, Reseeds) or simulator.why_no_reseeding:
+        if not supports(simulator, SupportsReseeding) or simulator.why_no_reseeding:
             return
         first = self._drive(simulator, 1)
         after = max(0, len(first) // 2 - 1)
@@ -188,12 +188,12 @@ class SimulatorContract:
         simulator.close()
 
     def test_braking_as_hard_as_it_can_is_an_action_that_does_not_speed_up(self, make: Make) -> None:
-        """The action of `BrakesFully` is inside the space, and slows the vehicle down."""
+        """The action of `SupportsFullBraking` is inside the space, and slows the vehicle down."""
         simulator = make()
         simulator.reset(seed=1)
         names = tuple(simulator.agents)
         brakes: dict[str, FullBraking] = {}
-        if supports(simulator, BrakesFully):
+        if supports(simulator, SupportsFullBraking):
             for name in names:
                 braking = simulator.full_braking(name)
                 if braking is not None:
@@ -253,9 +253,9 @@ class SimulatorContract:
         simulator.close()
 
     def test_only_events_that_it_looks_for_happen(self, make: Make) -> None:
-        """`TellsEvents`: its scenes have events of those kinds only, and none without it."""
+        """`ReportsEvents`: its scenes have events of those kinds only, and none without it."""
         simulator = make()
-        kinds = tuple(simulator.reported_events) if supports(simulator, TellsEvents) else ()
+        kinds = tuple(simulator.reported_events) if supports(simulator, ReportsEvents) else ()
         assert {Outcome(kind).is_traffic_event for kind in kinds} <= {True}
         assert {event.kind for event in self._events(simulator)} <= set(kinds)
         simulator.close()
@@ -297,9 +297,9 @@ class SimulatorContract:
         simulator.close()
 
     def test_notices_are_lines(self, make: Make) -> None:
-        """`TellsNotices`: each is one line of text."""
+        """`ReportsNotices`: each is one line of text."""
         simulator = make()
-        if supports(simulator, TellsNotices):
+        if supports(simulator, ReportsNotices):
             self._drive(simulator, 1)
             for notice in simulator.notices:
                 assert isinstance(notice, str)
@@ -319,9 +319,9 @@ class SimulatorContract:
         simulator.close()
 
     def test_tidying_changes_no_episode(self, make: Make) -> None:
-        """`Tidies`: before the first episode, and between two."""
+        """`RestoresState`: before the first episode, and between two."""
         simulator = make()
-        if not supports(simulator, Tidies):
+        if not supports(simulator, RestoresState):
             simulator.close()
             return
         first = self._drive(simulator, 1)
@@ -329,7 +329,7 @@ class SimulatorContract:
         assert self._drive(simulator, 1) == first
         simulator.close()
         fresh = make()
-        assert supports(fresh, Tidies)
+        assert supports(fresh, RestoresState)
         fresh.tidy()
         assert self._drive(fresh, 1) == first
         fresh.close()

@@ -113,7 +113,7 @@ class CrashEpisodes:
             divergence = start.repeat(episode, stage.agent)
         if divergence:
             return None, {}, divergence
-        return *self._shown(episode), ""
+        return *self._observation_and_info(episode), ""
 
     def reset_to_plain(self, hunt: int, seed: int) -> tuple[object, dict[str, object]]:
         """Begin an episode with a traffic of a hunt.
@@ -133,7 +133,7 @@ class CrashEpisodes:
             failure = episode.result.failure
             why = failure.message if failure is not None else str(episode.result.outcome)
             raise SimulatorError(f"no episode with seed {seed}: {why}", fix="check the scenario with crashhunt run")
-        return self._shown(episode)
+        return self._observation_and_info(episode)
 
     def step(self, action: object) -> tuple[object, float, bool, bool, dict[str, object]]:
         """Advance one step; return observation, reward, whether it has terminated or is truncated, and the info."""
@@ -145,7 +145,7 @@ class CrashEpisodes:
         result = _advance(episode, {stage.agent: encoded})
         if result is not None and result.outcome.is_software_fault:
             raise episode.error or SimulatorError(str(result.outcome))
-        observation, info = self._shown(episode)
+        observation, info = self._observation_and_info(episode)
         is_over = bool(episode.terminations.get(stage.agent))
         reward = float(episode.rewards.get(stage.agent, 0.0))
         if result is None:
@@ -157,21 +157,21 @@ class CrashEpisodes:
 
     def close(self) -> None:
         """End the simulation and remove its files."""
-        self._leave()
+        self._end_episode()
         for stage in self._stages.values():
             stage.simulator.close()
         self._folder.remove()
 
     def _enter(self, hunt: Path) -> _Stage:
         """Return the stage of a hunt; end the simulation of another one, because SUMO has one for the process."""
-        self._leave()
+        self._end_episode()
         stage = self._stages[hunt]
         if self._running is not None and self._running is not stage:
             self._running.simulator.close()
         self._running = stage
         return stage
 
-    def _leave(self) -> None:
+    def _end_episode(self) -> None:
         if self._episode is not None:
             self._episode.close()
             self._episode = None
@@ -187,7 +187,7 @@ class CrashEpisodes:
         episode.start()
         return episode
 
-    def _shown(self, episode: Episode) -> tuple[object, dict[str, object]]:
+    def _observation_and_info(self, episode: Episode) -> tuple[object, dict[str, object]]:
         assert self._running is not None
         agent, scene = self._running.agent, episode.scene
         assert scene is not None

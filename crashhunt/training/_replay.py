@@ -25,7 +25,7 @@ _STALENESS_SHARE = 0.1
 """rho; the value of the paper for Procgen."""
 _TEMPERATURE = 1.0
 """beta; 1 draws in proportion to the score. The paper's 0.1 is for ranks."""
-_FORGETTING = 0.2
+_FORGETTING_RATE = 0.2
 """Weight of the newest outcome in a score: about ten episodes change it by nine tenths."""
 
 
@@ -72,7 +72,7 @@ class CrashReplay:
 
     def record(self, index: int, *, has_crashed: bool) -> None:
         """Record how an episode that began with a crash ended."""
-        self.scores[index] += _FORGETTING * (has_crashed - self.scores[index])
+        self.scores[index] += _FORGETTING_RATE * (has_crashed - self.scores[index])
 
     def remove(self, index: int) -> None:
         """Never draw a crash again."""

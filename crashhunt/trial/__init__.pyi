@@ -5,9 +5,9 @@ from ._data import (
 )
 from ._disturbance import (
     CELLS as CELLS,
-    HELD as HELD,
+    HOLD_KINDS as HOLD_KINDS,
     KINDS as KINDS,
-    OF_AGENT as OF_AGENT,
+    SENSOR_KINDS as SENSOR_KINDS,
     Disturbance as Disturbance,
     Manoeuvre as Manoeuvre,
     in_turn as in_turn,
@@ -47,7 +47,7 @@ from ._space import (
     without_folder as without_folder,
 )
 from ._specification import (
-    EVERYBODY as EVERYBODY,
+    ALL_AGENTS as ALL_AGENTS,
     Forcing as Forcing,
     Handover as Handover,
     Overruled as Overruled,

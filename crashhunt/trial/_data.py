@@ -27,7 +27,7 @@ __all__ = ["check_disturbances", "check_parts", "check_plain"]
 _TEXT_OR_NUMBER = bool | float | str | None
 
 
-_SPEC = {
+_SPECIFICATION_TYPES = {
     "arguments": dict[str, dict[str, _TEXT_OR_NUMBER]],
     "scenario_arguments": dict[str, _TEXT_OR_NUMBER],
 }
@@ -43,7 +43,7 @@ def check_plain(data: JsonObject) -> None:
     typed_where_there(data, {"sim_time_s": float, "digest": str, "wall_s": float})
     spec = data["spec"]
     typed(spec, dict.fromkeys(("number", "seed", "max_steps"), int))
-    typed_where_there(spec, _SPEC)
+    typed_where_there(spec, _SPECIFICATION_TYPES)
     typed({"events": data.get("events")}, {"events": dict | None})
     typed(data.get("events") or {}, dict.fromkeys(data.get("events") or (), int))
     for planned in (data.get("disturbances"), spec.get("disturbances")):

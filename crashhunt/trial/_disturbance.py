@@ -13,12 +13,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 __all__ = [
-    "CELLS", "HELD", "KINDS", "OF_AGENT", "Disturbance", "Kind", "Manoeuvre", "in_turn", "steps_of", "why_not",
+    "CELLS", "HOLD_KINDS", "KINDS", "SENSOR_KINDS", "Disturbance", "Kind", "Manoeuvre", "in_turn", "steps_of",
+    "why_not",
 ]  # fmt: skip
 
-_DIGITS = 9  # decimal places of a duration in s, so that three steps of 0.1 s are 0.3 s
+_DURATION_DIGITS = 9  # decimal places of a duration in s, so that three steps of 0.1 s are 0.3 s
 
-_PLACES = {
+_CELL_BY_PLACE = {
     "left ahead": "ahead of {} to the left",
     "ahead": "ahead of {}",
     "right ahead": "ahead of {} to the right",
@@ -29,7 +30,7 @@ _PLACES = {
     "behind": "behind {}",
     "right behind": "behind {} to the right",
 }
-CELLS = tuple(_PLACES)
+CELLS = tuple(_CELL_BY_PLACE)
 """The places in the grid around a driving agent: three lanes, with the agent itself in the middle."""
 
 
@@ -71,7 +72,7 @@ KINDS: Mapping[str, Kind] = {
 }  # fmt: skip
 """The types of disturbances that crashhunt has, by name; other simulators may add types."""
 
-HELD: Mapping[str, Kind] = {
+HOLD_KINDS: Mapping[str, Kind] = {
     "keep_speed": Kind("", "{vehicle} is held to its speed for {long:g} s"),
     "keep_lane": Kind("", "{vehicle} is held in its lane for {long:g} s"),
     "gone": Kind("", "{vehicle} is taken off the road"),
@@ -85,7 +86,7 @@ Manoeuvre = Literal[
 
 With the last three, a reference driver corrects its speed, its lane changes, or both, where they are not safe."""
 
-OF_AGENT = frozenset(name for name, kind in KINDS.items() if kind.of_agent)
+SENSOR_KINDS = frozenset(name for name, kind in KINDS.items() if kind.of_agent)
 """The types that affect the agent itself and need no support by the simulator."""
 
 
@@ -97,7 +98,7 @@ def steps_of(seconds: float, step_length_s: float) -> int:
 def _in_steps(seconds: float, step_length_s: float) -> float:
     """Return a duration in s, rounded to whole steps, but at least one step; 0 stays 0."""
     found = steps_of(seconds, step_length_s) * step_length_s if seconds > 0 else 0.0
-    return seconds if math.isclose(found, seconds) else round(found, _DIGITS)
+    return seconds if math.isclose(found, seconds) else round(found, _DURATION_DIGITS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,12 +108,12 @@ class Disturbance(Serializable):
     Args:
         step: The step in which the disturbance begins, from 1.
         who: The place of the vehicle in the grid around the agent when the disturbance begins, one of `CELLS`.
-        what: The type: one of `KINDS` or `HELD`, or a type that another simulator adds.
+        what: The type: one of `KINDS` or `HOLD_KINDS`, or a type that another simulator adds.
         how_strong: The strength in the unit of the type: m/s² of braking, s of delay, a share of a speed or of a value.
         how_long: The duration in s of simulation time.
         agent: The controlled vehicle around which the grid lies.
         vehicle: The vehicle that was at the place. It is empty if the disturbance is planned, or if no vehicle was at
-            the place. A hold (`HELD`) names its vehicle from the beginning.
+            the place. A hold (`HOLD_KINDS`) names its vehicle from the beginning.
     """
 
     step: int
@@ -142,7 +143,7 @@ class Disturbance(Serializable):
         """A sentence that describes the disturbance, such as ``main.35 brakes with 4 m/s² for 2 s``."""
         agent = self.agent or "the agent"
         vehicle = self.vehicle or (agent if self.who == "itself" else f"the actor {self.place}")
-        kind = KINDS.get(self.what) or HELD.get(self.what)
+        kind = KINDS.get(self.what) or HOLD_KINDS.get(self.what)
         if kind is None:
             return f"{vehicle}: {self.what} {self.how_strong:g} for {self.how_long:g} s"
         always, _, where_strong = kind.words.partition("|")
@@ -155,7 +156,7 @@ class Disturbance(Serializable):
         """A phrase for the place, such as ``ahead of ego to the left``."""
         agent = self.agent or "the agent"
         # A later version may add places.
-        return _PLACES[self.who].format(agent) if self.who in _PLACES else f"{self.who} of {agent}"
+        return _CELL_BY_PLACE[self.who].format(agent) if self.who in _CELL_BY_PLACE else f"{self.who} of {agent}"
 
     def is_active(self, step: int, step_length_s: float) -> bool:
         """Whether the disturbance is active in a step."""

@@ -22,13 +22,13 @@ from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._space import Value
 from crashhunt.world import Paths
 
-__all__ = ["EVERYBODY", "Forcing", "Handover", "Overruled", "Reseeding", "TrialSpec"]
+__all__ = ["ALL_AGENTS", "Forcing", "Handover", "Overruled", "Reseeding", "TrialSpec"]
 
-EVERYBODY = "*"
+ALL_AGENTS = "*"
 """In `TrialSpec.only`: no actor is excluded, but the trial records which actors enter."""
 
 
-_ESSENTIAL = {**ESSENTIAL, **OMIT_DEFAULT}
+_ESSENTIAL_METADATA = {**ESSENTIAL, **OMIT_DEFAULT}
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +48,9 @@ class Overruled(Serializable):
 
     agent: str
     after: int
-    manoeuvre: str = field(default="brake", metadata=_ESSENTIAL)
-    keeps: str = field(default="", metadata=_ESSENTIAL)
-    reference: str = field(default="", metadata=_ESSENTIAL)
+    manoeuvre: str = field(default="brake", metadata=_ESSENTIAL_METADATA)
+    keeps: str = field(default="", metadata=_ESSENTIAL_METADATA)
+    reference: str = field(default="", metadata=_ESSENTIAL_METADATA)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class Reseeding(Serializable):
 
     after: int
     seed: int
-    earlier: tuple[tuple[int, int], ...] = field(default=(), metadata=_ESSENTIAL)
+    earlier: tuple[tuple[int, int], ...] = field(default=(), metadata=_ESSENTIAL_METADATA)
 
     def seed_after(self, step: int) -> int | None:
         """Return the seed that the generators get after a step; None if they continue."""
@@ -135,14 +135,14 @@ class TrialSpec(Serializable):
     arguments: Mapping[str, Mapping[str, Value]]
     scenario_arguments: Mapping[str, Value]
     max_steps: int
-    overruled: Overruled | None = field(default=None, metadata=_ESSENTIAL)
+    overruled: Overruled | None = field(default=None, metadata=_ESSENTIAL_METADATA)
     parent: int | None = field(default=None, metadata=OMIT_DEFAULT)
     origin: str = field(default="", metadata=OMIT_DEFAULT)
-    disturbances: tuple[Disturbance, ...] = field(default=(), metadata=_ESSENTIAL)
-    only: tuple[str, ...] | None = field(default=None, metadata=_ESSENTIAL)
-    script: Paths | None = field(default=None, metadata=_ESSENTIAL)
-    handover: Handover | None = field(default=None, metadata=_ESSENTIAL)
-    reseeding: Reseeding | None = field(default=None, metadata=_ESSENTIAL)
+    disturbances: tuple[Disturbance, ...] = field(default=(), metadata=_ESSENTIAL_METADATA)
+    only: tuple[str, ...] | None = field(default=None, metadata=_ESSENTIAL_METADATA)
+    script: Paths | None = field(default=None, metadata=_ESSENTIAL_METADATA)
+    handover: Handover | None = field(default=None, metadata=_ESSENTIAL_METADATA)
+    reseeding: Reseeding | None = field(default=None, metadata=_ESSENTIAL_METADATA)
     forcing: Forcing | None = field(default=None, metadata=OMIT_DEFAULT)
 
     def to_json(self) -> JsonObject:

@@ -17,7 +17,7 @@ from ._interventions import (
     interventions_of as interventions_of,
     step_before as step_before,
 )
-from ._reruns import Ended as Ended, Reruns as Reruns, StoppedError as StoppedError
+from ._reruns import EndedRun as EndedRun, Reruns as Reruns, StoppedError as StoppedError
 from ._types_by_cause import (
     REPRESENTATIVES as REPRESENTATIVES,
     divide_by_cause as divide_by_cause,

@@ -35,17 +35,17 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialResult
-    from crashhunt.whatif._reruns import Ended
+    from crashhunt.whatif._reruns import EndedRun
 
 
-__all__ = ["CannotError", "Search", "Tried", "judge"]
+__all__ = ["AvoidanceSearch", "CannotError", "Tried", "judge"]
 
 
 # The search for the last step from which a manoeuvre avoids a collision: which runs it asks for, and in what order.
 
-_FOR_BRAKING = 0.6  # of the runs; the rest is for changing lanes
-_STANDS = 0.1  # m/s²
-_TOO_FEW = "no runs were left for changing lanes"
+_BRAKING_SHARE_OF_RUNS = 0.6  # of the runs; the rest is for changing lanes
+_MIN_DECELERATION_MPS2 = 0.1  # m/s²
+_NO_RUNS_LEFT = "no runs were left for changing lanes"
 
 
 class CannotError(Exception):
@@ -89,7 +89,7 @@ class _Tries:
         return max((step for step, ending in self.endings.items() if ending == "avoided"), default=None)
 
 
-class Search:
+class AvoidanceSearch:
     """Bisects, and then runs what is left after the last step that helped: helping need not end for good.
 
     Args:
@@ -114,7 +114,7 @@ class Search:
             self.why_not = "it crashed in its first step"
             return
         start = min(max(0, self._start), self._end - 1)
-        last = self._try("brake", int(self._runs * _FOR_BRAKING) or 1, start, 0)
+        last = self._try("brake", int(self._runs * _BRAKING_SHARE_OF_RUNS) or 1, start, 0)
         first = 0 if last is None else last + 1
         if last == self._end - 1:
             return  # nothing can help any longer
@@ -124,7 +124,7 @@ class Search:
             if self._left > 0:
                 self._try(side, self._left // share or 1, self._end - 1, first)
             elif all(tries.last is None for tries in self._tries):  # else it would read as if nothing could help
-                self.why_not = _TOO_FEW
+                self.why_not = _NO_RUNS_LEFT
 
     def judgement(self) -> Judgement:
         """Return the results so far."""
@@ -133,7 +133,9 @@ class Search:
                 manoeuvre=tried.manoeuvre,
                 end=self._end,
                 endings=dict(tried.endings),
-                deceleration=max((value for value in tried.decelerations if value > _STANDS), default=None),
+                deceleration=max(
+                    (value for value in tried.decelerations if value > _MIN_DECELERATION_MPS2), default=None
+                ),
                 changed=tried.changed.get(tried.last, ()) if tried.last is not None else (),
             )
             for tried in self._tries
@@ -142,12 +144,12 @@ class Search:
         return Judgement(tuple(attempts), self.why_not)
 
     def _try(self, manoeuvre: str, most: int, start: int, first: int) -> int | None:
-        """Search for the last step from which a manoeuvre helps; return it, None if none was found."""
+        """AvoidanceSearch for the last step from which a manoeuvre helps; return it, None if none was found."""
         tries = _Tries(manoeuvre, most)
         self._tries.append(tries)
         try:
             self._find(tries, start, first)
-            self._look_after(tries, first)
+            self._run_later_steps(tries, first)
         except _Enough:
             pass
         except CannotError as error:
@@ -157,7 +159,7 @@ class Search:
 
     def _find(self, tries: _Tries, start: int, first: int) -> None:
         """Bisect between a step that helps and one that does not."""
-        self._ask(tries, {start, self._end - 1} if self._parallel > 1 else {start})
+        self._run_after_steps(tries, {start, self._end - 1} if self._parallel > 1 else {start})
         stride = 1
         while True:
             helps = tries.last
@@ -173,18 +175,18 @@ class Search:
             else:
                 parts = min(self._parallel, late - helps - 1) + 1
                 steps = {helps + (late - helps) * part // parts for part in range(1, parts)}
-            self._ask(tries, steps)
+            self._run_after_steps(tries, steps)
 
-    def _look_after(self, tries: _Tries, first: int) -> None:
+    def _run_later_steps(self, tries: _Tries, first: int) -> None:
         """Run what is left after the last step that helped, the latest first."""
         while True:
             above = first - 1 if tries.last is None else tries.last
             left = [step for step in range(self._end - 1, above, -1) if step not in tries.endings]
             if not left:
                 return
-            self._ask(tries, left[: self._parallel])
+            self._run_after_steps(tries, left[: self._parallel])
 
-    def _ask(self, tries: _Tries, steps: Iterable[int]) -> None:
+    def _run_after_steps(self, tries: _Tries, steps: Iterable[int]) -> None:
         """Run the manoeuvre after each of some steps.
 
         Raises:
@@ -204,7 +206,7 @@ class Search:
                 raise _Enough
 
 
-_GUESS = 4.5  # m/s², to begin the search somewhere
+_ASSUMED_DECELERATION_MPS2 = 4.5  # m/s², to begin the search somewhere
 
 
 def judge(
@@ -245,7 +247,7 @@ def judge(
     result = bundle.result
     hit = result.collision
     of_two = result.outcome is Outcome.COLLISION and hit is not None and bool(hit.other)
-    _see_that_it_can_be_judged(bundle, of_two=of_two, why=why)
+    _require_judgeable(bundle, of_two=of_two, why=why)
     rerun = prepare(bundle, options or ReplayOptions())
     with temporary_folder("judge") as scratch:
         reruns = Reruns(rerun, scratch, parallel=parallel, stopped=stopped)
@@ -256,7 +258,7 @@ def judge(
 
         lanes = LaneMap(read_lanes(bundle.path / layout.LOG), (hit.x, hit.y) if hit is not None else (0.0, 0.0))
         trials = _Trials(result=result, recorded=rerun.recorded, reruns=reruns, lanes=lanes, tell=tell)
-        search = Search(result.steps, _start(rerun) if of_two else 0, trials.run, runs=runs, parallel=parallel)
+        search = AvoidanceSearch(result.steps, _start(rerun) if of_two else 0, trials.run, runs=runs, parallel=parallel)
         found = None
         try:
             if of_two:
@@ -283,7 +285,7 @@ def judge(
     return replace(search.judgement(), why=found, visible_step=visible, reference=omitted)
 
 
-def _see_that_it_can_be_judged(bundle: Bundle, *, of_two: bool, why: int) -> None:
+def _require_judgeable(bundle: Bundle, *, of_two: bool, why: int) -> None:
     """See that there is something to run.
 
     Raises:
@@ -308,7 +310,7 @@ def _start(rerun: Rerun) -> int:
     """The step after which braking may just have helped, as far as a calculation says it."""
     hit, end = rerun.bundle.result.collision, rerun.bundle.result.steps
     assert hit is not None
-    guess = last_escape(rerun.recorded, hit.agent, hit.other, braking=_GUESS)
+    guess = last_escape(rerun.recorded, hit.agent, hit.other, braking=_ASSUMED_DECELERATION_MPS2)
     return end - 1 if guess is None else guess
 
 
@@ -343,7 +345,7 @@ class _Trials:
                 raise
             raise CannotError(str(error)) from error  # the crashhunt of an older snapshot knows braking only
 
-    def _tried(self, manoeuvre: str, step: int, ended: Ended) -> Tried:
+    def _tried(self, manoeuvre: str, step: int, ended: EndedRun) -> Tried:
         result, recording = ended.result, ended.recording
         if result.outcome is Outcome.INVALID:
             raise CannotError(result.failure.message if result.failure else "its trial could not be set up")

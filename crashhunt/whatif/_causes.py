@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
     from crashhunt.trial import Distribution, TrialResult, TrialSpec, Value
-    from crashhunt.whatif._reruns import Ended, Reruns
+    from crashhunt.whatif._reruns import EndedRun, Reruns
     from crashhunt.world import Scene
 
 
-__all__ = ["Doing", "find_why", "maneuvers_of", "relevant_actors"]
+__all__ = ["Maneuver", "find_why", "maneuvers_of", "relevant_actors"]
 
 
 # What agent and others did before a collision that it may hang on: braking, speeding up, changing lanes.
@@ -43,13 +43,13 @@ __all__ = ["Doing", "find_why", "maneuvers_of", "relevant_actors"]
 _BEFORE_S = 10.0  # manoeuvres longer before the collision are not examined
 _NEAR_S, _NEAR_M = 5.0, 60.0  # who is further away than that is not asked about
 _BRAKES, _SPEEDS_UP = -1.5, 1.0  # m/s²; less is driving along
-_BEGINS = 0.3  # m/s²; from here on, it belongs to what follows
+_ONSET_ACCELERATION_MPS2 = 0.3  # m/s²; from here on, it belongs to what follows
 _PAUSE_S = 0.5  # a shorter interruption does not end a manoeuvre
-_CHANGED = 1.0  # m/s in all; less makes no difference
+_MIN_SPEED_CHANGE_MPS = 1.0  # m/s in all; less makes no difference
 
 
 @dataclass(frozen=True, slots=True)
-class Doing:
+class Maneuver:
     """A manoeuvre of an actor.
 
     Args:
@@ -92,7 +92,7 @@ def relevant_actors(recording: Recording, agent: str, other: str, most: int) -> 
     ]
 
 
-def maneuvers_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> list[Doing]:
+def maneuvers_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> list[Maneuver]:
     """Return an actor's manoeuvres in the last seconds before a step: the last one of each type.
 
     Args:
@@ -116,11 +116,11 @@ def maneuvers_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> 
     for what, limit in (("braked", _BRAKES), ("sped up", _SPEEDS_UP)):
         place = _onset(np.diff(speeds) / dt, limit, max(1, round(_PAUSE_S / dt)), dt)
         if place is not None:
-            found.append(Doing(actor=actor, what=what, step=steps[place], speed=float(speeds[place])))
+            found.append(Maneuver(actor=actor, what=what, step=steps[place], speed=float(speeds[place])))
     place = _change(recording, scenes, actor, lanes)
     if place is not None:
         found.append(
-            Doing(
+            Maneuver(
                 actor=actor, what="changed lanes", step=steps[place], speed=float(speeds[min(place, len(speeds) - 1)])
             )
         )
@@ -135,9 +135,9 @@ def _onset(changes: NDArray[np.float64], limit: float, pause: int, dt: float) ->
         breaks = np.flatnonzero(np.diff(hard) > pause)
         begin = int(hard[breaks[-1] + 1]) if len(breaks) else int(hard[0])
         until = int(hard[-1])
-        while begin > 0 and way * changes[begin - 1] >= _BEGINS:
+        while begin > 0 and way * changes[begin - 1] >= _ONSET_ACCELERATION_MPS2:
             begin -= 1
-        if abs(float(changes[begin : until + 1].sum())) * dt >= _CHANGED:
+        if abs(float(changes[begin : until + 1].sum())) * dt >= _MIN_SPEED_CHANGE_MPS:
             return begin
         hard = hard[hard < begin]
     return None
@@ -153,19 +153,19 @@ def _change(recording: Recording, scenes: Sequence[Scene], actor: str, lanes: La
     return None if place is None else min(place, len(scenes) - 2)
 
 
-_OTHERS = 5  # who is asked about, besides the agent
+_MAX_OTHER_ACTORS = 5  # who is asked about, besides the agent
 _DRAWS, _SEEDS = 8, 8
 _EARLIER_S = (0.0, 0.5, 1.0)  # a manoeuvre is suppressed from these times before its beginning
 _GONE_S = (3.0, 4.0, 5.0)  # an actor is removed at these times before the collision
 _LONGER_S = 5.0  # simulation time past the collision, so that one that only comes later is seen
-_TRAFFIC = 0x776879  # apart from what else is drawn of a trial's seed
-_SAYS_NOTHING = (Outcome.INVALID, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
-_HOLDS = {"braked": "keep_speed", "sped up": "keep_speed", "changed lanes": "keep_lane"}
-_KEEPS = {"braked": "speed", "sped up": "speed", "changed lanes": "lane"}
+_TRAFFIC_STREAM = 0x776879  # apart from what else is drawn of a trial's seed
+_INCONCLUSIVE_OUTCOMES = (Outcome.INVALID, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
+_HOLD_BY_MANEUVER = {"braked": "keep_speed", "sped up": "keep_speed", "changed lanes": "keep_lane"}
+_FACULTY_BY_MANEUVER = {"braked": "speed", "sped up": "speed", "changed lanes": "lane"}
 
 
 @dataclass(slots=True)
-class _Asked:
+class _Candidate:
     """A candidate cause, and the runs without it.
 
     Args:
@@ -243,9 +243,9 @@ class _Search:
         self.steps = max(min(self._spec.max_steps, 2 * self._end + longer), self._end)
         self._inside = replace(self._spec, max_steps=self._end + longer)
         self._settings = read_settings(rerun.bundle.hunt / layout.HUNT)
-        self._lanes = LaneMap(read_lanes(rerun.bundle.path / layout.LOG), self._place())
+        self._lanes = LaneMap(read_lanes(rerun.bundle.path / layout.LOG), self._crash_place())
 
-    def _place(self) -> tuple[float, float]:
+    def _crash_place(self) -> tuple[float, float]:
         """Where it was: around there, lanes are known."""
         hit = self._result.collision
         if hit is not None:
@@ -256,21 +256,21 @@ class _Search:
                 return float(x), float(y)
         return 0.0, 0.0
 
-    def asked(self) -> list[_Asked]:
+    def asked(self) -> list[_Candidate]:
         """Return everything, what says most first."""
         found = [*self._disturbances(), *self._agents()]
-        names = relevant_actors(self._recording, self._agent, self._other, _OTHERS)
+        names = relevant_actors(self._recording, self._agent, self._other, _MAX_OTHER_ACTORS)
         others = {name: self._others(name) for name in names}
         found += [one for name in names for one in others[name] if one.factor.what != "there"]
         found += [*self._arguments(), *self._seeds()]
         found += [one for name in names for one in others[name] if one.factor.what == "there"]
         return [one for one in found if one.runs]
 
-    def ending(self, asked: _Asked, place: int, ended: Ended) -> LeftOut:
+    def ending(self, asked: _Candidate, place: int, ended: EndedRun) -> LeftOut:
         """Return what became of the collision in a run."""
         given = asked.runs[place][0]
         result, recording = ended.result, ended.recording
-        if result.outcome in _SAYS_NOTHING and result.outcome is not self._result.outcome:
+        if result.outcome in _INCONCLUSIVE_OUTCOMES and result.outcome is not self._result.outcome:
             return LeftOut(given, "unclear")
         into = ""
         changed: tuple[str, ...] = ()
@@ -313,7 +313,7 @@ class _Search:
                     return str(name)
         return ""
 
-    def _disturbances(self) -> Iterator[_Asked]:
+    def _disturbances(self) -> Iterator[_Candidate]:
         """What the trial was disturbed by."""
         planned = self._spec.disturbances
         targets = {(one.step, one.agent, one.what): one.vehicle for one in self._rerun.bundle.result.disturbances}
@@ -321,50 +321,55 @@ class _Search:
             if who := targets.get((one.step, one.agent, one.what)):
                 spec = replace(self._spec, disturbances=tuple(each for each in planned if each is not one))
                 longer = replace(spec, max_steps=self._inside.max_steps)
-                yield _Asked(
+                yield _Candidate(
                     Factor(kind="disturbance", name=who, what=one.what, step=one.step),
                     [(one.step - 1, longer)],
                     inside=True,
                 )
 
-    def _agents(self) -> Iterator[_Asked]:
+    def _agents(self) -> Iterator[_Candidate]:
         """What the agent decided; and the other actor, where that is one too."""
         agents = [name for name in (self._agent, self._other) if name in self._recording.agents]
-        for doing in (doing for agent in agents for doing in self._doings(agent)):
+        for doing in (doing for agent in agents for doing in self._maneuver_factors(agent)):
             runs = [
-                (step, replace(self._inside, overruled=Overruled(doing.actor, step, keeps=_KEEPS[doing.what])))
+                (
+                    step,
+                    replace(
+                        self._inside, overruled=Overruled(doing.actor, step, keeps=_FACULTY_BY_MANEUVER[doing.what])
+                    ),
+                )
                 for step in self._earlier(doing.step, _EARLIER_S)
             ]
-            yield _Asked(
+            yield _Candidate(
                 Factor(kind="agent", name=doing.actor, what=doing.what, step=doing.step, was=doing.speed),
                 runs,
                 inside=True,
             )
 
-    def _others(self, name: str) -> list[_Asked]:
+    def _others(self, name: str) -> list[_Candidate]:
         """Return another actor's manoeuvres and its presence as candidate causes."""
         found = []
-        for doing in self._doings(name):
-            what = _HOLDS[doing.what]
+        for doing in self._maneuver_factors(name):
+            what = _HOLD_BY_MANEUVER[doing.what]
             held = name if what == "keep_speed" else ""
             runs = [(step, self._held(name, what, step)) for step in self._earlier(doing.step, _EARLIER_S)]
             found.append(
-                _Asked(
+                _Candidate(
                     factor=Factor(kind="other", name=name, what=doing.what, step=doing.step, was=doing.speed),
                     runs=runs,
                     inside=True,
                     held=held,
                 )
             )
-        steps = [step for step in self._earlier(self._end, _GONE_S) if self._is_there(name, step)]
+        steps = [step for step in self._earlier(self._end, _GONE_S) if self._is_present(name, step)]
         runs = [(step, self._held(name, "gone", step)) for step in steps]
-        found.append(_Asked(Factor(kind="other", name=name, what="there", step=self._end), runs, True))
+        found.append(_Candidate(Factor(kind="other", name=name, what="there", step=self._end), runs, True))
         return found
 
-    def _doings(self, actor: str) -> list[Doing]:
+    def _maneuver_factors(self, actor: str) -> list[Maneuver]:
         return maneuvers_of(self._recording, actor, self._lanes, self._end)
 
-    def _is_there(self, name: str, step: int) -> bool:
+    def _is_present(self, name: str, step: int) -> bool:
         return name in self._recording.scene(step).roster.index
 
     def _earlier(self, step: int, ago_s: tuple[float, ...]) -> list[int]:
@@ -378,7 +383,7 @@ class _Search:
         )
         return replace(self._inside, disturbances=(*self._inside.disturbances, held))
 
-    def _arguments(self) -> Iterator[_Asked]:
+    def _arguments(self) -> Iterator[_Candidate]:
         """Every argument that varies: at its default, and at other values that the hunt may draw."""
         defaults = self._rerun.defaults
         for (agent, name), distribution in self._settings.space.items():
@@ -388,16 +393,18 @@ class _Search:
             was, title, default = known[name], f"{agent}.{name}" if agent else name, defaults.get((agent, name))
             if default is not None and default != was:
                 at_default = [(default, self._with(agent, name, default))]
-                yield _Asked(Factor("argument", title, "default", was=was), at_default)
-            drawn = dict.fromkeys(self._drawn(title, distribution))  # the same value again would be the same trial
+                yield _Candidate(Factor("argument", title, "default", was=was), at_default)
+            drawn = dict.fromkeys(
+                self._drawn_argument(title, distribution)
+            )  # the same value again would be the same trial
             values = [value for value in drawn if value not in (was, default)]
-            yield _Asked(
+            yield _Candidate(
                 Factor("argument", title, "drawn", was=was),
                 [(value, self._with(agent, name, value)) for value in values[:_DRAWS]],
             )
 
-    def _drawn(self, title: str, distribution: Distribution) -> list[Value]:
-        sequence = np.random.SeedSequence(self._spec.seed, spawn_key=(_TRAFFIC, *title.encode()))
+    def _drawn_argument(self, title: str, distribution: Distribution) -> list[Value]:
+        sequence = np.random.SeedSequence(self._spec.seed, spawn_key=(_TRAFFIC_STREAM, *title.encode()))
         rng = np.random.default_rng(sequence)
         if isinstance(distribution, Choice):
             return [distribution.options[place] for place in rng.permutation(len(distribution.options))]
@@ -409,11 +416,11 @@ class _Search:
             return replace(spec, scenario_arguments={**spec.scenario_arguments, name: value})
         return replace(spec, arguments={**spec.arguments, agent: {**spec.arguments[agent], name: value}})
 
-    def _seeds(self) -> Iterator[_Asked]:
+    def _seeds(self) -> Iterator[_Candidate]:
         """Other traffic, and other luck of whatever draws."""
-        sequence = np.random.SeedSequence(self._spec.seed, spawn_key=(_TRAFFIC,))
+        sequence = np.random.SeedSequence(self._spec.seed, spawn_key=(_TRAFFIC_STREAM,))
         seeds = [int(each) >> 1 for each in sequence.generate_state(_SEEDS)]
         spec = replace(self._spec, max_steps=self.steps)
-        yield _Asked(
+        yield _Candidate(
             Factor("seed", "seed", "drawn", was=self._spec.seed), [(seed, replace(spec, seed=seed)) for seed in seeds]
         )

@@ -30,8 +30,8 @@ from crashhunt.base.errors import UsageError, WorkerError
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes import wilson
 from crashhunt.recording import first_divergence
-from crashhunt.replays import ReplayOptions, is_todays, prepare, up_to
-from crashhunt.trial import EVERYBODY, Outcome, Reseeding
+from crashhunt.replays import ReplayOptions, is_current_code, prepare, up_to
+from crashhunt.trial import ALL_AGENTS, Outcome, Reseeding
 from crashhunt.whatif._interventions import LeaveOut, Reseed, SetArguments
 from crashhunt.whatif._reruns import NotUnderstoodError, Reruns, StoppedError
 
@@ -43,17 +43,17 @@ if TYPE_CHECKING:
     from crashhunt.replays import Code, Rerun
     from crashhunt.trial import TrialSpec
     from crashhunt.whatif._interventions import Intervention
-    from crashhunt.whatif._reruns import Ended
+    from crashhunt.whatif._reruns import EndedRun
 
 
 __all__ = ["FUTURES", "Counts", "Run", "WhatIfOptions", "future_seed", "what_if"]
 
 FUTURES = 50
 """How many futures are run where the user gives no number: their interval is at most 0.27 wide."""
-_SELF_TEST = 4  # futures to begin with, of which one is run twice
-_RARE = 20  # futures that must not all be equal
-_NO_CRASH = (Outcome.SURVIVED, Outcome.FINISHED)
-_INTERRUPTED = "stopped"
+_SELF_TEST_RUNS = 4  # futures to begin with, of which one is run twice
+_MIN_DIFFERENT_FUTURES = 20  # futures that must not all be equal
+_HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)
+_INTERRUPTED_REASON = "stopped"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,7 +126,7 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
         except NotUnderstoodError as error:
             raise _too_old() from error
         except WorkerError as error:
-            if rerun.code == "snapshot" and not is_todays(rerun):
+            if rerun.code == "snapshot" and not is_current_code(rerun):
                 raise _too_old(error.message) from error
             raise
         finally:
@@ -187,7 +187,7 @@ class _Stop:
 
     def is_asked(self) -> bool:
         if self._stopped():
-            self.reason = _INTERRUPTED
+            self.reason = _INTERRUPTED_REASON
         elif self._until is not None and time.monotonic() >= self._until:
             self.reason = "the time is over"
         return bool(self.reason)
@@ -211,7 +211,7 @@ class _Runs:
 
     def leave_out(self, interventions: Sequence[LeaveOut], recorded: TrialSpec) -> None:
         """Determine the actors of the recorded trial, and remove some."""
-        (ended,) = self._reruns.run([replace(recorded, only=(EVERYBODY,))])
+        (ended,) = self._reruns.run([replace(recorded, only=(ALL_AGENTS,))])
         same = ended.result.digest == self._rerun.bundle.result.digest
         entered = ended.entered if same else ()
         for one in interventions:
@@ -234,18 +234,18 @@ class _Runs:
             return replace(self._spec, reseeding=Reseeding(after, seed))
 
         title = self._rerun.worker.scenario.backend.title
-        again = self._run([*range(_SELF_TEST), 0], future)
-        one, other = again[0], again[_SELF_TEST]
+        again = self._run([*range(_SELF_TEST_RUNS), 0], future)
+        one, other = again[0], again[_SELF_TEST_RUNS]
         if not (one.excluded or other.excluded) and one.digest != other.digest:
             raise UsageError(
                 f"--futures: {title} ran the same future twice with different results, so futures cannot be counted",
                 fix="omit --futures",
             )
         tested = list(again.values())
-        begun = _SELF_TEST
+        begun = _SELF_TEST_RUNS
         if _equal_futures(tested):  # chance may be rare, so that a few say little
-            tested += self._run(list(range(begun, _RARE)), future).values()
-            begun = _RARE
+            tested += self._run(list(range(begun, _MIN_DIFFERENT_FUTURES)), future).values()
+            begun = _MIN_DIFFERENT_FUTURES
             if equal := _equal_futures(tested):
                 raise UsageError(
                     f"--futures: {equal} futures with different seeds are bit-identical: {title} draws no random "
@@ -268,7 +268,7 @@ class _Runs:
                     self._watch(len(self.found), self._times)
         return places
 
-    def _counted(self, number: int, ended: Ended) -> Run:
+    def _counted(self, number: int, ended: EndedRun) -> Run:
         """Return how a run ended, and whether it counts.
 
         Raises:
@@ -288,11 +288,11 @@ class _Runs:
             excluded=self._why_excluded(ended, crashed=crashed),
         )
 
-    def _why_excluded(self, ended: Ended, *, crashed: bool) -> str:
+    def _why_excluded(self, ended: EndedRun, *, crashed: bool) -> str:
         result = ended.result
         if result.was_killed_from_outside:
             return f"its process was killed from outside: {result.failure.message if result.failure else ''}"
-        if not crashed and result.outcome not in _NO_CRASH:
+        if not crashed and result.outcome not in _HARMLESS_OUTCOMES:
             return f"{result.outcome} is no outcome that this hunt counts"
         if self._prefix is None or self.from_step is None:
             return ""

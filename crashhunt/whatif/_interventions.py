@@ -13,7 +13,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import ArgumentError, UsageError
 from crashhunt.base.text import one_of
 from crashhunt.plans import Owners, agent_of, takes_of
-from crashhunt.trial import OF_AGENT, Constant, Handover, Manoeuvre, Overruled, in_turn, parse_spec
+from crashhunt.trial import SENSOR_KINDS, Constant, Handover, Manoeuvre, Overruled, in_turn, parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -92,7 +92,7 @@ class Disturb:
     @property
     def from_step(self) -> int:
         """The step before the first one; what an agent sees is decided one step earlier."""
-        return max(0, min(one.step - (2 if one.what in OF_AGENT else 1) for one in self.disturbances))
+        return max(0, min(one.step - (2 if one.what in SENSOR_KINDS else 1) for one in self.disturbances))
 
     def applied(self, rerun: Rerun) -> Rerun:
         """Return the run with the disturbances."""
@@ -205,7 +205,7 @@ class HandOver:
                 owner = owners.of(word, option=self.option)
                 if owner is None:
                     raise owners.unknown(word, option=self.option, whose=driver)
-                given[owner[1]] = _value(self.option, word, text)
+                given[owner[1]] = _parse_value(self.option, word, text)
         worker = replace(rerun.worker, scenario=rerun.worker.scenario.with_agents({agent: driver}))
         log = str((rerun.bundle.path / layout.LOG).resolve())
         spec = replace(
@@ -267,7 +267,7 @@ def _agent_of(name: str, rerun: Rerun) -> str:
     return agents[0]
 
 
-def _value(option: str, name: str, text: str) -> Value:
+def _parse_value(option: str, name: str, text: str) -> Value:
     distribution = parse_spec(text, None, where=f"{option} {name}")
     if not isinstance(distribution, Constant):
         raise ArgumentError(f"{option} {name}: {text!r} is not a single value", fix="give one value")

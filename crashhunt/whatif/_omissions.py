@@ -6,7 +6,7 @@ The period is the cause if no such run ends in a crash. The run from its beginni
 Where all crashes of such runs are other ones, the agent may have brought them about with its other faculty. Then the
 reference driver takes both faculties over, from the same steps, and no run may end in a crash.
 
-Cost: one run that watches, three or six for each candidate, and one repetition; at most `_CANDIDATES` candidates.
+Cost: one run that watches, three or six for each candidate, and one repetition; at most `_MAX_CANDIDATES` candidates.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from crashhunt.crashes import (
 )
 from crashhunt.plans import with_recorded_load_order
 from crashhunt.recording import has_same_scenes, read_lanes
-from crashhunt.replays import is_todays
+from crashhunt.replays import is_current_code
 from crashhunt.trial import Outcome, Overruled
 from crashhunt.whatif._reruns import Reruns, StoppedError
 
@@ -42,20 +42,22 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialResult, TrialSpec
-    from crashhunt.whatif._reruns import Ended
+    from crashhunt.whatif._reruns import EndedRun
 
 __all__ = ["find_omission"]
 
 _BEFORE_S = 10.0  # a period that ended longer before the crash has not led to it
 _EARLIER_S = (0.0, 0.5, 1.0)  # the reference driver takes over from these times before the period
 _LONGER_S = 5.0  # simulation time past the crash: a reference driver may only postpone it
-_CANDIDATES = 4
+_MAX_CANDIDATES = 4
 _SPEED_CHANGED_MPS = 0.5  # less is no braking
 _INSTEAD_S = 2.0  # before the crash: whether the agent then sped up for most of the time
 _SPEEDS_UP_MPS2 = 0.3  # less is a kept speed
-_SAYS_NOTHING = (Outcome.INVALID, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
-_DIFFERS = "the trial was not bit-identical when it was run again"
-_OLD = "the crashhunt of the snapshot has no reference driver, and with this crashhunt the trial is not bit-identical"
+_INCONCLUSIVE_OUTCOMES = (Outcome.INVALID, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
+_NOT_IDENTICAL_REASON = "the trial was not bit-identical when it was run again"
+_OLD_SNAPSHOT_REASON = (
+    "the crashhunt of the snapshot has no reference driver, and with this crashhunt the trial is not bit-identical"
+)
 
 
 def find_omission(
@@ -82,7 +84,7 @@ def find_omission(
     Raises:
         CrashhuntError: no trial can be run.
     """
-    old = not is_todays(rerun)
+    old = not is_current_code(rerun)
     if old:
         order = rerun.snapshot.environment().get("load_order")
         rerun = replace(
@@ -91,7 +93,7 @@ def find_omission(
     runs = Reruns(rerun, scratch, parallel=parallel, stopped=stopped, todays=True)
     search = _Search(rerun, runs, most, tell)
     try:
-        return search.find(_OLD if old else _DIFFERS)
+        return search.find(_OLD_SNAPSHOT_REASON if old else _NOT_IDENTICAL_REASON)
     except StoppedError:
         return Reference(runs=tuple(search.runs), why_not=INTERRUPTED)
     except RecorderError:
@@ -157,7 +159,7 @@ class _Search:
         def order(one: JsonObject) -> tuple[bool, int]:
             return one["faculty"] != "lateral", -int(one["last"])
 
-        return sorted(recent, key=order)[:_CANDIDATES]
+        return sorted(recent, key=order)[:_MAX_CANDIDATES]
 
     def _try(self, candidate: JsonObject, faculty: str) -> Reference | None:
         """Return the cause if no run with the reference driver crashes from the beginning of a period on."""
@@ -177,13 +179,13 @@ class _Search:
             return Reference(runs=tuple(self.runs), why_not="a run with the reference driver could not be repeated")
         return Reference(omission=self._omission(candidate, faculty), runs=tuple(self.runs))
 
-    def _run(self, specs: list[TrialSpec], faculty: str, steps: list[int]) -> list[Ended]:
+    def _run(self, specs: list[TrialSpec], faculty: str, steps: list[int]) -> list[EndedRun]:
         """Run a reference driver from each of some steps on."""
         made = [
             replace(spec, overruled=Overruled(self._agent, step, reference=faculty))
             for spec, step in zip(specs, steps, strict=True)
         ]
-        found: dict[int, Ended] = {}
+        found: dict[int, EndedRun] = {}
         for ended in self._reruns.run(made):
             found[ended.place] = ended
             self._left -= 1
@@ -191,7 +193,7 @@ class _Search:
             self._tell(self._done)
         return [found[place] for place in range(len(made))]
 
-    def _judged(self, faculty: str, step: int, ended: Ended) -> ReferenceRun:
+    def _judged(self, faculty: str, step: int, ended: EndedRun) -> ReferenceRun:
         recording = ended.recording
         ending: Without = "unclear"
         changed: tuple[str, ...] = ()
@@ -203,7 +205,7 @@ class _Search:
     def _ending(self, result: TrialResult) -> Without:
         if result.outcome in (Outcome.SURVIVED, Outcome.FINISHED):
             return "none"
-        if result.outcome in _SAYS_NOTHING:
+        if result.outcome in _INCONCLUSIVE_OUTCOMES:
             return "unclear"
         was, now = self._result.collision, result.collision
         if was is None or now is None:

@@ -27,7 +27,7 @@ from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor, run_trials
 from crashhunt.recording import Recording, read_black_box
-from crashhunt.replays import is_todays
+from crashhunt.replays import is_current_code
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult, TrialSpec
 
 
-__all__ = ["Ended", "NotUnderstoodError", "Reruns", "StoppedError"]
+__all__ = ["EndedRun", "NotUnderstoodError", "Reruns", "StoppedError"]
 
-_WARM_COPIES = 2  # suspended set-ups of each worker: most runs begin as the crash did
+_SUSPENDED_SETUPS = 2  # suspended set-ups of each worker: most runs begin as the crash did
 
 
 class StoppedError(Exception):
@@ -53,7 +53,7 @@ class NotUnderstoodError(CrashhuntError):
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class EndedRun:
     """A run that has ended.
 
     Args:
@@ -94,19 +94,19 @@ class Reruns:
         parallel: int,
         stopped: Callable[[], bool],
         keep_all: bool = True,
-        warm_copies: int = _WARM_COPIES,
+        warm_copies: int = _SUSPENDED_SETUPS,
         todays: bool | None = None,
     ) -> None:
         self._scratch, self._stopped = scratch, stopped
         worker = replace(rerun.worker, scratch=scratch, keep_trials=keep_all, warm_copies=warm_copies)
-        kind = PoolExecutor if (is_todays(rerun) if todays is None else todays) else FreshProcessExecutor
+        kind = PoolExecutor if (is_current_code(rerun) if todays is None else todays) else FreshProcessExecutor
         self._executor: Executor = kind(worker, parallel=parallel)
         self._keep_all = keep_all
         self._numbers = itertools.count(1)  # folders of their own
 
     def run(
         self, specs: Sequence[TrialSpec], *, recorded: bool = True, needed: Callable[[int], bool] = lambda _: True
-    ) -> Iterator[Ended]:
+    ) -> Iterator[EndedRun]:
         """Yield trials as they end; those that have not ended when the caller stops asking are cancelled.
 
         Args:
@@ -138,7 +138,7 @@ class Reruns:
             raise StoppedError
         return False
 
-    def _ended(self, place: int, result: TrialResult, folder: Path, *, recorded: bool) -> Ended:
+    def _ended(self, place: int, result: TrialResult, folder: Path, *, recorded: bool) -> EndedRun:
         recording = None
         if recorded:
             with suppress(BundleError):  # its process died
@@ -151,7 +151,7 @@ class Reruns:
         if result.spec.overruled is not None and result.spec.overruled.reference:
             with suppress(OSError, ValueError):
                 responses = tuple(json.loads((folder / layout.RESPONSES).read_text(encoding="utf-8")))
-        return Ended(
+        return EndedRun(
             place=place,
             result=result,
             recording=recording,

@@ -62,4 +62,4 @@ from ._scene import (
     is_person as is_person,
     joined_frame as joined_frame,
 )
-from ._tracks import Path as Path, Paths as Paths, State as State, paths_of as paths_of
+from ._tracks import ActorState as ActorState, Path as Path, Paths as Paths, paths_of as paths_of

@@ -48,10 +48,10 @@ class ClosestApproach(Serializable):
     required_deceleration: float = field(default=0.0, metadata=null_is(math.inf))
 
 
-_CHUNK = 256  # scenes per call, which costs a tenth of one scene per call
+_SCENES_PER_CALL = 256  # scenes per call, which costs a tenth of one scene per call
 _GAP_M = 50.0  # larger gaps are ignored
 _HORIZON_S = 10.0  # later collisions are ignored: velocities change within that time
-_NOTHING = ClosestApproach()
+_NO_APPROACH = ClosestApproach()
 _SAME_WAY = math.cos(math.radians(30.0))  # of a vehicle ahead, the least cosine of the angle between the headings
 _HALF_LANE_M = 1.7  # of a vehicle ahead, the greatest lateral offset
 _LEAST_GAP_M = 0.01
@@ -109,13 +109,13 @@ def closing_rate(frame: Frame, agent: str) -> float:
 def closest_approach(scenes: Sequence[Scene], agents: Sequence[str]) -> ClosestApproach:
     """Return the closest approach over some scenes."""
     meter = ApproachMeter(agents)
-    for first in range(0, len(scenes), _CHUNK):
-        meter.measure([scene.frame for scene in scenes[first : first + _CHUNK]])
+    for first in range(0, len(scenes), _SCENES_PER_CALL):
+        meter.measure([scene.frame for scene in scenes[first : first + _SCENES_PER_CALL]])
     return meter.closest
 
 
 def approaches(
-    frames: Sequence[Frame], agent: str, closest: ClosestApproach = _NOTHING, *, only_best: bool = False
+    frames: Sequence[Frame], agent: str, closest: ClosestApproach = _NO_APPROACH, *, only_best: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the closest approach of an agent in each scene.
 

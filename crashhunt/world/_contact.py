@@ -47,11 +47,11 @@ Face = Literal["front", "rear", "left", "right"]
 
 _JUMP_M = 1.5  # sideways in one step: less is drift within a lane, more is an instantaneous lane change
 _LANES_M = 12.0  # sideways in one step: more is a teleport, not a lane change
-_TURN = 2.0  # rad in one step: more is not a bend that a cubic describes
+_MAX_TURN_RAD = 2.0  # rad in one step: more is not a bend that a cubic describes
 _STEP_M = 1e-3  # of relative motion: shorter overlaps are not searched for
-_TOUCH = 1e-9  # m: smaller overlaps are rounding errors
-_FRONT = math.cos(math.pi / 4)  # an actor within 45° of straight ahead is in front
-_CURVE = 1 / 32  # of distance times turn: a quarter of the height of a bend above its chord
+_MIN_OVERLAP_M = 1e-9  # m: smaller overlaps are rounding errors
+_FRONT_COSINE = math.cos(math.pi / 4)  # an actor within 45° of straight ahead is in front
+_CURVE_SHARE = 1 / 32  # of distance times turn: a quarter of the height of a bend above its chord
 _DRIFT_MPS = 1e-3  # towards each other: a smaller difference is a rounding error
 _SLACK_M = 0.4  # upper bound of the tolerance for unknown ways between scenes
 _KINK, _NO_TURN = 0.02, 0.01  # tolerance as a share of the distance, reached at this turn in rad: lanes have corners
@@ -123,7 +123,7 @@ class _Party:
         """Return the side of the rectangle that faces a direction."""
         c, s = math.cos(self.rectangle[2]), math.sin(self.rectangle[2])
         ahead, left = x * c + y * s, y * c - x * s
-        if abs(ahead) > _FRONT and (self.leads if ahead > 0 else self.trails):
+        if abs(ahead) > _FRONT_COSINE and (self.leads if ahead > 0 else self.trails):
             return "front" if ahead > 0 else "rear"
         return "left" if left > 0 else "right"
 
@@ -156,12 +156,14 @@ class _Way:
         self.slack = _SLACK_M if any(self.jump) else 0.0
         first, second = (x0 + dx / 3, y0 + dy / 3), (x0 + 2 * dx / 3, y0 + 2 * dy / 3)
         # Vehicles that stand, reverse or turn on the spot, as persons do, go straight.
-        if bends and abs(turn) < _TURN and dx * math.cos(middle) + dy * math.sin(middle) > 0:
+        if bends and abs(turn) < _MAX_TURN_RAD and dx * math.cos(middle) + dy * math.sin(middle) > 0:
             # With these handles the cubic is almost exactly an arc where the motion is one.
-            third = distance * (2 / 3 * math.tan(turn / 4) / math.sin(turn / 2) if abs(turn) > _TOUCH else 1 / 3)
+            third = distance * (
+                2 / 3 * math.tan(turn / 4) / math.sin(turn / 2) if abs(turn) > _MIN_OVERLAP_M else 1 / 3
+            )
             first = (x0 + third * math.cos(start[2]), y0 + third * math.sin(start[2]))
             second = (x0 + dx - third * math.cos(end[2]), y0 + dy - third * math.sin(end[2]))
-            self.slack += min(_SLACK_M, distance * (abs(turn) * _CURVE + _KINK * min(1.0, abs(turn) / _NO_TURN)))
+            self.slack += min(_SLACK_M, distance * (abs(turn) * _CURVE_SHARE + _KINK * min(1.0, abs(turn) / _NO_TURN)))
         self.points = ((x0, y0), first, second, (x0 + dx, y0 + dy))
         self.legs = tuple((b[0] - a[0], b[1] - a[1]) for a, b in pairwise(self.points))
 
@@ -343,7 +345,7 @@ def _speed_at(share: float, was: float, now: float, way: _Way, step_s: float) ->
     """
     (x0, y0), *_, (x1, y1) = way.points
     mean, driven = (was + now) / 2, math.hypot(x1 - x0, y1 - y0) / step_s
-    steady = min(1.0, max(0.0, (driven - mean) / (now - mean))) if abs(now - mean) > _TOUCH else 0.0
+    steady = min(1.0, max(0.0, (driven - mean) / (now - mean))) if abs(now - mean) > _MIN_OVERLAP_M else 0.0
     return steady * now + (1 - steady) * ((1 - share) * was + share * now)
 
 
@@ -415,7 +417,7 @@ def _first_share(way: _Way, other: _Way, *, until: float, still: bool) -> float 
 
     Conservative advancement: during the gap divided by a bound of the approach speed, no contact is possible.
     """
-    touching = separation(way.end, other.end)[0] < -_TOUCH
+    touching = separation(way.end, other.end)[0] < -_MIN_OVERLAP_M
     if still:
         return 1.0 if touching else None
     fastest = 3 * max(
@@ -424,13 +426,13 @@ def _first_share(way: _Way, other: _Way, *, until: float, still: bool) -> float 
     for each in (way, other):
         fastest += abs(each.turn) * each.reach
     # The way between scenes is known to some centimetres only, so ignore grazing contacts in bends.
-    slack = _TOUCH if touching else _TOUCH + way.slack + other.slack
+    slack = _MIN_OVERLAP_M if touching else _MIN_OVERLAP_M + way.slack + other.slack
     share, apart_at = 0.0, 0.0
     while share < until:
         apart = separation(way.at(share), other.at(share))[0]
         if apart < -slack:
             return _bisect(way, other, apart_at, share)
-        if apart >= -_TOUCH:
+        if apart >= -_MIN_OVERLAP_M:
             apart_at = share
         if not fastest:
             break
@@ -441,7 +443,7 @@ def _first_share(way: _Way, other: _Way, *, until: float, still: bool) -> float 
 def _bisect(way: _Way, other: _Way, apart: float, together: float) -> float:
     while together - apart > 1e-9:
         middle = (apart + together) / 2
-        if separation(way.at(middle), other.at(middle))[0] < -_TOUCH:
+        if separation(way.at(middle), other.at(middle))[0] < -_MIN_OVERLAP_M:
             together = middle
         else:
             apart = middle
@@ -458,7 +460,7 @@ def _direction(first: _Party, second: _Party) -> tuple[float, float, bool]:
         return jump_x / length, jump_y / length, True
     _, x, y = separation(first.rectangle, second.rectangle)
     (own_x, own_y), (its_x, its_y) = _center(first.rectangle), _center(second.rectangle)
-    if abs((its_x - own_x) * x + (its_y - own_y) * y) < _TOUCH:  # the sign of the axis is a rounding error
+    if abs((its_x - own_x) * x + (its_y - own_y) * y) < _MIN_OVERLAP_M:  # the sign of the axis is a rounding error
         approach = (first.velocity[0] - second.velocity[0]) * x + (first.velocity[1] - second.velocity[1]) * y
         if approach < 0:
             x, y = -x, -y

@@ -60,16 +60,16 @@ __all__ = [
 
 _HALF_S = 10.0  # integral at which a trial has criticality 0.5
 _DECAY_S = 1.2  # time gap at which the criticality falls to 1/e
-_HARDEST = 12.0  # m/s²: more than any vehicle can brake
+_MAX_BRAKING_MPS2 = 12.0  # m/s²: more than any vehicle can brake
 _BLIND_S = 4.0  # time for which the agent is assumed to keep its speed
 AHEAD_M, _BEHIND_M = 100.0, 30.0  # along the way: actors beyond that add almost nothing and cost time
 _MOVES_M = 0.01  # from sample to sample: less counts as standing
 _UNKNOWN_M = 10.0  # beyond the end of the way: continuing straight on is a guess
-_SAME_WAY = np.cos(np.pi / 6)  # directions that differ by less than 30° are the same
-_PLACES = 3  # places that are tested in one call
-_NOWHERE = 1 << 30  # index beyond all samples
-_HALVINGS = 5  # bisections of the stretch of a first touch: 4 m become 13 cm
-_MOST = 0.999  # upper bound without a touch
+_SAME_DIRECTION_COSINE = np.cos(np.pi / 6)  # directions that differ by less than 30° are the same
+_PLACES_PER_CALL = 3  # places that are tested in one call
+_NO_INDEX = 1 << 30  # index beyond all samples
+_BISECTIONS = 5  # bisections of the stretch of a first touch: 4 m become 13 cm
+_MAX_DANGER_WITHOUT_CONTACT = 0.999  # upper bound without a touch
 _WINDOW, _TAIL = 4096, 128  # scenes: long episodes are summed per window; the tail waits for the ways that follow
 
 
@@ -208,9 +208,11 @@ def measured_along(track: Track, others: Others, *, same_way: bool = False) -> t
         order = np.lexsort((ahead, apart))[::-1]  # the last assignment per sample wins, and it is the nearest
         gaps[others.sample[order]], who[others.sample[order]] = apart[order], others.who[order]
         brakes, blockers = _needed_braking(way, track, others, ahead)
-        harder = brakes / _HARDEST > np.exp(-gaps / _DECAY_S)
+        harder = brakes / _MAX_BRAKING_MPS2 > np.exp(-gaps / _DECAY_S)
         who = np.where(harder & (blockers >= 0), blockers, who)
-    found: Array = np.minimum(np.maximum(np.exp(-gaps / _DECAY_S), brakes / _HARDEST), _MOST)
+    found: Array = np.minimum(
+        np.maximum(np.exp(-gaps / _DECAY_S), brakes / _MAX_BRAKING_MPS2), _MAX_DANGER_WITHOUT_CONTACT
+    )
     return found, who
 
 
@@ -246,7 +248,9 @@ class _Way:
         behind = self._first(others, -spacing, _BEHIND_M)
         there = np.isfinite(behind)
         heading = np.interp(self.along[others.sample[there]] + behind[there], self._at, self._heading)
-        behind[there] = np.where(np.cos(others.heading[there] - heading) < _SAME_WAY, -behind[there], np.inf)
+        behind[there] = np.where(
+            np.cos(others.heading[there] - heading) < _SAME_DIRECTION_COSINE, -behind[there], np.inf
+        )
         behind[~there] = np.inf
         return ahead, behind
 
@@ -255,7 +259,7 @@ class _Way:
         ahead, _ = self.first_contacts(others)
         there = np.isfinite(ahead)
         heading = np.interp(self.along[others.sample[there]] + ahead[there], self._at, self._heading)
-        ahead[there] = np.where(np.cos(others.heading[there] - heading) >= _SAME_WAY, ahead[there], np.inf)
+        ahead[there] = np.where(np.cos(others.heading[there] - heading) >= _SAME_DIRECTION_COSINE, ahead[there], np.inf)
         return ahead, np.full(len(ahead), np.inf)
 
     def _first(self, others: Others, spacing: float, far: float) -> Array:
@@ -267,7 +271,7 @@ class _Way:
             + np.hypot(self._track.half_length, self._track.half_width)[others.sample]
         )
         # Test several places at a time; all actors of one instant share the places of the agent.
-        stretch = _PLACES * spacing
+        stretch = _PLACES_PER_CALL * spacing
         middles = stretch * (np.arange(int(far / abs(stretch)) + 1) + 0.5) - spacing / 2
         samples, of = np.unique(others.sample, return_inverse=True)
         at = self.along[samples, None] + middles
@@ -277,18 +281,18 @@ class _Way:
         y -= others.y[:, None]
         around = reach + abs(stretch) / 2
         pair, place = np.nonzero(x * x + y * y < (around * around)[:, None])
-        number = (place[:, None] * _PLACES + np.arange(_PLACES)).ravel()
-        pair = np.repeat(pair, _PLACES)
+        number = (place[:, None] * _PLACES_PER_CALL + np.arange(_PLACES_PER_CALL)).ravel()
+        pair = np.repeat(pair, _PLACES_PER_CALL)
         known = (along := base[pair] + spacing * number) <= self._at[-1]
         known &= along >= self._at[0]
         pair, number, along = pair[known], number[known], along[known]
         hit = self._apart(others, pair, along, reach[pair]) < 0
-        first = np.full(len(found), _NOWHERE)
+        first = np.full(len(found), _NO_INDEX)
         np.minimum.at(first, pair[hit], number[hit])
-        pair = np.flatnonzero(first < _NOWHERE)
+        pair = np.flatnonzero(first < _NO_INDEX)
         inside = spacing * first[pair]
         outside = spacing * np.maximum(first[pair] - 1, 0)
-        for _ in range(_HALVINGS):
+        for _ in range(_BISECTIONS):
             middle = (inside + outside) / 2
             touches = self._apart(others, pair, base[pair] + middle) < 0
             inside, outside = np.where(touches, middle, inside), np.where(touches, outside, middle)
@@ -370,7 +374,7 @@ def _needed_braking(way: _Way, track: Track, others: Others, ahead: Array) -> tu
         brake = 2 * (gone - safe) / seconds**2
         # An actor that stands before then must stop within the room.
         brake = np.where(brake * seconds > way.speed[here], way.speed[here] ** 2 / (2 * safe), brake)
-        brake = np.where(short & np.isfinite(room), np.minimum(brake, _HARDEST), 0.0)
+        brake = np.where(short & np.isfinite(room), np.minimum(brake, _MAX_BRAKING_MPS2), 0.0)
         more = brake > needed[here]
         needed[here], blocker[here] = np.where(more, brake, needed[here]), np.where(more, who[there], blocker[here])
     return needed, blocker
@@ -382,7 +386,7 @@ def _needed_braking(way: _Way, track: Track, others: Others, ahead: Array) -> tu
 # count only where the actor's way leads into the back of the agent, both in the same direction. Crossing and oncoming
 # actors belong to the agent's own criticality.
 
-_LEAST = 2  # samples: a single one has no speed
+_MIN_SAMPLES = 2  # samples: a single one has no speed
 _SIDEWAYS_M = 10.0  # from the line through the agent: an actor never within it is not behind the agent
 
 
@@ -443,7 +447,7 @@ def _pieces(track: Track, others: Others, number: int) -> Iterator[tuple[NDArray
     samples, first = np.unique(others.sample[rows], return_index=True)
     rows = rows[first]
     for part in np.split(np.arange(len(samples)), np.flatnonzero(np.diff(samples) > 1) + 1):
-        if len(part) < _LEAST:
+        if len(part) < _MIN_SAMPLES:
             continue
         here, these = samples[part], rows[part]
         theirs = Track(

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DrivenMeter"]
 
-_DIGITS = 3  # mm and ms
+_ROUNDING_DIGITS = 3  # mm and ms
 
 
 class DrivenMeter:
@@ -52,13 +52,13 @@ class DrivenMeter:
             for frame in frames:
                 row = frame.roster.index.get(agent)
                 if row is None:
-                    self._take(agent, run)
+                    self._add_run(agent, run)
                     run, self._last[agent] = [], None
                 else:
                     run.append(frame.columns[:, 3 * len(frame.roster) + row])
-            self._take(agent, run)
+            self._add_run(agent, run)
 
-    def _take(self, agent: str, run: list[NDArray[np.float64]]) -> None:
+    def _add_run(self, agent: str, run: list[NDArray[np.float64]]) -> None:
         """Add successive scenes in which an agent is present."""
         if not run:
             return
@@ -74,9 +74,9 @@ class DrivenMeter:
     def driven_m(self) -> float | None:
         """The distance of all agents together, in m; None if no scene has an agent, or a speed is not a number."""
         meters = self._speeds * self._dt
-        return round(meters, _DIGITS) if self._seen and math.isfinite(meters) else None
+        return round(meters, _ROUNDING_DIGITS) if self._seen and math.isfinite(meters) else None
 
     @property
     def driven_s(self) -> float | None:
         """The time of all agents together, in s of simulation time; None if no scene has an agent."""
-        return round(self._steps * self._dt, _DIGITS) if self._seen else None
+        return round(self._steps * self._dt, _ROUNDING_DIGITS) if self._seen else None

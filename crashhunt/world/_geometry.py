@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 
-_TOUCH = 1e-9  # m; less is rounding, not overlap
+_MIN_OVERLAP_M = 1e-9  # m; less is rounding, not overlap
 
 
 def outlines_overlap(one: Rectangle, two: Rectangle, *, margin: float = 0.0) -> bool:
@@ -47,13 +47,13 @@ def outlines_overlap(one: Rectangle, two: Rectangle, *, margin: float = 0.0) -> 
     c1, s1, c2, s2 = cos(h1), sin(h1), cos(h2), sin(h2)
     dx, dy = (x2 - l2 / 2 * c2) - (x1 - l1 / 2 * c1), (y2 - l2 / 2 * s2) - (y1 - l1 / 2 * s1)
     along, across = abs(c1 * c2 + s1 * s2), abs(c1 * s2 - s1 * c2)
-    if abs(-dx * s1 + dy * c1) >= (w1 + l2 * across + w2 * along) / 2 - _TOUCH + margin:
+    if abs(-dx * s1 + dy * c1) >= (w1 + l2 * across + w2 * along) / 2 - _MIN_OVERLAP_M + margin:
         return False
-    if abs(dx * c1 + dy * s1) >= (l1 + l2 * along + w2 * across) / 2 - _TOUCH + margin:
+    if abs(dx * c1 + dy * s1) >= (l1 + l2 * along + w2 * across) / 2 - _MIN_OVERLAP_M + margin:
         return False
-    if abs(-dx * s2 + dy * c2) >= (w2 + l1 * across + w1 * along) / 2 - _TOUCH + margin:
+    if abs(-dx * s2 + dy * c2) >= (w2 + l1 * across + w1 * along) / 2 - _MIN_OVERLAP_M + margin:
         return False
-    return abs(dx * c2 + dy * s2) < (l2 + l1 * along + w1 * across) / 2 - _TOUCH + margin
+    return abs(dx * c2 + dy * s2) < (l2 + l1 * along + w1 * across) / 2 - _MIN_OVERLAP_M + margin
 
 
 def separation(one: Rectangle, two: Rectangle) -> tuple[float, float, float]:

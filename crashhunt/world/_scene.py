@@ -149,7 +149,7 @@ class Roster:
 
 
 _NO_SPINES: Mapping[int, Spine] = {}  # shared, so never written to
-_LATER: Any = None  # in place of what is made of the core's columns when it is asked for
+_NOT_COMPUTED: Any = None  # in place of what is made of the core's columns when it is asked for
 
 
 class Frame(NamedTuple):
@@ -274,9 +274,9 @@ class Scene:
         self,
         time_s: float,
         roster: Roster,
-        points: Sequence[tuple[float, float]] = _LATER,
-        headings: Sequence[float] = _LATER,
-        speeds: Sequence[float] = _LATER,
+        points: Sequence[tuple[float, float]] = _NOT_COMPUTED,
+        headings: Sequence[float] = _NOT_COMPUTED,
+        speeds: Sequence[float] = _NOT_COMPUTED,
         contacts: tuple[Contact, ...] = (),
         off_road: tuple[str, ...] = (),
         lanes: tuple[str, ...] = (),
@@ -311,21 +311,21 @@ class Scene:
     @property
     def points(self) -> Sequence[tuple[float, float]]:
         """The centre of each front bumper: x and y, in m."""
-        if self._points is _LATER and self.columns is not None:
+        if self._points is _NOT_COMPUTED and self.columns is not None:
             self._points = self.columns.points
         return self._points
 
     @property
     def headings(self) -> Sequence[float]:
         """In rad, counter-clockwise from the x axis."""
-        if self._headings is _LATER and self.columns is not None:
+        if self._headings is _NOT_COMPUTED and self.columns is not None:
             self._headings = self.columns.headings
         return self._headings
 
     @property
     def speeds(self) -> Sequence[float]:
         """In m/s."""
-        if self._speeds is _LATER and self.columns is not None:
+        if self._speeds is _NOT_COMPUTED and self.columns is not None:
             self._speeds = self.columns.speeds
         return self._speeds
 

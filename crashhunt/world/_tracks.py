@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 
 __all__ = [
+    "ActorState",
     "Others",
     "Path",
     "Paths",
     "Reach",
-    "State",
     "Track",
     "paths_of",
     "sampled",
@@ -210,7 +210,7 @@ def _fronts_from_core(
         return None
     (own, steps), (theirs, pairs) = found
     if not steps:
-        return _NOWHERE
+        return _NO_FRONTS
     x, y, heading, *half = np.frombuffer(own).reshape(5, -1)
     flat = np.zeros(len(x))
     tall = np.full(len(x), next(one.height for frame in frames for one in frame.roster.actors if one.id == agent))
@@ -244,12 +244,12 @@ def _fronts(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) -
         theirs.append((near[0] + first, *near[1:]))
         first += len(instants)
     if not times:
-        return _NOWHERE
+        return _NO_FRONTS
     columns = [np.concatenate(column) for column in zip(*theirs, strict=True)]
     return _Fronts(time=np.concatenate(times), own=np.concatenate(own, axis=1), theirs=columns, names=list(numbers))
 
 
-_NOWHERE = _Fronts(time=np.zeros(0), own=np.zeros((7, 0)), theirs=[np.zeros(0)] * 9, names=[])
+_NO_FRONTS = _Fronts(time=np.zeros(0), own=np.zeros((7, 0)), theirs=[np.zeros(0)] * 9, names=[])
 
 
 def _filled(seen: _Fronts, between: int, step_length_s: float) -> _Fronts:
@@ -357,7 +357,7 @@ def _bent(frame: Frame, row: int, names: NDArray[np.intp], within_m: float) -> t
 _MOST_BYTES = 1 << 28  # of unpacked data: more is damage or an attack, not a recording
 
 
-class State(NamedTuple):
+class ActorState(NamedTuple):
     """The state of an actor after a step.
 
     Args:
@@ -391,7 +391,7 @@ class Path:
 
     actor: Actor
     first: int
-    states: tuple[State, ...]
+    states: tuple[ActorState, ...]
     lanes: tuple[tuple[int, str], ...] = ()
     spines: tuple[tuple[int, Spine], ...] = ()
 
@@ -400,7 +400,7 @@ class Path:
         """The step after which it was last visible."""
         return self.first + len(self.states) - 1
 
-    def at(self, step: int, step_length_s: float) -> State:
+    def at(self, step: int, step_length_s: float) -> ActorState:
         """Return the state of the actor after a step; after its last one, it continues straight at constant speed."""
         state = self.states[min(step, self.last) - self.first]
         if step <= self.last:
@@ -531,14 +531,14 @@ class _Open:
 
     def __init__(self, actor: Actor, first: int) -> None:
         self._actor, self._first = actor, first
-        self._states: list[State] = []
+        self._states: list[ActorState] = []
         self._lanes: list[tuple[int, str]] = []
         self._spines: list[tuple[int, Spine]] = []
 
     def add(self, scene: Scene, row: int, step: int) -> None:
         x, y = scene.points[row]
         high = (float(scene.heights[row]), float(scene.grades[row])) if scene.heights else (0.0, 0.0)
-        self._states.append(State(float(x), float(y), float(scene.headings[row]), float(scene.speeds[row]), *high))
+        self._states.append(ActorState(float(x), float(y), float(scene.headings[row]), float(scene.speeds[row]), *high))
         if scene.lanes:
             self._lanes.append((step, scene.lanes[row]))
         if row in scene.spines:
@@ -573,7 +573,7 @@ def _path(
     actor = Actor(str(name), str(kind), *map(float, size))
     centre_lines = tuple((int(step), tuple(tuple(map(float, point)) for point in line)) for step, line in spines)
     where = tuple((int(step), str(lane)) for step, lane in lanes)
-    seen = tuple(State(*map(float, state)) for state in states)
+    seen = tuple(ActorState(*map(float, state)) for state in states)
     if not seen:
         raise ValueError(f"{name} is nowhere")
     return Path(actor=actor, first=int(first), states=seen, lanes=where, spines=centre_lines)  # type: ignore[arg-type]

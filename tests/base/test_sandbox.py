@@ -69,6 +69,6 @@ def test_without_landlock_nothing_changes(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("version", "rights"), [(1, 13), (2, 14), (3, 15), (4, 15), (5, 16), (9, 16)])
 def test_an_older_kernel_is_asked_for_what_it_knows(version, rights):
-    assert sandbox._newest(sandbox._RIGHTS, version).bit_length() == rights
-    assert bool(sandbox._newest(sandbox._PORTS, version)) == (version >= 4)
-    assert bool(sandbox._newest(sandbox._OTHERS, version)) == (version >= 6)
+    assert sandbox._newest(sandbox._FILE_RIGHTS_BY_VERSION, version).bit_length() == rights
+    assert bool(sandbox._newest(sandbox._PORT_RIGHTS_BY_VERSION, version)) == (version >= 4)
+    assert bool(sandbox._newest(sandbox._SCOPES_BY_VERSION, version)) == (version >= 6)

@@ -19,7 +19,7 @@ import pytest
 from crashhunt.base import temporary, temporary as segments
 from crashhunt.base.files import exchange, put_in_place, whole_file
 from crashhunt.base.temporary import (
-    Owner,
+    OwnerProcess,
     TemporaryFolder,
     has_ended,
     owner_in,
@@ -176,7 +176,7 @@ def test_a_living_process_keeps_everything(place, tmp_path):
         # Not even where its start time says that it has ended: it holds the lock.
         owner = owner_in(folder.name)
         assert owner.pid == pid
-        wrong = Owner(pid, owner.started + 1, owner.boot, owner.namespace)
+        wrong = OwnerProcess(pid, owner.started + 1, owner.boot, owner.namespace)
         folder.rename(folder.with_name(wrong.token))
         remove_leftovers()
         assert (place / wrong.token / "replay-1").is_dir()
@@ -184,7 +184,7 @@ def test_a_living_process_keeps_everything(place, tmp_path):
     assert not place.exists()
 
 
-def owned(place: Path, owner: Owner) -> Path:
+def owned(place: Path, owner: OwnerProcess) -> Path:
     folder = place / owner.token / "replay-1"
     folder.mkdir(parents=True)
     place.chmod(0o700)
@@ -193,7 +193,7 @@ def owned(place: Path, owner: Owner) -> Path:
 
 def test_a_process_id_that_was_given_to_another_process_is_not_taken_for_the_owner(place):
     here = this_process()
-    folder = owned(place, Owner(here.pid, here.started - 1, here.boot, here.namespace))
+    folder = owned(place, OwnerProcess(here.pid, here.started - 1, here.boot, here.namespace))
     (place / f"x{ended().token}").mkdir()
     remove_leftovers()
     assert not folder.exists()
@@ -201,7 +201,7 @@ def test_a_process_id_that_was_given_to_another_process_is_not_taken_for_the_own
 
 
 def test_a_process_that_proc_does_not_show_counts_as_alive(monkeypatch):
-    other = Owner(os.getppid(), 5, this_process().boot, this_process().namespace)
+    other = OwnerProcess(os.getppid(), 5, this_process().boot, this_process().namespace)
     assert has_ended(other)
     monkeypatch.setattr(temporary, "start_time", lambda pid: -1)
     assert not has_ended(other)
@@ -212,12 +212,12 @@ def test_what_another_host_boot_or_container_has_stays(place, field):
     here = this_process()
     gone = next(pid for pid in range(4_000_000, 5_000_000) if start_time(pid) == 0)
     theirs = {
-        "boot": Owner(gone, 5, "0123456789ab", here.namespace),
-        "namespace": Owner(gone, 5, here.boot, "01234567"),
-        "unknown": Owner(gone, 0, "0" * 12, "0" * 8),
+        "boot": OwnerProcess(gone, 5, "0123456789ab", here.namespace),
+        "namespace": OwnerProcess(gone, 5, here.boot, "01234567"),
+        "unknown": OwnerProcess(gone, 0, "0" * 12, "0" * 8),
     }[field]
     folder = owned(place, theirs)
-    ours = owned(place, Owner(gone, 5, here.boot, here.namespace))
+    ours = owned(place, OwnerProcess(gone, 5, here.boot, here.namespace))
     remove_leftovers()
     assert (folder.exists(), ours.exists()) == (True, False)
 
@@ -227,8 +227,8 @@ def test_where_a_process_does_not_know_itself_it_removes_nothing_of_others(place
     with monkeypatch.context() as patched, fresh():
         patched.setattr(temporary, "_BOOT_ID", "/nowhere")
         assert this_process().boot == "0" * 12
-        folder = owned(place, Owner(here.pid, 1, here.boot, here.namespace))
-        unknown = owned(place, Owner(here.pid + 1, 0, "0" * 12, "0" * 8))
+        folder = owned(place, OwnerProcess(here.pid, 1, here.boot, here.namespace))
+        unknown = owned(place, OwnerProcess(here.pid + 1, 0, "0" * 12, "0" * 8))
         remove_leftovers()
         assert folder.exists()
         assert unknown.exists()
@@ -248,10 +248,10 @@ def fresh():
         temporary._owner.cache_clear()
 
 
-def ended() -> Owner:
+def ended() -> OwnerProcess:
     """An owner of which it is certain that it has ended."""
     here = this_process()
-    return Owner(here.pid, here.started - 1, here.boot, here.namespace)
+    return OwnerProcess(here.pid, here.started - 1, here.boot, here.namespace)
 
 
 def test_a_symbolic_link_that_looks_like_a_leftover_stays_and_so_does_its_target(place, tmp_path):
@@ -275,7 +275,7 @@ def test_a_symbolic_link_that_looks_like_a_leftover_stays_and_so_does_its_target
 
 
 def test_a_link_to_what_has_not_the_name_of_the_process_removes_nothing(place, tmp_path):
-    other = Owner(ended().pid, ended().started - 1, ended().boot, ended().namespace)
+    other = OwnerProcess(ended().pid, ended().started - 1, ended().boot, ended().namespace)
     names = ["thesis.tex", f".made.{other.token}.part", f".{other.token}.{ended().token}.part", "fifo"]
     for name in names[:3]:
         (tmp_path / name).write_text("x")
@@ -342,11 +342,11 @@ def test_a_kernel_without_time_namespaces_has_owners_too(tmp_path, monkeypatch):
     before = this_process()
     (tmp_path / "pid").symlink_to(os.readlink("/proc/self/ns/pid"))  # noqa: PTH115 - it is no path
     with monkeypatch.context() as patched, fresh():
-        patched.setattr(temporary, "_NAMESPACES", str(tmp_path))
+        patched.setattr(temporary, "_NAMESPACE_FOLDER", str(tmp_path))
         here = this_process()
         assert (here.pid, here.started, here.boot) == (before.pid, before.started, before.boot)
         assert here.namespace not in (before.namespace, "0" * 8)
-        assert has_ended(Owner(here.pid, here.started - 1, here.boot, here.namespace))
+        assert has_ended(OwnerProcess(here.pid, here.started - 1, here.boot, here.namespace))
     assert this_process() == before
 
 
@@ -357,7 +357,7 @@ def test_a_zombie_has_ended():
     os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
     try:
         assert start_time(pid) == 0
-        assert has_ended(Owner(pid, 5, this_process().boot, this_process().namespace))
+        assert has_ended(OwnerProcess(pid, 5, this_process().boot, this_process().namespace))
     finally:
         os.waitpid(pid, 0)
     assert start_time(pid) == 0
@@ -596,7 +596,7 @@ def test_owners_are_read_from_names():
     here = this_process()
     assert owner_in(here.token) == here
     assert owner_in(f".x-1.{here.token}.part") == here
-    other = Owner(1, 2, "a" * 12, "b" * 8)
+    other = OwnerProcess(1, 2, "a" * 12, "b" * 8)
     for name in (
         "",
         "1-2-3-4",

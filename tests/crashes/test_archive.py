@@ -262,7 +262,7 @@ def test_sizes_and_hashes_are_checked(tmp_path, monkeypatch):
         pass
     # Also what is longer than one piece that is read at a time.
     monkeypatch.undo()
-    monkeypatch.setattr(archives, "_CHUNK", 7)
+    monkeypatch.setattr(archives, "_CHUNK_BYTES", 7)
     with open_archive(written(tmp_path / "good.zip", {"hunt.toml": b"12345" * 9})) as archive:
         assert (archive.directory / "hunt.toml").read_bytes() == b"12345" * 9
 

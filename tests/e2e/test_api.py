@@ -14,7 +14,7 @@ from conftest import keeps_going
 
 import crashhunt
 from crashhunt.errors import CrashhuntError, HuntDirectoryError, UsageError
-from crashhunt.hunts import HuntResults, SuiteResults, UnfinishedWarning
+from crashhunt.hunts import HuntResults, IncompleteHuntWarning, SuiteResults
 
 if TYPE_CHECKING:
     from crashhunt.hunts import HuntState
@@ -80,7 +80,7 @@ def test_what_is_not_finished_states_so(hunt):
     suite = crashhunt.Suite.read("s.toml")
     assert repr(suite) == "<suite of 2 hunts, 2 runs: a, b>"
     assert suite.plan("s") == suite.plan("s")
-    with pytest.warns(UnfinishedWarning, match="queued"):
+    with pytest.warns(IncompleteHuntWarning, match="queued"):
         found = crashhunt.load("s")
     assert isinstance(found, SuiteResults)
     assert sorted(found) == ["a/0", "b/0"]

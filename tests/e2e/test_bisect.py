@@ -65,7 +65,7 @@ def test_what_is_no_revision_is_reported(toy, made_once):
     assert "run it in the repository" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err
     git(toy.folder, "init", "-q")
     git(toy.folder, "commit", "-qm", "empty", "--allow-empty")
-    assert "'v1' is no commit" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err
+    assert "'v1' is not a commit" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err
 
 
 @pytest.mark.nightly

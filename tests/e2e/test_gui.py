@@ -104,7 +104,7 @@ def test_a_simulator_without_its_window_ends_as_closed(monkeypatch, capfd):
     for call in (lambda: window.begin(None), lambda: window.end(ended)):
         with pytest.raises(SystemExit) as left:
             call()
-        assert left.value.code == _debugger._LEFT
+        assert left.value.code == _debugger._LEFT_EXIT_CODE
         assert capfd.readouterr().err == "the window was closed\n"
 
 

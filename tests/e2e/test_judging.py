@@ -12,7 +12,7 @@ from crashhunt.errors import UsageError
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Outcome
 from crashhunt.whatif import judge
-from crashhunt.whatif._avoidability import Search
+from crashhunt.whatif._avoidability import AvoidanceSearch
 from crashhunt.whatif._causes import _Search
 
 HUNT = ("--scenario", "toy", "--arg", "speed=14", "--seed", "1")
@@ -136,9 +136,13 @@ def test_the_last_step_is_the_one_that_running_every_step_finds(shell, monkeypat
     def every_step(self):
         self._try("brake", 30, bundle.result.steps - 1, first)
 
-    monkeypatch.setattr(Search, "all", every_step)
-    monkeypatch.setattr(Search, "_find", lambda *_: None)
-    monkeypatch.setattr(Search, "_look_after", lambda self, tries, first: self._ask(tries, range(first, self._end)))
+    monkeypatch.setattr(AvoidanceSearch, "all", every_step)
+    monkeypatch.setattr(AvoidanceSearch, "_find", lambda *_: None)
+    monkeypatch.setattr(
+        AvoidanceSearch,
+        "_run_later_steps",
+        lambda self, tries, first: self._run_after_steps(tries, range(first, self._end)),
+    )
     every = judge(bundle, ReplayOptions(), runs=30, parallel=2)
     assert set(every.attempts[0].endings) == set(range(first, bundle.result.steps))
     assert (

@@ -26,7 +26,7 @@ from test_bisect import git
 from test_corpus import DRIVER, MENDED
 
 from crashhunt.base.git import run_to_end
-from crashhunt.base.temporary import Owner, owner_in, remove_leftovers, remove_tree, start_time, this_process
+from crashhunt.base.temporary import OwnerProcess, owner_in, remove_leftovers, remove_tree, start_time, this_process
 from crashhunt.corpus import _bisect
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError
@@ -443,7 +443,9 @@ def test_a_hunt_that_was_killed_leaves_nothing_for_long_not_even_shared_memory(t
 def leftover(folder: Path, start: str, *, alive: bool = False, boot: str = "") -> Path:
     """Make a folder with the name of something temporary, of this process or of one that has ended."""
     here = this_process()
-    made = folder / f"{start}{Owner(here.pid, here.started - (not alive), boot or here.boot, here.namespace).token}"
+    made = (
+        folder / f"{start}{OwnerProcess(here.pid, here.started - (not alive), boot or here.boot, here.namespace).token}"
+    )
     made.mkdir(parents=True)
     return made
 

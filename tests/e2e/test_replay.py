@@ -272,12 +272,12 @@ def test_a_crash_keeps_the_order_of_links_that_it_was_recorded_with(crash_on_sum
         rerun = prepare(find_bundle(crash.folder / "h"), ReplayOptions(code=code))
         return rerun.worker.scenario.table(SumoSetup).fix_link_order, rerun.warnings
 
-    monkeypatch.setattr("crashhunt.native._link_order._installed", lambda: "/somewhere/library.so")
+    monkeypatch.setattr("crashhunt.native._link_order._load_library", lambda: "/somewhere/library.so")
     monkeypatch.setattr("crashhunt.native._link_order._interface", lambda: 1)
     for code in ("current", "snapshot"):
         assert prepared(code, load_order="fixed") == (None, ())
         assert prepared(code, load_order="not fixed: the library is not built") == (False, ())
-    monkeypatch.setattr("crashhunt.native._link_order._installed", lambda: None)
+    monkeypatch.setattr("crashhunt.native._link_order._load_library", lambda: None)
     warning = "the order of SUMO's links was fixed and is not fixed: the library is not built"
     assert prepared("current", load_order="fixed") == (None, (warning,))
     del environment["load_order"]  # as in a snapshot of an earlier version, whose own code does not know the key
@@ -298,7 +298,7 @@ def test_a_case_keeps_the_order_of_links_that_it_was_recorded_with(crash_on_sumo
     monkeypatch.setattr(
         "crashhunt.corpus._run.FreshProcessExecutor", lambda settings: asked.append(settings) or submitted
     )
-    monkeypatch.setattr("crashhunt.native._link_order._installed", lambda: None)
+    monkeypatch.setattr("crashhunt.native._link_order._load_library", lambda: None)
     missing = "the order of SUMO's links was fixed and is not fixed: the library is not built, which may be why"
     for recorded, kept, warnings in (({}, False, ()), ({"load_order": "fixed"}, None, (missing,))):
         environment.pop("load_order", None)
@@ -315,7 +315,7 @@ def test_a_fixed_order_of_links_that_is_missing_is_the_first_suspect(crash_on_su
     monkeypatch.setattr(type(rerun.snapshot), "environment", lambda _: environment)
     result = rerun.bundle.result
     other = replace(result, outcome=Outcome.SURVIVED)
-    monkeypatch.setattr("crashhunt.native._link_order._installed", lambda: None)
+    monkeypatch.setattr("crashhunt.native._link_order._load_library", lambda: None)
     report = judged(rerun, rerun.recorded, rerun.recorded, other)
     assert (report.verdict, report.reason) == (
         "not_comparable",

@@ -128,7 +128,7 @@ DOORS_OPEN = """
 from crashhunt.scenario.backends.sumo import _files as files
 files.is_output = files.is_shown = lambda name: False
 files.rewritten = lambda content, *_: content
-files.ALWAYS.pop("device.ssm.file", None)
+files.FIXED_OPTIONS.pop("device.ssm.file", None)
 """
 
 

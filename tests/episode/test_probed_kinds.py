@@ -6,14 +6,14 @@ import math
 
 from crashhunt.disturbances import disturber_of
 from crashhunt.episode import PROBED
-from crashhunt.trial import CELLS, KINDS, OF_AGENT, steps_of
+from crashhunt.trial import CELLS, KINDS, SENSOR_KINDS, steps_of
 
 
 def test_every_kind_is_asked_for():
     assert sorted(kind.what for kind in PROBED) == sorted(KINDS)
     for kind in PROBED:
         assert set(kind.who) <= set(CELLS)
-        assert (kind.who == ("itself",)) == (kind.what in OF_AGENT)
+        assert (kind.who == ("itself",)) == (kind.what in SENSOR_KINDS)
 
 
 def test_the_worst_is_one_that_the_models_draw():

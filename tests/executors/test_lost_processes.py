@@ -63,7 +63,7 @@ def victim(pool, name, supervisor):
 @pytest.mark.parametrize("name", ["fork server", "template", "supervisor", "zygote"])
 def test_process_that_dies_before_it_is_written_to_costs_no_trial(pool, monkeypatch, name):
     first = run(pool, 0)
-    give, killed = pool._give, []
+    give, killed = pool._send_trial, []
 
     def kill_and_give(worker, attempt):
         if not killed:
@@ -71,7 +71,7 @@ def test_process_that_dies_before_it_is_written_to_costs_no_trial(pool, monkeypa
             kill(killed[0])
         give(worker, attempt)
 
-    monkeypatch.setattr(pool, "_give", kill_and_give)
+    monkeypatch.setattr(pool, "_send_trial", kill_and_give)
     second = run(pool, 1)
     assert killed
     assert second.outcome is Outcome.SURVIVED
@@ -85,7 +85,7 @@ def test_fork_server_that_dies_before_it_is_asked_for_a_supervisor_costs_no_tria
     deadline = time.monotonic() + DEADLINE_S
     while pool._workers and time.monotonic() < deadline:
         time.sleep(0.002)
-    hire, killed = pool._hire, []
+    hire, killed = pool._start_worker, []
 
     def kill_and_hire(link):
         if not killed:
@@ -93,7 +93,7 @@ def test_fork_server_that_dies_before_it_is_asked_for_a_supervisor_costs_no_tria
             kill(killed[0], until=link._kept.process.pid)  # the keeper has the socket as well
         return hire(link)
 
-    monkeypatch.setattr(pool, "_hire", kill_and_hire)
+    monkeypatch.setattr(pool, "_start_worker", kill_and_hire)
     assert run(pool, 1).outcome is Outcome.SURVIVED
     assert killed
     assert "the process that starts the workers was killed from outside, and was started again" in pool.notes()

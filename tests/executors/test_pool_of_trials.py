@@ -11,7 +11,7 @@ import pytest
 from crashhunt.episode import WorkerSettings
 from crashhunt.errors import CrashhuntError
 from crashhunt.executors import PoolExecutor, _pool
-from crashhunt.executors._postmortem import Attempt
+from crashhunt.executors._postmortem import TrialAttempt
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
@@ -27,7 +27,7 @@ def pool(tmp_path):
 
 def test_trials_up_to_the_given_number_and_errors_remain(pool):
     specs = [TrialSpec(number, 1, {}, {}, 9) for number in range(4)]
-    pool._waiting.extend(map(Attempt, specs))
+    pool._waiting.extend(map(TrialAttempt, specs))
     for spec in specs:
         pool._done.put(TrialResult(spec, Outcome.SURVIVED))
     pool._done.put(CrashhuntError("the disk is full", fix="free some space"))
@@ -49,27 +49,29 @@ def started(pool, monkeypatch):
         numbers.append(attempt.spec.number)
 
     pool._link = SimpleNamespace(ready=True, fork=lambda *_: None, kill=lambda *_: None, end=lambda: None)
-    monkeypatch.setattr(pool, "_give", give)
+    monkeypatch.setattr(pool, "_send_trial", give)
     return numbers
 
 
 def test_as_many_trials_run_as_there_are_slots_that_are_not_held_back(pool, started):
     pool._parallel, pool.held_back = 3, 1
-    pool._waiting.extend(Attempt(TrialSpec(number, 1, {}, {}, 9)) for number in range(5))
-    pool._hand_out()
+    pool._waiting.extend(TrialAttempt(TrialSpec(number, 1, {}, {}, 9)) for number in range(5))
+    pool._assign_trials()
     assert started == [0, 1]
     pool.held_back = 0
-    pool._hand_out()
+    pool._assign_trials()
     assert started == [0, 1, 2]
 
 
 def test_trial_that_was_killed_runs_alone(pool, started):
     pool._parallel = 3
     specs = [TrialSpec(number, 1, {}, {}, 9) for number in range(3)]
-    pool._waiting.extend([Attempt(specs[0]), Attempt(specs[1], [(-signal.SIGKILL, 5)]), Attempt(specs[2])])
+    pool._waiting.extend(
+        [TrialAttempt(specs[0]), TrialAttempt(specs[1], [(-signal.SIGKILL, 5)]), TrialAttempt(specs[2])]
+    )
     for expected in ([0], [0, 1], [0, 1, 2]):
         for _ in range(2):  # while it runs, nothing else starts
-            pool._hand_out()
+            pool._assign_trials()
             assert started == expected
         for worker in pool._workers.values():
             worker.attempt = None

@@ -15,7 +15,7 @@ import pytest
 from crashhunt.base.errors import PluginError, UsageError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors.ray import RayExecutor
-from crashhunt.executors.ray._cluster import OLDEST, cluster_of, require_ray
+from crashhunt.executors.ray._cluster import OLDEST_RAY_VERSION, cluster_of, require_ray
 from crashhunt.scenario import Scenario
 from crashhunt.trial import CRASHES
 
@@ -188,4 +188,4 @@ def test_a_ray_that_is_too_old_is_named(version, good, monkeypatch, tmp_path):
 
 def test_the_oldest_ray_is_the_one_that_is_installed_with_crashhunt():
     wanted = [line for line in importlib.metadata.requires("crashhunt") if line.startswith("ray")]
-    assert {line.partition(";")[0].strip() for line in wanted} == {f"ray>={'.'.join(map(str, OLDEST))}"}
+    assert {line.partition(";")[0].strip() for line in wanted} == {f"ray>={'.'.join(map(str, OLDEST_RAY_VERSION))}"}

@@ -14,7 +14,7 @@ from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors.ray import RayExecutor, _bridge, _executor
 from crashhunt.executors.ray._cluster import Found, Lost, Meant
-from crashhunt.executors.ray._messages import Ended, News
+from crashhunt.executors.ray._messages import EndedTrial, News
 from crashhunt.scenario import Scenario
 from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
 
@@ -154,7 +154,7 @@ def submit(bridge, *numbers):
 def ended(number, files=None):
     result = TrialResult(TrialSpec(number, number, {}, {}, max_steps=3), Outcome.SURVIVED, steps=3, wall_s=0.0)
     line = json.dumps({"ticket": 100 + number, "result": result.to_json()}).encode() + b"\n"
-    return Ended(100 + number, number, line, files or {})
+    return EndedTrial(100 + number, number, line, files or {})
 
 
 def notes(told):

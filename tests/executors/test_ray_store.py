@@ -20,8 +20,8 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors.ray import RayExecutor
-from crashhunt.executors.ray._bridge import Node, Roster, Trial, shares
-from crashhunt.executors.ray._code_archive import Folder, Parcel, Store, settings_in, unpack
+from crashhunt.executors.ray._bridge import Node, NodeScheduler, Trial, shares
+from crashhunt.executors.ray._code_archive import CodeArchive, Folder, Store, settings_in, unpack
 from crashhunt.executors.ray._node_actor import Site, code_digest
 from crashhunt.executors.ray._node_worker import Work
 from crashhunt.recording import BlackBox, Tag, read_black_box
@@ -46,7 +46,7 @@ def settings(tmp_path):
 
 
 def test_a_parcel_arrives_as_it_was_sent(settings, tmp_path):
-    parcel = Parcel.of(settings)
+    parcel = CodeArchive.of(settings)
     unpack(parcel.packed(), parcel.digest(), tmp_path / "there")
     there = settings_in(settings, parcel.folders, tmp_path / "there", tmp_path / "scratch there")
     assert [path.read_text() for path in (tmp_path / "there").rglob("*.py")] == ["x = 1"]
@@ -59,9 +59,9 @@ def test_a_parcel_arrives_as_it_was_sent(settings, tmp_path):
 
 def test_what_can_be_run_can_be_run_there(settings, tmp_path):
     """And a parcel that was sent before somebody thought of that is not taken for it."""
-    before = Parcel.of(settings).digest()
+    before = CodeArchive.of(settings).digest()
     (tmp_path / "code" / "mine" / "agent.py").chmod(0o700)
-    parcel = Parcel.of(settings)
+    parcel = CodeArchive.of(settings)
     assert parcel.digest() != before
     unpack(parcel.packed(), parcel.digest(), tmp_path / "there")
     assert os.access(tmp_path / "there" / "code" / "0" / "mine" / "agent.py", os.X_OK)
@@ -72,7 +72,7 @@ def test_a_name_is_any_that_a_file_can_have(settings, tmp_path):
     names = [os.fsdecode(name) for name in (b"not Unicode \xff", "übung".encode(), b"two\nlines", b"back\\slash")]
     for name in names:
         (tmp_path / "code" / "mine" / name).write_text(name, errors="surrogateescape")
-    parcel = Parcel.of(settings)
+    parcel = CodeArchive.of(settings)
     unpack(parcel.packed(), parcel.digest(), tmp_path / "there")
     there = (tmp_path / "there" / "code" / "0" / "mine").iterdir()
     assert {path.name for path in there} == {*names, "agent.py"}
@@ -88,7 +88,7 @@ def test_what_represents_the_current_folder_is_that_of_the_other_machine(setting
     homes = {}
     for folder in ("proj", "proj/agents", "else/agents", "."):
         monkeypatch.chdir(tmp_path / folder)
-        homes[folder] = Parcel.of(settings).home
+        homes[folder] = CodeArchive.of(settings).home
     assert homes == {"proj": "code/0/@proj", "proj/agents": "code/0/@proj/agents", "else/agents": "", ".": ""}
 
 
@@ -97,7 +97,7 @@ def test_a_folder_of_code_that_is_in_another_one_travels_once(settings, tmp_path
     (tmp_path / "code" / "@proj" / "mine" / "of.py").write_text("y = 1")
     inner = tmp_path / "code" / "@proj" / "mine"
     settings = replace(settings, code=(str(inner), str(tmp_path / "code"), str(tmp_path / "code" / "@proj")))
-    parcel = Parcel.of(settings)
+    parcel = CodeArchive.of(settings)
     assert len({*map(str, parcel.files.values())}) == len(parcel.files) == 3
     unpack(parcel.packed(), parcel.digest(), tmp_path / "there")
     there = settings_in(settings, parcel.folders, tmp_path / "there", tmp_path)
@@ -107,11 +107,11 @@ def test_a_folder_of_code_that_is_in_another_one_travels_once(settings, tmp_path
 
 
 def test_a_parcel_that_is_not_what_was_sent_is_refused(settings, tmp_path):
-    parcel = Parcel.of(settings)
+    parcel = CodeArchive.of(settings)
     packed, digest = parcel.packed(), parcel.digest()
     (tmp_path / "code" / "mine" / "agent.py").write_text("x = 2")
-    assert Parcel.of(settings).digest() != digest
-    changed = Parcel.of(settings).packed()
+    assert CodeArchive.of(settings).digest() != digest
+    changed = CodeArchive.of(settings).packed()
     leading_out = io.BytesIO()
     with zipfile.ZipFile(leading_out, "w") as archive:
         archive.writestr("../out.py", "x = 3")
@@ -349,7 +349,7 @@ def test_trials_at_a_time_are_divided_evenly(free, wanted, expected):
 
 
 def roster(**slots):
-    found = Roster()
+    found = NodeScheduler()
     found.nodes = {name: Node(name, name, name, count, None, ready=True) for name, count in slots.items()}
     return found
 

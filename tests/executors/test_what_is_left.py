@@ -14,7 +14,7 @@ from crashhunt.base import layout
 from crashhunt.episode import scratch_of
 from crashhunt.errors import PluginError, UsageError
 from crashhunt.executors import _postmortem, _protocol, _time_limits
-from crashhunt.executors._postmortem import Attempt
+from crashhunt.executors._postmortem import TrialAttempt
 from crashhunt.executors._protocol import Notes
 from crashhunt.recording import Phase
 from crashhunt.trial import KILLED, Outcome, TrialSpec
@@ -132,7 +132,7 @@ def test_a_trial_that_is_killed_from_outside_runs_again_alone(begun, monkeypatch
     monkeypatch.setattr(
         _postmortem, "where_it_is", lambda *_: SimpleNamespace(step=next(steps), phase=Phase.ACT)
     )  # fmt: skip
-    attempt = Attempt(SPEC)
+    attempt = TrialAttempt(SPEC)
     assert not attempt.alone
     assert attempt.again(begun, SEGV) == ""  # it did that itself
     assert attempt.again(begun, 3) == ""
@@ -158,18 +158,18 @@ def test_a_trial_that_is_killed_from_outside_runs_again_alone(begun, monkeypatch
 def test_a_trial_that_is_killed_twice_before_its_first_step_has_a_third_attempt(begun, monkeypatch, header):
     """What forks the processes of trials may have been killed once: both attempts end with it."""
     monkeypatch.setattr(_postmortem, "where_it_is", lambda *_: header)
-    attempt = Attempt(SPEC)
+    attempt = TrialAttempt(SPEC)
     assert [bool(attempt.again(begun, KILL)) for _ in range(3)] == [True, True, False]
 
 
 def test_a_trial_that_is_killed_twice_at_one_step_did_it_itself(begun, tmp_path):
-    attempt = Attempt(SPEC)
+    attempt = TrialAttempt(SPEC)
     assert attempt.again(begun, KILL)
     assert attempt.again(begun, KILL) == ""
     assert not attempt.is_killed_from_outside
     assert _postmortem.result_of_death(attempt, begun, KILL).outcome is not Outcome.SURVIVED
     assert _postmortem.result_of_death(attempt, begun, KILL).failure.kind == "signal"
-    nowhere = Attempt(TrialSpec(9, 1, {}, {}, 9))
+    nowhere = TrialAttempt(TrialSpec(9, 1, {}, {}, 9))
     assert nowhere.again(tmp_path, KILL)
     assert nowhere.ends == [(KILL, -1)]
 

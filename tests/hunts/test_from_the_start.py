@@ -9,7 +9,7 @@ import pytest
 
 from crashhunt.base.errors import SimulatorError
 from crashhunt.disturbances import disturber_of, parse_rates
-from crashhunt.hunts._fork_results import CopiedCrashes
+from crashhunt.hunts._fork_results import ForkCrashes
 from crashhunt.hunts._progress import PhaseClock, Progress
 from crashhunt.hunts._verification import Found, VerificationRuns
 from crashhunt.trial import Branch, Branches, Disturbance, Outcome, Stress, TrialResult, TrialSpec
@@ -82,7 +82,7 @@ def looked(copies, *results, deterministic=False):
     """Which trial ends a hunt by a copy, and what was run from the start."""
     copies.again.settings.run.deterministic = deterministic
     progress = Progress()
-    at = CopiedCrashes(copies, progress, SimpleNamespace(upcoming=None))
+    at = ForkCrashes(copies, progress, SimpleNamespace(upcoming=None))
     for result in results:
         at.add(result)
     told = []
@@ -113,7 +113,7 @@ def test_only_kinds_that_a_hunt_has_end_it():
 def test_a_copy_of_an_earlier_trial_comes_before_a_crash_where_that_is_asked_for():
     for deterministic, wanted in ((False, 4), (True, 2)):
         copies, progress = Copies(deterministic=deterministic), Progress()
-        at = CopiedCrashes(copies, progress, SimpleNamespace(upcoming=None))
+        at = ForkCrashes(copies, progress, SimpleNamespace(upcoming=None))
         crashed = replace(ended(4), outcome=Outcome.COLLISION)
         progress.found[4] = crashed
         for number in (2, 6):
@@ -129,7 +129,7 @@ def test_a_deterministic_hunt_that_is_resumed_runs_trials_of_lower_numbers_first
     for deterministic, waits in ((False, False), (True, True)):
         copies, progress = Copies(deterministic=deterministic), Progress()
         trials = SimpleNamespace(upcoming=1)
-        at = CopiedCrashes(copies, progress, trials)
+        at = ForkCrashes(copies, progress, trials)
         copies.again.ledger = SimpleNamespace(
             plain_results=lambda: [ended(3, branch=3.0).to_json(), ended(0).to_json()],
             result={3: ended(3, branch=3.0)}.get,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from crashhunt.errors import HuntDirectoryError, UntrustedError, UsageError
-from crashhunt.hunts import FACTS, HuntResults, SuiteResults, UnfinishedWarning, load
+from crashhunt.hunts import FACTS, HuntResults, IncompleteHuntWarning, SuiteResults, load
 from crashhunt.ledger import Ledger
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
@@ -38,7 +38,7 @@ def edit(hunt, old, new):
 def test_one_hunt_is_a_hunt_and_hunts_below_a_folder_are_a_suite(hunt):
     shutil.copytree(hunt, hunt.parent / "town" / "0")
     with warnings.catch_warnings():
-        warnings.simplefilter("error", UnfinishedWarning)
+        warnings.simplefilter("error", IncompleteHuntWarning)
         one, suite = load(hunt), load(hunt.parent)
     assert type(one) is HuntResults
     assert one.directory == hunt
@@ -54,10 +54,10 @@ def test_an_unfinished_hunt_is_loaded_with_a_warning(hunt):
     shutil.copytree(hunt, hunt.parent / "town" / "0")
     enter(hunt, "interrupted", "at noon")
     with pytest.warns(
-        UnfinishedWarning, match="interrupted, 4 of 4 trials, 2 crashes> is not finished: at noon"
+        IncompleteHuntWarning, match="interrupted, 4 of 4 trials, 2 crashes> is not finished: at noon"
     ) as one:
         load(hunt)
-    with pytest.warns(UnfinishedWarning) as both:
+    with pytest.warns(IncompleteHuntWarning) as both:
         load(hunt.parent)
     assert len(one) == len(both) == 1
     assert one[0].filename == __file__  # the line that called
@@ -116,7 +116,7 @@ def test_files_of_two_hunts_are_refused(hunt):
     with pytest.raises(HuntDirectoryError, match="has seed 2, but the trials have seed 1"):
         _ = load(hunt).settings
     (hunt / "ledger.sqlite").unlink()
-    with pytest.warns(UnfinishedWarning):
+    with pytest.warns(IncompleteHuntWarning):
         assert load(hunt).settings.seed == 2
 
 

@@ -143,7 +143,7 @@ def test_a_report_reads_only_the_bundles_that_it_shows(hunts, monkeypatch):
 
 def test_crashes_whose_type_is_not_noted_yet_are_counted_apart(hunts, monkeypatch):
     hunt = hunts.folder / "all"
-    monkeypatch.setattr(tally_module, "_MOST_LOGS", 1)
+    monkeypatch.setattr(tally_module, "_MAX_READ_LOGS", 1)
     with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
         kinds = ledger.facts()["kinds"]
         ledger.note(kinds=[{**kinds[0], "count": kinds[0]["count"] - 2}, *kinds[1:]])

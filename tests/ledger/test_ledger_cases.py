@@ -301,7 +301,7 @@ def test_reads_are_the_same_in_pieces(path, monkeypatch):
             )
     with closing(Ledger(path)) as reader:
         whole = list(reader.table())
-        monkeypatch.setattr("crashhunt.ledger._reader._CHUNK", 3)
+        monkeypatch.setattr("crashhunt.ledger._reader._CHUNK_ROWS", 3)
         assert list(reader.table()) == whole
         assert sorted(whole)[4] == (4, 28, "collision", 10, 5.0 - 4 / 3)
 

@@ -174,7 +174,7 @@ def test_a_ledger_of_later_that_asks_for_more_is_refused(tmp_path):
     write(path)
     newer(path, reader=98)
     for writable in (False, True):
-        with pytest.raises(HuntDirectoryError, match="of version 99, but this crashhunt reads versions up to"):
+        with pytest.raises(HuntDirectoryError, match="has version 99, but this crashhunt reads versions up to"):
             Ledger(path, writable=writable)
 
 

@@ -20,7 +20,7 @@ from crashhunt.maps import MapSource, read_network
 from crashhunt.maps._convert import ConvertOptions, convert
 from crashhunt.maps._demand import Demand, Route, _ego_routes, _entry_capacity, route_file
 from crashhunt.maps._folder import agent_module, arguments_of, next_commands, readme, scenario_toml, workflow
-from crashhunt.maps._network import Edge, Lane, Network
+from crashhunt.maps._network import Edge, NetworkLane, RoadNetwork
 from crashhunt.maps._picture import draw_map, drawable
 from crashhunt.maps._plain_run import PlainRun
 from crashhunt.maps._tools import Tools
@@ -29,14 +29,14 @@ from crashhunt.scenario import scenario_from_dict, shipped_folder
 
 def lane(allowed=None, disallowed=(), length=100.0, at_m=0.0):
     allowed = None if allowed is None else frozenset(allowed)
-    return Lane(
+    return NetworkLane(
         length_m=length, speed_mps=10.0, allowed=allowed, disallowed=frozenset(disallowed),
         shape=((0.0, at_m), (length, at_m)),
     )  # fmt: skip
 
 
 def network(**lanes):
-    return Network(edges={name: Edge(name, "", tuple(found)) for name, found in lanes.items()})
+    return RoadNetwork(edges={name: Edge(name, "", tuple(found)) for name, found in lanes.items()})
 
 
 def route(name, *edges, weight=1, length=400.0):

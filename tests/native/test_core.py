@@ -473,11 +473,11 @@ def test_it_is_used_only_where_it_is_known(monkeypatch):
     monkeypatch.setattr(_core, "_INTERFACE", -1)
     assert "another version of crashhunt" in why_not("1.28.0")
     monkeypatch.setattr(_core, "_MODULE", "_no_such_core")
-    _core._installed.cache_clear()
+    _core._load_module.cache_clear()
     try:
         assert why_not("1.28.0") == "it is not built"
     finally:
-        _core._installed.cache_clear()
+        _core._load_module.cache_clear()
 
 
 class _Lies:

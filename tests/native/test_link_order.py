@@ -17,7 +17,7 @@ import pytest
 
 from crashhunt.native import LinkOrder, _link_order, link_order, why_no_link_order
 from crashhunt.plans import RunSettings, load_order_change, load_order_of, with_recorded_load_order
-from crashhunt.plans._plan import _noted
+from crashhunt.plans._plan import _with_notes
 from crashhunt.scenario import load_scenario
 from crashhunt.scenario.backends.sumo import SumoSetup
 
@@ -182,13 +182,13 @@ def test_a_library_that_is_not_loaded_is_refused():
 
 
 def test_reason_names_what_is_missing(monkeypatch):
-    monkeypatch.setattr(_link_order, "_installed", lambda: "/somewhere/library.so")
+    monkeypatch.setattr(_link_order, "_load_library", lambda: "/somewhere/library.so")
     monkeypatch.setattr(_link_order, "_interface", lambda: _link_order._INTERFACE)
     assert why_no_link_order("1.28.0") == ""
     assert "this is 1.99.0" in why_no_link_order("1.99.0")
     monkeypatch.setattr(_link_order, "_interface", lambda: 77)
     assert "of another version of crashhunt (77 instead of 1)" in why_no_link_order("1.28.0")
-    monkeypatch.setattr(_link_order, "_installed", lambda: None)
+    monkeypatch.setattr(_link_order, "_load_library", lambda: None)
     assert why_no_link_order("1.28.0") == "the library is not built"
     link_order.cache_clear()
     try:
@@ -200,7 +200,7 @@ def test_reason_names_what_is_missing(monkeypatch):
 @pytest.mark.parametrize("content", [b"", b"no library"])
 def test_a_damaged_library_is_of_no_version(monkeypatch, tmp_path, content):
     (tmp_path / "library.so").write_bytes(content)
-    monkeypatch.setattr(_link_order, "_installed", lambda: str(tmp_path / "library.so"))
+    monkeypatch.setattr(_link_order, "_load_library", lambda: str(tmp_path / "library.so"))
     _link_order._interface.cache_clear()
     try:
         assert "(0 instead of 1)" in why_no_link_order("1.28.0")
@@ -261,8 +261,8 @@ def test_a_load_that_is_not_ordered_is_reported_once(tmp_path, monkeypatch):
 def test_check_load_reports_whether_the_library_was_called():
     loads = [(0, 0), (1, 0), (1, 1), (1, 1)]
     order = LinkOrder(None, "")
-    order._counted = lambda: loads.pop(0)  # type: ignore[method-assign]
-    order._loads = order._counted()
+    order._count_calls = lambda: loads.pop(0)  # type: ignore[method-assign]
+    order._loads = order._count_calls()
     assert order.check_load() == ""
     assert order.check_load() == "libsumo constructs links in another way"
     assert order.check_load() == "libsumo does not call the library"
@@ -272,7 +272,7 @@ def test_recorded_order_is_kept(tmp_path, monkeypatch):
     scenario = sumo_scenario(tmp_path)
     for recorded, kept in ((None, False), ("not fixed: the library is not built", False), ("fixed", None)):
         assert with_recorded_load_order(scenario, recorded).table(SumoSetup).fix_link_order is kept
-    monkeypatch.setattr(_link_order, "_installed", lambda: None)
+    monkeypatch.setattr(_link_order, "_load_library", lambda: None)
     missing = "not fixed: the library is not built"
     assert load_order_of(scenario) == missing
     assert load_order_change(scenario, "fixed") == f"the order of SUMO's links was fixed and is {missing}"
@@ -286,18 +286,18 @@ def test_recorded_order_is_kept(tmp_path, monkeypatch):
 
 def test_hunt_states_where_the_order_is_not_fixed(tmp_path, monkeypatch):
     scenario = sumo_scenario(tmp_path)
-    monkeypatch.setattr(_link_order, "_installed", lambda: "/somewhere/library.so")
+    monkeypatch.setattr(_link_order, "_load_library", lambda: "/somewhere/library.so")
     monkeypatch.setattr(_link_order, "_interface", lambda: _link_order._INTERFACE)
     monkeypatch.setattr(metadata, "version", lambda _: "1.28.0")
-    assert not [note for note in _noted(scenario, RunSettings()).notes if "order" in note]
+    assert not [note for note in _with_notes(scenario, RunSettings()).notes if "order" in note]
     text = (tmp_path / "scenario.toml").read_text().replace("[sumo]\n", "[sumo]\nfix_link_order = false\n")
     (tmp_path / "scenario.toml").write_text(text)
-    (note,) = (note for note in _noted(load_scenario(tmp_path), RunSettings()).notes if "order" in note)
+    (note,) = (note for note in _with_notes(load_scenario(tmp_path), RunSettings()).notes if "order" in note)
     assert note == (
         "the order of SUMO's links is not fixed: the scenario says so; a trial may differ between processes"
     )
-    monkeypatch.setattr(_link_order, "_installed", lambda: None)
-    (note,) = (note for note in _noted(scenario, RunSettings(native=False)).notes if "order" in note)
+    monkeypatch.setattr(_link_order, "_load_library", lambda: None)
+    (note,) = (note for note in _with_notes(scenario, RunSettings(native=False)).notes if "order" in note)
     assert "not fixed: the library is not built;" in note
 
 

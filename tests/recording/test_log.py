@@ -109,7 +109,10 @@ def test_what_is_no_log_is_refused(tmp_path):
     path = tmp_path / "log.mcap"
     with pytest.raises(BundleError, match="cannot be read"):
         read_log(path)
-    for metadata, says in (({}, "not written by crashhunt"), ({"crashhunt_log_schema": "99"}, "schema is 99")):
+    for metadata, says in (
+        ({}, "not written by crashhunt"),
+        ({"crashhunt_log_schema": "99"}, "is 99; this crashhunt reads 1"),
+    ):
         with path.open("wb") as file:
             writer = Writer(file)
             writer.start()

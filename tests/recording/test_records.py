@@ -27,7 +27,7 @@ from crashhunt.recording import (
     values_around,
     write_log,
 )
-from crashhunt.recording._blackbox import FIRST_ASIDE, is_evidence
+from crashhunt.recording._blackbox import FIRST_NON_EVIDENCE_TAG, is_evidence
 from crashhunt.recording.records._type import BytesForm, RecordType, TextForm
 from crashhunt.world import Actor, Roster, Scene
 
@@ -141,4 +141,4 @@ def test_no_tag_topic_or_name_is_given_twice_and_later_types_can_be_read_by_ever
         assert len({getattr(kind, what) for kind in kinds}) == len(kinds)
     assert [tag for tag in RECORD_TYPES if not is_evidence(tag)] == [11]
     assert all(isinstance(kind.form, TextForm | BytesForm) for kind in kinds if kind.tag > 11)
-    assert max(RECORD_TYPES) < FIRST_ASIDE
+    assert max(RECORD_TYPES) < FIRST_NON_EVIDENCE_TAG

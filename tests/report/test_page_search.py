@@ -72,7 +72,7 @@ def test_a_lineage_leads_from_parent_to_parent_and_ends_where_a_trial_is_missing
 @pytest.mark.parametrize("trials", [100, 200, 401, 1000])
 def test_of_many_trials_those_that_are_drawn_are_of_all_origins(tmp_path, monkeypatch, trials):
     """Every fifth trial of a guided hunt is a plain random one: a page with every fifth or tenth had no others."""
-    monkeypatch.setattr(_page, "_DOTS", 40)
+    monkeypatch.setattr(_page, "_MAX_PLOTTED_TRIALS", 40)
     ledger = Ledger(tmp_path / layout.LEDGER, writable=True)
     with ledger.together():
         for number in range(trials):

@@ -16,7 +16,7 @@ from crashhunt.executors import NodeFigures
 from crashhunt.hunts import HuntStatus, PhaseStatus, SearchStatus, StrategyStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher, describe_running
-from crashhunt.report._status_screen import _line, _near, describe_kinds, format_inputs
+from crashhunt.report._status_screen import _line, _nearest_words, describe_kinds, format_inputs
 from crashhunt.trial import Disturbance, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -84,7 +84,7 @@ def test_line_of_a_trial_without_arguments_ends_after_its_seed(arguments, words)
     spec = TrialSpec(number=3, seed=5, arguments=arguments, scenario_arguments={}, max_steps=9)
     result = TrialResult(spec, Outcome.SURVIVED)
     assert format_inputs(result) == f"seed 5{words}"
-    assert _near(result) == f"trial 3, never on a collision course{words}"
+    assert _nearest_words(result) == f"trial 3, never on a collision course{words}"
 
 
 def test_margin_that_is_not_fully_asked_is_shown_as_such():

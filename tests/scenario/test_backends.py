@@ -70,7 +70,7 @@ class TestToy(_Written):
 
 
 def test_what_comes_with_crashhunt_is_found_without_entry_points(monkeypatch):
-    monkeypatch.setattr("crashhunt.scenario._scenario._others", dict)
+    monkeypatch.setattr("crashhunt.scenario._scenario._plugin_backends", dict)
     assert {"gym", "highway", "sumo", "toy"} <= set(backend_names())
     assert backend_of("a.module:Simulator") is None
 
@@ -91,7 +91,7 @@ class Point:
 def test_a_broken_backend_is_an_error_where_it_is_asked_for_and_nowhere_else(monkeypatch, target, says):
     from crashhunt.scenario import installed_backends
 
-    monkeypatch.setattr("crashhunt.scenario._scenario._others", lambda: {"other": Point(target)})
+    monkeypatch.setattr("crashhunt.scenario._scenario._plugin_backends", lambda: {"other": Point(target)})
     with pytest.raises(PluginError) as caught:
         backend_of("other")
     assert says in str(caught.value)

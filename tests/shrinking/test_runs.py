@@ -10,8 +10,8 @@ import pytest
 from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError
 from crashhunt.crashes import Bundle, Signature, signature_of
 from crashhunt.shrinking import _runs
-from crashhunt.trial import EVERYBODY, Collision, Failure, Outcome, TrialResult, TrialSpec
-from crashhunt.whatif import Ended, StoppedError, _reruns
+from crashhunt.trial import ALL_AGENTS, Collision, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.whatif import EndedRun, StoppedError, _reruns
 
 
 @dataclass
@@ -49,7 +49,7 @@ def test_an_older_crashhunt_that_refuses_to_leave_others_out_has_no_one_excluded
     rerun = SimpleNamespace(worker=Worker(), bundle=SimpleNamespace(result=SimpleNamespace(steps_begun=9)))
     words = {"parallel": 1, "budget": 9, "time_s": None, "stopped": lambda: False, "watch": None}
     runs = _runs.Runs(rerun, None, tmp_path, tmp_path / "memory", **words)
-    spec = TrialSpec(0, 1, {}, {}, 9, only=(EVERYBODY,))
+    spec = TrialSpec(0, 1, {}, {}, 9, only=(ALL_AGENTS,))
     assert runs.entered(spec) == ()
     monkeypatch.setattr(Refuses, "error", RecorderError)
     with pytest.raises(RecorderError):  # of a full disk nobody concludes anything
@@ -108,7 +108,7 @@ def candidate(same, steps=5, name=0):
 def make_runs(tmp_path, monkeypatch):
     """Makes runs of a crash of 20 steps; the memory of what came of candidates is a file."""
     monkeypatch.setattr(_reruns, "PoolExecutor", Instant)
-    monkeypatch.setattr(_reruns, "is_todays", lambda rerun: True)
+    monkeypatch.setattr(_reruns, "is_current_code", lambda rerun: True)
     monkeypatch.setattr(Instant, "made", ())
     result = TrialResult(candidate("yes", 20), Outcome.AGENT_ERROR, steps=20, failure=FAILED, digest="f" * 32)
     bundle = Bundle(tmp_path / "b", result, 1, "abc")
@@ -204,7 +204,7 @@ def test_who_enters_is_what_the_same_trial_has_written(make_runs, tmp_path, monk
     monkeypatch.setattr(_reruns.layout, "ENTERED", "entered.json")
     result = runs._rerun.bundle.result
     runs._rerun = SimpleNamespace(bundle=SimpleNamespace(result=replace(result, digest=digest)))
-    everybody = replace(candidate("yes", 4), only=(EVERYBODY,))
+    everybody = replace(candidate("yes", 4), only=(ALL_AGENTS,))
     assert runs.entered(everybody) == names
     assert (runs.count, runs.steps) == (1, 4)
     assert not folder.exists()
@@ -244,7 +244,7 @@ def test_of_a_collision_the_signature_is_made_only_where_it_may_be_the_same(
     asked = []
     monkeypatch.setattr(runs, "_signature_of", lambda result, folder: asked.append(result) or runs._signature)
     result = TrialResult(candidate("yes"), outcome, steps=7, collision=collision, digest="d")
-    assert runs._judged(Ended(0, result, None, bundle.path)) == _runs.Ran(same, 7, "d")
+    assert runs._judged(EndedRun(0, result, None, bundle.path)) == _runs.Ran(same, 7, "d")
     assert len(asked) == same
 
 

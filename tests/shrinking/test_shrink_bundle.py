@@ -121,10 +121,10 @@ def test_of_what_does_not_come_again_the_next_larger_is_taken(crash, tmp_path, m
         smaller=specs, best=None, removed=lambda: ("a",), changed=lambda: {"ego.speed": (1.0, 2.0)}, steps_cut=7
     )
     monkeypatch.setattr(_shrink, "_run_fresh", run_fresh)
-    monkeypatch.setattr(_shrink, "_kept", lambda small: small)
+    monkeypatch.setattr(_shrink, "_confirm_smallest", lambda small: small)
     monkeypatch.setattr(_shrink, "is_same", lambda found, wanted, spec: spec.number == 1)
     monkeypatch.setattr(_shrink, "signature_of", lambda bundle: None)
-    small = _shrink._written(SimpleNamespace(bundle=crash), search, None)
+    small = _shrink._write_smallest(SimpleNamespace(bundle=crash), search, None)
     assert ran == [2] * tries + [1]
     assert search.best is specs[1]
     assert [path.name for path in sorted(tmp_path.glob("small-*"))] == [f"small-{tries + 1}"]
@@ -132,7 +132,7 @@ def test_of_what_does_not_come_again_the_next_larger_is_taken(crash, tmp_path, m
         "of": crash.id, "removed": ["a"], "changed": {"ego.speed": [1.0, 2.0]}, "steps_cut": 7,
     }  # fmt: skip
     monkeypatch.setattr(_shrink, "is_same", lambda found, wanted, spec: False)
-    assert _shrink._written(SimpleNamespace(bundle=crash), search, None) is None
+    assert _shrink._write_smallest(SimpleNamespace(bundle=crash), search, None) is None
 
 
 def test_what_cannot_be_confirmed_leaves_nothing(crash, tmp_path, monkeypatch):
@@ -141,10 +141,10 @@ def test_what_cannot_be_confirmed_leaves_nothing(crash, tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(type(crash), "write", lambda self: written.append(self.confirmed))
     monkeypatch.setattr(_shrink, "confirm", lambda bundle, *, trusted: replace(bundle, confirmed=False))
-    assert _shrink._kept(replace(small, confirmed=None)).confirmed is False
+    assert _shrink._confirm_smallest(replace(small, confirmed=None)).confirmed is False
     assert written == [None, False]
     monkeypatch.setattr(_shrink, "confirm", lambda bundle, *, trusted: None)
-    assert _shrink._kept(small) is small
+    assert _shrink._confirm_smallest(small) is small
     assert path.exists()
 
     def stops(bundle, *, trusted):
@@ -152,7 +152,7 @@ def test_what_cannot_be_confirmed_leaves_nothing(crash, tmp_path, monkeypatch):
 
     monkeypatch.setattr(_shrink, "confirm", stops)
     with pytest.raises(KeyboardInterrupt):
-        _shrink._kept(small)
+        _shrink._confirm_smallest(small)
     assert not path.exists()
 
 

@@ -12,8 +12,8 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.shrinking import _scripting, _stages, fewest, plainest
 from crashhunt.shrinking._runs import OutOfTimeError
 from crashhunt.shrinking._scripting import Part
-from crashhunt.shrinking._stages import Search
-from crashhunt.trial import EVERYBODY, Disturbance, Escape, TrialSpec
+from crashhunt.shrinking._stages import Minimizer
+from crashhunt.trial import ALL_AGENTS, Disturbance, Escape, TrialSpec
 from crashhunt.whatif import StoppedError
 from crashhunt.world import Actor, Roster, Scene
 
@@ -143,8 +143,8 @@ class Runs:
 def test_time_that_runs_out_while_others_are_moved_takes_nothing_away(monkeypatch, scripted):
     monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS[:6]))
     monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
-    monkeypatch.setattr(_stages.Search, "steps_cut", 0)
-    search = _stages.Search(RERUN, Runs(scripted), "either")
+    monkeypatch.setattr(_stages.Minimizer, "steps_cut", 0)
+    search = _stages.Minimizer(RERUN, Runs(scripted), "either")
     search._scripting = Scripting()
     assert search.run(lambda: False)[0] in ("time", "done")
     assert search.best == replace(RERUN.spec, only=("a", "b", "c"))
@@ -188,7 +188,7 @@ class LaterRuns(Runs):
 def test_fewer_are_enough_where_it_begins_later(monkeypatch, pair):
     monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS))
     monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
-    search = _stages.Search(RERUN, LaterRuns(pair), "either")
+    search = _stages.Minimizer(RERUN, LaterRuns(pair), "either")
     search._scripting = FromLaterOn()
     assert search.run(lambda: False)[0] == "done"
     assert (set(search.best.script.names), search.best.max_steps) == ({*pair}, 60)
@@ -208,7 +208,7 @@ class FewRuns(LaterRuns):
 def test_which_it_takes_no_more_where_it_begins_later_is_excluded_of_a_few_as_well(monkeypatch):
     monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS))
     monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
-    search = _stages.Search(RERUN, FewRuns("gh"), "either")
+    search = _stages.Minimizer(RERUN, FewRuns("gh"), "either")
     search._scripting = FromLaterOn()
     assert search.run(lambda: False)[0] == "done"
     assert (search.best.script.names, search.best.max_steps) == (("g",), 60)
@@ -304,7 +304,7 @@ class Takes:
         self._crashes, self._entered = crashes, entered
 
     def entered(self, spec):
-        assert spec.only == (EVERYBODY,)
+        assert spec.only == (ALL_AGENTS,)
         return self._entered
 
     def first(self, specs, *, again=False):
@@ -319,7 +319,7 @@ class Takes:
 @pytest.mark.parametrize(("confirmed", "tries"), [(True, 3), (False, 10), (None, 3)])
 def test_a_crash_that_does_not_come_again_is_given_up_after_some_runs(confirmed, tries):
     rerun, runs = crash(confirmed=confirmed), Takes(lambda spec: False)
-    search = Search(rerun, runs, "traffic")
+    search = Minimizer(rerun, runs, "traffic")
     assert search.run(lambda: False) == ("done", f"it did not come again in {tries} runs")
     assert (search.reproduced, search.smaller, search.best) == (False, [], rerun.spec)
     assert runs.tried == [(100, rerun.spec)] * tries
@@ -329,7 +329,7 @@ def test_a_crash_that_does_not_come_again_is_given_up_after_some_runs(confirmed,
 def test_a_crash_that_comes_again_late_is_made_smaller():
     left = [False, False, True]
     runs = Takes(lambda spec: left.pop(0) if left else False)
-    search = Search(crash(), runs, "traffic")
+    search = Minimizer(crash(), runs, "traffic")
     assert search.run(lambda: False) == ("done", "")
     assert search.reproduced
     assert runs.again[:3] == [True, True, True]
@@ -355,7 +355,7 @@ def test_why_a_search_ended_is_reported_and_the_best_is_kept(error, stopped, end
         return True
 
     plain = replace(rerun.spec, arguments={"ego": {"speed": 15.0}})
-    search = Search(rerun, Takes(crashes), "traffic")
+    search = Minimizer(rerun, Takes(crashes), "traffic")
     found, words = search.run(lambda: stopped)
     assert found == ended
     assert says in words
@@ -369,18 +369,18 @@ def test_an_error_before_the_crash_has_come_again_is_raised():
         raise CrashhuntError("a worker died")
 
     with pytest.raises(CrashhuntError, match="a worker died"):
-        Search(crash(), Takes(fails), "traffic").run(lambda: False)
+        Minimizer(crash(), Takes(fails), "traffic").run(lambda: False)
 
 
 def test_a_form_that_the_simulator_does_not_have_is_reported():
     rerun = crash()
-    search = Search(rerun, Takes(), "scripted")
+    search = Minimizer(rerun, Takes(), "scripted")
     ended, words = search.run(lambda: False)
     assert ended == "done"
     assert words.startswith("A toy cannot move others along recorded ways")
     assert search.smaller == []
     rerun.worker.scenario.backend.title = ""
-    assert Search(rerun, Takes(), "scripted").run(lambda: False)[1].startswith("its simulator cannot")
+    assert Minimizer(rerun, Takes(), "scripted").run(lambda: False)[1].startswith("its simulator cannot")
 
 
 def test_traffic_loses_others_disturbances_and_odd_values_that_it_does_not_take():
@@ -391,7 +391,7 @@ def test_traffic_loses_others_disturbances_and_odd_values_that_it_does_not_take(
         fast = spec.arguments["ego"]["speed"] > 16
         return {*"bf"} <= {*present} and fast and STOP in spec.disturbances
 
-    search = Search(rerun, Takes(crashes), "traffic")
+    search = Minimizer(rerun, Takes(crashes), "traffic")
     assert search.run(lambda: False) == ("done", "")
     assert search.notes == []
     best = search.best
@@ -407,7 +407,7 @@ def test_traffic_loses_others_disturbances_and_odd_values_that_it_does_not_take(
 
 def test_who_is_likely_is_tried_first_and_short_trials_before_long_ones():
     runs = Takes(lambda spec: spec.only is None or {*"bf"} <= {*spec.only})
-    search = Search(crash(arguments={"ego": {}}, scenario_arguments={}), runs, "traffic")
+    search = Minimizer(crash(arguments={"ego": {}}, scenario_arguments={}), runs, "traffic")
     assert search.run(lambda: False) == ("done", "")
     likely = [(), ("c",), ("a", "b"), *((name,) for name in "abdefgh"), tuple("abcdef")]
     first = [(steps, spec.only) for steps, spec in runs.tried[1:] if spec.only is not None]
@@ -415,7 +415,7 @@ def test_who_is_likely_is_tried_first_and_short_trials_before_long_ones():
     assert search.best.only == ("b", "f")
 
     runs = Takes(lambda spec: spec.only is None or {*"bh"} <= {*spec.only})
-    search = Search(crash(arguments={"ego": {}}, scenario_arguments={}), runs, "traffic")
+    search = Minimizer(crash(arguments={"ego": {}}, scenario_arguments={}), runs, "traffic")
     assert search.run(lambda: False) == ("done", "")
     lengths = [steps for steps, spec in runs.tried[1:]]
     # 250 steps are twice as long as the crash, and 5 s.
@@ -429,7 +429,7 @@ def test_with_another_form_at_hand_only_a_few_are_tried_in_traffic(monkeypatch):
     monkeypatch.setattr(_stages, "Scripting", lambda rerun: None)
     names = ("ego", *(f"n{number}" for number in range(12)))
     runs = Takes(lambda spec: spec.only is None, entered=names[1:])
-    search = Search(crash(names=names, other="n9"), runs, "either")
+    search = Minimizer(crash(names=names, other="n9"), runs, "either")
     search._scripting = object()
     search._fewer_others()
     groups = [spec.only for steps, spec in runs.tried if steps == 100]
@@ -441,7 +441,7 @@ def test_with_another_form_at_hand_only_a_few_are_tried_in_traffic(monkeypatch):
 @pytest.mark.parametrize("kept", [None, ("c",), ("c", "d", "e")])
 def test_traffic_is_scripted_where_it_takes_many(kept, monkeypatch):
     monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
-    search = Search(crash(), Takes(), "either")
+    search = Minimizer(crash(), Takes(), "either")
     search.best = replace(search.best, only=kept)
     assert search._wants_script() is (kept != ("c",))
     search.best = replace(search.best, only=("c", "d"))
@@ -451,31 +451,31 @@ def test_traffic_is_scripted_where_it_takes_many(kept, monkeypatch):
 
 
 def test_two_agents_are_always_scripted_as_well():
-    search = Search(crash(agents=("ego", "a")), Takes(), "either")
+    search = Minimizer(crash(agents=("ego", "a")), Takes(), "either")
     search.best = replace(search.best, only=("c",))
     assert search._wants_script()
 
 
 def test_where_no_one_can_be_excluded_that_is_reported():
-    search = Search(crash(), Takes(entered=()), "traffic")
+    search = Minimizer(crash(), Takes(entered=()), "traffic")
     assert search.run(lambda: False) == ("done", "")
     assert len(search.notes) == 1
     assert search.notes[0].startswith("all others stay")
     assert search.best.only is None
     assert search.removed() == ()
-    alone = Search(crash(names=("a", "ego"), agents=("a", "ego")), Takes(entered=()), "traffic")
+    alone = Minimizer(crash(names=("a", "ego"), agents=("a", "ego")), Takes(entered=()), "traffic")
     assert alone.run(lambda: False)[0] == "done"
     assert alone.notes == []  # there is nobody else
 
 
 def test_the_others_of_a_crash_are_those_of_the_collision_or_of_the_event():
-    assert Search(crash(other="c"), Takes(), "traffic")._others_of_the_crash() == ["c"]
-    assert Search(crash(other=""), Takes(), "traffic")._others_of_the_crash() == []
+    assert Minimizer(crash(other="c"), Takes(), "traffic")._others_of_the_crash() == ["c"]
+    assert Minimizer(crash(other=""), Takes(), "traffic")._others_of_the_crash() == []
     event = SimpleNamespace(others=("d", "", "b"))
     rerun = crash(event=event)
-    assert Search(rerun, Takes(), "traffic")._others_of_the_crash() == ["d", "b"]
+    assert Minimizer(rerun, Takes(), "traffic")._others_of_the_crash() == ["d", "b"]
     rerun.bundle.result.event = None
-    assert Search(rerun, Takes(), "traffic")._others_of_the_crash() == []
+    assert Minimizer(rerun, Takes(), "traffic")._others_of_the_crash() == []
 
 
 @dataclass(frozen=True)
@@ -488,7 +488,7 @@ class Moved:
 
 
 def test_of_a_script_the_steps_that_are_cut_off_and_who_is_gone_are_reported():
-    search = Search(crash(disturbances=(BRAKE, STOP, LATE, replace(LATE, step=50))), Takes(), "traffic")
+    search = Minimizer(crash(disturbances=(BRAKE, STOP, LATE, replace(LATE, step=50))), Takes(), "traffic")
     script = Moved(12.0, ("b",), (SimpleNamespace(actor=Actor("ego", "passenger", 5.0, 1.8)),))
     search.best = replace(search.best, script=script, disturbances=(replace(LATE, step=20),))
     assert search.steps_cut == 20
@@ -510,7 +510,7 @@ def test_of_a_script_the_steps_that_are_cut_off_and_who_is_gone_are_reported():
 )
 def test_a_script_is_smaller_with_fewer_actors_or_agents_or_steps(names, agents, only, begins_s, smaller):
     driving = ("ego", "a") if "a" in names else ("ego",)
-    search = Search(crash(agents=driving), Takes(), "either")
+    search = Minimizer(crash(agents=driving), Takes(), "either")
     than = replace(search.best, only=only)
     actors = tuple(SimpleNamespace(actor=Actor(name, "passenger", 5.0, 1.8)) for name in agents)
     search.best = replace(than, script=Moved(begins_s, names, actors))
@@ -521,7 +521,7 @@ def test_a_script_is_smaller_with_fewer_actors_or_agents_or_steps(names, agents,
 
 def test_one_look_at_the_others_leaves_out_all_that_it_does_not_take():
     runs = Takes(lambda spec: spec.only is None or {*"bf"} <= {*spec.only})
-    search = Search(crash(), runs, "traffic")
+    search = Minimizer(crash(), runs, "traffic")
     search._fewer_others()
     assert search.best.only == ("b", "f")  # of the six that are nearest
     assert runs.most_steps == 100
@@ -538,17 +538,17 @@ def test_an_agent_that_need_not_drive_is_moved():
         return spec.script is None or ({*"ac"} <= {*spec.script.names, *spec.script.agents})
 
     rerun = crash(agents=("ego", "a"), other="c")
-    search = Search(rerun, Takes(crashes), "traffic")
+    search = Minimizer(rerun, Takes(crashes), "traffic")
     assert search._fewest_moved(TwoDrive()) == Part(("ego",), ("a", "c"))
     rerun.bundle.driver = "nobody"
-    assert Search(rerun, Takes(crashes), "traffic")._fewest_moved(TwoDrive()) == Part(("ego", "a"), ("c",))
-    never = Search(rerun, Takes(lambda spec: spec.script is None), "traffic")
+    assert Minimizer(rerun, Takes(crashes), "traffic")._fewest_moved(TwoDrive()) == Part(("ego", "a"), ("c",))
+    never = Minimizer(rerun, Takes(lambda spec: spec.script is None), "traffic")
     assert never._fewest_moved(TwoDrive()) is None
 
 
 def test_where_it_begins_later_pairs_with_which_it_crashed_are_tried_first():
     runs = Takes(lambda spec: False)
-    search = Search(crash(other="c"), runs, "traffic")
+    search = Minimizer(crash(other="c"), runs, "traffic")
     search._fewer_from_later_on(FromLaterOn(), Part(("ego",), ("a", "b", "c", "d"), 60))
     tried = [(spec.max_steps, spec.script.names) for _, spec in runs.tried]
     groups = [(), ("c",), *(("c", name) for name in "abdefgh")]
@@ -580,7 +580,7 @@ class Many(Scripting):
 
 def test_pairs_are_tried_with_so_many_that_were_near_and_no_more():
     runs = Takes(lambda spec: False)
-    search = Search(crash(names=("ego", *Many.whole.others), other="n29"), runs, "traffic")
+    search = Minimizer(crash(names=("ego", *Many.whole.others), other="n29"), runs, "traffic")
     search._fewer_from_later_on(Many(), Part(("ego",), Many.whole.others[:5], 60))
     pairs = {spec.script.names for _, spec in runs.tried if len(spec.script.names) == 2}
     assert pairs == {("n29", f"n{number}") for number in range(24)}
@@ -593,7 +593,7 @@ def test_with_few_left_no_other_beginning_is_tried():
         return spec.max_steps == 60 and {"n3", "n5"} <= {*spec.script.names}
 
     runs = Takes(crashes)
-    search = Search(crash(names=("ego", *Many.whole.others), other="n29"), runs, "traffic")
+    search = Minimizer(crash(names=("ego", *Many.whole.others), other="n29"), runs, "traffic")
     search._fewer_from_later_on(Many(), Part(("ego",), Many.whole.others[:9], 60))
     assert (search.best.script.names, search.best.max_steps) == (("n3", "n5"), 60)
     assert not any(spec.max_steps != 60 and len(spec.script.names) > 2 for _, spec in runs.tried)
@@ -601,12 +601,14 @@ def test_with_few_left_no_other_beginning_is_tried():
 
 def test_where_no_script_does_it_the_traffic_is_looked_through_after_all():
     runs = Takes(lambda spec: spec.script is None and (spec.only is None or {*"bh"} <= {*spec.only}))
-    search = Search(crash(arguments={"ego": {}}, scenario_arguments={}), runs, "either")
+    search = Minimizer(crash(arguments={"ego": {}}, scenario_arguments={}), runs, "either")
     search._scripting = Scripting()
     assert search.run(lambda: False) == ("done", "")
     assert any(spec.script for _, spec in runs.tried)
     assert search.best.only == ("b", "h")
-    asked = Search(crash(arguments={"ego": {}}, scenario_arguments={}), Takes(lambda spec: not spec.script), "scripted")
+    asked = Minimizer(
+        crash(arguments={"ego": {}}, scenario_arguments={}), Takes(lambda spec: not spec.script), "scripted"
+    )
     asked._scripting = Scripting()
     assert asked.run(lambda: False) == ("done", "")
     assert asked.best.only is None  # only scripts were asked for
@@ -646,7 +648,7 @@ def test_after_a_part_was_excluded_the_parts_stay_as_small():
 
 
 def test_scripts_are_tried_where_only_scripts_are_asked_for():
-    search = Search(crash(), Takes(), "scripted")
+    search = Minimizer(crash(), Takes(), "scripted")
     search.best = replace(search.best, only=("c",))
     assert search._wants_script()
 
@@ -690,7 +692,7 @@ def test_plainer_arguments_never_make_the_crash_longer():
         slow = spec.arguments["ego"]["speed"] != 17.2345  # every other value takes longer
         return (60 if few else 100) + (15 if slow else 0) if spec.only is None or "c" in spec.only else None
 
-    search = Search(crash(), Lasting(steps), "traffic")
+    search = Minimizer(crash(), Lasting(steps), "traffic")
     assert search.run(lambda: False) == ("done", "")
     assert search.best.only == ("c",)
     assert search.best.arguments == {"ego": {"speed": 17.2345}}  # 75 steps are less than 100 and more than 60
@@ -707,7 +709,7 @@ def test_few_actors_with_which_the_crash_takes_longer_are_scripted_from_later_on
 
     monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS))
     monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
-    search = Search(crash(arguments={"ego": {}}, scenario_arguments={}), Lasting(steps), "either")
+    search = Minimizer(crash(arguments={"ego": {}}, scenario_arguments={}), Lasting(steps), "either")
     search._scripting = FromLaterOn()
     assert search.run(lambda: False)[0] == "done"
     # A script may take as many steps as the crash that is known, and not as many as one in traffic.
@@ -720,7 +722,7 @@ def test_few_actors_with_which_the_crash_takes_longer_are_scripted_from_later_on
 
 def test_the_default_of_the_agents_own_code_is_tried_before_that_of_the_scenario():
     runs = Takes()
-    search = Search(crash(), runs, "traffic", {("ego", "speed"): 5})
+    search = Minimizer(crash(), runs, "traffic", {("ego", "speed"): 5})
     search._plainer_arguments()
     first_tried = runs.tried[0][1].arguments["ego"]["speed"]
     assert (first_tried, type(first_tried)) == (5.0, float)

@@ -32,9 +32,9 @@ from highway_env.vehicle.objects import Landmark
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.accelerator import (
-    Frame,
     Network,
     Onlooker,
+    TrafficFrame,
     _kernel,
     _switch as accelerator,
     _versions,
@@ -382,7 +382,7 @@ def test_it_steps_aside_for_a_changed_installation(monkeypatch):
 
 
 def test_it_steps_aside_without_a_usable_kernel(monkeypatch):
-    monkeypatch.setattr(_kernel, "_found", lambda: (None, "it is not built"))
+    monkeypatch.setattr(_kernel, "_load_kernel", lambda: (None, "it is not built"))
     assert switch_on() == "the compiled kernel is not used: it is not built"
     assert Road.act.__module__ == "highway_env.road.road"
 
@@ -416,7 +416,7 @@ def test_it_steps_aside_where_another_has_replaced_a_method(tmp_path):
 
 
 def test_it_is_undone():
-    before = {(owner, name): getattr(owner, name) for owner, name, _ in accelerator._REPLACED}
+    before = {(owner, name): getattr(owner, name) for owner, name, _ in accelerator._REPLACEMENTS}
     assert switch_on() == switch_on() == ""
     assert all(getattr(owner, name) is not before[owner, name] for owner, name in before)
     switch_off()
@@ -485,7 +485,7 @@ def test_roads_of_earlier_episodes_are_forgotten():
 def test_a_vehicle_that_calls_itself_equal_to_another_is_not_taken_for_it():
     env = gymnasium.make("highway-fast-v0", disable_env_checker=True).unwrapped
     env.reset(seed=0)
-    frame = Frame(Network(env.road.network), env.road)
+    frame = TrafficFrame(Network(env.road.network), env.road)
     assert frame.is_of(env.road)
     other = copy.copy(env.road.vehicles[-1])
     other.__class__ = type("Equal", (type(other),), {"__eq__": lambda *_: True, "__hash__": object.__hash__})

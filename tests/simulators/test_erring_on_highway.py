@@ -74,7 +74,7 @@ def place(episode, lane, ahead_m, speed=20.0):
     agent.speed = agent.target_speed = 20.0
     other = IDMVehicle(road, np.array([100.0 + ahead_m, 4.0 * lane]), 0.0, speed, target_speed=speed, timer=0.0)
     road.vehicles[:] = [agent, other]
-    episode.simulator._look(())
+    episode.simulator._read_scene(())
     return other
 
 
@@ -179,7 +179,7 @@ def crossing(episode, other_road, meters):
         vehicle.lane = lane
         vehicle.plan_route_to(f"o{(int(start[1]) + 2) % 4}")
     road.vehicles[:] = [agent, vehicle]
-    episode.simulator._look(())
+    episode.simulator._read_scene(())
     return vehicle
 
 
@@ -229,7 +229,7 @@ def test_who_is_steered_has_no_route_and_its_way_is_crossed_where_its_lane_leads
         crosser = IDMVehicle(road, other.position(95.0, 0.0), other.heading_at(95.0), 9.0)
         crosser.plan_route_to("o3")
         road.vehicles[:] = [agent, crosser]
-        episode.simulator._look(())
+        episode.simulator._read_scene(())
         found = [cell for cell in CELLS if episode.simulator.resolve_target(planned(1, "ignore_priority", cell, 1.0))]
         places[road_of_agent] = found
     assert places == {("o0", "ir0"): [], ("ir0", "il2"): ["left ahead"]}
@@ -246,7 +246,7 @@ def test_a_vehicle_merges_only_where_its_lane_ends(begin):
     other.lane_index = other.target_lane_index = ("b", "c", 2)
     other.lane = lane
     road.vehicles[:] = [agent, other]
-    episode.simulator._look(())
+    episode.simulator._read_scene(())
     merged = []
     for _ in range(30):
         episode.step()

@@ -99,7 +99,7 @@ def test_a_function_with_one_other_bit_disables_the_kernel(name, monkeypatch):
 
     wrong = SimpleNamespace(INTERFACE=_kernel._INTERFACE, bind=lambda *_: None, compute=compute)
     monkeypatch.setattr(_kernel.importlib, "import_module", lambda _: wrong)
-    assert _kernel._found.__wrapped__() == (None, f"on this processor, it computes {name} otherwise than NumPy")
+    assert _kernel._load_kernel.__wrapped__() == (None, f"on this processor, it computes {name} otherwise than NumPy")
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_a_function_with_one_other_bit_disables_the_kernel(name, monkeypatch):
 )
 def test_without_the_kernel_there_is_a_reason(error, reason, monkeypatch):
     monkeypatch.setattr(_kernel.importlib, "import_module", error)
-    assert _kernel._found.__wrapped__() == (None, reason)
+    assert _kernel._load_kernel.__wrapped__() == (None, reason)
 
 
 def test_missing_kernel_is_noted_before_a_hunt(monkeypatch):

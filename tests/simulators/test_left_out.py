@@ -7,7 +7,7 @@ import pytest
 
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.simulators.sumo import SumoSimulator
-from crashhunt.trial import EVERYBODY
+from crashhunt.trial import ALL_AGENTS
 
 STEPS = 30
 
@@ -35,7 +35,7 @@ def driven(simulator, **options):
 def test_only_those_take_part_that_are_named(simulator):
     everybody = driven(simulator)
     assert simulator.entered == []
-    assert driven(simulator, only=(EVERYBODY,)) == everybody
+    assert driven(simulator, only=(ALL_AGENTS,)) == everybody
     entered = list(simulator.entered)
     assert everybody.keys() <= {*entered, "ego"}
     assert len(set(entered)) == len(entered) > 3

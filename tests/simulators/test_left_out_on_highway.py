@@ -7,7 +7,7 @@ import pytest
 
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators.highway import HighwaySimulator
-from crashhunt.trial import EVERYBODY
+from crashhunt.trial import ALL_AGENTS
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def driven(simulator, steps=8, **options):
 def test_only_those_take_part_that_are_named(simulator):
     everybody, saw = driven(simulator)
     assert simulator.entered == []
-    again, seen = driven(simulator, only=(EVERYBODY,))
+    again, seen = driven(simulator, only=(ALL_AGENTS,))
     assert again == everybody
     np.testing.assert_array_equal(seen, saw)
     entered = list(simulator.entered)

@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 from crashhunt.trial import (
     CELLS,
     KINDS,
-    OF_AGENT,
+    SENSOR_KINDS,
     Disturbance,
     Outcome,
     TrialResult,
@@ -90,4 +90,4 @@ def test_what_had_an_effect_began_by_the_end_with_an_actor_there():
 
 
 def test_the_eyes_and_hands_of_agents_are_no_business_of_simulators():
-    assert {"late_observation", "noisy_observation", "late_action"} == OF_AGENT
+    assert {"late_observation", "noisy_observation", "late_action"} == SENSOR_KINDS

@@ -13,7 +13,7 @@ from hypothesis import given, strategies as st
 from crashhunt.base import errors
 from crashhunt.errors import CrashhuntError
 from crashhunt.trial import CRASHES, Collision, Escape, Failure, Outcome, TrialResult, TrialSpec
-from crashhunt.world import Actor, ClosestApproach, Path, Paths, State
+from crashhunt.world import Actor, ActorState, ClosestApproach, Path, Paths
 
 ALL_ERRORS = [kind for _, kind in inspect.getmembers(errors, inspect.isclass) if issubclass(kind, CrashhuntError)]
 
@@ -36,7 +36,9 @@ ways = st.builds(
     Path,
     st.builds(Actor, st.text(), st.text(), finite, finite),
     st.integers(0, 99),
-    st.tuples(st.builds(State, *[finite] * 6)),  # a named tuple: what has a default would be any number, of any size
+    st.tuples(
+        st.builds(ActorState, *[finite] * 6)
+    ),  # a named tuple: what has a default would be any number, of any size
 )
 results = st.builds(
     TrialResult,

@@ -7,7 +7,7 @@ import random
 import pytest
 
 from crashhunt.crashes import Attempt, Judgement
-from crashhunt.whatif._avoidability import CannotError, Search, Tried
+from crashhunt.whatif._avoidability import AvoidanceSearch, CannotError, Tried
 
 
 class Runs:
@@ -30,7 +30,7 @@ class Runs:
 
 
 def found(runs, end=40, start=30, most=10**6, parallel=1):
-    search = Search(end, start, runs, runs=most, parallel=parallel)
+    search = AvoidanceSearch(end, start, runs, runs=most, parallel=parallel)
     search.all()
     judgement = search.judgement()
     assert len(runs.asked) == len(set(runs.asked)) == judgement.runs <= most

@@ -9,7 +9,7 @@ import pytest
 
 from crashhunt.crashes import Factor
 from crashhunt.trial import Choice, Disturbance, Outcome, Range, TrialSpec
-from crashhunt.whatif._causes import _Asked, _Search
+from crashhunt.whatif._causes import _Candidate, _Search
 
 SPEC = TrialSpec(7, 1, {"ego": {}}, {}, 99)
 
@@ -54,14 +54,14 @@ def told(step, what, vehicle):
 def test_run_in_which_the_actor_was_not_held_is_unclear(disturbances, ending):
     held = Disturbance(5, "itself", "gone", 0.0, 1.0, "ego", "x")
     spec = TrialSpec(7, 1, {"ego": {}}, {}, 99, disturbances=(held,))
-    asked = _Asked(Factor("other", "x", "there", 8), [(4, spec)], inside=True)
+    asked = _Candidate(Factor("other", "x", "there", 8), [(4, spec)], inside=True)
     result = SimpleNamespace(outcome=Outcome.SURVIVED, collision=None)
     ended = SimpleNamespace(place=0, result=result, recording=Recorded(*disturbances))
     assert search().ending(asked, 0, ended).ending == ending
 
 
 def test_values_are_drawn_as_the_hunt_draws_them():
-    drawn = search()._drawn
+    drawn = search()._drawn_argument
     options = tuple(range(20))
     chosen = drawn("a", Choice(options))
     assert sorted(chosen) == [*options]

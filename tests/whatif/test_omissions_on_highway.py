@@ -17,7 +17,7 @@ from crashhunt.scenario import AgentSetup, ObservationSetup, Scenario
 from crashhunt.scenario.backends.highway import HighwaySetup
 from crashhunt.simulators.highway import HighwaySimulator
 from crashhunt.trial import Outcome, TrialSpec
-from crashhunt.whatif import Ended, _omissions
+from crashhunt.whatif import EndedRun, _omissions
 
 CONFIG = {"simulation_frequency": 15, "policy_frequency": 5, "vehicles_count": 1, "lanes_count": 3, "duration": 999}
 LEFT, IDLE, SLOWER = 0, 1, 4
@@ -95,7 +95,7 @@ def find(tmp_path, monkeypatch):
             result = run_episode(spec, simulator=simulator, make_agent=make, box=box, oracles=(ReportedCollision(),))
             box.close()
             responses = tuple(getattr(made[0], "responses", ()))
-            return Ended(place, result, Recording(read_black_box(path)), tmp_path, responses=responses)
+            return EndedRun(place, result, Recording(read_black_box(path)), tmp_path, responses=responses)
 
         class InProcess:
             def run(self, specs):

@@ -9,7 +9,7 @@ import pytest
 
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.crashes import wilson
-from crashhunt.episode import TakingOver, _action_override
+from crashhunt.episode import HandedOver, _action_override
 from crashhunt.trial import Disturbance, Handover, Outcome, Reseeding, TrialSpec
 from crashhunt.whatif import Counts, Disturb, LeaveOut, Overrule, Reseed, Run, SetArguments, WhatIfOptions
 from crashhunt.whatif._engine import _from_step, _Runs, future_seed
@@ -151,7 +151,7 @@ def test_agent_that_takes_over_is_reset_at_the_step_and_has_seen_nothing_before(
 
     monkeypatch.setattr(_action_override, "Recorded", Log)
     driver = _Driver()
-    agent = TakingOver(driver, Handover("ego", after, "log.mcap"))
+    agent = HandedOver(driver, Handover("ego", after, "log.mcap"))
     for _ in range(2):  # the second episode is like the first
         driver.calls.clear()
         agent.reset(11)

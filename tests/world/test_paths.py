@@ -9,7 +9,7 @@ import zlib
 
 import pytest
 
-from crashhunt.world import Actor, Paths, Roster, Scene, State, paths_of
+from crashhunt.world import Actor, ActorState, Paths, Roster, Scene, paths_of
 
 EGO, LEFT, BUS = Actor("ego", "passenger", 5.0, 1.8), Actor("left.1", "truck", 7.1, 2.4), Actor("bus", "bus", 14.0, 2.5)
 SPINE = ((1 / 3, 0.1, 0.0), (-13.0, 0.2, 0.5))
@@ -35,7 +35,7 @@ def test_everybody_is_where_it_was_and_who_comes_back_has_two_paths():
     assert [(path.actor, path.first, path.last) for path in (*found.agents, *found.others)] == [
         (EGO, 0, 4), (LEFT, 0, 1), (BUS, 1, 2), (LEFT, 3, 4),
     ]  # fmt: skip
-    assert found.agents[0].states[3] == State(3 + 3 / 3, 3 * 0.1, math.pi / 7, 3 / 7, 3.3000000000000003, 0.01)
+    assert found.agents[0].states[3] == ActorState(3 + 3 / 3, 3 * 0.1, math.pi / 7, 3 / 7, 3.3000000000000003, 0.01)
     assert found.agents[0].lanes == ((0, "ego_0"), (2, "ego_2"), (4, "ego_4"))
     assert found.others[1].spines == ((1, SPINE), (2, SPINE))
     assert found.only(["bus"]).names == ("bus",)

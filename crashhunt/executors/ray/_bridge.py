@@ -27,7 +27,7 @@ from crashhunt.base.exceptions import in_words
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors._postmortem import killed_from_outside
 from crashhunt.executors.ray._cluster import Cluster, Lost, TokenError, UnreachableError
-from crashhunt.executors.ray._code_archive import Parcel
+from crashhunt.executors.ray._code_archive import CodeArchive
 from crashhunt.executors.ray._node_worker import unpacked
 from crashhunt.trial import TrialSpec
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from crashhunt.executors.ray._cluster import Found
     from crashhunt.executors.ray._messages import (
         BridgeJob,
-        Ended,
+        EndedTrial,
         Figures,
         FromBridge,
         News,
@@ -48,13 +48,13 @@ if TYPE_CHECKING:
     )
 
 
-__all__ = ["Node", "Roster", "Trial", "main", "shares"]
+__all__ = ["Node", "NodeScheduler", "Trial", "main", "shares"]
 
 
 # Which trials run on which node: the part of the bridge that knows nothing of Ray.
 
-_AHEAD = 2  # trials that a node has for each of its CPUs, so that none waits for the wire
-_TRIAL_LOSSES = 2  # of a trial with its node; then it runs alone on one, in case it is what ends them
+_TRIALS_PER_CPU = 2  # trials that a node has for each of its CPUs, so that none waits for the wire
+_MAX_TRIAL_LOSSES = 2  # of a trial with its node; then it runs alone on one, in case it is what ends them
 
 
 @dataclass(slots=True, eq=False)
@@ -78,7 +78,7 @@ class Trial:
     @property
     def alone(self) -> bool:
         """Whether the trial runs alone on a node."""
-        return self.losses >= _TRIAL_LOSSES
+        return self.losses >= _MAX_TRIAL_LOSSES
 
 
 @dataclass(slots=True, eq=False)
@@ -116,7 +116,7 @@ class Node:
     @property
     def has_room(self) -> bool:
         """Whether the node can run one more trial."""
-        return self.ready and len(self.running) < _AHEAD * self.slots
+        return self.ready and len(self.running) < _TRIALS_PER_CPU * self.slots
 
     @property
     def rate_per_s(self) -> float:
@@ -125,7 +125,7 @@ class Node:
         return self.done / elapsed_s if elapsed_s > 0 else 0.0
 
 
-class Roster:
+class NodeScheduler:
     """The nodes, and the trials that wait for one."""
 
     def __init__(self) -> None:
@@ -214,26 +214,28 @@ def shares(free: Mapping[str, int], wanted: int | None) -> dict[str, int]:
         return left
     found: dict[str, int] = {}
     for _ in range(min(wanted, sum(left.values()))):
-        node = max(_still(left), key=lambda node: (left[node], -found.get(node, 0)))
+        node = max(_remaining_s(left), key=lambda node: (left[node], -found.get(node, 0)))
         left[node] -= 1
         found[node] = found.get(node, 0) + 1
     return found
 
 
-def _still(left: Mapping[str, int]) -> Iterable[str]:
+def _remaining_s(left: Mapping[str, int]) -> Iterable[str]:
     return (node for node, count in left.items() if count > 0)
 
 
 _LOOK_EVERY_S = 1.0  # which nodes there are
 _WAIT_S = 0.2  # for a node to answer, before the next node is asked
 _REFILL_S = 0.005  # for the hunt to submit more, which then goes along with the next question
-_RECEIVED = 1 << 18  # bytes at a time
+_CHUNK_BYTES = 1 << 18  # bytes at a time
 _TAKE_S = 2.0  # how long a node waits for a trial to end, before it says that there is nothing new
 _FREE_S = 3.0  # for CPUs to become free that another job has just released
 _START_S = 30.0  # for an actor to be placed; after that, another job that is no hunt has the CPUs
-_LOOKS = 3  # that show free CPUs, before a node that takes part runs more: Ray is late to say what has been taken
+_FREE_CPU_READINGS = (
+    3  # that show free CPUs, before a node that takes part runs more: Ray is late to say what has been taken
+)
 _CLOSE_S = 1.5  # for nodes to end everything; then they are killed
-_NODE_LOSSES = 3  # of a node without a trial between
+_MAX_NODE_LOSSES = 3  # of a node without a trial between
 
 
 def main() -> None:
@@ -267,13 +269,13 @@ class Bridge:
         self._control = control
         self._job = job
         self._settings = WorkerSettings.from_json(job["settings"])
-        self._parcel = Parcel.of(self._settings)
+        self._parcel = CodeArchive.of(self._settings)
         self._digest = self._parcel.digest()
         self._lock = threading.RLock()
         self._refilled = threading.Condition(self._lock)
         self._missing = 0  # trials that have ended, and for which the hunt has submitted no others yet
         self._tickets = 0  # that were given out
-        self._roster = Roster()
+        self._roster = NodeScheduler()
         self._refused: dict[str, str] = {}  # machine to why
         self._losses: dict[str, int] = {}
         self._free: dict[str, int] = {}  # machine to looks that have shown free CPUs
@@ -300,13 +302,13 @@ class Bridge:
     def turn(self, wait_s: float = _WAIT_S) -> None:
         """Update the nodes, submit trials, and process answers; wait at most this long for the first answer."""
         with self._lock:
-            self._look_for_nodes()
-            self._hand_out()
+            self._refresh_nodes()
+            self._assign_trials()
             for node in self._roster.nodes.values():
                 if node.ready and node.answer is None:
                     given, node.given = node.given, []
-                    self._ask(node, "take", _TAKE_S, given)
-            self._tell_figures()
+                    self._call_node(node, "take", _TAKE_S, given)
+            self._send_figures()
             asked = {node.answer: node for node in self._roster.nodes.values() if node.answer is not None}
         if not asked:
             time.sleep(wait_s / 2)
@@ -315,7 +317,7 @@ class Bridge:
         for answer in self._cluster.answered(list(asked), wait_s):
             with self._lock:
                 if asked[answer].answer is answer and not self._closing:
-                    self._hear(asked[answer])
+                    self._handle_answer(asked[answer])
         with self._refilled:
             self._refilled.wait_for(lambda: self._missing <= 0, timeout=min(wait_s, _REFILL_S))
 
@@ -323,16 +325,16 @@ class Bridge:
         """Process the messages of the hunt, also while the bridge waits for nodes."""
         received = b""
         try:
-            while data := self._control.recv(_RECEIVED):
+            while data := self._control.recv(_CHUNK_BYTES):
                 *lines, received = (received + data).split(b"\n")
                 with self._lock:
                     for line in lines:
-                        self._want(json.loads(line))
-                    self._hand_out()
+                        self._handle_request(json.loads(line))
+                    self._assign_trials()
         finally:
             self._closing = True
 
-    def _want(self, message: ToBridge) -> None:
+    def _handle_request(self, message: ToBridge) -> None:
         if "submit" in message:
             self._roster.waiting += [Trial(ticket, spec) for ticket, spec in message["submit"]]
             self._tickets = max([self._tickets, *(ticket + 1 for ticket, _ in message["submit"])])
@@ -346,10 +348,10 @@ class Bridge:
         if self._missing <= 0:
             self._refilled.notify()
 
-    def _say(self, **message: Unpack[FromBridge]) -> None:
+    def _send(self, **message: Unpack[FromBridge]) -> None:
         self._control.sendall(json.dumps(message).encode() + b"\n")
 
-    def _hand_out(self) -> None:
+    def _assign_trials(self) -> None:
         """Submit waiting trials. A node that is asked soon gets them with that call, because each call costs time."""
         for node, trials in self._roster.assign().items():
             given = [(trial.ticket, trial.spec) for trial in trials]
@@ -358,7 +360,7 @@ class Bridge:
             else:
                 self._cluster.order(node.actor, "submit", given)
 
-    def _look_for_nodes(self) -> None:
+    def _refresh_nodes(self) -> None:
         """Find new and lost nodes, and prepare the new ones."""
         if time.monotonic() - self._looked < _LOOK_EVERY_S:
             return
@@ -366,9 +368,9 @@ class Bridge:
         alive = self._cluster.nodes()
         for node in list(self._roster.nodes.values()):
             if node.machine not in alive:
-                self._lose(node)
+                self._drop_node(node)
             elif self._is_too_late(node, alive[node.machine]):
-                self._give_up(node)
+                self._release_actor(node)
         able = {found.id: found for found in alive.values() if found.cpus > 0}
         taken = sum(node.slots for node in self._roster.nodes.values())
         free = {found.id: self._room(found) for found in able.values() if found.id not in self._refused}
@@ -384,7 +386,7 @@ class Bridge:
                 stood=now,
             )
             self._roster.nodes[name] = node
-            self._ask(node, "differs", self._job["versions"], self._job["code"])
+            self._call_node(node, "differs", self._job["versions"], self._job["code"])
         if self._roster.nodes:
             return
         if able and all(name in self._refused for name in able):
@@ -401,7 +403,7 @@ class Bridge:
             )
         if self._ever_ready and not self._alone:
             self._alone = True
-            self._say(note="no node of the cluster is left; the hunt waits until one is back", capacity=0)
+            self._send(note="no node of the cluster is left; the hunt waits until one is back", capacity=0)
 
     def _room(self, found: Found) -> int:
         """Return the number of further trials that a machine can run."""
@@ -410,7 +412,7 @@ class Bridge:
             return found.free
         settled = found.free > 0 and all(node.ready for node in parts)
         self._free[found.id] = self._free.get(found.id, 0) + 1 if settled else 0
-        return found.free if self._free[found.id] >= _LOOKS else 0
+        return found.free if self._free[found.id] >= _FREE_CPU_READINGS else 0
 
     def _is_too_late(self, node: Node, found: Found) -> bool:
         """Return whether an actor has waited too long for its CPUs, for example because another hunt uses them."""
@@ -420,29 +422,29 @@ class Bridge:
         taken = self._cluster.held(node.machine) + node.slots > found.cpus
         return taken or waited_s > self._patience.get(node.machine, _START_S)
 
-    def _give_up(self, node: Node) -> None:
+    def _release_actor(self, node: Node) -> None:
         """Cancel an actor that was not placed; the next actor waits longer."""
         self._patience[node.machine] = 2 * self._patience.get(node.machine, _START_S)
         self._roster.lose(node)
         self._cluster.kill(node.actor)
         self._began = time.monotonic()  # Ray takes a moment to say that what it had is free
 
-    def _ask(self, node: Node, what: str, *arguments: Any) -> None:
+    def _call_node(self, node: Node, what: str, *arguments: Any) -> None:
         node.doing, node.answer = what, self._cluster.ask(node.actor, what, *arguments)
 
-    def _hear(self, node: Node) -> None:
+    def _handle_answer(self, node: Node) -> None:
         """Process the answer of a node, and send its next request."""
         answer, node.answer = node.answer, None
         try:
             said = self._cluster.value(answer)
         except Lost:
-            self._lose(node)
+            self._drop_node(node)
             return
         except Exception as error:  # of ours, over there
             self._refuse(node, in_words(error))
             return
         if node.doing == "take":
-            self._take(node, said)
+            self._handle_news(node, said)
         elif node.doing == "differs" and said:
             self._refuse(node, said)
         elif node.doing == "differs":
@@ -454,38 +456,38 @@ class Bridge:
                 "home": self._parcel.home,
                 "slots": node.slots,
             }
-            self._ask(node, "begin", job)
+            self._call_node(node, "begin", job)
         elif said == "ready":
             node.ready, node.since, self._ever_ready, self._alone = True, time.monotonic(), True, False
-            self._say(capacity=self._roster.capacity)
-            self._tell_figures(now=True)
+            self._send(capacity=self._roster.capacity)
+            self._send_figures(now=True)
         elif said == "lacks":
-            self._ask(node, "deliver", self._cluster.shared(self._parcel.packed))
+            self._call_node(node, "deliver", self._cluster.shared(self._parcel.packed))
         else:
             self._refuse(node, said)
 
-    def _take(self, node: Node, news: News) -> None:
+    def _handle_news(self, node: Node, news: News) -> None:
         """Pass the events of a node on to the hunt."""
         if news.map:
             self._maps[node.id] = news.map
         found = [ended for ended in news.ended if self._roster.ended(node, ended.ticket)]
         if found:
             self._losses.pop(node.machine, None)
-            self._tell_figures(now=self._roster.idle)  # before the last result, after which the hunt reads no more
+            self._send_figures(now=self._roster.idle)  # before the last result, after which the hunt reads no more
         for ended in found:
             if ended.files:
                 self._keep(node, ended)
         self._missing += len(found)
         for note in news.notes:  # before results, too: after the last one the hunt reads no more
-            self._say(note=note)
+            self._send(note=note)
         self._control.sendall(b"".join(ended.line for ended in found))
         if news.where is not None:
-            self._say(node=node.id, where=news.where)
+            self._send(node=node.id, where=news.where)
         if news.error is not None:
             error = CrashhuntError.from_json(news.error)
             self._refuse(node, f"{error.where}: {error.message}" if error.where else error.message)
 
-    def _keep(self, node: Node, ended: Ended) -> None:
+    def _keep(self, node: Node, ended: EndedTrial) -> None:
         """Write the files of a kept trial to the folder where the hunt expects them.
 
         Raises:
@@ -505,29 +507,29 @@ class Bridge:
                 where=str(error.filename or ""),
             ) from error
 
-    def _lose(self, node: Node) -> None:
+    def _drop_node(self, node: Node) -> None:
         """Continue without a node; its trials run again elsewhere."""
         count = len(node.running)
         culprits = self._roster.lose(node)
-        self._tell_figures(now=True)
+        self._send_figures(now=True)
         self._cluster.kill(node.actor)
         self._losses[node.machine] = 0 if culprits else self._losses.get(node.machine, 0) + 1
-        if self._losses[node.machine] >= _NODE_LOSSES:
-            why = f"{node.name}: its process was ended {_NODE_LOSSES} times before a trial was done"
+        if self._losses[node.machine] >= _MAX_NODE_LOSSES:
+            why = f"{node.name}: its process was ended {_MAX_NODE_LOSSES} times before a trial was done"
             if self._job["address"] and not self._ever_ready and os.environ.get("RAY_AUTH_MODE") == "token":
                 why += ", as happens with RAY_AUTH_MODE=token here and not on the cluster"
             self._refused[node.machine] = why
-            self._say(note=f"node {self._refused[node.machine]}; it takes no part any more")
+            self._send(note=f"node {self._refused[node.machine]}; it takes no part any more")
         elif node.ready:
             again = f" with {count} trial{'s' * (count != 1)}, to be run again" if count and not culprits else ""
-            self._say(note=f"node {node.name} was lost{again}")
-        self._say(capacity=self._roster.capacity, node=node.id, where={})
+            self._send(note=f"node {node.name} was lost{again}")
+        self._send(capacity=self._roster.capacity, node=node.id, where={})
         for trial in culprits:
             # Nothing shows at which step each node was lost. So the trial is not known to be the cause, as where a
             # pool's process is killed at another step each time.
             why = f"the node on which it ran was lost {trial.losses} times, at last with this trial alone on it"
             result = killed_from_outside(TrialSpec.from_json(trial.spec), why, -signal.SIGKILL)
-            self._say(ticket=trial.ticket, result=result.to_json())
+            self._send(ticket=trial.ticket, result=result.to_json())
 
     def _refuse(self, node: Node, why: str) -> None:
         """Continue without a node that cannot run trials."""
@@ -535,13 +537,15 @@ class Bridge:
         for trial in node.running.values():
             trial.losses -= 1  # it is not to blame
         self._roster.lose(node)
-        self._tell_figures(now=True)
+        self._send_figures(now=True)
         self._cluster.order(node.actor, "close")
         self._cluster.kill(node.actor, after_s=_CLOSE_S)
         self._looked = 0.0
-        self._say(note=f"node {node.name} takes no part: {why}", capacity=self._roster.capacity, node=node.id, where={})
+        self._send(
+            note=f"node {node.name} takes no part: {why}", capacity=self._roster.capacity, node=node.id, where={}
+        )
 
-    def _tell_figures(self, *, now: bool = False) -> None:
+    def _send_figures(self, *, now: bool = False) -> None:
         if now or time.monotonic() - self._told > _LOOK_EVERY_S:
             self._told = time.monotonic()
-            self._say(nodes=self._roster.figures())
+            self._send(nodes=self._roster.figures())

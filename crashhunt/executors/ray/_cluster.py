@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "OLDEST",
-    "TOKEN",
+    "OLDEST_RAY_VERSION",
+    "TOKEN_FIX",
     "Cluster",
     "Found",
     "Lost",
@@ -42,18 +42,18 @@ __all__ = [
 
 # Find the Ray cluster, and check whether it answers, without an import of Ray.
 
-TOKEN = "put the one that the cluster was started with into RAY_AUTH_TOKEN, or into ~/.ray/auth_token"
+TOKEN_FIX = "put the one that the cluster was started with into RAY_AUTH_TOKEN, or into ~/.ray/auth_token"
 """What to do about a token that is asked for."""
-OLDEST = (2, 10)
+OLDEST_RAY_VERSION = (2, 10)
 """The first Ray with which it works, as in pyproject.toml, where the reason is."""
 _PROBE_TIMEOUT_S = 5.0
-_HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and no settings of ours
+_HTTP2_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and no settings of ours
 _FRAME, _KIND, _SETTINGS = (
     9,
     3,
     4,
 )  # bytes of a frame's head, the place of its kind there, and the first kind that is sent
-_START = "start one with 'ray start --head', or give the address of one: --executor ray:HOST:PORT"
+_START_FIX = "start one with 'ray start --head', or give the address of one: --executor ray:HOST:PORT"
 
 
 class Meant(NamedTuple):
@@ -82,8 +82,8 @@ def require_ray() -> None:
     with suppress(importlib.metadata.PackageNotFoundError):
         there_is = importlib.metadata.version("ray")
         found = re.match(r"(\d+)\.(\d+)", there_is)
-        if found and (int(found[1]), int(found[2])) < OLDEST:
-            oldest = ".".join(map(str, OLDEST))
+        if found and (int(found[1]), int(found[2])) < OLDEST_RAY_VERSION:
+            oldest = ".".join(map(str, OLDEST_RAY_VERSION))
             raise PluginError(
                 f"--executor ray needs Ray {oldest} or newer, and {there_is} is installed",
                 fix=f"pip install 'ray>={oldest}', on every machine of the cluster",
@@ -110,11 +110,11 @@ def cluster_of(argument: str) -> Meant:
     if wanted == "local":
         return ours
     if wanted in ("", "auto"):
-        found = _started_here()
+        found = _local_address()
         if found and not silent(found):
-            return _joined(found)
+            return _connect(found)
         if wanted == "auto":
-            raise UsageError("--executor ray:auto: no Ray cluster runs on this machine", fix=_START)
+            raise UsageError("--executor ray:auto: no Ray cluster runs on this machine", fix=_START_FIX)
         return ours
     whence = f"--executor ray:{wanted}" if argument == wanted else f"RAY_ADDRESS={wanted}"
     if "://" in wanted:
@@ -128,8 +128,8 @@ def cluster_of(argument: str) -> Meant:
         raise UsageError(f"{whence} is not an address HOST:PORT", fix=f"write --executor ray:{host or wanted}:6379")
     why = silent(wanted)
     if why:
-        raise UsageError(f"{whence}: {why}", fix=_START)
-    return _joined(wanted)
+        raise UsageError(f"{whence}: {why}", fix=_START_FIX)
+    return _connect(wanted)
 
 
 def silent(address: str) -> str:
@@ -140,7 +140,7 @@ def silent(address: str) -> str:
     def ask() -> None:
         try:
             with socket.create_connection((host.strip("[]"), int(port)), timeout=_PROBE_TIMEOUT_S) as connection:
-                said.put(_greeting(connection))
+                said.put(_protocol_error(connection))
         except OSError as error:
             said.put(f"no cluster answers there ({error.strerror or error})")
         except UnicodeError:
@@ -153,13 +153,13 @@ def silent(address: str) -> str:
         return "no cluster answers there in time"
 
 
-def _greeting(connection: socket.socket) -> str:
+def _protocol_error(connection: socket.socket) -> str:
     """Return why the listening process is not the head of a Ray cluster, which uses HTTP/2; empty if it may be one."""
     if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):
         return ""
     found = b""
     try:
-        connection.sendall(_HELLO)
+        connection.sendall(_HTTP2_PREFACE)
         while len(found) < _FRAME and (data := connection.recv(_FRAME - len(found))):
             found += data
     except TimeoutError:
@@ -170,7 +170,7 @@ def _greeting(connection: socket.socket) -> str:
     return "" if speaks else "what answers there is not the head of a Ray cluster"
 
 
-def _joined(address: str) -> Meant:
+def _connect(address: str) -> Meant:
     """Return a cluster that already runs.
 
     Raises:
@@ -180,11 +180,11 @@ def _joined(address: str) -> Meant:
     there_is = there_is or Path("~/.ray/auth_token").expanduser().exists()
     mode = os.environ.get("RAY_AUTH_MODE", "")
     if mode == "token" and not there_is:
-        raise UsageError("RAY_AUTH_MODE is token, but there is no token", fix=TOKEN)
-    return Meant(address, {}, {"RAY_AUTH_MODE": "token"} if not mode and there_is and _here(address) else {})
+        raise UsageError("RAY_AUTH_MODE is token, but there is no token", fix=TOKEN_FIX)
+    return Meant(address, {}, {"RAY_AUTH_MODE": "token"} if not mode and there_is and _is_local(address) else {})
 
 
-def _here(address: str) -> bool:
+def _is_local(address: str) -> bool:
     """Return whether an address belongs to this machine; a process can listen only on such an address."""
     with suppress(OSError):
         kind, *_, place = socket.getaddrinfo(address.rpartition(":")[0].strip("[]"), 0, type=socket.SOCK_STREAM)[0]
@@ -194,7 +194,7 @@ def _here(address: str) -> bool:
     return False
 
 
-def _started_here() -> str:
+def _local_address() -> str:
     """Return the address of the last cluster that was started on this machine, as recorded by Ray."""
     try:
         folder = Path(os.environ.get("RAY_TMPDIR", "/tmp"))
@@ -206,9 +206,9 @@ def _started_here() -> str:
 _ANSWER_S = 5.0  # for a head; it takes milliseconds where it is not very busy
 _STORE_BYTES = 400 * 10**6  # of a cluster of the hunt's own: room for a parcel; memory is taken when it is used
 _ORDERS, _ANSWERS = "orders", "answers"  # calls of one kind run in their order, in parallel to those of the other
-_NAME = "crashhunt-"  # of actors; what follows is how many CPUs one has
-_GROUPS = {"differs": _ANSWERS, "begin": _ANSWERS, "deliver": _ANSWERS, "take": _ANSWERS}
-_GROUPS |= {"submit": _ORDERS, "cancel": _ORDERS, "close": _ORDERS}
+_ACTOR_PREFIX = "crashhunt-"  # of actors; what follows is how many CPUs one has
+_CONCURRENCY_GROUPS = {"differs": _ANSWERS, "begin": _ANSWERS, "deliver": _ANSWERS, "take": _ANSWERS}
+_CONCURRENCY_GROUPS |= {"submit": _ORDERS, "cancel": _ORDERS, "close": _ORDERS}
 
 
 class Lost(Exception):  # noqa: N818 - it is no fault
@@ -265,16 +265,16 @@ class Cluster:
             options |= {"num_cpus": cpus, "include_dashboard": False, "_temp_dir": temporary}
             options |= {"object_store_memory": _STORE_BYTES}
         else:
-            _greet(address)
+            _check_protocol(address)
         try:
             ray.init(address=address or "local", **options)
         except Exception as error:
             raise UnreachableError(
-                f"the Ray cluster at {self.address} cannot be used: {_in_short(error)}",
+                f"the Ray cluster at {self.address} cannot be used: {_first_line(error)}",
                 fix="run the hunt on a machine of the cluster that has its versions of Ray and Python",
             ) from error
         cloudpickle.register_pickle_by_value(_node_actor)
-        for method, group in _GROUPS.items():
+        for method, group in _CONCURRENCY_GROUPS.items():
             ray.method(concurrency_group=group)(getattr(_node_actor.Site, method))
         groups = {_ORDERS: 1, _ANSWERS: 1}
         # Without Ray's events of every call, which crashhunt does not use, a call costs a tenth less.
@@ -307,7 +307,7 @@ class Cluster:
     def stand(self, node: str, slots: int) -> Any:
         """Start an actor on a node, with a number of its CPUs."""
         strategy = self._affinity(node_id=node, soft=False)
-        name = f"{_NAME}{slots}-{secrets.token_hex(8)}"
+        name = f"{_ACTOR_PREFIX}{slots}-{secrets.token_hex(8)}"
         return self._kind.options(num_cpus=slots, scheduling_strategy=strategy, name=name).remote()
 
     def held(self, node: str) -> int:
@@ -318,8 +318,8 @@ class Cluster:
         with suppress(Exception):
             for actor in actors(actor_state_name="ALIVE").values():
                 name = actor.get("Name") or ""
-                if name.startswith(_NAME) and actor["Address"]["NodeID"] == node:
-                    found += int(name.removeprefix(_NAME).partition("-")[0])
+                if name.startswith(_ACTOR_PREFIX) and actor["Address"]["NodeID"] == node:
+                    found += int(name.removeprefix(_ACTOR_PREFIX).partition("-")[0])
         return found
 
     def waits(self, actor: Any) -> bool:
@@ -393,7 +393,7 @@ class Cluster:
         time.sleep(0.05)  # for the last of these to be on its way
 
 
-def _greet(address: str) -> None:
+def _check_protocol(address: str) -> None:
     """Check that a cluster answers, because Ray itself waits very long for an answer.
 
     Raises:
@@ -421,14 +421,14 @@ def _greet(address: str) -> None:
         shown = os.environ.get("RAY_AUTH_MODE") == "token"
         raise TokenError(
             f"the Ray cluster at {address} {'expects another token' if shown else 'needs a token'}",
-            fix=TOKEN if shown else f"set RAY_AUTH_MODE=token, and {TOKEN}",
+            fix=TOKEN_FIX if shown else f"set RAY_AUTH_MODE=token, and {TOKEN_FIX}",
         )
     raise UnreachableError(
-        f"the server at {address} is not the head of a Ray cluster: {_in_short(error)}",
+        f"the server at {address} is not the head of a Ray cluster: {_first_line(error)}",
         fix="give the address that 'ray start --head' has printed; its port is 6379 unless another was chosen",
     )
 
 
-def _in_short(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     """Return the message of an error of Ray in one line."""
     return " ".join(str(error).split()).rstrip(":") or type(error).__name__

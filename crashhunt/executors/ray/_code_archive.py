@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from crashhunt.episode import WorkerSettings
 
 
-__all__ = ["LIMIT_MB", "Folder", "Parcel", "Place", "Store", "owned", "remove_if_left", "settings_in", "unpack"]
+__all__ = ["LIMIT_MB", "CodeArchive", "Folder", "Place", "Store", "owned", "remove_if_left", "settings_in", "unpack"]
 
 
 LIMIT_MB = 200
@@ -35,7 +35,7 @@ _SCENARIO, _CODE, _FILES = "scenario", "code", "files"
 
 
 @dataclass(frozen=True, slots=True)
-class Parcel:
+class CodeArchive:
     """The files that trials need, and the folders here that they replace.
 
     Args:
@@ -49,7 +49,7 @@ class Parcel:
     home: str = ""
 
     @classmethod
-    def of(cls, settings: WorkerSettings) -> Parcel:
+    def of(cls, settings: WorkerSettings) -> CodeArchive:
         """Return the parcel of a hunt.
 
         Raises:
@@ -78,7 +78,9 @@ class Parcel:
                 f"the largest file is {largest} ({sizes[largest] / _MEGABYTE:.0f} MB)",
                 fix="make it smaller, or list unneeded files in .gitignore",
             )
-        return cls(files, folders, next((folders[folder] for folder in settings.code if _is_here(Path(folder))), ""))
+        return cls(
+            files, folders, next((folders[folder] for folder in settings.code if _is_same_snapshot(Path(folder))), "")
+        )
 
     def digest(self) -> str:
         """Return the digest of the whole content.
@@ -86,7 +88,7 @@ class Parcel:
         Raises:
             OSError: a file cannot be read.
         """
-        return digest_of_data({_as_sent(place): _described(path) for place, path in self.files.items()})
+        return digest_of_data({_archive_bytes(place): _described(path) for place, path in self.files.items()})
 
     def packed(self) -> bytes:
         """Return the parcel as compressed bytes.
@@ -97,7 +99,7 @@ class Parcel:
         buffer = io.BytesIO()
         with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as archive:
             for place, path in self.files.items():
-                archive.write(path, _as_sent(place))
+                archive.write(path, _archive_bytes(place))
         return buffer.getvalue()
 
 
@@ -149,7 +151,7 @@ def unpack(packed: bytes, digest: str, root: Path) -> None:
         raise BundleError(f"the code archive {digest} is damaged: {error}", fix="run the hunt again") from None
 
 
-def _is_here(folder: Path) -> bool:
+def _is_same_snapshot(folder: Path) -> bool:
     """Return whether a folder of a snapshot is a copy of the current folder: same name and same files."""
     here = Path.cwd()
     _, tree, place = folder.as_posix().rpartition(f"/{layout.CODE}/@")
@@ -158,7 +160,7 @@ def _is_here(folder: Path) -> bool:
     return all((here / path.name).exists() for path in folder.iterdir())
 
 
-def _as_sent(place: str) -> str:
+def _archive_bytes(place: str) -> str:
     """A name as it is in an archive, which takes none that is not Unicode: a character for each of its bytes."""
     return os.fsencode(place).decode("latin-1")
 
@@ -178,7 +180,7 @@ def _modules(folder: Path) -> Iterator[tuple[str, Path]]:
 # The folder of a cluster of the hunt's own, which goes with it, or with the next one where the hunt was killed.
 
 _PREFIX, _FOLDER_LOCK = "chr-", "crashhunt.lock"
-_LONGEST = 40  # characters of a folder in which Ray can make its sockets
+_MAX_FOLDER_CHARACTERS = 40  # characters of a folder in which Ray can make its sockets
 
 
 class Folder:
@@ -190,7 +192,7 @@ class Folder:
 
     def __init__(self, parent: Path | None = None) -> None:
         usual = tempfile.gettempdir()
-        parent = parent or Path(usual if len(usual) <= _LONGEST and usual.isascii() else "/tmp")
+        parent = parent or Path(usual if len(usual) <= _MAX_FOLDER_CHARACTERS and usual.isascii() else "/tmp")
         for old in parent.glob(f"{_PREFIX}*"):
             remove_if_left(old / _FOLDER_LOCK)
         self.path = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
@@ -228,8 +230,8 @@ def remove_if_left(lock: Path) -> None:
 # What a node keeps on its disk: parcels that it was sent, for hunts to come, and a folder for each hunt that runs.
 
 _KEPT_BYTES = 10**9  # of parcels
-_KEPT = 32
-_LOCK = "lock"
+_MAX_KEPT_ARCHIVES = 32
+_LOCK_NAME = "lock"
 
 
 class Store:
@@ -285,7 +287,7 @@ class Store:
             OSError: the disk is full.
         """
         for old in self._folder.glob("hunt-*"):
-            remove_if_left(old / _LOCK)
+            remove_if_left(old / _LOCK_NAME)
         return Place(Path(tempfile.mkdtemp(prefix="hunt-", dir=self._folder)))
 
     def _file(self, digest: str) -> Path:
@@ -299,7 +301,7 @@ class Store:
         total = 0
         for count, (_, size, file) in enumerate(sorted(found, reverse=True)):
             total += size
-            if count and (total > self._kept_bytes or count >= _KEPT):
+            if count and (total > self._kept_bytes or count >= _MAX_KEPT_ARCHIVES):
                 with suppress(OSError):
                     file.unlink()
 
@@ -315,7 +317,7 @@ class Place:
         self.path = path
         self.code = path / "parcel"
         self.scratch = path / "scratch"
-        self._lock = owned(path / _LOCK)
+        self._lock = owned(path / _LOCK_NAME)
         self.scratch.mkdir()
 
     def unpack(self, packed: bytes, digest: str) -> bool:

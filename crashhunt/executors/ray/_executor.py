@@ -18,7 +18,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.reaper import Kept
 from crashhunt.executors._protocol import NodeFigures, Notes
 from crashhunt.executors.ray._cluster import cluster_of, require_ray, silent
-from crashhunt.executors.ray._code_archive import Folder, Parcel
+from crashhunt.executors.ray._code_archive import CodeArchive, Folder
 from crashhunt.executors.ray._node_actor import code_digest
 from crashhunt.plans import FIXED, load_order_of
 from crashhunt.recording import BlackBoxHeader, Phase
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 __all__ = ["RayExecutor"]
 
-_RECEIVED = 1 << 18  # bytes at a time
+_CHUNK_BYTES = 1 << 18  # bytes at a time
 _CLOSE_S = 3.0  # for the bridge to end what runs on the nodes
 _RETRY_S = 3.0  # between looks whether a cluster that was lost is back
-_LOSSES = 3  # of a cluster of the hunt's own, without a trial between
+_MAX_CLUSTER_LOSSES = 3  # of a cluster of the hunt's own, without a trial between
 _numbers = itertools.count()
 
 
@@ -65,7 +65,7 @@ class RayExecutor:
     ) -> None:
         require_ray()
         self._address, self._environment, self._spare = cluster_of(argument)
-        Parcel.of(settings)
+        CodeArchive.of(settings)
         self._settings = settings
         self._parallel = parallel
         self._recycle_after = recycle_after
@@ -174,7 +174,7 @@ class RayExecutor:
             self._kept = Kept(
                 "crashhunt.executors.ray._bridge",
                 [str(theirs.fileno()), str(job)],
-                environment={**os.environ, **_QUIET, **self._environment},
+                environment={**os.environ, **_RAY_ENVIRONMENT, **self._environment},
                 inherited=[theirs.fileno(), *([] if self._folder is None else [self._folder.fileno()])],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -194,36 +194,36 @@ class RayExecutor:
                     left = left[self._control.send(left, socket.MSG_DONTWAIT) :]
                     continue
                 readable, _, _ = select.select([self._control], [self._control], [])
-                if readable and not self._take_in(self._control):
+                if readable and not self._read_bridge(self._control):
                     return
 
     def _receive(self, wait_s: float) -> None:
         """Receive messages of the bridge; wait at most this long for the first."""
         if self._control is None:
-            if self._closed or not self._is_back():
+            if self._closed or not self._record_return():
                 time.sleep(wait_s)
             return
         heard = b"\n" in self._received  # while something was sent
         if not heard and not select.select([self._control], [], [], wait_s)[0]:
             return
-        is_there = heard or self._take_in(self._control)
+        is_there = heard or self._read_bridge(self._control)
         *lines, rest = bytes(self._received).split(b"\n")
         self._received = bytearray(rest)
         for line in lines:
-            self._hear(json.loads(line))
+            self._handle_message(json.loads(line))
         if not is_there and self._control is not None:
-            self._lose()
+            self._record_loss()
 
-    def _take_in(self, control: socket.socket) -> bool:
+    def _read_bridge(self, control: socket.socket) -> bool:
         """Process the received messages; return whether the bridge is still connected."""
         try:
-            data = control.recv(_RECEIVED)
+            data = control.recv(_CHUNK_BYTES)
         except OSError:
             data = b""
         self._received += data
         return bool(data)
 
-    def _hear(self, message: FromBridge) -> None:
+    def _handle_message(self, message: FromBridge) -> None:
         if "result" in message:
             if self._open.pop(message["ticket"], None) is not None:
                 self._found.append(TrialResult.from_json(message["result"]))
@@ -238,7 +238,7 @@ class RayExecutor:
                 return
             if not message["passing"] or not self._ever_up or not self._address:
                 raise error
-            self._lose(error.message)
+            self._record_loss(error.message)
             return
         if "capacity" in message:
             self._slots = message["capacity"]
@@ -261,7 +261,7 @@ class RayExecutor:
                 for number, (pid, trial, started, committed, step, phase, agent) in message["where"].items()
             }
 
-    def _lose(self, why: str = "") -> None:
+    def _record_loss(self, why: str = "") -> None:
         """Handle the loss of the bridge, and of the cluster or the connection to it.
 
         Raises:
@@ -272,7 +272,7 @@ class RayExecutor:
         self._where.clear()
         self._nodes = []
         self._losses += 1
-        if not self._ever_up or (not self._address and self._losses >= _LOSSES):
+        if not self._ever_up or (not self._address and self._losses >= _MAX_CLUSTER_LOSSES):
             lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             raise CrashhuntError(
                 f"Ray has ended unexpectedly{f': {lines[-1]}' if lines else ''}",
@@ -280,7 +280,7 @@ class RayExecutor:
             )
         self._notes.add(f"the Ray cluster was lost{f' ({why})' if why else ''}; the hunt waits until it is back")
 
-    def _is_back(self) -> bool:
+    def _record_return(self) -> bool:
         """Return whether a lost cluster answers again, so that the hunt can resume on it."""
         if time.monotonic() - self._lost_at < (_RETRY_S if self._address else 0.0):
             return False
@@ -303,7 +303,7 @@ class RayExecutor:
 
 
 # Nothing goes to the makers of Ray, and it gives a lost head up soon: the hunt looks for it again.
-_QUIET = {
+_RAY_ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_gcs_rpc_server_reconnect_timeout_s": "10",
     "RAY_NUM_REDIS_GET_RETRIES": "5",

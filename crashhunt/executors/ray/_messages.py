@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.json_types import ErrorData, ErrorWords
 
-__all__ = ["BridgeJob", "Ended", "Figures", "FromBridge", "Header", "News", "NodeJob", "Submitted", "ToBridge"]
+__all__ = ["BridgeJob", "EndedTrial", "Figures", "FromBridge", "Header", "News", "NodeJob", "Submitted", "ToBridge"]
 
 Submitted = tuple[int, "JsonObject"]
 """A trial, and its ticket: a number that identifies this submission of the trial."""
@@ -83,7 +83,7 @@ class FromBridge(TypedDict, total=False):
     where: dict[int, Header]
 
 
-class Ended(NamedTuple):
+class EndedTrial(NamedTuple):
     """A trial that has ended on a node.
 
     Attributes:
@@ -110,7 +110,7 @@ class News(NamedTuple):
         map: map of all trials, when the first one is kept; compressed.
     """
 
-    ended: list[Ended]
+    ended: list[EndedTrial]
     where: dict[int, Header] | None
     notes: list[str]
     error: ErrorData | None

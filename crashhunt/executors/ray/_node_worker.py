@@ -17,7 +17,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors._pool import PoolExecutor
 from crashhunt.executors.ray._code_archive import Store, settings_in
-from crashhunt.executors.ray._messages import Ended, News
+from crashhunt.executors.ray._messages import EndedTrial, News
 from crashhunt.recording import read_header
 from crashhunt.trial import TrialSpec
 
@@ -36,8 +36,8 @@ __all__ = ["Work", "unpacked"]
 
 _WHERE_EVERY_S = 0.5  # as often as people can read
 _GATHER_S = 0.05  # in which what ends goes back together, while there is enough to do
-_HEAD = 64  # bytes of a black box that say what is in the rest, most of which is room for more
-_TEXTS = (layout.RUN_LOG, layout.ERROR_LOG, layout.STACK)
+_HEADER_BYTES = 64  # bytes of a black box that say what is in the rest, most of which is room for more
+_TEXT_FILES = (layout.RUN_LOG, layout.ERROR_LOG, layout.STACK)
 
 
 class Work:
@@ -121,7 +121,7 @@ class Work:
         """Queue trials; return the events; wait at most this long for a trial to end."""
         assert self._pool is not None
         self.submit(trials)
-        ended: list[Ended] = []
+        ended: list[EndedTrial] = []
         error: ErrorData | None = None
         try:
             if self._broken is not None:
@@ -130,14 +130,14 @@ class Work:
                 with self._lock:
                     ticket = self._tickets.pop(result.spec.number, None)
                 if ticket is not None:
-                    ended.append(self._handed_over(ticket, result))
+                    ended.append(self._queue_trials(ticket, result))
         except CrashhuntError as problem:
-            error = {"error": self._named_as_there(problem.to_json()["error"])}
+            error = {"error": self._with_hunt_paths(problem.to_json()["error"])}
         where: dict[int, Header] | None = None
         if time.monotonic() - self._looked > _WHERE_EVERY_S:
             self._looked = time.monotonic()
             where = {number: _values(header) for number, header in self._pool.where().items()}
-        notes = [self._named_as_there(note) for note in self._pool.notes()]
+        notes = [self._with_hunt_paths(note) for note in self._pool.notes()]
         return News(
             ended=ended,
             where=where,
@@ -168,10 +168,10 @@ class Work:
         if self._place is not None:
             self._place.remove()
 
-    def _handed_over(self, ticket: int, result: TrialResult) -> Ended:
+    def _queue_trials(self, ticket: int, result: TrialResult) -> EndedTrial:
         data = result.to_json()
         if data.get("failure"):
-            data["failure"] = self._named_as_there(data["failure"])
+            data["failure"] = self._with_hunt_paths(data["failure"])
         line = json.dumps({"ticket": ticket, "result": data}).encode() + b"\n"
         files = {}
         if result.kept:
@@ -181,23 +181,23 @@ class Work:
                 if path.is_file() and not path.is_symlink():
                     files[path.name] = zlib.compress(self._content(path), 1)
             shutil.rmtree(folder, ignore_errors=True)  # whatever else an agent has put there
-        return Ended(ticket=ticket, number=result.spec.number, line=line, files=files)
+        return EndedTrial(ticket=ticket, number=result.spec.number, line=line, files=files)
 
     def _content(self, path: Path) -> bytes:
         with path.open("rb") as file:
             box = read_header(path) if path.name == layout.BLACK_BOX else None
-            content = file.read(max(_HEAD, box.committed) if box is not None else -1)
-        if path.name in _TEXTS:
+            content = file.read(max(_HEADER_BYTES, box.committed) if box is not None else -1)
+        if path.name in _TEXT_FILES:
             for here, there in self._renamed:
                 content = content.replace(os.fsencode(here), os.fsencode(there))
         return content
 
-    def _named_as_there(self, said: Any) -> Any:
+    def _with_hunt_paths(self, said: Any) -> Any:
         """Return a result with the file names of the machine of the hunt."""
         if isinstance(said, dict):
-            return {key: self._named_as_there(value) for key, value in said.items()}
+            return {key: self._with_hunt_paths(value) for key, value in said.items()}
         if isinstance(said, list):
-            return [self._named_as_there(value) for value in said]
+            return [self._with_hunt_paths(value) for value in said]
         if isinstance(said, str):
             for here, there in self._renamed:
                 said = said.replace(here, there)

@@ -49,7 +49,7 @@ def configured(default: Config, scenario: Scenario, arguments: Mapping[str, Valu
     if not 0 < policy <= simulation:
         message = f"must be above 0 and at most simulation_frequency, {simulation}"
         raise mistake(scenario, "config.policy_frequency", policy, message, "change one of the two frequencies")
-    _let_in(scenario, config)
+    _set_controlled_vehicles(scenario, config)
     _use_tuples(config["observation"])
     return config
 
@@ -74,7 +74,7 @@ def restore_classes() -> None:
                 setattr(kind, name, value)
 
 
-def _let_in(scenario: Scenario, config: Config) -> None:
+def _set_controlled_vehicles(scenario: Scenario, config: Config) -> None:
     """Configure as many controlled vehicles as the scenario has agents."""
     count = len(scenario.agents)
     if "controlled_vehicles" in config:

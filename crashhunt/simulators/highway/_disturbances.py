@@ -179,24 +179,24 @@ class HighwayDisturbances:
         hardest = min(strong, float(vehicle.ACC_MAX))
         active: _Active
         if disturbance.what in ("brake", "stop"):
-            active = _Slows(vehicle, self._let_go, hardest, hardest)
+            active = _Slows(vehicle, self._release, hardest, hardest)
         elif disturbance.what == "dawdle":
             target = max(0.0, 1.0 - strong) * float(vehicle.speed)
-            active = _Slows(vehicle, self._let_go, strong, _DAWDLING_DECELERATION_MPS2, target=target)
+            active = _Slows(vehicle, self._release, strong, _DAWDLING_DECELERATION_MPS2, target=target)
         elif disturbance.what == "speed":
-            active = _Speeds(vehicle, self._let_go, strong)
+            active = _Speeds(vehicle, self._release, strong)
         elif disturbance.what == "ignore_priority":
-            active = _Ignores(vehicle, self._let_go, 1.0)
+            active = _Ignores(vehicle, self._release, 1.0)
         elif disturbance.what == "late_merge":
             left = self._left_of_lane(vehicle)
             if left is None or vehicle.lane_index != vehicle.target_lane_index:
                 return None
-            active = _MergesLate(vehicle, self._let_go, min(strong, left))
+            active = _MergesLate(vehicle, self._release, min(strong, left))
         else:
             in_other_lane = vehicle.lane_index[:2] == agent.lane_index[:2] and vehicle.lane_index != agent.lane_index
             if not in_other_lane or vehicle.lane_index != vehicle.target_lane_index:
                 return None  # the vehicle is on another road, in the agent's lane, or already changing lanes
-            active = _CutsIn(vehicle, self._let_go, hardest, agent.lane_index)
+            active = _CutsIn(vehicle, self._release, hardest, agent.lane_index)
         self._active.append(active)
         return active
 
@@ -208,7 +208,7 @@ class HighwayDisturbances:
         if kind is None:
             self._road.vehicles.remove(vehicle)
             return _Active(vehicle, lambda _: None, 1.0)
-        active: _Active = kind(vehicle, self._let_go, 1.0)
+        active: _Active = kind(vehicle, self._release, 1.0)
         self._active.append(active)
         return active
 
@@ -221,9 +221,9 @@ class HighwayDisturbances:
         after = self._road.network.graph.get(end, {})
         if not number or not after or number < min(len(lanes) for lanes in after.values()):
             return None
-        return _left(vehicle)
+        return _distance_to_lane_end(vehicle)
 
-    def _let_go(self, active: _Active) -> None:
+    def _release(self, active: _Active) -> None:
         self._active.remove(active)
 
 
@@ -233,7 +233,7 @@ class _Active:
     def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], how_strong: float) -> None:
         self.vehicle = vehicle
         self.how_strong = how_strong
-        self._let_go = let_go
+        self._release = let_go
 
     def override(self, dt: float) -> None:
         """Change the vehicle's decision for a sub-step of ``dt`` s."""
@@ -246,7 +246,7 @@ class _Active:
 
     def end(self) -> None:
         """Let the vehicle drive by itself again."""
-        self._let_go(self)
+        self._release(self)
 
     def _brake(self, deceleration: float, dt: float, down_to: float = 0.0) -> None:
         """Brake at least with this deceleration, until the speed is ``down_to``."""
@@ -354,7 +354,7 @@ class _MergesLate(_Active):
 
     def override(self, dt: float) -> None:
         vehicle = self.vehicle
-        if vehicle.target_lane_index == self._ending and _left(vehicle) <= self.how_strong:
+        if vehicle.target_lane_index == self._ending and _distance_to_lane_end(vehicle) <= self.how_strong:
             _change(vehicle, self._lane)
 
     def end(self) -> None:
@@ -377,7 +377,7 @@ class _Ignores(_Active):
             vehicle.is_yielding = False
 
 
-def _left(vehicle: Any) -> float:
+def _distance_to_lane_end(vehicle: Any) -> float:
     """Return the distance of a vehicle to the end of its lane, in m."""
     return float(vehicle.lane.length - vehicle.lane.local_coordinates(vehicle.position)[0])
 

@@ -13,10 +13,10 @@ from types import ModuleType
 
 __all__ = ["highway_env"]
 
-_LATER = ("matplotlib", "matplotlib.pyplot", "pandas")
+_DEFERRED_MODULES = ("matplotlib", "matplotlib.pyplot", "pandas")
 
 
-class _Later(ModuleType):
+class _DeferredModule(ModuleType):
     """Placeholder for a module in highway-env's modules; imports the module on the first access to an attribute."""
 
     def __getattr__(self, name: str) -> object:
@@ -26,15 +26,15 @@ class _Later(ModuleType):
 
 def _remove_placeholders() -> None:
     """Remove the placeholders from ``sys.modules``, so that other importers get the real modules."""
-    for name in _LATER:
-        if isinstance(sys.modules.get(name), _Later):
+    for name in _DEFERRED_MODULES:
+        if isinstance(sys.modules.get(name), _DeferredModule):
             del sys.modules[name]
 
 
 def _imported() -> ModuleType:
-    absent = [name for name in _LATER if name.partition(".")[0] not in sys.modules]
+    absent = [name for name in _DEFERRED_MODULES if name.partition(".")[0] not in sys.modules]
     for name in absent:
-        sys.modules[name] = later = _Later(name)
+        sys.modules[name] = later = _DeferredModule(name)
         package, _, module = name.rpartition(".")
         if package:  # `import matplotlib.pyplot as plt` reads the attribute of the package
             setattr(sys.modules[package], module, later)

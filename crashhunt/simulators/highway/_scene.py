@@ -9,7 +9,7 @@ import numpy as np
 from highway_env.vehicle.objects import Obstacle
 
 from crashhunt.simulators._standstill import Standstill
-from crashhunt.trial import EVERYBODY
+from crashhunt.trial import ALL_AGENTS
 from crashhunt.world import Contact, Event, Lane, rectangle_gap
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from crashhunt.world import Actor
 
 
-__all__ = ["Hidden", "HighwayEvents", "TakingPart", "contact_of", "gap", "lanes_of"]
+__all__ = ["Hidden", "HighwayEvents", "VehicleFilter", "contact_of", "gap", "lanes_of"]
 
 
 _LANE_STEP_M = 2.0  # distance between the points of a curved lane
@@ -94,7 +94,7 @@ def contact_of(
 # Vehicles and obstacles that are excluded from an episode.
 
 
-class TakingPart:
+class VehicleFilter:
     """Removes excluded vehicles and obstacles from the road after the step in which they enter.
 
     Objects get their names in the order in which they enter, whether they stay or not. An environment that adds
@@ -133,7 +133,7 @@ class TakingPart:
             if name not in self._seen and name not in self._agents:
                 self._seen.add(name)
                 self.entered.append(name)
-            if name not in self._takes_part and EVERYBODY not in self._takes_part:
+            if name not in self._takes_part and ALL_AGENTS not in self._takes_part:
                 gone.add(id(thing))
         if gone:
             self._road.vehicles = [thing for thing in self._road.vehicles if id(thing) not in gone]

@@ -11,7 +11,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Obstacle
 
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.world import State
+from crashhunt.world import ActorState
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -101,9 +101,9 @@ class Puppets:
         for agent, vehicle in agents.items():
             if agent not in begins:
                 raise InvalidEpisodeError(f"the start position of {agent!r} is unknown")
-            _place(vehicle, begins[agent], late=script.time_s > 0)
+            _set_pose(vehicle, begins[agent], late=script.time_s > 0)
         self.things: list[tuple[Path, RoadObject]] = [
-            (path, _thing(road, path, sub_steps, step_length_s)) for path in script.others
+            (path, _make_puppet(road, path, sub_steps, step_length_s)) for path in script.others
         ]
         self.enter(0)
 
@@ -115,7 +115,7 @@ class Puppets:
     def enter(self, steps: int) -> None:
         """Put exactly the actors on the road that were recorded at this step; keep objects that cannot be hit."""
         road = self._road
-        there = [thing for path, thing in self.things if self._is_there(path, steps)]
+        there = [thing for path, thing in self.things if self._is_present(path, steps)]
         known = {id(thing) for thing in road.vehicles}
         for thing in there:
             if isinstance(thing, Puppet) and id(thing) not in known:
@@ -124,18 +124,18 @@ class Puppets:
         marks = [thing for thing in road.objects if not (thing.solid and thing.collidable)]
         road.objects = [*marks, *(thing for thing in there if not isinstance(thing, Vehicle))]
 
-    def _is_there(self, path: Path, steps: int) -> bool:
+    def _is_present(self, path: Path, steps: int) -> bool:
         return path.first <= steps and (steps <= path.last or path.last >= self._end)
 
 
-def place_of(state: State, length: float) -> tuple[NDArray[np.float64], float, float]:
+def place_of(state: ActorState, length: float) -> tuple[NDArray[np.float64], float, float]:
     """Return the centre, heading and speed in highway-env's coordinates of a state in scene coordinates."""
     x = state.x - length / 2 * math.cos(state.heading)
     y = state.y - length / 2 * math.sin(state.heading)
     return np.array([x, -y]), -state.heading, state.speed
 
 
-def _thing(road: Road, path: Path, sub_steps: int, step_length_s: float) -> RoadObject:
+def _make_puppet(road: Road, path: Path, sub_steps: int, step_length_s: float) -> RoadObject:
     if not path.actor.id.startswith("obstacle."):
         return Puppet(road, path, sub_steps, step_length_s)
     thing = Obstacle(road, *place_of(path.states[0], path.actor.length))
@@ -144,7 +144,7 @@ def _thing(road: Road, path: Path, sub_steps: int, step_length_s: float) -> Road
     return thing
 
 
-def _place(vehicle: Any, state: State, *, late: bool) -> None:
+def _set_pose(vehicle: Any, state: ActorState, *, late: bool) -> None:
     """Put a controlled vehicle at its recorded state.
 
     The recording does not hold the vehicle's intention. If the episode begins late, the vehicle keeps lane and speed.
@@ -157,10 +157,10 @@ def _place(vehicle: Any, state: State, *, late: bool) -> None:
     if isinstance(vehicle, MDPVehicle):
         vehicle.speed_index = vehicle.speed_to_index(vehicle.target_speed)
         vehicle.target_speed = vehicle.index_to_speed(vehicle.speed_index)
-    vehicle.route = _rest(vehicle.route, vehicle.lane_index)
+    vehicle.route = _remaining_route(vehicle.route, vehicle.lane_index)
 
 
-def _rest(route: Sequence[Any] | None, lane: Sequence[Any]) -> list[Any] | None:
+def _remaining_route(route: Sequence[Any] | None, lane: Sequence[Any]) -> list[Any] | None:
     """Return the rest of a route from a lane on."""
     if not route:
         return None
@@ -168,9 +168,9 @@ def _rest(route: Sequence[Any] | None, lane: Sequence[Any]) -> list[Any] | None:
     return list(route[here[0] :]) if here else list(route)
 
 
-def _between(state: State, after: State, share: float) -> State:
+def _between(state: ActorState, after: ActorState, share: float) -> ActorState:
     turn = math.remainder(after.heading - state.heading, math.tau)
-    return State(
+    return ActorState(
         x=state.x + share * (after.x - state.x),
         y=state.y + share * (after.y - state.y),
         heading=state.heading + share * turn,

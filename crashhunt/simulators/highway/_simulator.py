@@ -36,7 +36,7 @@ from crashhunt.simulators._kinematics import Kinematics, Unseen
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances
-from crashhunt.simulators.highway._scene import Hidden, HighwayEvents, TakingPart, contact_of, lanes_of
+from crashhunt.simulators.highway._scene import Hidden, HighwayEvents, VehicleFilter, contact_of, lanes_of
 from crashhunt.simulators.highway._scripted import Puppet, Puppets
 from crashhunt.simulators.highway._surroundings import surroundings_of
 from crashhunt.world import Actor, Lane, Roster, Scene
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HighwaySimulator"]
 
-_LANES_EVERY = 10  # steps between two scenes that contain the lane of each vehicle
+_LANE_INTERVAL_STEPS = 10  # steps between two scenes that contain the lane of each vehicle
 
 assert highway_env  # importing it registers its environments
 
@@ -116,14 +116,14 @@ class HighwaySimulator:
         self._crashed: set[str] = set()
         self._contacts: list[Contact] = []
         self._steps = 0
-        self._taking_part: TakingPart | None = None
+        self._taking_part: VehicleFilter | None = None
         self._puppets: Puppets | None = None
         self._begins_s = 0.0
         if (script := (options or {}).get("script")) is not None:
-            self._play(script)
+            self._start_scripts(script)
             shown = env.observation_type.observe()
         elif (only := (options or {}).get("only")) is not None:
-            self._taking_part = TakingPart(env.road, only, self.agents, self._objects, self._actor)
+            self._taking_part = VehicleFilter(env.road, only, self.agents, self._objects, self._actor)
             if self._taking_part.remove():
                 shown = env.observation_type.observe()
         self._driven = dict.fromkeys(self.agents, 0.0)
@@ -132,7 +132,7 @@ class HighwaySimulator:
         self._disturbances = HighwayDisturbances(env.road, self._controlled.values())
         self._watch()
         self._events = HighwayEvents(self.step_length_s, self._scenario.events, lanes_are_road=self._lanes_are_road)
-        self._look(())
+        self._read_scene(())
         return self._show(self.agents, shown), {}
 
     party = Party.SIMULATOR
@@ -168,7 +168,7 @@ class HighwaySimulator:
             was, self._on_road[agent] = self._on_road[agent], bool(vehicle.on_road)
             if self._lanes_are_road and agent in actions and was and not self._on_road[agent]:
                 (arrived if self._is_at_an_end(vehicle) else off_road).append(agent)
-        self._look(tuple(off_road))
+        self._read_scene(tuple(off_road))
         self._scene.events = tuple([event for agent in actions for event in self._events_of(agent)])
         ended = bool(terminated or truncated)
         rewards = info.get("agents_rewards", (reward,) * len(self._possible))
@@ -292,7 +292,7 @@ class HighwaySimulator:
             kind = env.observation_type.agents_observation_types[0] if self._many_see else env.observation_type
             self.observation_names = tuple(getattr(kind, "features", ())) if len(seen[0].shape or ()) == 2 else ()
 
-    def _play(self, script: Paths) -> None:
+    def _start_scripts(self, script: Paths) -> None:
         """Move the other actors along recorded paths; an agent whose path is scripted no longer drives."""
         driven = {path.actor.id for path in script.agents}
         self._controlled = {agent: vehicle for agent, vehicle in self._controlled.items() if agent in driven}
@@ -379,7 +379,7 @@ class HighwaySimulator:
             self._known[id(thing)] = found
         return found[1]
 
-    def _look(self, off_road: tuple[str, ...]) -> None:
+    def _read_scene(self, off_road: tuple[str, ...]) -> None:
         things = self._objects()
         seen = tuple(map(id, things))
         if seen != self._seen:
@@ -391,7 +391,7 @@ class HighwaySimulator:
         points, headings, speeds = poses if poses is not None else self._poses(things)
         contacts = tuple(self._contacts)
         lanes: tuple[str, ...] = ()
-        if self._steps % _LANES_EVERY == 0 or contacts or off_road:
+        if self._steps % _LANE_INTERVAL_STEPS == 0 or contacts or off_road:
             lanes = tuple([self._lane_name(thing.lane_index) for thing in things])
         time_s = self._begins_s + self._steps * self.step_length_s
         self._scene = Scene(time_s, self._roster, points, headings, speeds, contacts, off_road, lanes)

@@ -38,10 +38,10 @@ __all__ = ["JunctionLanes", "SteppingOut", "SumoDisturbances", "can_step_out", "
 
 _AHEAD_M, _ASIDE_M = 60.0, 15.0  # persons further ahead or further to the side are no target
 _INNER_M = 1.6  # half a lane: persons nearer to the agent's axis are already in its way
-_WALKS = 2  # SUMO's type of a walking stage
+_WALKING_STAGE = 2  # SUMO's type of a walking stage
 # Weights in SUMO's score of lanes for a moved person: distance in lane widths, angle in half turns.
 _BY_DISTANCE, _BY_ANGLE, _LANE_WIDTH_M = 0.5, 0.35, 3.2
-_MARGIN = 0.05
+_MARGIN_SHARE = 0.05
 """Safety margin of the score comparison: another lane counts as better even if its score is lower by up to this.
 
 SUMO adds up to 0.1 each to lanes on the person's route and to the person's own lane, and this comparison omits both. Of
@@ -105,7 +105,7 @@ def can_step_out(actor: str, agent: str, reach_m: float, junctions: JunctionLane
     shape = sumo.lane_getShape(lane)
     nearby = junctions.near(way.start, far)
     at_the_end = sumo.lane_getLength(lane) - sumo.person_getLanePosition(person) < _END_M
-    margin = _MARGIN_AT_THE_END if at_the_end else _MARGIN
+    margin = _MARGIN_AT_THE_END if at_the_end else _MARGIN_SHARE
     count = max(1, math.ceil(far / _LOOK_EVERY_M))
     for index in range(count + 1):
         point = way.at(far * index / count)
@@ -233,7 +233,7 @@ class _Way(NamedTuple):
 
 def _walks(actor: str) -> bool:
     stage = libsumo.person.getStage(actor.removeprefix(PERSON))
-    return bool(stage.type == _WALKS)
+    return bool(stage.type == _WALKING_STAGE)
 
 
 class SteppingOut:

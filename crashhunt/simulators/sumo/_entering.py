@@ -9,7 +9,7 @@ import libsumo
 from libsumo import _libsumo as sumo
 
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.trial import EVERYBODY
+from crashhunt.trial import ALL_AGENTS
 from crashhunt.world import PERSON
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import Value
 
 
-__all__ = ["TakingPart", "enter", "replaced_by", "steps_counted"]
+__all__ = ["VehicleFilter", "enter", "replaced_by", "steps_counted"]
 
 
 def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]) -> dict[str, str]:
@@ -55,7 +55,7 @@ def steps_counted(simulator: CountsSetUp, step_length_s: float) -> Iterator[None
 
 
 def enter(
-    scenario: Scenario, setups: Mapping[str, AgentSetup], replaced: Mapping[str, str], taking_part: TakingPart | None
+    scenario: Scenario, setups: Mapping[str, AgentSetup], replaced: Mapping[str, str], taking_part: VehicleFilter | None
 ) -> None:
     """Warm up, add the agents' vehicles that the traffic does not have, and wait until all are on the road.
 
@@ -150,7 +150,7 @@ def _replace(vehicle: str, agent: str) -> None:
 # Vehicles and persons that are excluded from an episode.
 
 
-class TakingPart:
+class VehicleFilter:
     """Removes excluded actors at the end of the step in which they enter, before a scene contains them.
 
     SUMO creates the vehicles of a flow one after another, so their names are known only when they enter. SUMO removes a
@@ -166,7 +166,7 @@ class TakingPart:
 
     def __init__(self, takes_part: Iterable[str], leaving: set[str]) -> None:
         self._takes_part = frozenset(takes_part)
-        self._all_take_part = EVERYBODY in self._takes_part
+        self._all_take_part = ALL_AGENTS in self._takes_part
         self._leaving = leaving
         self.entered: list[str] = []
 

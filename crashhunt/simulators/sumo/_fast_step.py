@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from crashhunt.world import Roster
 
 
-__all__ = ["Present", "UsualSteps"]
+__all__ = ["PresentVehicles", "UsualSteps"]
 
 
-_ROSTERS = 3  # rosters to keep: of the last scene, the scene before it, and the next scene, which may not be needed
-_OBSERVED = np.dtype("<f4")
+_MAX_ROSTERS = 3  # rosters to keep: of the last scene, the scene before it, and the next scene, which may not be needed
+_FLOAT32 = np.dtype("<f4")
 
 
 P = ParamSpec("P")
@@ -41,7 +41,7 @@ class WrapsPartOfStep(Protocol):
         """Return the wrapped function."""
 
 
-class Present(NamedTuple):
+class PresentVehicles(NamedTuple):
     """The state of a simulator between two steps.
 
     Args:
@@ -56,7 +56,7 @@ class Present(NamedTuple):
 
 
 class UsualSteps:
-    """Implements `AtOnce`: runs uneventful steps of one episode in the compiled core.
+    """Implements `FastStepper`: runs uneventful steps of one episode in the compiled core.
 
     While the core runs steps, the simulator, its sight and its events keep an older state. The method `catch_up` brings
     them to the state of the core. The method `resume` brings the core to their state.
@@ -91,8 +91,8 @@ class UsualSteps:
         *,
         simulate: Callable[[], None],
         part: WrapsPartOfStep,
-        present: Callable[[], Present],
-        arrive: Callable[[Present], None],
+        present: Callable[[], PresentVehicles],
+        arrive: Callable[[PresentVehicles], None],
         apply: Callable[[str, NDArray[np.generic]], bool],
         finish: Callable[[Mapping[str, NDArray[np.generic]]], StepResult],
         from_left: Callable[[str, int], float],
@@ -108,7 +108,7 @@ class UsualSteps:
         self.apply, self.finish, self.enter = part(apply), part(finish), part(self._enter)
         shape = kinematics.shape
         self.core = core.UsualSteps(
-            agent, SimpleNamespace(simulationStep=simulate), (np.ndarray, shape, _OBSERVED), shape[0] - 1,
+            agent, SimpleNamespace(simulationStep=simulate), (np.ndarray, shape, _FLOAT32), shape[0] - 1,
             step_length_s, lateral, takes_speed, sight.around, start_m,
         )  # fmt: skip
         self._from_left, self._instead_of = from_left, instead_of
@@ -135,7 +135,7 @@ class UsualSteps:
         seen, row = self._sight.plain, self.roster.index.get(self._agent)
         if seen is None or row is None:
             return None
-        while len(self._rosters) > _ROSTERS:
+        while len(self._rosters) > _MAX_ROSTERS:
             del self._rosters[next(iter(self._rosters))]
         self._rosters[seen[0]] = self.roster
         return *seen, row, self._controlled
@@ -170,7 +170,7 @@ class UsualSteps:
         scene.follow(previous)
         observations: Observations = {agent: observation}  # type: ignore[dict-item]
         self._events.resume(scene, step, {agent: follower})
-        self._arrive(Present(scene, observations, step))
+        self._arrive(PresentVehicles(scene, observations, step))
         self._last = observations, {agent: reward}, {agent: False}, {agent: False}, {agent: {}}
         return self._last
 

@@ -22,7 +22,9 @@ __all__ = ["VERSION", "Loading", "keep_xml_ready", "ready_xml"]
 # SUMO's XML library, which stays initialized between trials.
 
 # xercesc_3_2::XMLPlatformUtils::Initialize(locale, nls_home, panic_handler, memory_manager)
-_INITIALIZE = "_ZN11xercesc_3_216XMLPlatformUtils10InitializeEPKcS2_PNS_12PanicHandlerEPNS_13MemoryManagerE"
+_XERCES_INITIALIZE_SYMBOL = (
+    "_ZN11xercesc_3_216XMLPlatformUtils10InitializeEPKcS2_PNS_12PanicHandlerEPNS_13MemoryManagerE"
+)
 
 
 def keep_xml_ready() -> bool:
@@ -34,7 +36,7 @@ def keep_xml_ready() -> bool:
     a simulation runs.
     """
     try:
-        initialize = getattr(ctypes.CDLL(sumo.__file__), _INITIALIZE)
+        initialize = getattr(ctypes.CDLL(sumo.__file__), _XERCES_INITIALIZE_SYMBOL)
     except (
         OSError,
         AttributeError,
@@ -47,7 +49,7 @@ def keep_xml_ready() -> bool:
 
 
 VERSION = metadata.version("libsumo")  # libsumo before 1.26 has no version attribute
-_UNORDERED = "the order of SUMO's links is not fixed, and trials may differ between processes"
+_LINK_ORDER_WARNING = "the order of SUMO's links is not fixed, and trials may differ between processes"
 ready_xml = cache(keep_xml_ready)
 """Keep SUMO's XML library initialized; runs once per process."""
 
@@ -84,4 +86,4 @@ class Loading:
         reason = self._order.check_load()
         if not reason or not self._fix_link_order or why_no_link_order(VERSION):
             return ""
-        return f"{_UNORDERED}: {reason}"
+        return f"{_LINK_ORDER_WARNING}: {reason}"

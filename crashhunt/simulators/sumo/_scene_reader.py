@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     Lists = tuple[list[tuple[float, float]], list[float], list[float]]
 
 
-__all__ = ["LOOK_AROUND_EVERY", "SIGHT_M", "Bends", "Sight", "height_at", "is_articulated"]
+__all__ = ["LOOK_AROUND_INTERVAL_STEPS", "SIGHT_M", "Bends", "Sight", "height_at", "is_articulated"]
 
 
 # Long vehicles bend along the lanes that they occupy, as SUMO's own geometry does.
 
-_RAILS = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
+_RAIL_CLASSES = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
 _RIGID_M = 15.0  # longest rigid bus in the EU (Directive 96/53/EC, Annex I); a longer vehicle has a joint
 _JOINT_M = 6.0  # a shorter rail vehicle or trailer is treated as rigid
 _PIECE_M = 5.0  # longest straight piece of a bent vehicle: a car's length
@@ -37,7 +37,7 @@ Point = tuple[float, float]
 
 def is_articulated(actor: Actor) -> bool:
     """Whether a vehicle has joints: rail vehicles, trailers, and vehicles longer than a rigid bus."""
-    jointed = actor.kind in _RAILS or actor.kind == "trailer"
+    jointed = actor.kind in _RAIL_CLASSES or actor.kind == "trailer"
     return actor.length > (_JOINT_M if jointed else _RIGID_M)
 
 
@@ -182,7 +182,7 @@ SIGHT_M = 150.0
 
 Actors further away take no part in a crash, and a town has thousands of them."""
 
-LOOK_AROUND_EVERY = 10
+LOOK_AROUND_INTERVAL_STEPS = 10
 """Steps between two looks around. A further look follows when a vehicle enters or leaves.
 
 With steps above 0.1 s, a look around happens every second. Every 10th scene contains the lane of each vehicle, because
@@ -190,10 +190,10 @@ reading a string per vehicle is expensive."""
 
 _LOOK_AROUND_S = 1.0  # at a closing speed of 75 m/s, two vehicles approach by half of `SIGHT_M` in this time
 _SIGHT_SQUARED = SIGHT_M**2
-_RADIANS = math.pi / 180.0
+_RAD_PER_DEGREE = math.pi / 180.0
 _HEIGHT_EVERY_M = 20.0  # distance between the points of a lane at which heights are read
 _FLAT_M = 0.5  # a map with smaller height differences has no bridges and is treated as flat
-_WITH_PERSONS = frozenset({"sharedLane", "junctionPedestrian", "crossing", "walkingarea"})
+_PERSON_LANE_TYPES = frozenset({"sharedLane", "junctionPedestrian", "crossing", "walkingarea"})
 """SUMO's collision types with a person as victim; a person may have the same id as a vehicle."""
 
 
@@ -226,7 +226,7 @@ class Sight:
         self.core = core
         self._controlled = tuple(controlled)
         self._eyes: Vehicles | None = core.Vehicles(self._controlled, [], [], []) if core is not None else None
-        self._every = max(1, min(LOOK_AROUND_EVERY, round(_LOOK_AROUND_S / step_length_s)))
+        self._every = max(1, min(LOOK_AROUND_INTERVAL_STEPS, round(_LOOK_AROUND_S / step_length_s)))
         self._speeds = speeds
         self.leaving: set[str] = set()
         self._high: bool | None = None
@@ -259,7 +259,7 @@ class Sight:
                 columns = None if self._plain is None else self._plain.read()
             if columns is not None:
                 lanes: tuple[str, ...] = ()
-                if steps % LOOK_AROUND_EVERY == 0 or off_road:
+                if steps % LOOK_AROUND_INTERVAL_STEPS == 0 or off_road:
                     lanes = tuple(map(sumo.vehicle_getLaneID, self._ids))
                 return Scene(
                     sumo.simulation_getTime(), self._roster, off_road=tuple(off_road), lanes=lanes, swept=True,
@@ -270,18 +270,18 @@ class Sight:
             or (self.core.is_coming_or_going() if self.core is not None else _is_coming_or_going())
             or (self._persons_count and self._persons_changed())
         ):
-            self._look_around()
+            self._select_in_sight()
         ids, persons = self._ids, self._persons
         contacts = self._contacts()
         lanes = ()
-        if steps % LOOK_AROUND_EVERY == 0 or contacts or off_road:
+        if steps % LOOK_AROUND_INTERVAL_STEPS == 0 or contacts or off_road:
             lanes = tuple(map(sumo.vehicle_getLaneID, ids))
         columns = self._vehicles.read() if self._vehicles is not None else None
         points, headings, speeds = self._columns() if columns is None else _lists(columns)
         if persons:
             # For persons as for vehicles, the position is that of the front.
             points += map(sumo.person_getPosition, persons)
-            headings += [(90.0 - angle) * _RADIANS for angle in map(sumo.person_getAngle, persons)]
+            headings += [(90.0 - angle) * _RAD_PER_DEGREE for angle in map(sumo.person_getAngle, persons)]
             speeds += map(sumo.person_getSpeed, persons)
             for person in self._speeds.keys() & set(persons) if self._speeds else ():
                 speeds[len(ids) + persons.index(person)] = self._speeds[person]
@@ -293,8 +293,8 @@ class Sight:
         if self._high:
             heights = [sumo.vehicle_getPosition3D(vehicle)[2] for vehicle in ids]
             heights += [sumo.person_getPosition3D(person)[2] for person in persons]
-            grades = [math.tan(sumo.vehicle_getSlope(vehicle) * _RADIANS) for vehicle in ids]
-            grades += [math.tan(sumo.person_getSlope(person) * _RADIANS) for person in persons]
+            grades = [math.tan(sumo.vehicle_getSlope(vehicle) * _RAD_PER_DEGREE) for vehicle in ids]
+            grades += [math.tan(sumo.person_getSlope(person) * _RAD_PER_DEGREE) for person in persons]
         return Scene(
             sumo.simulation_getTime(), self._roster, points, headings, speeds, contacts, tuple(off_road), lanes,
             heights, grades, self._spines(points, headings) if self._long else {}, swept=True, core=self.core,
@@ -360,7 +360,7 @@ class Sight:
     def _columns(self) -> Lists:
         ids = self._ids
         # SUMO's angles are in degrees, clockwise from north.
-        headings = [(90.0 - angle) * _RADIANS for angle in map(sumo.vehicle_getAngle, ids)]
+        headings = [(90.0 - angle) * _RAD_PER_DEGREE for angle in map(sumo.vehicle_getAngle, ids)]
         return list(map(sumo.vehicle_getPosition, ids)), headings, list(map(sumo.vehicle_getSpeed, ids))
 
     def _spines(self, points: Sequence[tuple[float, float]], headings: Sequence[float]) -> dict[int, Spine]:
@@ -380,7 +380,7 @@ class Sight:
             return True
         return any(map(sumo.person_getVehicle, self._persons))
 
-    def _look_around(self) -> None:
+    def _select_in_sight(self) -> None:
         """Select the actors in sight: the controlled vehicles and all actors near them."""
         found = self.core.in_sight(self._eyes, _SIGHT_SQUARED) if self.core is not None and self._eyes else None
         ids, eyes = found or self._in_sight()
@@ -430,7 +430,7 @@ class Sight:
         found = []
         for collision in sumo.simulation_getCollisions():
             victim = collision.victim
-            if collision.type in _WITH_PERSONS:
+            if collision.type in _PERSON_LANE_TYPES:
                 if not self._persons_count:
                     continue
                 victim = PERSON + victim

@@ -15,7 +15,7 @@ import libsumo
 from libsumo import _libsumo as sumo
 
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.world import Actor, Path, Roster, Scene, State
+from crashhunt.world import Actor, ActorState, Path, Roster, Scene
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from crashhunt.simulators.sumo._scene_reader import Sight
     from crashhunt.world import Paths, Spine
 
-    Row = tuple[Actor, State, str, Spine | None]
+    Row = tuple[Actor, ActorState, str, Spine | None]
 
 __all__ = ["ScriptedSight", "place_agents"]
 
@@ -48,7 +48,7 @@ class ScriptedSight:
         rows = [
             self._agent(scene, row, steps) for row, actor in enumerate(scene.roster.actors) if actor.id in self._agents
         ]
-        rows += [self._row(path, steps) for path in self._script.others if self._is_there(path, steps)]
+        rows += [self._row(path, steps) for path in self._script.others if self._is_present(path, steps)]
         actors = tuple(actor for actor, *_ in rows)
         if actors != self._roster.actors:
             self._roster = Roster(actors)
@@ -75,10 +75,10 @@ class ScriptedSight:
         if steps == 0:  # SUMO reports the new position of a moved vehicle only after the next step
             return actor, self._agents[actor.id].states[0], lane, None
         high = (scene.heights[row], scene.grades[row]) if scene.heights else ()
-        state = State(*scene.points[row], scene.headings[row], scene.speeds[row], *high)
+        state = ActorState(*scene.points[row], scene.headings[row], scene.speeds[row], *high)
         return actor, state, lane, scene.spines.get(row)
 
-    def _is_there(self, path: Path, steps: int) -> bool:
+    def _is_present(self, path: Path, steps: int) -> bool:
         return path.first <= steps and (steps <= path.last or path.last >= self._script.steps)
 
     def _row(self, path: Path, steps: int) -> Row:

@@ -22,8 +22,8 @@ from crashhunt.simulators._kinematics import Kinematics, Unseen
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators.sumo._disturbances import SumoDisturbances
 from crashhunt.simulators.sumo._driving import Driving, hold_vehicle
-from crashhunt.simulators.sumo._entering import TakingPart, enter, replaced_by, steps_counted
-from crashhunt.simulators.sumo._fast_step import Present, UsualSteps
+from crashhunt.simulators.sumo._entering import VehicleFilter, enter, replaced_by, steps_counted
+from crashhunt.simulators.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.simulators.sumo._loading import VERSION, Loading, ready_xml
 from crashhunt.simulators.sumo._scene_reader import Sight
 from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents
@@ -47,8 +47,8 @@ __all__ = ["SumoSimulator"]
 
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
 _WINDOW_WIDTH_M = 150.0  # width of the visible part of the network when the window follows a vehicle
-_KEEPS_DECELERATION = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
-_DISTRUSTED = "the compiled core is disabled: its values differ from those of libsumo's getters"
+_DECELERATION_LIMIT_BIT = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
+_CORE_DISABLED_NOTICE = "the compiled core is disabled: its values differ from those of libsumo's getters"
 P = ParamSpec("P")
 T = TypeVar("T")
 _TRACI_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
@@ -94,7 +94,7 @@ class SumoSimulator:
         self._lanes: list[Lane] | None = None
         self._program = ["sumo"]
         self._events = SumoEvents(scenario.step_length_s, scenario.events)
-        self._taking_part: TakingPart | None = None
+        self._taking_part: VehicleFilter | None = None
         self.setup_steps = 0
         self.scripted = False
         self._setups = scenario.agents
@@ -158,13 +158,13 @@ class SumoSimulator:
         self._steps = 0
         self._kinematics.hidden.clear()
         self._off_road: list[str] = []
-        self._look()
+        self._read_scene()
         observations = self._observe_all()
         usual = self._usual_steps()
         if self._sight.core is not None and self._is_core_wrong(observations, usual):
             self._sight.distrust()
-            self.notices.append(_DISTRUSTED)
-            self._look()
+            self.notices.append(_CORE_DISABLED_NOTICE)
+            self._read_scene()
             observations, usual = self._observe_all(), None
         self._events.begin(self._scene, self.agents, self._moved)
         self._shown, self.at_once = observations, usual
@@ -201,7 +201,7 @@ class SumoSimulator:
             libsumo.simulationStep()
             return self._finish(actions)
         except _TRACI_ERRORS as error:
-            raise _gave_up(error) from error
+            raise _set_up_failure(error) from error
 
     def _finish(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Return the result of a step that SUMO has simulated."""
@@ -210,7 +210,7 @@ class SumoSimulator:
         if self._taking_part is not None:
             self._taking_part.remove()
         self._steps += 1
-        self._look()
+        self._read_scene()
         scene, present = self._scene, self._scene.roster.index
         observations: Observations = {}
         rewards: dict[str, float] = {}
@@ -249,7 +249,7 @@ class SumoSimulator:
         setup = self._scenario.agents[agent]
         if setup.action == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
-        if setup.speed_mode & _KEEPS_DECELERATION:
+        if setup.speed_mode & _DECELERATION_LIMIT_BIT:
             return FullBraking((0.0, 0), "the maximum of its vehicle type", float(libsumo.vehicle.getDecel(agent)))
         return FullBraking((0.0, 0), f"as hard as its speed mode {setup.speed_mode} allows")
 
@@ -303,7 +303,7 @@ class SumoSimulator:
         self._setups, self._replaced = setups, replaced_by(setups, arguments)
         self._moved = {**self._scenario.agents, **dict.fromkeys(script.names if script is not None else ())}
         stay = (*(only or ()), *setups, *self._replaced)
-        self._taking_part = None if only is None else TakingPart(stay, self._sight.leaving)
+        self._taking_part = None if only is None else VehicleFilter(stay, self._sight.leaving)
 
     def _stop_fast_path(self) -> None:
         """Stop the fast path of the last episode in this process, because another episode begins."""
@@ -333,7 +333,7 @@ class SumoSimulator:
             self._kinematics,
             simulate=_simulating(),
             part=_part,
-            present=lambda: Present(self._scene, self._shown, self._steps),
+            present=lambda: PresentVehicles(self._scene, self._shown, self._steps),
             arrive=self._arrive,
             apply=self._apply_alone,
             finish=self._finish,
@@ -345,7 +345,7 @@ class SumoSimulator:
             instead_of={"actions": self.actions, **own},
         )
 
-    def _arrive(self, present: Present) -> None:
+    def _arrive(self, present: PresentVehicles) -> None:
         """Adopt the state of the core."""
         self._scene, self._shown, self._steps = present
 
@@ -365,7 +365,7 @@ class SumoSimulator:
     def _observe_all(self) -> Observations:
         return {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}
 
-    def _look(self) -> None:
+    def _read_scene(self) -> None:
         """Read the scene."""
         self._scene = self._look_with.look(self._steps, self._off_road)
 
@@ -394,7 +394,7 @@ def _part(do: Callable[P, T]) -> Callable[P, T]:
         try:
             return do(*given, **named)
         except _TRACI_ERRORS as error:
-            raise _gave_up(error) from error
+            raise _set_up_failure(error) from error
 
     return step
 
@@ -404,12 +404,12 @@ def _simulating() -> Callable[[], None]:
         try:
             libsumo.simulationStep()
         except _TRACI_ERRORS as error:
-            raise _gave_up(error) from error
+            raise _set_up_failure(error) from error
 
     return step
 
 
-def _gave_up(error: BaseException) -> SimulatorError:
+def _set_up_failure(error: BaseException) -> SimulatorError:
     return SimulatorError(f"SUMO gave up: {_one_line(error)}")
 
 

@@ -16,7 +16,7 @@ __all__ = ["surroundings_of"]
 
 _MIN_LOOK_M, _LOOK_S = 60.0, 6.0  # further away, no safe distance of a road vehicle reaches
 _LEADERS, _RIGHT = 2, 1  # bits of the mode of getNeighbors
-_RED = frozenset("ruR")
+_RED_STATES = frozenset("ruR")
 _STOP_LINE_MARGIN_M = 1.0  # SUMO's vehicles stop this far before a line, too
 _MIN_BRAKING_MPS2 = 0.5  # a type may have a decel of 0, and a safe distance divides by it
 
@@ -72,7 +72,7 @@ def _red_lights(agent: str, look_m: float) -> list[Neighbor]:
             kind="red light",
         )
         for _, _, distance, state in sumo.vehicle_getNextTLS(agent)
-        if state in _RED and 0 <= distance <= look_m
+        if state in _RED_STATES and 0 <= distance <= look_m
     ]
 
 

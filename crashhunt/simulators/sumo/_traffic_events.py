@@ -158,10 +158,10 @@ class HardBraking:
         return found
 
 
-_RED = ("r", "u")  # red, and red with yellow; vehicles may pass "s" after a stop
-_LINKS_AT_ONCE = 6  # most links that a vehicle can cross in one long step
-_DIRECTION_EVERY = 10  # steps between two checks of the driving direction on the same lane
-_AGAINST = -0.5  # cosine of the angle between course and lane below which a vehicle drives the wrong way
+_RED_STATES = ("r", "u")  # red, and red with yellow; vehicles may pass "s" after a stop
+_MAX_LINKS_PER_STEP = 6  # most links that a vehicle can cross in one long step
+_DIRECTION_INTERVAL_STEPS = 10  # steps between two checks of the driving direction on the same lane
+_WRONG_WAY_COSINE = -0.5  # cosine of the angle between course and lane below which a vehicle drives the wrong way
 _NEAR_M = 150.0  # events further from every agent are not reported
 _CONSEQUENCE_S = 5.0  # a collision within this time after hard braking may be its consequence
 
@@ -237,7 +237,7 @@ class SumoEvents:
             if lane != before:
                 self._lanes[agent] = lane
                 self._entered(agent, before, lane, scene, found)
-            if lane != before or self._steps % _DIRECTION_EVERY == 0:
+            if lane != before or self._steps % _DIRECTION_INTERVAL_STEPS == 0:
                 self._ask_direction(agent, lane, last, scene, found)
             row = scene.roster.index[agent]
             speed = scene.speed(row)
@@ -278,7 +278,7 @@ class SumoEvents:
         if left == edge:
             return  # the vehicle has changed lanes
         ways = _ways_between(before, edge)
-        if ways and all(any(state in _RED for state in states) for states in ways):
+        if ways and all(any(state in _RED_STATES for state in states) for states in ways):
             speed = scene.speeds[scene.roster.index[agent]]
             what = f"{agent} ran a red light at {speed:.1f} m/s, coming from lane {before}"
             found.append(self._of(scene, agent, "red_light", what))
@@ -295,7 +295,7 @@ class SumoEvents:
         # Use the course, because the heading of a long vehicle turns late. SUMO's angles are clockwise from north.
         angle = math.radians(sumo.lane_getAngle(lane, sumo.vehicle_getLanePosition(agent)))
         along = ((x - was_x) * math.sin(angle) + (y - was_y) * math.cos(angle)) / driven
-        if along >= _AGAINST:
+        if along >= _WRONG_WAY_COSINE:
             self._wrong.discard(agent)
         elif agent not in self._wrong:
             self._wrong.add(agent)
@@ -360,7 +360,7 @@ def _ways_between(lane: str, edge: str) -> list[tuple[str, ...]]:
     none, because the signal stands where a vehicle enters.
     """
     ways: list[tuple[str, tuple[str, ...]]] = [(lane, ())]
-    for _ in range(_LINKS_AT_ONCE):  # shortest way first, because a vehicle cannot drive a detour in one step
+    for _ in range(_MAX_LINKS_PER_STEP):  # shortest way first, because a vehicle cannot drive a detour in one step
         further = []
         for place, states in ways:
             for link in sumo.lane_getLinks(place):

@@ -40,7 +40,7 @@ GRIDLOCK_S = 120.0
 GRIDLOCK_SHARE = 0.95
 MIN_VEHICLES_IN_GRIDLOCK = 5
 STANDING_MPS = 0.1
-STOPPED = 1  # bit of SUMO's stop state
+STOPPED_BIT = 1  # bit of SUMO's stop state
 
 
 def main() -> None:
@@ -126,7 +126,7 @@ def _run(files: StagedFiles, seed: int, values: dict[str, Value], deadline_s: fl
 
 def _standing(present: tuple[str, ...]) -> tuple[int, int]:
     """Return the number of vehicles that stand still, and of all vehicles, both without vehicles at a planned stop."""
-    free = [vehicle for vehicle in present if not sumo.vehicle_getStopState(vehicle) & STOPPED]
+    free = [vehicle for vehicle in present if not sumo.vehicle_getStopState(vehicle) & STOPPED_BIT]
     return sum(sumo.vehicle_getSpeed(vehicle) < STANDING_MPS for vehicle in free), len(free)
 
 

@@ -22,8 +22,18 @@ if TYPE_CHECKING:
 
 __all__ = ["BACKEND"]
 
-_VEHICLE = ("existing", "replaces", "type", "route", "edges", "depart_s", "depart_lane", "depart_pos", "depart_speed")
-_DRIVING = ("action", "target_speeds", "speed_mode")
+_VEHICLE_KEYS = (
+    "existing",
+    "replaces",
+    "type",
+    "route",
+    "edges",
+    "depart_s",
+    "depart_lane",
+    "depart_pos",
+    "depart_speed",
+)
+_DRIVING_KEYS = ("action", "target_speeds", "speed_mode")
 
 
 OSM_ENDINGS, OPENDRIVE_ENDINGS = (".osm", ".osm.gz", ".osm.xml", ".pbf"), (".xodr", ".xodr.gz")
@@ -152,7 +162,7 @@ BACKEND = Backend(
     title="SUMO",
     table=SumoSetup,
     example="net and routes",
-    keys=frozenset({"warmup_s", "insertion_timeout_s", *(f"agents.{key}" for key in (*_VEHICLE, *_DRIVING))}),
+    keys=frozenset({"warmup_s", "insertion_timeout_s", *(f"agents.{key}" for key in (*_VEHICLE_KEYS, *_DRIVING_KEYS))}),
     check=_check,
     check_names=_check_names,
     files=_files,

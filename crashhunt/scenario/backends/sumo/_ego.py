@@ -43,9 +43,19 @@ EGO_VEHICLE = "vehicle"
 NOT_GIVEN = "no --ego given: "
 _BUSY_AFTER_S, _WINDOW_S = 200.0, 300.0
 """An earlier departure meets an empty town; a later one costs simulated time before each trial."""
-_MANY = 10_000  # of one flow
-_AT_MOST = 200  # vehicles to draw from, spread over the window
-_NO_ROAD = {"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car", "ship", "aircraft"}
+_MAX_FLOW_VEHICLES = 10_000  # of one flow
+_MAX_CANDIDATES = 200  # vehicles to draw from, spread over the window
+_OFF_ROAD_CLASSES = {
+    "rail",
+    "rail_urban",
+    "rail_electric",
+    "rail_fast",
+    "tram",
+    "subway",
+    "cable_car",
+    "ship",
+    "aircraft",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +123,7 @@ def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
     """
     kind, _, value = ego.partition("=")
     if ego in ("", "any"):
-        return _anybody(ego, files, begin, path)
+        return _draw_ego(ego, files, begin, path)
     if not value:
         kind, value = "vehicle", ego
     if kind == "route":
@@ -140,7 +150,7 @@ def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
     )
 
 
-def _anybody(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
+def _draw_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
     """Draw a vehicle in each trial from those that depart amid traffic; if none departs, add one."""
     why = "" if ego else NOT_GIVEN
     # Who would have departed before the simulation begins never does.
@@ -176,8 +186,8 @@ def draw_among(
         when = "" if len(known) == 1 else f" from {since:.0f} to {since + _WINDOW_S:.0f} s"
         note = f"{why}the controlled vehicle is {names[0]!r}, the only one that {verb}s{when}"
         return Ego(agent=names[0], setup=AgentSetup(existing=True, depart_s=depart), note=note, arguments={})
-    if count > _AT_MOST:
-        names = [names[index * count // _AT_MOST] for index in range(_AT_MOST)]
+    if count > _MAX_CANDIDATES:
+        names = [names[index * count // _MAX_CANDIDATES] for index in range(_MAX_CANDIDATES)]
     others = {one.vehicle for one in known}
     agent = next(name for name in (keep_agent or _EGO, _EGO, f"crashhunt.{_EGO}") if name not in others)
     note = (
@@ -217,7 +227,7 @@ def _departures(files: list[Path]) -> list[Departure]:
     """Return the vehicles whose names are known before the simulation; of a flow, only those that depart soon."""
     found = []
     elements = _elements(files, "vehicle", "trip", "flow", "vType")
-    elsewhere = {one.get("id") for one in elements if one.tag == "vType" and one.get("vClass") in _NO_ROAD}
+    elsewhere = {one.get("id") for one in elements if one.tag == "vType" and one.get("vClass") in _OFF_ROAD_CLASSES}
     for element in elements:
         name, begin = element.get("id", ""), element.get("depart", element.get("begin", "0"))
         if not name or element.tag == "vType":  # no name: the flow of a calibrator
@@ -238,9 +248,11 @@ def _of_flow(flow: ET.Element, name: str, begin: float, off_road: bool) -> list[
     try:
         interval = _interval(flow, begin)
         end = seconds(flow.get("end", "inf"), Path())
-        most = int(number(flow.get("number", "inf"), "number", Path())) if "number" in flow.attrib else _MANY
+        most = (
+            int(number(flow.get("number", "inf"), "number", Path())) if "number" in flow.attrib else _MAX_FLOW_VEHICLES
+        )
         span = min(end - begin, 2 * (_BUSY_AFTER_S + _WINDOW_S))
-        count = max(1, min(most, _MANY, int(span / interval) if interval > 0 else 1))
+        count = max(1, min(most, _MAX_FLOW_VEHICLES, int(span / interval) if interval > 0 else 1))
     except (ScenarioError, ZeroDivisionError, OverflowError, ValueError):
         return [Departure(f"{name}.0", begin, off_road)]
     return [Departure(f"{name}.{index}", begin + index * interval, off_road) for index in range(count)]
@@ -352,7 +364,7 @@ def refine(scenario: Scenario, answer: Json) -> Scenario:
         NoValidTrialError: no vehicle enters.
     """
     runs = cast("list[SurveyedRun]", answer)
-    known = _entering(runs)
+    known = _entering_in_all_runs(runs)
     (agent,) = scenario.agents
     setup = scenario.agents[agent]
     if not known and any(run["cut_short"] for run in runs):
@@ -369,7 +381,9 @@ def refine(scenario: Scenario, answer: Json) -> Scenario:
         return replace(scenario, notes=(scenario.notes[0], *notes, *scenario.notes[1:]))
     stuck_s = min((run["gridlock"]["since_s"] for run in runs if run["gridlock"]), default=None)
     kept = agent if setup.replaces else ""
-    drawn = draw_among(_before(stuck_s, known), few=FEW_CANDIDATES, keep_agent=kept, why=_why(scenario))
+    drawn = draw_among(
+        _entering_before_gridlock(stuck_s, known), few=FEW_CANDIDATES, keep_agent=kept, why=_entry_failure(scenario)
+    )
     return replace(
         scenario,
         agents={drawn.agent: drawn.setup},
@@ -393,15 +407,18 @@ def restore(scenario: Scenario, kept: Scenario) -> Scenario | None:
         scenario,
         agents={agent: AgentSetup(replaces=EGO_VEHICLE, depart_s=before.depart_s)},
         arguments={**scenario.arguments, EGO_VEHICLE: argument},
-        notes=(f"{_why(scenario)}each trial replaces one of the {count} candidates of this hunt", *scenario.notes[1:]),
+        notes=(
+            f"{_entry_failure(scenario)}each trial replaces one of the {count} candidates of this hunt",
+            *scenario.notes[1:],
+        ),
     )
 
 
-def _why(scenario: Scenario) -> str:
+def _entry_failure(scenario: Scenario) -> str:
     return NOT_GIVEN if scenario.notes[0].startswith(NOT_GIVEN) else ""
 
 
-def _entering(runs: Sequence[SurveyedRun]) -> list[Departure]:
+def _entering_in_all_runs(runs: Sequence[SurveyedRun]) -> list[Departure]:
     """Return the drivable vehicles that entered in every run, by the latest time at which they did.
 
     A run that was cut short says nothing about what enters later. Where no vehicle entered in every run, those of the
@@ -419,7 +436,7 @@ def _entering(runs: Sequence[SurveyedRun]) -> list[Departure]:
     return sorted((Departure(vehicle, time_s, off_road=False) for vehicle, time_s in times.items()), key=_by_time)
 
 
-def _before(stuck_s: float | None, known: list[Departure]) -> list[Departure]:
+def _entering_before_gridlock(stuck_s: float | None, known: list[Departure]) -> list[Departure]:
     """Return the vehicles that enter before a gridlock, and where there are enough, before it builds up."""
     if stuck_s is None:
         return known

@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Literal
 from xml.parsers import expat
 
 from crashhunt.base.errors import CrashhuntError, InvalidEpisodeError, ScenarioError
-from crashhunt.scenario.backends.sumo._options import ALWAYS, INPUTS, USUALLY, SumoSetup, canonical, is_output, is_shown
+from crashhunt.scenario.backends.sumo._options import (
+    DEFAULT_OPTIONS,
+    FIXED_OPTIONS,
+    INPUTS,
+    SumoSetup,
+    canonical,
+    is_output,
+    is_shown,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -26,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = [
     "READ",
     "WRITTEN",
-    "Reference",
+    "FileReference",
     "StagedFiles",
     "filled_in",
     "movable",
@@ -52,7 +60,7 @@ READ = {
 
 WRITTEN = {"file", "output", "dest"}
 """The attributes that name what SUMO writes, wherever they are not `READ`."""
-_NOWHERE = {"", "NUL", "nul", "/dev/null", "stdout", "STDOUT", "-", "stderr", "STDERR"}
+_DISCARDED_OUTPUTS = {"", "NUL", "nul", "/dev/null", "stdout", "STDOUT", "-", "stderr", "STDERR"}
 """What SUMO does not take for the name of a file."""
 
 # What is not in a file's bytes, no attribute of it can be; most files have none of these. Networks are large, and a
@@ -66,7 +74,7 @@ _ATTRIBUTE = re.compile(rb"\s+([^\s=]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 
 
 @dataclass(frozen=True, slots=True)
-class Reference:
+class FileReference:
     """An attribute of an XML file that names another file.
 
     Args:
@@ -110,7 +118,7 @@ def read_xml(path: Path) -> bytes:
     return content
 
 
-def references(content: bytes, where: str) -> list[Reference]:
+def references(content: bytes, where: str) -> list[FileReference]:
     """Return the references to other files in an XML file.
 
     Raises:
@@ -118,7 +126,7 @@ def references(content: bytes, where: str) -> list[Reference]:
     """
     if not any(word in content and pattern.search(content) for word, pattern in _WORTH_PARSING.items()):
         return []
-    found: list[Reference] = []
+    found: list[FileReference] = []
     parser = expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
@@ -126,15 +134,19 @@ def references(content: bytes, where: str) -> list[Reference]:
             if (tag, name) in READ:
                 if value:
                     found.append(
-                        Reference(tag=tag, attribute=name, value=value, kind="read", offset=parser.CurrentByteIndex)
+                        FileReference(tag=tag, attribute=name, value=value, kind="read", offset=parser.CurrentByteIndex)
                     )
-            elif name in WRITTEN and value not in _NOWHERE:
+            elif name in WRITTEN and value not in _DISCARDED_OUTPUTS:
                 found.append(
-                    Reference(tag=tag, attribute=name, value=value, kind="written", offset=parser.CurrentByteIndex)
+                    FileReference(tag=tag, attribute=name, value=value, kind="written", offset=parser.CurrentByteIndex)
                 )
-        if tag == "param" and _is_written(attributes.get("key", "")) and attributes.get("value", "") not in _NOWHERE:
+        if (
+            tag == "param"
+            and _is_written(attributes.get("key", ""))
+            and attributes.get("value", "") not in _DISCARDED_OUTPUTS
+        ):
             found.append(
-                Reference(
+                FileReference(
                     tag=tag,
                     attribute="value",
                     value=attributes["value"],
@@ -156,7 +168,7 @@ def _is_written(key: str) -> bool:
     return key == "file" or (key.endswith(".file") and key != "device.fcd-replay.file")
 
 
-def rewritten(content: bytes, found: list[Reference], name: Callable[[Reference], str]) -> bytes:
+def rewritten(content: bytes, found: list[FileReference], name: Callable[[FileReference], str]) -> bytes:
     """Return an XML file in which attributes name other files; all else stays as it is.
 
     Args:
@@ -169,14 +181,14 @@ def rewritten(content: bytes, found: list[Reference], name: Callable[[Reference]
     parts, end = [], 0
     for reference in found:
         value = name(reference)
-        place = _place(content, reference)
+        place = _value_span(content, reference)
         if value != reference.value and place is not None:
             parts += [content[end : place[0]], quoteattr(value).encode("ascii", "xmlcharrefreplace")]
             end = place[1]
     return b"".join([*parts, content[end:]])
 
 
-def _place(content: bytes, reference: Reference) -> tuple[int, int] | None:
+def _value_span(content: bytes, reference: FileReference) -> tuple[int, int] | None:
     """Where the value of an attribute is, with its quotes; None for one that the document type gives by default."""
     wanted = reference.attribute.encode()
     match = _TAG.match(content, reference.offset)
@@ -194,7 +206,7 @@ def movable(path: Path) -> bytes | None:
     """
     content = read_xml(path)
 
-    def staged_name(reference: Reference) -> str:
+    def staged_name(reference: FileReference) -> str:
         is_absolute = reference.kind == "read" and reference.value.startswith("/")
         return os.path.relpath(reference.value, path.parent) if is_absolute else reference.value
 
@@ -217,7 +229,7 @@ def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) 
     waiting = list(names)
     while waiting:
         name = waiting.pop(0)
-        for nested in _named_by(folder, name):
+        for nested in _references_of(folder, name):
             if inside and nested.startswith(f"..{os.sep}"):
                 message, fix = f"names {nested!r}, outside the scenario's folder", "move it inside, to be archived"
                 raise ScenarioError(message, fix=fix, where=str(folder / name))
@@ -232,14 +244,14 @@ def written_by(folder: Path, names: tuple[str, ...]) -> list[str]:
     found = [
         f"{name}: {reference}"
         for name in dict.fromkeys((*names, *nested_files(folder, names)))
-        for reference in _before_it_is_filled_in(folder / name)
+        for reference in _template_of(folder / name)
         if reference.kind == "written"
     ]
     more = f" and {len(found) - 1} more" if len(found) > 1 else ""
     return [f"{found[0]}{more} (nothing is written)"] if found else []
 
 
-def _named_by(folder: Path, name: str) -> list[str]:
+def _references_of(folder: Path, name: str) -> list[str]:
     path = folder / name
     try:
         stat = path.stat()
@@ -248,7 +260,7 @@ def _named_by(folder: Path, name: str) -> list[str]:
     return [os.path.relpath(target, folder) for target in _targets(path, stat.st_mtime_ns, stat.st_size)]
 
 
-def _before_it_is_filled_in(path: Path) -> list[Reference]:
+def _template_of(path: Path) -> list[FileReference]:
     content = read_xml(path)
     try:
         return references(content, str(path))
@@ -261,7 +273,7 @@ def _before_it_is_filled_in(path: Path) -> list[Reference]:
 @lru_cache(maxsize=256)
 def _targets(path: Path, _mtime_ns: int, _size: int) -> tuple[str, ...]:
     targets = []
-    for reference in _before_it_is_filled_in(path):
+    for reference in _template_of(path):
         if reference.kind == "written":
             continue
         # As SUMO does it: relative to the file that names it, and ${NAME} is no variable here.
@@ -325,11 +337,11 @@ class StagedFiles:
                 ) from None
             if self._rendered.get(path) != text:
                 try:
-                    path.write_bytes(self._own(text.encode(), path))
+                    path.write_bytes(self._staged_content(text.encode(), path))
                 except CrashhuntError as error:
                     raise InvalidEpisodeError(error.message, fix=error.fix, where=path.name) from None
                 self._rendered[path] = text
-        options = USUALLY | {canonical(name): _text(value) for name, value in self._sumo.options.items()}
+        options = DEFAULT_OPTIONS | {canonical(name): _text(value) for name, value in self._sumo.options.items()}
         for name, setup in self._scenario.arguments.items():
             if setup.option and name in values:
                 options[canonical(setup.option)] = _text(values[name])
@@ -338,7 +350,7 @@ class StagedFiles:
             for name, value in options.items()
             if not is_output(name) and not is_shown(name)
         }
-        options |= {"seed": str(seed), "step-length": repr(self._scenario.step_length_s), **ALWAYS}
+        options |= {"seed": str(seed), "step-length": repr(self._scenario.step_length_s), **FIXED_OPTIONS}
         options["net-file"] = self._paths([self._sumo.net])
         for option, names in (("route-files", self._sumo.routes), ("additional-files", self._sumo.additional)):
             if names:
@@ -354,16 +366,16 @@ class StagedFiles:
             self._templates[staged] = string.Template(content.decode())
             staged.touch()  # a file that only a trial adds would show as something that the trial left behind
             return True
-        own = self._own(content, source)
+        own = self._staged_content(content, source)
         if own == content:
             return False
         staged.write_bytes(own)
         return True
 
-    def _own(self, content: bytes, path: Path) -> bytes:
+    def _staged_content(self, content: bytes, path: Path) -> bytes:
         """The content of a file that reads only what is staged, and writes nothing."""
 
-        def name(reference: Reference) -> str:
+        def name(reference: FileReference) -> str:
             if reference.kind == "written":
                 return _NULL_DEVICE
             if not reference.value.startswith("/"):

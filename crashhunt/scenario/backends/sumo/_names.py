@@ -26,7 +26,7 @@ __all__ = ["check_names", "explained", "line_of"]
 
 
 # Where one of these is, things may be defined that are not written there as `id="NAME"`.
-_SECRETIVE = re.compile(rb"""\bid\s*=\s*["'][^"']*(?:\$\{|&#)""")
+_GENERATED_ID = re.compile(rb"""\bid\s*=\s*["'][^"']*(?:\$\{|&#)""")
 _TAGS = {"type": b"vType|vTypeDistribution", "route": b"route|routeDistribution", "edge": b"edge"}
 _VEHICLES = b"vehicle|trip|flow"
 
@@ -42,7 +42,7 @@ def check_names(scenario: Scenario, ego: str = "") -> None:
         ScenarioError: a name is unknown; the message has the most similar one.
     """
     demand = [read_xml(scenario.folder / name) for name in scenario.texts()]
-    open_ended = any(_SECRETIVE.search(text) for text in demand)
+    open_ended = any(_GENERATED_ID.search(text) for text in demand)
     for agent, setup in scenario.agents.items():
         key = f"agents.{agent}"
         if not open_ended:
@@ -128,18 +128,18 @@ def _ids(tags: bytes, texts: list[bytes]) -> list[str]:
 
 # SUMO's complaints about an episode that it could not set up, as file, key and value that the user can correct.
 
-_RAISED = "SUMO could not set up the episode: "
-_MENDED = "correct it there"
+_SET_UP_ERROR = "SUMO could not set up the episode: "
+_FIX_IN_FILE = "correct it there"
 # SUMO raises one of these, and says on its output what it means.
-_VAGUE = ("Process Error", "Could not parse commandline options.")
-_STAGED = re.compile(r"/\S*?/stage-\d+/")
-_OPTION = re.compile(r"No option with the name '([^']+)' exists|On processing option '--([^']+)'")
-_NUMBER = re.compile(r"Invalid (?:Number|Bool) Format(?: \(\w+\))? (\S+)")
-_LINE = re.compile(r"In file '([^']+)' At line/column (\d+)")
-_VEHICLE = re.compile(r"(?:Invalid|departing) (\w+?)(?: definition)?(?: '[^']*')? for vehicle '([^']+)'")
-_KEYS = {"type": "type", "route": "route", "departLane": "depart_lane", "departPos": "depart_pos"}
-_KEYS |= {"departSpeed": "depart_speed"}
-_DEFINED = re.compile(r"(?:flow|vType|vehicle type|vehicle|trip|route|edge|lane|junction) '([^']+)'")
+_VAGUE_ERRORS = ("Process Error", "Could not parse commandline options.")
+_STAGED_PATH = re.compile(r"/\S*?/stage-\d+/")
+_OPTION_ERROR = re.compile(r"No option with the name '([^']+)' exists|On processing option '--([^']+)'")
+_NUMBER_ERROR = re.compile(r"Invalid (?:Number|Bool) Format(?: \(\w+\))? (\S+)")
+_LINE_ERROR = re.compile(r"In file '([^']+)' At line/column (\d+)")
+_VEHICLE_ERROR = re.compile(r"(?:Invalid|departing) (\w+?)(?: definition)?(?: '[^']*')? for vehicle '([^']+)'")
+_KEY_BY_ATTRIBUTE = {"type": "type", "route": "route", "departLane": "depart_lane", "departPos": "depart_pos"}
+_KEY_BY_ATTRIBUTE |= {"departSpeed": "depart_speed"}
+_DEFINED_ID = re.compile(r"(?:flow|vType|vehicle type|vehicle|trip|route|edge|lane|junction) '([^']+)'")
 
 
 def explained(message: str, output: str, scenario: Scenario) -> ScenarioError | None:
@@ -150,13 +150,13 @@ def explained(message: str, output: str, scenario: Scenario) -> ScenarioError | 
         output: what SUMO printed last.
         scenario: the loaded scenario, not the copy of the worker.
     """
-    said, errors = message.removeprefix(_RAISED), _errors(output)
+    said, errors = message.removeprefix(_SET_UP_ERROR), _errors(output)
     died = message.startswith("the process died") and errors
-    if not (died or message.startswith(_RAISED)):
+    if not (died or message.startswith(_SET_UP_ERROR)):
         return None
-    if died or (errors and said in _VAGUE):
+    if died or (errors and said in _VAGUE_ERRORS):
         said = f"{errors[0]} ({message})" if died else errors[0]
-    said = _STAGED.sub(f"{scenario.folder}/", said).rstrip(".")
+    said = _STAGED_PATH.sub(f"{scenario.folder}/", said).rstrip(".")
     return _about_an_option(said, scenario) or _about_a_vehicle(said, scenario) or _about_a_file(said, scenario)
 
 
@@ -179,7 +179,7 @@ def _about_an_option(said: str, scenario: Scenario) -> ScenarioError | None:
     options = scenario.table(SumoSetup).options
     keys = {name: f"sumo.options.{name}" for name in options}
     keys |= {setup.option: f"arguments.{name}.option" for name, setup in scenario.arguments.items() if setup.option}
-    found, number = _OPTION.search(said), _NUMBER.search(said)
+    found, number = _OPTION_ERROR.search(said), _NUMBER_ERROR.search(said)
     if found is not None:
         name = found[1] or found[2]
         if name in keys:
@@ -194,10 +194,10 @@ def _about_an_option(said: str, scenario: Scenario) -> ScenarioError | None:
 
 
 def _about_a_vehicle(said: str, scenario: Scenario) -> ScenarioError | None:
-    found = _VEHICLE.search(said)
-    if found is None or found[2] not in scenario.agents or found[1] not in _KEYS:
+    found = _VEHICLE_ERROR.search(said)
+    if found is None or found[2] not in scenario.agents or found[1] not in _KEY_BY_ATTRIBUTE:
         return None
-    key = _KEYS[found[1]]
+    key = _KEY_BY_ATTRIBUTE[found[1]]
     value = getattr(scenario.agents[found[2]], key)
     what = f"agents.{found[2]}.{key} = {value!r}: SUMO says: {said}"
     return ScenarioError(what, fix="change the value", where=scenario.origin)
@@ -205,13 +205,13 @@ def _about_a_vehicle(said: str, scenario: Scenario) -> ScenarioError | None:
 
 def _about_a_file(said: str, scenario: Scenario) -> ScenarioError:
     """The file and the line that SUMO names, or in which what it names is defined."""
-    line = _LINE.search(said)
+    line = _LINE_ERROR.search(said)
     if line is not None:
         text = said[: line.start()].strip()
-        return ScenarioError(f"SUMO says: {text}", fix=_MENDED, where=f"{line[1]}, line {line[2]}")
+        return ScenarioError(f"SUMO says: {text}", fix=_FIX_IN_FILE, where=f"{line[1]}, line {line[2]}")
     files = [scenario.folder / name for name in reversed(list(scenario.files()))]  # the network last, which is large
-    for name in _DEFINED.findall(said):
+    for name in _DEFINED_ID.findall(said):
         where = line_of(name, files)
         if where:
-            return ScenarioError(f"SUMO says: {said}", fix=_MENDED, where=where)
+            return ScenarioError(f"SUMO says: {said}", fix=_FIX_IN_FILE, where=where)
     return ScenarioError(f"SUMO says: {said}", fix="see [sumo] and the files that it names", where=scenario.origin)

@@ -10,11 +10,11 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "ALWAYS",
+    "DEFAULT_OPTIONS",
+    "FIXED_OPTIONS",
     "HARMLESS",
     "INPUTS",
     "RESERVED",
-    "USUALLY",
     "SumoSetup",
     "canonical",
     "is_output",
@@ -24,9 +24,9 @@ __all__ = [
 ]
 
 
-USUALLY = {"time-to-teleport": "-1"}  # otherwise a jam removes vehicles; a scenario may want just that
+DEFAULT_OPTIONS = {"time-to-teleport": "-1"}  # otherwise a jam removes vehicles; a scenario may want just that
 """What SUMO gets where a scenario says nothing else."""
-ALWAYS = {
+FIXED_OPTIONS = {
     "random": "false",
     "threads": "1",  # results depend on it
     "device.rerouting.threads": "0",
@@ -42,7 +42,7 @@ ALWAYS = {
 }
 """What every trial has, because it means something else with other values."""
 
-RESERVED = frozenset({*ALWAYS, "seed", "step-length", "net-file", "route-files", "additional-files"})
+RESERVED = frozenset({*FIXED_OPTIONS, "seed", "step-length", "net-file", "route-files", "additional-files"})
 RESERVED -= {"device.ssm.file", "device.toc.file"}  # disabled like every other output
 """The options that crashhunt sets itself."""
 
@@ -155,7 +155,7 @@ c=configuration-file configuration=configuration-file C=save-configuration save-
     route=route-files
 """
 
-_WRITING = frozenset(
+_OUTPUT_OPTIONS = frozenset(
     [
         "netstate-dump",
         "log",
@@ -173,15 +173,24 @@ _WRITING = frozenset(
     ]
 )
 # Options of output and display; none of them changes the traffic.
-_SHOWN_NAMES = """
+_DISPLAY_OPTION_NAMES = """
 write-license write-metadata precision human-readable-time verbose print-options help version no-warnings
 aggregate-warnings language xml-validation no-step-log remote-port num-clients configuration-file
 gui-settings-file quit-on-end start delay breakpoints edgedata-files alternative-net-file selection-file demo
 disable-textures registry-viewport window-size window-pos tracker-interval save-commented game osg-view
 
 """
-_SHOWN = frozenset(_SHOWN_NAMES.split())
-_SHOWN_FAMILIES = ("output-", "output.", "precision.", "save-", "log.", "duration-log.", "step-log.", "xml-validation.")
+_DISPLAY_OPTIONS = frozenset(_DISPLAY_OPTION_NAMES.split())
+_DISPLAY_FAMILIES = (
+    "output-",
+    "output.",
+    "precision.",
+    "save-",
+    "log.",
+    "duration-log.",
+    "step-log.",
+    "xml-validation.",
+)
 _WINDOW_FAMILIES = ("game.", "gui-testing", "device.ssm.filter-edges.")
 
 
@@ -211,7 +220,7 @@ def canonical(name: str) -> str:
 
 def writes(name: str) -> bool:
     """Whether the value of an option is a file that SUMO writes."""
-    return name in _WRITING or name.endswith(("-output", ".output"))
+    return name in _OUTPUT_OPTIONS or name.endswith(("-output", ".output"))
 
 
 def is_output(name: str) -> bool:
@@ -222,7 +231,7 @@ def is_output(name: str) -> bool:
 
 def is_shown(name: str) -> bool:
     """Return whether an option concerns printing, a window, or a remote control."""
-    return name in _SHOWN or name.startswith(_SHOWN_FAMILIES + _WINDOW_FAMILIES)
+    return name in _DISPLAY_OPTIONS or name.startswith(_DISPLAY_FAMILIES + _WINDOW_FAMILIES)
 
 
 def is_true(value: object) -> bool:

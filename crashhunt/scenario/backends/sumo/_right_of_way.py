@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["right_of_way"]
 
-_MOST_BYTES = 50_000_000  # a larger network is not worth the wait
-_SILENT = ("unregulated", "internal", "dead_end", "rail_signal", "rail_crossing")
+_MAX_NETWORK_BYTES = 50_000_000  # a larger network is not worth the wait
+_UNREGULATED_TYPES = ("unregulated", "internal", "dead_end", "rail_signal", "rail_crossing")
 
 
 def right_of_way(scenario: Scenario) -> RightOfWay | None:
@@ -34,7 +34,7 @@ def right_of_way(scenario: Scenario) -> RightOfWay | None:
 @lru_cache(maxsize=4)
 def _read(path: Path, _changed: int) -> RightOfWay | None:
     content = read_xml(path)
-    if len(content) > _MOST_BYTES or b"<!DOCTYPE" in content:
+    if len(content) > _MAX_NETWORK_BYTES or b"<!DOCTYPE" in content:
         return None
     root = ET.fromstring(content)
     shapes = {lane.attrib["id"]: _points(lane.get("shape", "")) for lane in root.iter("lane")}
@@ -68,7 +68,7 @@ def _read(path: Path, _changed: int) -> RightOfWay | None:
         )
     gives_way = set()
     for node in root.iter("junction"):
-        if node.get("type", "") in _SILENT:
+        if node.get("type", "") in _UNREGULATED_TYPES:
             continue
         ways = [places.get(lane) for lane in node.get("intLanes", "").split()]
         for request in node.iter("request"):

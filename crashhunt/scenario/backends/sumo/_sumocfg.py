@@ -14,7 +14,7 @@ from crashhunt.scenario.backends.sumo._check import check_options
 from crashhunt.scenario.backends.sumo._ego import choose_ego, number, seconds
 from crashhunt.scenario.backends.sumo._files import nested_files, read_xml, written_by
 from crashhunt.scenario.backends.sumo._options import (
-    ALWAYS,
+    FIXED_OPTIONS,
     INPUTS,
     RESERVED,
     SumoSetup,
@@ -36,7 +36,7 @@ __all__ = ["changes", "is_left_out", "load_sumocfg", "read_config", "split_names
 
 _VARIABLE = re.compile(r"\$\{(.+?)\}")
 # Why a trial has another value than the configuration; the rest of what is always so changes nothing on the road.
-_WHY = {
+_REASONS = {
     "random": "a trial must be the same again",
     "threads": "results depend on their number",
     "device.rerouting.threads": "results depend on their number",
@@ -102,8 +102,8 @@ def changes(options: Mapping[str, str]) -> list[str]:
     for name, value in options.items():
         if name == "seed":
             found.append(f"seed {value} (each trial has its own)")
-        elif name in _WHY and not _same(value, ALWAYS[name]):
-            found.append(f"{name} {value} (it is {ALWAYS[name]}: {_WHY[name]})")
+        elif name in _REASONS and not _is_equal(value, FIXED_OPTIONS[name]):
+            found.append(f"{name} {value} (it is {FIXED_OPTIONS[name]}: {_REASONS[name]})")
         elif name == "load-state":
             found.append(f"load-state {value} (a trial begins with an empty road)")
         elif name == "end" and not value.startswith("-"):
@@ -114,7 +114,7 @@ def changes(options: Mapping[str, str]) -> list[str]:
     return found
 
 
-def _same(value: str, other: str) -> bool:
+def _is_equal(value: str, other: str) -> bool:
     if other in ("true", "false"):
         return is_true(value) is (other == "true")
     try:
@@ -128,8 +128,8 @@ def is_left_out(name: str) -> bool:
     return is_output(name) or is_shown(name) or name.startswith("load-state")
 
 
-_FILES = ("net-file", "route-files", "additional-files")
-_TAKEN = {"begin", "step-length", "scale"}  # a scenario has a key of its own for each of them
+_FILE_OPTIONS = ("net-file", "route-files", "additional-files")
+_KEY_OPTIONS = {"begin", "step-length", "scale"}  # a scenario has a key of its own for each of them
 _TELEPORT_S = "300"  # SUMO's own
 # A flow is not punctual, and a full road admits no vehicle.
 _PATIENCE_S = 300.0
@@ -158,11 +158,11 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
         options["phemlight-path"] = str(path.resolve().parent / options["phemlight-path"]) + os.sep
         notes.append(f"phemlight-path is {options['phemlight-path']}, which is not archived")
     folder, files = _files(options, path, "; ".join(note for note in notes if note.endswith("is not set")))
-    (net, *_), routes, additional = (files[key] for key in _FILES)
+    (net, *_), routes, additional = (files[key] for key in _FILE_OPTIONS)
     begin, step_length = _times(options, path)
     driven = choose_ego(ego, [folder / file for file in (*routes, *additional)], begin, path)
     scale = number(options.get("scale", "1"), "scale", path)
-    kept = {key: value for key, value in options.items() if key not in _TAKEN | RESERVED}
+    kept = {key: value for key, value in options.items() if key not in _KEY_OPTIONS | RESERVED}
     check_options(kept, str(path))
     kept |= {key: ",".join(files[key]) for key in INPUTS & files.keys()}
     changed += written_by(folder, (*routes, *additional))
@@ -199,8 +199,8 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
 def _files(options: dict[str, str], path: Path, unset: str) -> tuple[Path, dict[str, tuple[str, ...]]]:
     """Return the folder that holds all files of the configuration, and their names in it by option."""
     base = path.resolve().parent
-    named: dict[str, list[str]] = {key: [] for key in _FILES}
-    for key in [key for key in options if key in _FILES or key in INPUTS]:
+    named: dict[str, list[str]] = {key: [] for key in _FILE_OPTIONS}
+    for key in [key for key in options if key in _FILE_OPTIONS or key in INPUTS]:
         for name in split_names(options.pop(key)):
             file = os.path.normpath(base / name)
             if not os.path.isfile(file):  # noqa: PTH113
