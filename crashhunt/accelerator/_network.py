@@ -136,7 +136,7 @@ def _is_array(value: object) -> bool:
 
 
 def _lane_extensions() -> list[float]:
-    """Return the distance in m by which each class of lanes extends beyond its end."""
+    """Return for each class of lanes how far beyond its end highway-env counts vehicles as on the lane, in m."""
     return [kind.VEHICLE_LENGTH for kind in _KNOWN]
 
 

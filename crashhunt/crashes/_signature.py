@@ -45,7 +45,7 @@ class StackFrame:
 
     Args:
         file: file in which it is.
-        line: line of it, from 1.
+        line: line of the file, counted from 1.
         function: function in which it is.
     """
 

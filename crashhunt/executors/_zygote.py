@@ -486,7 +486,7 @@ class _Zygote:
 
 
 def _why_not(error: BaseException) -> FromZygote:
-    """Return why no trial can run."""
+    """Return the message to the supervisor for an error with which no trial can run."""
     if isinstance(error, CrashhuntError):
         return {"error": error.to_json()["error"]}
     full = isinstance(error, OSError) and error.errno in DISK

@@ -49,7 +49,7 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RecordedPath:
-    """The way of an actor while it was in sight; of one who came back, there are several.
+    """The path of an actor while it was in sight. An actor that came back into sight has several paths.
 
     Args:
         path: as it was recorded.

@@ -81,7 +81,7 @@ MAX_EXCLUDED: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Root:
-    """The value of one root.
+    """The estimates from one root, which is a plain trial from which copies were forked.
 
     Args:
         undisturbed: its estimate of the probability of a crash that no disturbance had an effect on.

@@ -48,7 +48,7 @@ class Minimizer:
 
     Attributes:
         best: the smallest that did it.
-        smaller: all smaller candidates that still crash, in their order.
+        smaller: the minimized candidates that still crash, in the order in which they were found.
         reproduced: whether the crash itself came again.
         notes: what could not be tried, in words.
     """

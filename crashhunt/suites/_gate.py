@@ -397,7 +397,7 @@ class _Run:
         if not corpus.is_dir():
             if gate.corpus is None:
                 return None
-            raise UsageError(f"--corpus {gate.corpus} is not a folder of HEAD", fix="give the folder of a corpus")
+            raise UsageError(f"--corpus {gate.corpus} is not a folder in HEAD", fix="give a folder that HEAD contains")
         try:
             cases = find_cases([corpus])
         except CrashhuntError:

@@ -152,7 +152,7 @@ class Side:
 
     Args:
         exists: whether there is a lane that the agent may use.
-        ahead: the nearest vehicle ahead on it.
+        ahead: the nearest vehicle ahead of the agent in this lane.
         behind: the nearest vehicle behind on it.
     """
 

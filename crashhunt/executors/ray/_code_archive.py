@@ -321,7 +321,7 @@ class Place:
         self.scratch.mkdir()
 
     def unpack(self, packed: bytes, digest: str) -> bool:
-        """Unpack a parcel, which is verified; return whether it is as it should be."""
+        """Unpack an archive of code; return whether its content matches its digest."""
         try:
             unpack(packed, digest, self.code)
         except BundleError:

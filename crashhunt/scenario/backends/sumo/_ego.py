@@ -209,7 +209,7 @@ def draw_among(
 
 
 def _nameable(vehicles: Sequence[Departure]) -> list[str]:
-    """Return the ids that a specification can list: its separator is ``|``."""
+    """Return the ids of vehicles that contain no ``|``, which separates the ids in a specification."""
     return list(dict.fromkeys(one.vehicle for one in vehicles if "|" not in one.vehicle))
 
 
