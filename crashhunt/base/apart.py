@@ -19,6 +19,7 @@ import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from crashhunt.base import errors
@@ -103,7 +104,7 @@ class ServerApart:
         self._answers, answers = os.pipe()
         ends.update((self._requests, self._answers))
         try:
-            serve = lambda: _serve(work, requests, answers)  # noqa: E731
+            serve = partial(_serve, work, requests, answers)
             self._keeper = _keeper_of(serve, math.inf, keeps=(requests, answers))
         except CannotForkError:
             self._close()

@@ -45,7 +45,7 @@ __all__ = [
 
 
 T = TypeVar("T")
-_DIGEST_CHUNK_BYTES = 1 << 20  # bytes
+_SMALL_FILE_BYTES = 1 << 20  # bytes
 
 
 class FileEntry(TypedDict):
@@ -85,7 +85,7 @@ def digest_of_file(path: Path) -> str:
         OSError: it cannot be read.
     """
     with open(path, "rb", buffering=0) as file:  # hundreds at a time, and a Path takes twice as long
-        if os.fstat(file.fileno()).st_size < _DIGEST_CHUNK_BYTES:
+        if os.fstat(file.fileno()).st_size < _SMALL_FILE_BYTES:
             return digest_of_content(file.readall())
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 

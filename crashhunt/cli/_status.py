@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_status", "show_states", "states_console", "states_table"]
 
-_MIN_COLUMNS = 120
+_COLUMNS_WITHOUT_TERMINAL = 120
 _MAX_LISTED_NODES = 20  # of a hunt, one a line
 _STATE_COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "green", "interrupted": "yellow"}
 
@@ -69,7 +69,7 @@ def states_console(*, stderr: bool = False) -> Console:
     from rich.console import Console
 
     console = Console(stderr=stderr, highlight=False)
-    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_MIN_COLUMNS)
+    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_COLUMNS_WITHOUT_TERMINAL)
 
 
 def states_table(states: list[HuntState]) -> Group:

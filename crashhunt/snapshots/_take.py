@@ -260,7 +260,7 @@ def _take_root(root: Path, imported: ImportedModules, found: Sources, without: P
 
 
 _MEGABYTE = 10**6
-_MAX_SMALL_FILE_BYTES = 1 << 20  # bytes
+_SMALL_FILE_BYTES = 1 << 20  # bytes
 
 
 @clear_constructor
@@ -446,7 +446,7 @@ def _store(path: str, copy: str) -> FileEntry | None:
     try:
         with open(path, "rb", buffering=0) as file:
             status = os.fstat(file.fileno())
-            content = file.readall() if status.st_size < _MAX_SMALL_FILE_BYTES else None
+            content = file.readall() if status.st_size < _SMALL_FILE_BYTES else None
         if content is None:
             shutil.copy(path, copy)
             return {"size": _size(copy), "blake2b": digest_of_file(Path(copy))}

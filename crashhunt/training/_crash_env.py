@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CrashEnv", "make_training_env"]
 
-_MAX_SEED = 2**31
+_SEED_LIMIT = 2**31
 """Seeds of plain episodes are drawn from 0 to here, as those of trials are."""
 _MAX_INVALID = 20
 """Plain episodes in a row that cannot be set up, such as by a vehicle that never enters."""
@@ -200,9 +200,9 @@ class CrashEnv(gymnasium.Env[Any, Any]):
         self._index = None
         for attempt in range(_MAX_INVALID):
             hunt = int(self.np_random.integers(len(self._training)))
-            seed = int(self.np_random.integers(_MAX_SEED))
+            seed = int(self.np_random.integers(_SEED_LIMIT))
             while is_test_traffic(seed, self._split.test):
-                seed = int(self.np_random.integers(_MAX_SEED))
+                seed = int(self.np_random.integers(_SEED_LIMIT))
             try:
                 observation, info = self._episodes.reset_to_plain(hunt, seed)
             except SimulatorError:

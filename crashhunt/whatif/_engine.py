@@ -51,7 +51,7 @@ __all__ = ["FUTURES", "Counts", "Run", "WhatIfOptions", "future_seed", "what_if"
 FUTURES = 50
 """How many futures are run where the user gives no number: their interval is at most 0.27 wide."""
 _SELF_TEST_RUNS = 4  # futures to begin with, of which one is run twice
-_MIN_DIFFERENT_FUTURES = 20  # futures that must not all be equal
+_COMPARED_FUTURES = 20  # futures that must not all be equal
 _HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)
 _INTERRUPTED_REASON = "stopped"
 
@@ -244,8 +244,8 @@ class _Runs:
         tested = list(again.values())
         begun = _SELF_TEST_RUNS
         if _equal_futures(tested):  # chance may be rare, so that a few say little
-            tested += self._run(list(range(begun, _MIN_DIFFERENT_FUTURES)), future).values()
-            begun = _MIN_DIFFERENT_FUTURES
+            tested += self._run(list(range(begun, _COMPARED_FUTURES)), future).values()
+            begun = _COMPARED_FUTURES
             if equal := _equal_futures(tested):
                 raise UsageError(
                     f"--futures: {equal} futures with different seeds are bit-identical: {title} draws no random "
