@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import shutil
 import time
 from typing import TYPE_CHECKING
@@ -228,7 +229,8 @@ def test_handler_that_raises_again_and_again_is_the_agents(run):
 def test_fatal_signal_in_a_signal_handler_is_named_as_the_agents(run):
     (result,) = run([("segfaults", "signal handler")]).values()
     assert (str(result.outcome), result.failure.agent) == (DIED, "ego")
-    assert result.failure.message.startswith("the process died of SIGSEGV in ego's code at step ")
+    # The signal arrives after a time, not at a place: now and then in the middle of a call of act().
+    assert re.match(r"the process died of SIGSEGV in ego's (code at|act\(\) of) step \d+$", result.failure.message)
 
 
 MESSAGES = {
