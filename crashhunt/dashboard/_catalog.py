@@ -174,18 +174,20 @@ def unreadable_below(folder: Path, root: Path) -> str:
         folder: which may be missing.
         root: that the files must lie in.
     """
-    folders = [folder]
+    folders = [str(folder)]  # texts: a snapshot has 50 folders, and making a path takes longer than listing its folder
     while folders:
-        inside = folders.pop()
+        inside, odd = folders.pop(), []
         try:
-            with os.scandir(inside) as found:
-                entries = list(found)
+            with os.scandir(inside) as entries:
+                for entry in entries:
+                    if entry.is_dir(follow_symlinks=False):
+                        folders.append(entry.path)
+                    elif not entry.is_file(follow_symlinks=False):
+                        odd.append(entry.name)
         except OSError:
             continue
-        odd = [one.name for one in entries if one.is_symlink() or not (one.is_file() or one.is_dir())]
-        if why := unreadable(inside, root, odd):
-            return f"in {inside.relative_to(root)}, {why}"
-        folders += [Path(one.path) for one in entries if one.is_dir(follow_symlinks=False)]
+        if odd and (why := unreadable(Path(inside), root, odd)):
+            return f"in {Path(inside).relative_to(root)}, {why}"
     return ""
 
 

@@ -32,13 +32,16 @@ export async function get(path, { always = false } = {}) {
   return data;
 }
 
-/* Asks again and again while the page is looked at; a failure is said at the top, and the next success removes it. */
+/* Asks again and again while the page is looked at; a failure is said at the top, and the next success removes it. Where
+   an answer takes long to get and to draw, the pauses become longer: a page takes time that a hunt on this machine needs. */
+const SHARE_OF_TIME = 0.05, LONGEST_PAUSE_MS = 6000;
 export function poll(ask, everyMs) {
   let timer = null, running = false;
   const turn = async () => {
     clearTimeout(timer);
     if (running) return;
     running = true;
+    const began = performance.now();
     try {
       await ask();
       tell("");
@@ -47,7 +50,8 @@ export function poll(ask, everyMs) {
     }
     running = false;
     document.body.dataset.polls = String(Number(document.body.dataset.polls || 0) + 1);
-    if (!document.hidden) timer = setTimeout(turn, everyMs);
+    const pauseMs = Math.min((performance.now() - began) / SHARE_OF_TIME, LONGEST_PAUSE_MS);
+    if (!document.hidden) timer = setTimeout(turn, Math.max(everyMs, pauseMs));
   };
   document.addEventListener("visibilitychange", () => { if (!document.hidden) turn(); });
   return turn();
