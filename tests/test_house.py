@@ -95,7 +95,7 @@ NAMED_ALL_THE_SAME = {
     "cli/_init.py": "says to people which maps it takes",
     "guide/": "has the names of pages",
     "native/": "is compiled for libsumo, and finds its functions by name",
-    "plans/_options.py": "says to people what an option is for",
+    "plans/_run_options.py": "says to people what an option is for",
 }
 
 

@@ -7,7 +7,7 @@ import sys
 from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UntrustedError, UsageError
@@ -26,12 +26,6 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "BAD_INPUT",
-    "DONE",
-    "INTERRUPTED",
-    "NO_ANSWER",
-    "NO_VALID_TRIAL",
-    "THE_ANSWER_IS_NO",
     "Commands",
     "Parser",
     "add_ci_options",
@@ -284,16 +278,6 @@ def ask_to_trust(refusal: UntrustedError, *, as_json: bool) -> bool:
     print(visible(f"{refusal.where}: {refusal.message}"), file=sys.stderr)
     print("Trust this code from now on and run it? [y/N] ", end="", file=sys.stderr, flush=True)
     return sys.stdin.readline().strip().lower() in ("y", "yes")
-
-
-# What a command's exit code says; 130 is the shell's own for Ctrl-C.
-
-DONE: Final = 0
-THE_ANSWER_IS_NO: Final = 1
-BAD_INPUT: Final = 2
-NO_VALID_TRIAL: Final = 3
-NO_ANSWER: Final = 3
-INTERRUPTED: Final = 130
 
 
 # The bar of `film`, `export` and whatever takes its time; what a hunt shows while it runs is in `report`.

@@ -11,7 +11,6 @@ from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import in_lines
 from crashhunt.cli._common import (
-    INTERRUPTED,
     add_ci_options,
     add_json,
     add_trust,
@@ -23,6 +22,7 @@ from crashhunt.cli._common import (
     shown_progress,
     tell,
 )
+from crashhunt.cli._exit_codes import INTERRUPTED
 
 if TYPE_CHECKING:
     import argparse

@@ -9,17 +9,8 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import (
-    DONE,
-    INTERRUPTED,
-    add_ci_options,
-    add_json,
-    add_trust,
-    check_trust,
-    integer,
-    say,
-    tell,
-)
+from crashhunt.cli._common import add_ci_options, add_json, add_trust, check_trust, integer, say, tell
+from crashhunt.cli._exit_codes import DONE, INTERRUPTED
 
 if TYPE_CHECKING:
     import argparse

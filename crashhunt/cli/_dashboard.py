@@ -8,7 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.cli._common import DONE, add_json, integer, say
+from crashhunt.cli._common import add_json, integer, say
+from crashhunt.cli._exit_codes import DONE
 
 if TYPE_CHECKING:
     import argparse

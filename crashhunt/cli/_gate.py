@@ -13,10 +13,6 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.cli._common import (
-    DONE,
-    INTERRUPTED,
-    NO_ANSWER,
-    THE_ANSWER_IS_NO,
     add_ci_options,
     add_json,
     add_options,
@@ -27,6 +23,7 @@ from crashhunt.cli._common import (
     say,
     tell,
 )
+from crashhunt.cli._exit_codes import DONE, INTERRUPTED, NO_ANSWER, THE_ANSWER_IS_NO
 
 if TYPE_CHECKING:
     import argparse

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
-from crashhunt.cli._common import DONE, add_json, say
+from crashhunt.cli._common import add_json, say
+from crashhunt.cli._exit_codes import DONE
 
 if TYPE_CHECKING:
     import argparse

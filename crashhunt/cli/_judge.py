@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import (
-    DONE,
-    INTERRUPTED,
     add_crash,
     add_json,
     add_trust,
@@ -22,6 +20,7 @@ from crashhunt.cli._common import (
     say,
     shown_progress,
 )
+from crashhunt.cli._exit_codes import DONE, INTERRUPTED
 
 if TYPE_CHECKING:
     import argparse

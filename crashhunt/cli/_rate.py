@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import DONE, NO_ANSWER, THE_ANSWER_IS_NO, add_json, number, say
+from crashhunt.cli._common import add_json, number, say
+from crashhunt.cli._exit_codes import DONE, NO_ANSWER, THE_ANSWER_IS_NO
 from crashhunt.plans import RATE_PERS
 
 if TYPE_CHECKING:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import in_lines
 from crashhunt.cli._common import (
-    INTERRUPTED,
     add_crash,
     add_json,
     add_trust,
@@ -18,6 +17,7 @@ from crashhunt.cli._common import (
     say,
     shown_progress,
 )
+from crashhunt.cli._exit_codes import INTERRUPTED
 
 if TYPE_CHECKING:
     import argparse

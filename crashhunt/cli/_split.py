@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.cli._common import DONE, add_json, say
+from crashhunt.cli._common import add_json, say
+from crashhunt.cli._exit_codes import DONE
 
 if TYPE_CHECKING:
     import argparse

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import one_line, out_of
-from crashhunt.cli._common import BAD_INPUT, DONE, add_json
+from crashhunt.cli._common import add_json
+from crashhunt.cli._exit_codes import BAD_INPUT, DONE
 
 if TYPE_CHECKING:
     import argparse

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 from crashhunt.base.errors import UntrustedError
 from crashhunt.cli._common import (
-    DONE,
-    THE_ANSWER_IS_NO,
     add_json,
     add_options_of_machine,
     add_trust,
@@ -20,6 +18,7 @@ from crashhunt.cli._common import (
     pairs,
     say,
 )
+from crashhunt.cli._exit_codes import DONE, THE_ANSWER_IS_NO
 from crashhunt.cli._status import show_states, states_console, states_table
 
 if TYPE_CHECKING:

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, get_args
 
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import (
-    DONE,
-    INTERRUPTED,
     add_crash,
     add_json,
     add_trust,
@@ -21,6 +19,7 @@ from crashhunt.cli._common import (
     say,
     shown_progress,
 )
+from crashhunt.cli._exit_codes import DONE, INTERRUPTED
 from crashhunt.trial import Manoeuvre
 
 if TYPE_CHECKING:

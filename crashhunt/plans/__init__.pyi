@@ -10,14 +10,6 @@ from ._declaration import (
     seconds_of as seconds_of,
     share_of as share_of,
 )
-from ._options import (
-    Driver as Driver,
-    HuntOptions as HuntOptions,
-    SnapshotChoices as SnapshotChoices,
-    Spec as Spec,
-    TrialOptions as TrialOptions,
-    hunt_options as hunt_options,
-)
 from ._plan import (
     FIXED as FIXED,
     Owners as Owners,
@@ -35,6 +27,14 @@ from ._plan import (
     takes_of as takes_of,
     with_recorded_load_order as with_recorded_load_order,
     with_settings as with_settings,
+)
+from ._run_options import (
+    Driver as Driver,
+    HuntOptions as HuntOptions,
+    SnapshotChoices as SnapshotChoices,
+    Spec as Spec,
+    TrialOptions as TrialOptions,
+    hunt_options as hunt_options,
 )
 from ._settings import (
     AgentSettings as AgentSettings,

@@ -20,7 +20,7 @@ from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import ModelApart, disturber_of, locate_model, parse_fixed, parse_rates, word_of
 from crashhunt.oracles import chosen_oracles, outcomes_brought
 from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code
-from crashhunt.plans._options import TrialOptions
+from crashhunt.plans._run_options import TrialOptions
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
 from crashhunt.scenario import Scenario, backend_of, load_scenario, scenario_digest, titles, with_action

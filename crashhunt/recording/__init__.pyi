@@ -8,6 +8,11 @@ from ._blackbox import (
     read_black_box as read_black_box,
     read_header as read_header,
 )
+from ._first_difference import (
+    first_divergence as first_divergence,
+    has_same_scenes as has_same_scenes,
+    values_around as values_around,
+)
 from ._foxglove import foxglove_layout as foxglove_layout, lane_borders as lane_borders, read_lanes as read_lanes
 from ._log import read_log as read_log, write_log as write_log
 from ._reading import (
@@ -16,13 +21,7 @@ from ._reading import (
     Prologue as Prologue,
     StepRecord as StepRecord,
 )
-from ._recording import (
-    Compact as Compact,
-    Recording as Recording,
-    first_divergence as first_divergence,
-    has_same_scenes as has_same_scenes,
-    values_around as values_around,
-)
+from ._recording import Compact as Compact, Recording as Recording
 from ._values import (
     OPAQUE_SHAPE as OPAQUE_SHAPE,
     OpaqueValue as OpaqueValue,

@@ -177,7 +177,7 @@ class Divergence:
 
 
 def first_difference(left: NDArray[np.generic], right: NDArray[np.generic]) -> tuple[int, ...]:
-    """Return the index of the first difference in bits between two arrays of the same shape; None if there is none."""
+    """Return the index of the first difference in bits between two arrays of the same shape, which differ."""
     size = left.itemsize
     was, now = left.tobytes(), right.tobytes()
     flat = next(n for n in range(left.size) if was[n * size : (n + 1) * size] != now[n * size : (n + 1) * size])

@@ -1,4 +1,4 @@
-"""Recordings of episodes, from any file: whole or compact, and the first difference of two recordings."""
+"""Recordings of episodes, from any file: whole or compact."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from crashhunt.base.errors import BundleError
 from crashhunt.base.text import one_of
 from crashhunt.recording._blackbox import digest_of, is_evidence
-from crashhunt.recording._reading import Divergence, Prologue, Reading
+from crashhunt.recording._reading import Prologue, Reading
 from crashhunt.recording._values import is_opaque
 from crashhunt.recording.records import RECORD_TYPES
 from crashhunt.recording.records._agents import OBSERVATION, PROLOGUE
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
     from crashhunt.recording._blackbox import Record
     from crashhunt.recording._reading import AgentChannel, StepRecord
-    from crashhunt.recording.records._type import Difference
     from crashhunt.trial import Disturbance
     from crashhunt.world import Actor, Scene
 
@@ -47,9 +46,6 @@ __all__ = [
     "PresentActors",
     "Recording",
     "compact_records",
-    "first_divergence",
-    "has_same_scenes",
-    "values_around",
 ]
 
 
@@ -315,95 +311,3 @@ def compact_records(records: Iterable[Record], choose: ActorSelector, *, observa
             yield one._replace(payload=select_actors(one.tag, one.payload, mask, agents))
         waiting = []
     yield from (one for one in waiting if one.tag not in scene)
-
-
-# Where two recordings first differ, and the values around it; how values are compared is in `records`, a type each.
-
-
-def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | None:
-    """Return the first difference between two recordings; None if they are bit-identical.
-
-    Within a step, observations come before actions and actions before the scene, as in the episode. If the first is
-    compact, the values of its actors are compared, and the digest of the whole recording.
-    """
-    whole, replayed = replayed, replayed.like(recorded)
-    if recorded.prologue != replayed.prologue:
-        return Divergence(
-            step=0,
-            agent="",
-            field="setup",
-            recorded=recorded.prologue.encode().decode(),
-            replayed=replayed.prologue.encode().decode(),
-        )
-    differences = _differences(recorded.prologue.agents)
-    for left, right in zip(recorded.all_steps, replayed.all_steps, strict=False):
-        for difference, agent in differences:
-            found = difference(left, right, agent)
-            if found is not None:
-                return found
-    if len(recorded.all_steps) != len(replayed.all_steps):
-        step = min(len(recorded.all_steps), len(replayed.all_steps))
-        return Divergence(
-            step=step,
-            agent="",
-            field="length",
-            recorded=len(recorded.all_steps) - 1,
-            replayed=len(replayed.all_steps) - 1,
-        )
-    if recorded.compact is not None and not recorded.compact.digest:  # the beginning of one
-        whole = replayed.beginning(len(replayed.records))
-    if recorded.digest != whole.digest:
-        # Every value of every step agrees, so only the way it was written can differ, or an actor that is not kept.
-        return Divergence(
-            step=recorded.steps, agent="", field="digest", recorded=recorded.digest, replayed=whole.digest
-        )
-    return None
-
-
-def values_around(
-    recorded: Recording, replayed: Recording, divergence: Divergence, *, reach: int
-) -> list[tuple[int, object, object]]:
-    """Return (step, recorded value, replayed value) of the field that diverges, in the steps around.
-
-    The result is empty if the divergence is not about one value. A value is None if a recording lacks the step.
-    """
-    if divergence.place is None:
-        return []
-    first = max(0, divergence.step - reach)
-    return [
-        (step, _value(recorded, step, divergence), _value(replayed, step, divergence))
-        for step in range(first, divergence.step + reach + 1)
-    ]
-
-
-def _value(recording: Recording, number: int, divergence: Divergence) -> object:
-    if divergence.place is None or number >= len(recording.all_steps):
-        return None
-    name, index = divergence.place
-    kind = next(kind for kind in RECORD_TYPES.values() if kind.name == name)
-    return None if kind.value is None else kind.value(recording.all_steps[number], divergence.agent, index)
-
-
-def _differences(agents: tuple[AgentChannel, ...]) -> list[tuple[Difference, AgentChannel | None]]:
-    """Return the comparisons of the steps of two recordings, in their order."""
-    kinds = [(kind.per_agent, kind.difference) for kind in RECORD_TYPES.values() if kind.difference is not None]
-    of_agents = [(difference, agent) for agent in agents for per_agent, difference in kinds if per_agent]
-    return [*of_agents, *((difference, None) for per_agent, difference in kinds if not per_agent)]
-
-
-def has_same_scenes(recorded: Recording, rerun: Recording, step: int) -> bool:
-    """Return whether the scenes of a run are bit-identical to the recorded ones up to and including a step.
-
-    Where a change begins after this step, only such a run says something about the recorded trial. Observations and
-    actions are not compared: other versions may record them in another form.
-
-    Args:
-        recorded: the recording of the trial, which reaches the step.
-        rerun: the recording of the run.
-        step: the last step to compare.
-    """
-    rerun = rerun.like(recorded)
-    return rerun.steps >= step and all(
-        recorded.scene(number).frame[1].tobytes() == rerun.scene(number).frame[1].tobytes()
-        for number in range(step + 1)
-    )

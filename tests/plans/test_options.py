@@ -31,7 +31,7 @@ from crashhunt.snapshots import SnapshotOptions
 from crashhunt.suites import RunRequest, Suite, SuiteEntry
 
 PACKAGE = Path(crashhunt.__file__).parent
-LIST = "plans/_options.py"
+LIST = "plans/_run_options.py"
 ADDED = """
     warm_up_s: float = option(
         2.5, "driven before anything counts, in s", flag="--warm-up", metavar="S", check=above_zero("give more"),

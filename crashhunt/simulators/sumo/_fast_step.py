@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.native import Core, Vehicles
     from crashhunt.simulators._kinematics import Kinematics
     from crashhunt.simulators._protocol import Observations, Simulator, StepResult
-    from crashhunt.simulators.sumo._scene_reader import Sight
+    from crashhunt.simulators.sumo._range_of_sight import Sight
     from crashhunt.simulators.sumo._traffic_events import SumoEvents
     from crashhunt.world import Roster
 

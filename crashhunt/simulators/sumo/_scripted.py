@@ -20,7 +20,7 @@ from crashhunt.world import Actor, ActorState, Path, Roster, Scene
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.simulators.sumo._scene_reader import Sight
+    from crashhunt.simulators.sumo._range_of_sight import Sight
     from crashhunt.world import Paths, Spine
 
     Row = tuple[Actor, ActorState, str, Spine | None]

@@ -25,7 +25,7 @@ from crashhunt.simulators.sumo._driving import Driving, hold_vehicle
 from crashhunt.simulators.sumo._entering import VehicleFilter, enter, replaced_by, steps_counted
 from crashhunt.simulators.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.simulators.sumo._loading import VERSION, Loading, ready_xml
-from crashhunt.simulators.sumo._scene_reader import Sight
+from crashhunt.simulators.sumo._range_of_sight import Sight
 from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents
 from crashhunt.simulators.sumo._surroundings import surroundings_of
 from crashhunt.simulators.sumo._traffic_events import SumoEvents

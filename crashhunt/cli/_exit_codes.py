@@ -1,0 +1,15 @@
+"""The exit codes of all commands."""
+
+from __future__ import annotations
+
+from typing import Final
+
+__all__ = ["BAD_INPUT", "DONE", "INTERRUPTED", "NO_ANSWER", "NO_VALID_TRIAL", "THE_ANSWER_IS_NO"]
+
+DONE: Final = 0
+THE_ANSWER_IS_NO: Final = 1
+BAD_INPUT: Final = 2
+NO_VALID_TRIAL: Final = 3
+NO_ANSWER: Final = 3
+INTERRUPTED: Final = 130
+"""As a shell says it after Ctrl-C."""
