@@ -24,6 +24,7 @@ from crashhunt.rates import (
     BarWatch,
     Bets,
     CountingRule,
+    Estimated,
     RareCounter,
     RareEstimate,
     RateTest,
@@ -230,6 +231,7 @@ def rare_run(case: dict[str, Any], seed: int, *, roots: int) -> list[RareEstimat
         root = replace(
             root,
             undisturbed=(root.undisturbed + alone) / TRIALS_PER_ROOT,
+            counted=(root.counted + alone) / TRIALS_PER_ROOT,
             plain=len(plain),
             plain_undisturbed=alone,
             plain_crashes=int((plain < undisturbed + disturbed).sum()),
@@ -255,22 +257,31 @@ def _print_rare(name: str, runs: list[list[RareEstimate]]) -> None:
     from markov import Model
 
     repetitions = len(runs)
-    truth = math.fsum(Model(**CASES[name]).truth())
+    parts = Model(**CASES[name]).truth()
+    truth = math.fsum(parts)
     values = np.array([run[0].estimate for run in runs], float)
     z = (values.mean() - truth) / (values.std(ddof=1) / math.sqrt(repetitions))
-    told = [run[0].estimated for run in runs if run[0].estimated is not None]
-    covered = [one.low <= truth <= one.high for one in told]
-    later = [run[1].estimated is not None for run in runs if len(run) > 1]
+    by_roots = [run[0] for run in runs], [run[1] for run in runs if len(run) > 1]
+    whole = "; ".join(_coverage([one.estimated for one in some], truth) for some in by_roots)
+    disturbed = "; ".join(_coverage([one.estimated_disturbed for one in some], parts[1]) for some in by_roots)
     low, high = np.transpose([run[0].certain for run in runs if run[0].certain is not None])
     gain = np.median([(run[0].plain_equivalent_steps or 0.0) / run[0].steps for run in runs])
-    covers = f"{np.mean(covered):.1%}" if covered else "-"
     print(
         f"{name:<34} {repetitions} repetitions  truth {truth:.3g}  mean {values.mean():.3g}  z {z:+.2f}  "
-        f"reported {len(told) / repetitions:.0%}, with 400 roots {np.mean(later):.0%}  covers {covers}  "
+        f"with 200 and 400 roots: {whole}  disturbed part: {disturbed}  "
         f"at most covers {np.mean(high >= truth):.1%}  at least covers {np.mean(low <= truth):.1%}  "
         f"median at most {np.median(high):.2g}  median at least {np.median(low):.2g}  steps saved {gain:.0f} times",
         flush=True,
     )
+
+
+def _coverage(found: list[Estimated | None], truth: float) -> str:
+    """Return how often an interval was reported, how often it covers the truth, and how often it lies above it."""
+    told = [one for one in found if one is not None]
+    if not told:
+        return "reported 0%"
+    above, below = np.mean([one.low > truth for one in told]), np.mean([one.high < truth for one in told])
+    return f"reported {len(told) / len(found):.1%}, covers {1 - above - below:.1%} (above the truth {above:.1%})"
 
 
 def main(words: list[str]) -> None:

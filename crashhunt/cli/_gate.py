@@ -231,6 +231,6 @@ def _watched(*, as_json: bool) -> Iterator[Callable[[GateProgress], None]]:
 
 def _progress(progress: GateProgress) -> str:
     return (
-        f"{progress.name}: {progress.done:,} of {progress.most:,} pairs, {progress.only_base} crash only with BASE, "
-        f"{progress.only_head} only with HEAD (evidence {progress.evidence:.3g})"
+        f"{progress.name}: {progress.done:,} of {progress.most:,} pairs; only BASE crashes in {progress.only_base}, "
+        f"only HEAD in {progress.only_head}; evidence {progress.evidence:.3g}"
     )

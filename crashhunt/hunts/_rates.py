@@ -364,11 +364,10 @@ class SplittingWatch(RareWatch):
     def _value_of(self, first: TrialResult, plain: Sequence[TrialResult]) -> Root | None:
         tree = tree_of(first, self._settings.crash_on)
         # A tree knows more of undisturbed crashes than a plain trial, so its plain trials stay out of its value.
-        return (
-            None
-            if tree is None
-            else replace(with_plain(tree, plain, self._settings.crash_on), undisturbed=tree.undisturbed)
-        )
+        if tree is None:
+            return None
+        counted = with_plain(tree, plain, self._settings.crash_on)
+        return replace(counted, undisturbed=tree.undisturbed, counted=0.0)
 
     def estimate(self) -> RareEstimate:
         """Return the estimate of the trials that were read."""

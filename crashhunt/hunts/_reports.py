@@ -228,6 +228,8 @@ class RareReport:
         lines.append("  " + "; ".join([undisturbed, *shares[:_MAX_SHOWN_CELLS]]))
         if len(shares) > _MAX_SHOWN_CELLS:
             lines.append(f"  {_MAX_SHOWN_CELLS} of {len(shares)} parts shown; run --json has all of them")
+        if found.undisturbed_crashes and (part := found.estimated_disturbed) is not None:
+            lines.append(f"  with a disturbance: {found.disturbed:.2g} per trial ({part.low:.2g} to {part.high:.2g})")
         if found.plain_equivalent_steps is not None:
             spent = f"{found.steps} steps, {found.plain_steps} of them in plain trials"
             lines.append(f"  {spent}; plain trials alone need about {found.plain_equivalent_steps:.2g} steps")

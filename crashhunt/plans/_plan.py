@@ -329,8 +329,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     _check_rare(settings, scenario, find)
     sampler_of(settings)  # it refuses what it cannot sample
     # Last, as looking for the executor imports what runs trials: what is refused is refused sooner.
-    run = replace(settings.run, keep_going=True) if settings.rare else settings.run
-    return scenario, replace(settings, run=sized(run)), code
+    return scenario, replace(settings, run=sized(settings.run)), code
 
 
 def _with_notes(scenario: Scenario, run: RunSettings) -> Scenario:

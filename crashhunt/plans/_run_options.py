@@ -219,7 +219,7 @@ class RunOptions(_Options):
     keep: int = option(
         0, "number of bundles to keep of each crash type, the shortest crashes first; 0: all",
         help="keep only the N shortest bundles of each crash type; the ledger keeps all crashes. Requires "
-        "--keep-going or --distinct; 0: keep all",
+        "--keep-going, --distinct or --rare; 0: keep all",
         brief="keep only the N shortest crashes of each type",
         flag="--keep", group="kept", metavar="N", check=at_least(0, zero="keep all"),
     )  # fmt: skip

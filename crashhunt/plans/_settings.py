@@ -386,7 +386,7 @@ class Request(TrialOptions, Subject):
         if not self.trials and not self.run.duration and not self.run.until_rate:
             raise UsageError("TRIALS is 0", fix="give at least 1, or 0 (no limit) and a time with --for")
         checked = super().checked()
-        run = self.run.checked()
+        run = (replace(self.run, keep_going=True) if checked.rare else self.run).checked()
         if run.until_rate and (checked.sampler != "random" or checked.seeds):
             option = "--seeds" if checked.seeds else f"--sampler {checked.sampler}"
             raise UsageError(

@@ -14,10 +14,13 @@ whatever the number of workers, and no worker waits for the end of a block. The 
 90 % the law times the square root of the smoothed crash share of each cell. That minimizes the variance for
 independent copies of equal cost; the 10 % bound all weights.
 
-The estimated interval is that of Student's t with Hall's correction for skewness. Few roots have large values, so
-without the correction the interval is too often too low. It is reported only where the data can carry it. The effective
-sample size and the number of roots with a crash are at least 20, and no root has more than 20 % of the sum. No interval
-from weighted copies can exclude a failure mode that no copy has met.
+The estimated interval joins two parts. Undisturbed crashes of roots and plain trials are counted, so their share has
+Clopper and Pearson's interval, which is valid for any number of crashes. The part with weights has Student's t interval
+with Hall's correction for skewness. Few roots have large values, so without the correction the interval is too often
+too low. It is reported only where the data can carry it. The effective sample size and the number of roots with a crash
+are at least 20, and no root has more than 20 % of the sum. The distances of both intervals from their estimates add up
+as squares. No interval from weighted copies can exclude a failure mode that no copy has met. Nor does the estimated
+interval include undisturbed crashes before the first one is met.
 
 The certain interval is for that: it is the one of `crashhunt.rates._betting`, so it is valid at any number of roots. A
 plain trial is a unit with 0 or 1 crashes and exposure 1. A root is a unit with the value V, which is at most B. Its
@@ -28,7 +31,9 @@ whole, so a lower bound of it is one of the whole. Both intervals together have 
 inequality. The first has three quarters of the risk, the second a quarter.
 
 Source: Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 to 9; Kish, Survey sampling, 1965, for the
-effective sample size; P. Hall, On the removal of skewness by transformation, JRSS B 54(1), 1992.
+effective sample size; P. Hall, On the removal of skewness by transformation, JRSS B 54(1), 1992; C. J. Clopper and
+E. S. Pearson, Biometrika 26(4), 1934; G. Y. Zou and A. Donner, Construction of confidence limits about effect measures,
+Statistics in Medicine 27(10), 2008, for the sum of two parts.
 Cost: constant for a root; the certain interval takes milliseconds for each hundred roots with different values.
 """
 
@@ -86,6 +91,7 @@ class Root:
     Args:
         undisturbed: its estimate of the probability of a crash that no disturbance had an effect on.
         disturbed: the same for the other crashes.
+        counted: the part of ``undisturbed`` that is a share of trials, without copies.
         own: the part of their sum that is not of copies, from 0 to 1.
         by: by cell, the part of ``disturbed`` that is of copies.
         steps: simulated for it, those of copies included.
@@ -102,6 +108,7 @@ class Root:
 
     undisturbed: float
     disturbed: float
+    counted: float = 0.0
     own: float = 0.0
     by: Mapping[str, float] = field(default_factory=dict)
     steps: int = 0
@@ -128,9 +135,9 @@ class Estimated:
     Args:
         low: lower end of the interval.
         high: upper end of the interval.
-        effective: effective sample size, in roots.
-        largest_share: share of the root with the greatest value in the sum, 0 to 1.
-        roots_with_crash: how many roots have a value above 0.
+        effective: effective sample size of the part with weights, in roots.
+        largest_share: share of the root with the greatest value in the sum of that part, 0 to 1.
+        roots_with_crash: how many roots have a value above 0 in that part.
     """
 
     low: float
@@ -267,6 +274,7 @@ def with_plain(root: Root, trials: Iterable[TrialResult], crash_on: Sequence[Out
     return replace(
         root,
         undisturbed=(root.undisturbed + undisturbed) / (1 + len(valid)),
+        counted=(root.counted + undisturbed) / (1 + len(valid)),
         plain=len(valid),
         invalid=len(trials) - len(valid),
         plain_crashes=len(crashed),
@@ -301,6 +309,7 @@ def root_of(result: TrialResult, crash_on: Sequence[Outcome], hazard: float) -> 
     return Root(
         undisturbed=undisturbed,
         disturbed=disturbed,
+        counted=0.0 if result.disturbed else own,
         own=own,
         by=by,
         steps=result.steps + result.other_steps,
@@ -430,8 +439,9 @@ class RareCounter:
         self.confidence = confidence
         self.excluded = 0
         self.roots = 0
-        self._whole, self._disturbed = _Sums(), _Sums()
-        self._undisturbed = 0.0
+        self._whole, self._weighted, self._disturbed = _Sums(), _Sums(), _Sums()
+        self._undisturbed = self._counted = 0.0
+        self._trials = 0  # in which undisturbed crashes are counted
         self._parts: defaultdict[str, float] = defaultdict(float)
         self._counts: Counter[str] = Counter()
         self._tests = None
@@ -453,6 +463,9 @@ class RareCounter:
             return
         self.roots += 1
         self._whole.add(root.value)
+        self._weighted.add(root.undisturbed - root.counted + root.disturbed)
+        self._counted += root.counted
+        self._trials += 1 + root.plain
         self._disturbed.add(root.disturbed)
         self._undisturbed += root.undisturbed
         for cell, weight in root.by.items():
@@ -511,7 +524,7 @@ class RareCounter:
             why = f"{counts['invalid']} of {counts['plain'] + counts['invalid']} plain trials are invalid, more than "
             why += f"{MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
         certain = None if why else certain
-        whole, why_not, more = self._whole.interval(count, self.confidence)
+        whole, why_not, more = self._interval()
         part, why_not_part, _ = self._disturbed.interval(count, self.confidence)
         if not why and whole is not None and certain is not None and certain[0] > whole.high:
             # Certain bounds rest on less. Where the two exclude each other, the copies have missed something.
@@ -543,6 +556,21 @@ class RareCounter:
             plain_equivalent_steps=plain_steps,
             confidence=self.confidence,
         )
+
+    def _interval(self) -> tuple[Estimated | None, str, int | None]:
+        """Return the estimated interval, or None with the reason and how many more roots are probably needed."""
+        count = self.roots
+        weighted, _, _ = self._weighted.interval(count, self.confidence)
+        if not self._counted or weighted is None:
+            return self._whole.interval(count, self.confidence)
+        share, mean = self._counted / count, self._weighted.total / count
+        low, high = _clopper_pearson(share * self._trials, self._trials, self.confidence)
+        joint = replace(
+            weighted,
+            low=max(0.0, share + mean - math.hypot(share - low, mean - weighted.low)),
+            high=share + mean + math.hypot(high - share, weighted.high - mean),
+        )
+        return joint, "", None
 
 
 def rare_estimate(
@@ -622,6 +650,21 @@ class _Sums:
             roots_with_crash=self.positive,
         )
         return found, "", None
+
+
+def _clopper_pearson(events: float, trials: int, confidence: float) -> tuple[float, float]:
+    """Return Clopper and Pearson's interval for a probability.
+
+    Args:
+        events: number of events, above 0; a trial may count as a part of one, which makes the interval wider only.
+        trials: number of trials.
+        confidence: of the interval, in (0, 1).
+    """
+    from scipy.special import betaincinv
+
+    missing, risk = max(0.0, trials - events), (1.0 - confidence) / 2.0
+    low = float(betaincinv(events, missing + 1.0, risk))
+    return low, float(betaincinv(events + 1.0, missing, 1.0 - risk)) if missing else 1.0
 
 
 def _unskewed(quantile: float, skewness: float, count: int) -> float:

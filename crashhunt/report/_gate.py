@@ -60,11 +60,14 @@ def _evidence(found: GateReport) -> list[str]:
         return ["no pair of trials has ended"]
     counts = f"{found.only_base} crash only with BASE, {found.only_head} only with HEAD, {found.both} with both"
     needed = 1 / (1 - found.confidence / 100)
-    lines = [f"of {found.pairs:,} pairs of trials, {counts} (evidence {found.evidence:.3g}; {needed:.3g} decides)"]
+    confidence = f"{found.confidence:g} %, valid whenever you look"
+    lines = [
+        f"{found.pairs:,} pairs: {counts}",
+        f"evidence: {found.evidence:.3g}; {needed:.3g} decides ({confidence})",
+    ]
     if found.difference is not None:
         low, high = found.difference
-        confidence = f"{found.confidence:g} %, valid whenever you look"
-        lines.append(f"difference: {low:+.2%} to {high:+.2%} crashes per trial (HEAD minus BASE, {confidence})")
+        lines.append(f"difference: {low:+.2%} to {high:+.2%} crashes per trial (HEAD minus BASE)")
     return lines
 
 

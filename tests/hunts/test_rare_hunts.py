@@ -15,6 +15,7 @@ from crashhunt.disturbances import DisturbanceSampler, brake
 from crashhunt.errors import UsageError
 from crashhunt.hunts import _rates as rare_module, hunt_state
 from crashhunt.hunts._rates import Forcings, RareWatch
+from crashhunt.hunts._reports import RareReport
 from crashhunt.ledger import Ledger
 from crashhunt.rates import BLOCK, TRIALS_PER_ROOT, _splitting as splitting, is_root
 from crashhunt.trial import CRASHES, Disturbance, Forced, ForcedCopy, Forcing, Outcome, TrialResult, TrialSpec
@@ -64,6 +65,11 @@ def test_rare_mode_refuses_what_it_has_no_law_for(tmp_path, options, says):
     with pytest.raises(UsageError, match=says) as refused:
         crashhunt.prepare(tmp_path / "h", 1, 8, 20, **(OPTIONS | options))
     assert refused.value.fix
+
+
+def test_rare_mode_keeps_going_so_it_may_keep_a_few_bundles_of_each_type(tmp_path):
+    hunt = crashhunt.prepare(tmp_path / "h", 1, 8, 20, **OPTIONS, disturb=["stop=0.01"], keep=2)
+    assert (hunt.settings.run.keep, hunt.settings.run.keep_going) == (2, True)
 
 
 def test_splitting_needs_no_disturbance_and_is_written_as_the_second_word_of_rare(tmp_path):
@@ -161,6 +167,10 @@ def test_crashes_of_plain_trials_count_for_the_undisturbed_part_and_for_the_cert
     rule.read()
     found, before = rule.estimate(), calm.estimate()
     assert (found.plain, found.plain_crashes, found.undisturbed_crashes) == (239, 5, 5)
+    lines = "\n".join(RareReport(found, 0, 0, ()).lines)
+    assert "undisturbed 5 of 299 trials" in lines
+    assert f"with a disturbance: {found.disturbed:.2g} per trial ({found.estimated_disturbed.low:.2g} to" in lines
+    assert "with a disturbance" not in "\n".join(RareReport(before, 0, 0, ()).lines)
     assert before.undisturbed == 0
     assert found.undisturbed == pytest.approx((2 / 4 + 3 / 5) / 60)  # the group of trial 4 has one trial fewer
     assert found.disturbed == before.disturbed

@@ -197,6 +197,38 @@ def test_interval_covers_a_skewed_rate_on_both_sides_alike():
     assert max(missed) < 14  # without the correction: 18 and 2
 
 
+def counted(value, crashes):
+    """Return a root with a number of plain trials that crashed undisturbed."""
+    share = crashes / TRIALS_PER_ROOT
+    return Root(share, value, counted=share, bound=1.0, plain=4, plain_crashes=crashes, plain_undisturbed=crashes)
+
+
+def test_few_undisturbed_crashes_widen_the_interval_and_do_not_withhold_it():
+    calm = [counted(1e-5 * (1 + number % 3), 0) for number in range(99)]
+    without, one, two = (rare_estimate([*calm, counted(1e-5, crashes)]).estimated for crashes in (0, 1, 2))
+    assert without.high < 3e-5
+    # Clopper and Pearson's intervals of 1 and 2 in 500 trials are 5.06e-5 to 0.01109, and 4.85e-4 to 0.01437.
+    assert (one.low, one.high) == pytest.approx((7.0e-5, 0.01111), rel=0.02)
+    assert (two.low, two.high) == pytest.approx((5.05e-4, 0.01439), rel=0.02)
+    assert (one.effective, one.roots_with_crash) == pytest.approx((without.effective, 100), rel=0.02)
+    nothing_weighted = rare_estimate([*(counted(0.0, 0) for _ in range(99)), counted(0.0, 3)])
+    assert "roots with a crash: 1 (at least 20)" in nothing_weighted.why_not
+
+
+def test_interval_of_two_parts_covers_where_either_is_large():
+    rng = np.random.default_rng(8)
+    for chance, weight in ((8e-3, 1e-5), (6e-3, 4e-3), (0.05, 0.2)):
+        missed, truth = [0, 0], chance + weight
+        for _ in range(200):
+            crashes = rng.binomial(TRIALS_PER_ROOT, chance, 200).tolist()
+            values = rng.gamma(0.5, weight / 0.5, 200).tolist()
+            found = rare_estimate(map(counted, values, crashes)).estimated
+            missed[0] += found.high < truth
+            missed[1] += found.low > truth
+        assert max(missed) < 13  # of 200 at 2.5 %: 5
+        assert sum(missed) >= 1  # an interval that never misses is too wide
+
+
 def test_interval_of_equal_roots_is_a_point():
     found = rare_estimate(roots(*[1e-3] * 40)).estimated
     assert (found.low, found.high) == pytest.approx((1e-3, 1e-3))
