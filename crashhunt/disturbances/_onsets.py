@@ -123,6 +123,7 @@ class _Place:
     what: str
     chance: float
     cells: Mapping[Drawn, tuple[_Cell, ...]]
+    all_cells: tuple[_Cell, ...]
 
 
 def cell_of(name: str, how_strong: float | None = None) -> str:
@@ -167,6 +168,7 @@ class FirstOnsets:
         first: the first step in which an onset is forced.
         after_place: in that step, only onsets of later places in the order are forced.
         stream: numbers that separate the draws from others with the same seed.
+        places: places of the sampler with the ratios of the forcing; None to make them.
 
     Attributes:
         survival: probability that no onset was effective so far.
@@ -183,14 +185,14 @@ class FirstOnsets:
         first: int = FIRST_STEP,
         after_place: int = -1,
         stream: tuple[int, ...] = (),
+        places: Sequence[_Place] | None = None,
     ) -> None:
         self.survival = 1.0
         self.masses: dict[str, float] = {}
         self._sampler, self._forcing, self._seed, self._last = sampler, forcing, seed, last
         self._first, self._after_place, self._stream = first, after_place, stream
-        names = [(agent, name) for agent in sampler.agents for name in sampler.models]
-        names.sort(key=lambda pair: sampler.models[pair[1]].what not in SENSOR_KINDS)
-        places = [self._place(order, agent, name) for order, (agent, name) in enumerate(names)]
+        places = _places_of(sampler, forcing.ratios) if places is None else places
+        self._places_of_seconds: list[_Place] | None = None  # made once for all copies: each would take as long
         self._of_agent = [place for place in places if place.what in SENSOR_KINDS]
         self._traffic = [place for place in places if place.what not in SENSOR_KINDS]
         self._points = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_ONSET_STREAM, *stream)))
@@ -208,7 +210,7 @@ class FirstOnsets:
         found: list[Onset] = []
         begins = step + 1
         if self._first <= begins <= self._last:
-            skipped: list[tuple[_Place, frozenset[Drawn]]] = []
+            skipped: list[tuple[_Place, list[_Cell]]] = []
             for number, place in enumerate(self._traffic):
                 if begins == self._first and place.order <= self._after_place:
                     continue
@@ -218,17 +220,21 @@ class FirstOnsets:
                     if asked is _UNLISTED_DRAW or has_target(_disturbance(place, asked, begins))
                 ]
                 cells = [cell for asked in there for cell in place.cells[asked]]
-                later = [*skipped, *((one, None) for one in self._traffic[number + 1 :])]
-                found += [self._onset(place, cell, begins, later, n) for cell, n in self._propose(place, cells)]
-                skipped.append((place, frozenset(cell.drawn for cell in cells)))
+                if proposed := self._propose(place, cells):
+                    later = [
+                        *((one, frozenset(cell.drawn for cell in some)) for one, some in skipped),
+                        *((one, None) for one in self._traffic[number + 1 :]),
+                    ]
+                    found += [self._onset(place, cell, begins, later, n) for cell, n in proposed]
+                skipped.append((place, cells))
         begins = step + 2
         if self._first <= begins <= self._last:
             for number, place in enumerate(self._of_agent):
                 if begins == self._first and place.order <= self._after_place:
                     continue
-                cells = [cell for some in place.cells.values() for cell in some]
-                later = [(one, None) for one in (*self._of_agent[number + 1 :], *self._traffic)]
-                found += [self._onset(place, cell, begins, later, n) for cell, n in self._propose(place, cells)]
+                if proposed := self._propose(place, place.all_cells):
+                    after = [(one, None) for one in (*self._of_agent[number + 1 :], *self._traffic)]
+                    found += [self._onset(place, cell, begins, after, n) for cell, n in proposed]
         return found
 
     def following(self, onset: Onset) -> FirstOnsets | None:
@@ -240,6 +246,8 @@ class FirstOnsets:
         is_pilot = onset.number == self._seed % COPIES_PER_ROOT
         if not forcing.second_spacing or not (is_pilot or onset.cell in forcing.second):
             return None
+        if self._places_of_seconds is None:
+            self._places_of_seconds = _places_of(self._sampler, {})
         return FirstOnsets(
             self._sampler,
             Forcing(forcing.second_spacing),
@@ -248,24 +256,7 @@ class FirstOnsets:
             first=onset.step,
             after_place=onset.place,
             stream=(onset.number,),
-        )
-
-    def _place(self, order: int, agent: str, name: str) -> _Place:
-        model, ratios = self._sampler.models[name], self._forcing.ratios
-        by_place = model.what in KINDS and model.what != _KIND_WITH_STRENGTH_TARGETS
-        cells: dict[Drawn, list[_Cell]] = {}
-        if supports(model, Enumerates):
-            for drawn, share in model.possibilities():
-                key = cell_of(name, drawn.how_strong)
-                asked = Drawn(drawn.who, 1.0, 1.0) if by_place else drawn
-                cells.setdefault(asked, []).append(_Cell(key=key, drawn=drawn, share=share, ratio=ratios.get(key, 1.0)))
-        else:  # every draw counts, whether it finds a vehicle or not
-            cells[_UNLISTED_DRAW] = [
-                _Cell(key=cell_of(name), drawn=_UNLISTED_DRAW, share=1.0, ratio=ratios.get(name, 1.0))
-            ]
-        frozen = {asked: tuple(some) for asked, some in cells.items()}
-        return _Place(
-            order=order, agent=agent, name=name, what=model.what, chance=self._sampler.chance(name), cells=frozen
+            places=self._places_of_seconds,
         )
 
     def _propose(self, place: _Place, cells: Sequence[_Cell]) -> list[tuple[_Cell, int]]:
@@ -327,6 +318,38 @@ class FirstOnsets:
             number=number,
             place=place.order,
         )
+
+
+def _places_of(sampler: DisturbanceSampler, ratios: Mapping[str, float]) -> list[_Place]:
+    """Return the places of all models around all agents, those of the agents' own disturbances first."""
+    names = [(agent, name) for agent in sampler.agents for name in sampler.models]
+    names.sort(key=lambda pair: sampler.models[pair[1]].what not in SENSOR_KINDS)
+    return [_place_of(sampler, ratios, order, agent, name) for order, (agent, name) in enumerate(names)]
+
+
+def _place_of(sampler: DisturbanceSampler, ratios: Mapping[str, float], order: int, agent: str, name: str) -> _Place:
+    model = sampler.models[name]
+    by_place = model.what in KINDS and model.what != _KIND_WITH_STRENGTH_TARGETS
+    cells: dict[Drawn, list[_Cell]] = {}
+    if supports(model, Enumerates):
+        for drawn, share in model.possibilities():
+            key = cell_of(name, drawn.how_strong)
+            asked = Drawn(drawn.who, 1.0, 1.0) if by_place else drawn
+            cells.setdefault(asked, []).append(_Cell(key=key, drawn=drawn, share=share, ratio=ratios.get(key, 1.0)))
+    else:  # every draw counts, whether it finds a vehicle or not
+        cells[_UNLISTED_DRAW] = [
+            _Cell(key=cell_of(name), drawn=_UNLISTED_DRAW, share=1.0, ratio=ratios.get(name, 1.0))
+        ]
+    frozen = {asked: tuple(some) for asked, some in cells.items()}
+    return _Place(
+        order=order,
+        agent=agent,
+        name=name,
+        what=model.what,
+        chance=sampler.chance(name),
+        cells=frozen,
+        all_cells=tuple(cell for some in frozen.values() for cell in some),
+    )
 
 
 def _disturbance(place: _Place, drawn: Drawn, step: int) -> Disturbance:
