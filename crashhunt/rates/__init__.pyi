@@ -1,4 +1,4 @@
-from ._betting import (
+from ._certain_interval import (
     Bets as Bets,
     Interval as Interval,
     RateTest as RateTest,

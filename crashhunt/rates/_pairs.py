@@ -15,8 +15,8 @@ martingale that begins at 1 / 2. By Ville's inequality it ever reaches 1 / alpha
 Each factor grows with d for every Z. So the differences that are not rejected are an interval, and bisection finds
 its end. The lower end is the upper end of -Z.
 
-Sources: as in `_betting`, from where the evidence of discordant pairs comes. For Z the bets are those of I. Waudby-
-Smith and A. Ramdas (2024), with a mixture over fixed shares.
+Sources: as in `_certain_interval`, from where the evidence of discordant pairs comes. For Z the bets are those of I.
+Waudby-Smith and A. Ramdas (2024), with a mixture over fixed shares.
 
 Cost: a pair adds to a counter. An end takes 50 evaluations, each of as many logarithms as there are components times
 different values of Z.
@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from crashhunt.rates._betting import Interval, discordance_evidence
+from crashhunt.rates._certain_interval import Interval, discordance_evidence
 from crashhunt.rates._units import MAX_INVALID_SHARE, has_too_many_invalid
 
 if TYPE_CHECKING:

@@ -22,10 +22,10 @@ are at least 20, and no root has more than 20 % of the sum. The distances of bot
 as squares. No interval from weighted copies can exclude a failure mode that no copy has met. Nor does the estimated
 interval include undisturbed crashes before the first one is met.
 
-The certain interval is for that: it is the one of `crashhunt.rates._betting`, so it is valid at any number of roots. A
-plain trial is a unit with 0 or 1 crashes and exposure 1. A root is a unit with the value V, which is at most B. Its
-forcing fixes B before the root begins. So V / B counts as events and 1 / B as exposure. Their ratio of means is the
-rate. A root without a crash counts as 1 / B of a trial. The lower end has a second source: the copies alone. Their
+The certain interval is for that: it is the one of `crashhunt.rates._certain_interval`, so it is valid at any number of
+roots. A plain trial is a unit with 0 or 1 crashes and exposure 1. A root is a unit with the value V, which is at most
+B. Its forcing fixes B before the root begins. So V / B counts as events and 1 / B as exposure. Their ratio of means is
+the rate. A root without a crash counts as 1 / B of a trial. The lower end has a second source: the copies alone. Their
 bound is that of their weights, so it is far below 1 for rare onsets. The crash probability by copies is a part of the
 whole, so a lower bound of it is one of the whole. Both intervals together have the confidence, by Bonferroni's
 inequality. The first has three quarters of the risk, the second a quarter.
@@ -45,7 +45,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from crashhunt.disturbances import COPIES_PER_ROOT, SECONDS_PER_COPY
-from crashhunt.rates._betting import Bets, RateTest
+from crashhunt.rates._certain_interval import Bets, RateTest
 from crashhunt.rates._units import MAX_INVALID_SHARE
 from crashhunt.trial import Forcing, Outcome
 
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.ledger import RunningRate
-    from crashhunt.rates._betting import Interval
+    from crashhunt.rates._certain_interval import Interval
     from crashhunt.trial import Forced, TrialResult
 
 __all__ = [

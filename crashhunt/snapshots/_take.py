@@ -22,7 +22,8 @@ from crashhunt.base.integrity import describe_files, digest_of_content, digest_o
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, load_order_of, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, digest_of_described
-from crashhunt.snapshots._snapshot import SCHEMA, Snapshot, code_of_manifest, environment
+from crashhunt.snapshots._environment import environment
+from crashhunt.snapshots._snapshot import SCHEMA, Snapshot, code_of_manifest
 from crashhunt.trial import Choice, Constant
 
 if TYPE_CHECKING:
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
 
     from crashhunt.base.integrity import FileEntry
     from crashhunt.base.plugins import ImportedModules
-    from crashhunt.snapshots._snapshot import Environment, Manifest
+    from crashhunt.snapshots._environment import Environment
+    from crashhunt.snapshots._snapshot import Manifest
 
 
 __all__ = ["SnapshotOptions", "Sources", "find_sources", "git", "take_snapshot"]

@@ -1,0 +1,160 @@
+"""``environment.json`` of a snapshot: Python, the machine, and the installed distributions. Results depend on them."""
+
+from __future__ import annotations
+
+import platform
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+from typing import NotRequired, TypedDict
+
+from crashhunt.base.plugins import ImportedModules, distributions as installed
+from crashhunt.scenario import installed_backends
+
+__all__ = ["Environment", "environment", "environment_changes", "environment_of_simulation", "processor", "versions"]
+
+
+class Environment(TypedDict):
+    """The content of ``environment.json``: everything besides code on which a result depends.
+
+    The entry ``git`` has the revision of each work tree. The entry ``core`` says whether the simulator's compiled core
+    was used, which does not change results. If results depend on an order at load, ``load_order`` is ``fixed`` or
+    ``not fixed: REASON``. Snapshots of earlier versions lack it.
+    """
+
+    schema: int
+    python: str
+    implementation: str
+    platform: str
+    machine: str
+    cpu: str
+    versions: dict[str, str]
+    distributions: dict[str, str]
+    loaded: list[str]
+    variables: dict[str, str]
+    core: NotRequired[str]
+    load_order: NotRequired[str]
+    git: NotRequired[dict[str, str]]
+
+
+_VERSIONED = ("crashhunt", "numpy")  # besides those of simulators
+_RECORDED_VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "OMP_NUM_THREADS", "VIRTUAL_ENV")
+
+
+def environment(imported: ImportedModules | None = None) -> Environment:
+    """Return the content of ``environment.json``.
+
+    ``loaded`` lists the distributions with an imported module, and those of simulators. Results may depend on them.
+
+    Args:
+        imported: The imported modules; by default those of this process.
+    """
+    imported = imported or ImportedModules.here()
+    modules, variables = imported.places.keys(), imported.variables
+    distributions: dict[str, str] = {}
+    named = versions()
+    loaded: set[str] = set()
+    for distribution in installed():
+        name, version, theirs = _facts_of(distribution)
+        if not name:
+            continue
+        distributions[name] = version
+        if name in named or not modules.isdisjoint(theirs):
+            loaded.add(name)
+    return {
+        "schema": 1,
+        "python": platform.python_version(),
+        "implementation": platform.python_implementation(),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "cpu": processor(),
+        "versions": named,
+        "distributions": dict(sorted(distributions.items(), key=lambda item: item[0].lower())),
+        "loaded": sorted(loaded, key=str.lower),
+        "variables": {name: variables[name] for name in _variables() if name in variables},
+    }
+
+
+@lru_cache(maxsize=1024)
+def _facts_of(distribution: metadata.Distribution) -> tuple[str, str, set[str]]:
+    return *_name_and_version(distribution), _top_level_modules(distribution)
+
+
+def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
+    """Return name and version from the head of the text, because `Distribution.metadata` parses the whole text."""
+    text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
+    head, _, _ = text.partition("\n\n")
+    found = dict(line.split(": ", 1) for line in head.splitlines() if line.startswith(("Name: ", "Version: ")))
+    if len(found) == 2:
+        return found["Name"].strip(), found["Version"].strip()
+    return distribution.metadata["Name"] or "", distribution.metadata["Version"] or ""
+
+
+def _version_of(name: str) -> str:
+    return _name_and_version(metadata.distribution(name))[1]
+
+
+def _top_level_modules(distribution: metadata.Distribution) -> set[str]:
+    """Return the modules of a distribution, as `importlib.metadata.packages_distributions` does, but faster."""
+    declared = (distribution.read_text("top_level.txt") or "").split()
+    if declared:
+        return set(declared)
+    record = distribution.read_text("RECORD")
+    names = map(str, distribution.files or ()) if record is None else record.splitlines()
+    files = (name.partition(",")[0].strip('"') for name in names)
+    return {file.partition("/")[0].removesuffix(".py") for file in files if file.endswith(".py")}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that every crash records, including those of all installed simulators."""
+    found = {"python": platform.python_version()}
+    for name in dict.fromkeys(
+        (*_VERSIONED, *(name for _, backend in installed_backends() for name in backend.versions))
+    ):
+        try:
+            found[name] = _version_of(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _variables() -> tuple[str, ...]:
+    return (*_RECORDED_VARIABLES, *(name for _, backend in installed_backends() for name in backend.variables))
+
+
+def environment_changes(recorded: Environment) -> dict[str, tuple[str, str]]:
+    """Return the versions that differ from an ``environment.json``: name to (recorded, current)."""
+    changes = {}
+    for name, then, now in (
+        ("python", recorded.get("python"), platform.python_version()),
+        ("implementation", recorded.get("implementation"), platform.python_implementation()),
+        ("machine", recorded.get("machine"), platform.machine()),
+    ):
+        if then not in (None, now):
+            changes[name] = (str(then), now)
+    distributions = recorded.get("distributions", {})
+    for name in recorded.get("loaded", ()):
+        try:
+            now = _version_of(name)
+        except metadata.PackageNotFoundError:
+            now = "not installed"
+        then = distributions.get(name, now)
+        if then != now and name != "crashhunt":  # crashhunt itself comes from the snapshot
+            changes[name] = (str(then), now)
+    return changes
+
+
+def processor() -> str:
+    """Return the model of the processor, because NumPy's results may differ between models."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+
+
+def environment_of_simulation(found: Environment) -> Environment:
+    """Return the environment without distributions that were not loaded, and without the user's folders."""
+    loaded = set(found["loaded"])
+    distributions = {name: version for name, version in found["distributions"].items() if name in loaded}
+    return {**found, "distributions": distributions, "variables": {}, "git": {}}
