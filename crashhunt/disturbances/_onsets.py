@@ -337,9 +337,7 @@ def _place_of(sampler: DisturbanceSampler, ratios: Mapping[str, float], order: i
             asked = Drawn(drawn.who, 1.0, 1.0) if by_place else drawn
             cells.setdefault(asked, []).append(_Cell(key=key, drawn=drawn, share=share, ratio=ratios.get(key, 1.0)))
     else:  # every draw counts, whether it finds a vehicle or not
-        cells[_UNLISTED_DRAW] = [
-            _Cell(key=cell_of(name), drawn=_UNLISTED_DRAW, share=1.0, ratio=ratios.get(name, 1.0))
-        ]
+        cells[_UNLISTED_DRAW] = [_Cell(key=cell_of(name), drawn=_UNLISTED_DRAW, share=1.0, ratio=ratios.get(name, 1.0))]
     frozen = {asked: tuple(some) for asked, some in cells.items()}
     return _Place(
         order=order,
