@@ -30,7 +30,7 @@ from ._probes import (
     Probed as Probed,
     Prober as Prober,
 )
-from ._questions import FirstCopy as FirstCopy
+from ._questions import FirstCopy as FirstCopy, Questions as Questions
 from ._run import (
     Parts as Parts,
     generators as generators,

@@ -93,6 +93,9 @@ class Brancher(Observer):
         crash_on: The outcomes that count as a crash.
         delay: Called with the wall time that branches have taken, in s.
         tell: Called with notices for the user.
+
+    Attributes:
+        questions: Runs the copies, and counts those without a result.
     """
 
     def __init__(
@@ -107,7 +110,7 @@ class Brancher(Observer):
         self._words = tuple(words)
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
-        self._questions = Questions("branches", tell)
+        self.questions = Questions("branches", tell)
         self._branches = Branches()
         self._asleep: deque[_StoredFork] = deque()
         self._frames: deque[Frame] = deque()
@@ -119,21 +122,12 @@ class Brancher(Observer):
         self._strongest_at = 0  # when everything may be asked for again
         self._any = False  # whether there might have been any
 
-    @property
-    def why_not(self) -> str:
-        """The reason why branches have ended, in words; empty if there are still branches."""
-        return self._questions.why_not
-
-    def stop(self, why_not: str) -> None:
-        """Ask no copies any more."""
-        self._questions.stop(why_not)
-
     def begin(self, episode: Episode) -> None:
         """Begin the next episode, and compute the number of steps per second."""
         self._second = steps_of(1.0, episode.simulator.step_length_s)
         self._frames = deque(maxlen=_WINDOW_S * self._second + 1)
         self._branches, self._draws, self._rests_until = Branches(), 0, 0
-        self._questions.begin_trial()
+        self.questions.begin_trial()
         self._drawn_steps, self._strongest_at = 0, 0
         self._owner = os.getpid()
         self._any = False
@@ -152,8 +146,8 @@ class Brancher(Observer):
         try:
             self._ask(episode)
         except CrashhuntError as error:
-            self._questions.stop(error.message)
-            self._questions.skip()
+            self.questions.stop(error.message)
+            self.questions.skip()
         finally:
             self._delay(time.monotonic() - began)
 
@@ -162,18 +156,18 @@ class Brancher(Observer):
             self._asleep.popleft().copy.end()
         self._any = True
         near = self._is_near(episode)
-        if self._questions.is_over:
+        if self.questions.is_over:
             if near:
-                self._questions.skip()
+                self.questions.skip()
             return
         if near and free_memory() < FREE:
             self._tell(f"less than {FREE:.0%} of the memory is free: trials branch less than they might")
-            self._questions.skip(f"less than {FREE:.0%} of the memory was free")
+            self.questions.skip(f"less than {FREE:.0%} of the memory was free")
         else:
             sleeper = self._suspend_fork(episode) if near else None
             if sleeper is not None and episode.steps >= self._strongest_at:
                 self._ask_for_everything(episode, sleeper)
-        if not self._questions.is_over:
+        if not self.questions.is_over:
             self._ask_dangerous_moment(episode, episode.steps)
 
     def _suspend_fork(self, episode: Episode) -> _StoredFork | None:
@@ -181,7 +175,7 @@ class Brancher(Observer):
         try:
             self._asleep.append(_StoredFork(episode.steps, episode.suspend_fork(self._run_branch)))
         except NoProcessError as error:
-            self._questions.miss(NoAnswer(f"could not be made: {error.message}", is_from_outside=True))
+            self.questions.miss(NoAnswer(f"could not be made: {error.message}", is_from_outside=True))
             return None
         return self._asleep[-1]
 
@@ -196,7 +190,7 @@ class Brancher(Observer):
             return result  # no branch could run, so there is no result
         if str(result.outcome) in self._crashes:
             return replace(result, branches=replace(self._branches, crashes=()))  # it needed no other
-        asked = self._questions
+        asked = self.questions
         branches = replace(
             self._branches,
             unanswered=asked.unanswered,
@@ -238,14 +232,14 @@ class Brancher(Observer):
         if found is None:
             return
         anyway = self._branch(episode, sleeper, fixed, min(until, found.step + self._second))
-        if anyway is not None or not self._questions.has_answer:
+        if anyway is not None or not self.questions.has_answer:
             return  # it is about to crash anyway, or may be
         first = not self._branches.crashes  # of which one that is likelier is looked for whatever it takes
         self._record_crash(episode, found)
         kept = [one for one in found.took_place if one not in draws.fixed]
         for one in kept:
             fewer = [other for other in kept if other is not one]
-            if not fewer or self._questions.is_over or (not first and self._is_spent(episode)):
+            if not fewer or self.questions.is_over or (not first and self._is_spent(episode)):
                 return
             found = self._branch(episode, sleeper, [*((other,) for other in fewer), *fixed], until)
             if found is not None:
@@ -273,7 +267,7 @@ class Brancher(Observer):
                 self._branches = replace(self._branches, left_out=self._branches.left_out + 1)
             elif not self._is_spent(episode):
                 self._draw(episode, sleeper)
-            if self._questions.is_over:
+            if self.questions.is_over:
                 return
 
     def _draw(self, episode: Episode, sleeper: _StoredFork) -> None:
@@ -305,7 +299,7 @@ class Brancher(Observer):
             copy = self._usable(episode, sleeper)
             return copy.ask(job, _PATIENCE_S), copy.no_answer
 
-        answer = self._questions.ask(attempt, lambda: sleeper.step == episode.steps or sleeper.copy.is_usable)
+        answer = self.questions.ask(attempt, lambda: sleeper.step == episode.steps or sleeper.copy.is_usable)
         if answer is None:
             return None
         before, steps = self._branches, cast(int, answer["steps"])

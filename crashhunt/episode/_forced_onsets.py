@@ -52,6 +52,9 @@ class OnsetForcer:
         patience_s: time limit of a copy, in s of wall time.
         delay: called with the wall time that copies have taken, in s.
         tell: called with messages for the user.
+
+    Attributes:
+        questions: runs the copies, and counts those without a result.
     """
 
     def __init__(
@@ -66,20 +69,11 @@ class OnsetForcer:
         self._crashes = frozenset(map(str, crash_on))
         self._patience_s = patience_s
         self._delay = delay
-        self._questions = Questions("rare", tell)
+        self.questions = Questions("rare", tell)
         self._sampler: DisturbanceSampler | None = None
         self._onsets: FirstOnsets | None = None
         self._copies: list[ForcedCopy] = []
         self._steps = 0
-
-    @property
-    def why_not(self) -> str:
-        """The reason why no more copies can be made, in words; empty if they can."""
-        return self._questions.why_not
-
-    def stop(self, why_not: str) -> None:
-        """Make no copies any more."""
-        self._questions.stop(why_not)
 
     def is_due(self, episode: Episode) -> bool:
         """Return whether the trial is a root; every step of a root is needed."""
@@ -90,21 +84,21 @@ class OnsetForcer:
         if self._onsets is None:
             self._onsets = self._begin(episode)
         for onset in self._onsets.after(episode.steps, partial(_has_target, episode)):
-            if self._questions.unanswered:
-                self._questions.skip(self._questions.why_unanswered)  # the root is incomplete anyway
+            if self.questions.unanswered:
+                self.questions.skip(self.questions.why_unanswered)  # the root is incomplete anyway
                 continue
             began = time.monotonic()
             try:
                 self._follow(episode, onset)
             except CrashhuntError as error:
-                self._questions.stop(error.message)
-                self._questions.skip()
+                self.questions.stop(error.message)
+                self.questions.skip()
             finally:
                 self._delay(time.monotonic() - began)
 
     def result(self, result: TrialResult) -> TrialResult:
         """Return the result of the root with the results of its copies, and begin the next trial."""
-        onsets, copies, steps, asked = self._onsets, tuple(self._copies), self._steps, self._questions
+        onsets, copies, steps, asked = self._onsets, tuple(self._copies), self._steps, self.questions
         self._onsets, self._copies, self._steps = None, [], 0
         if onsets is None:
             return result
@@ -144,11 +138,11 @@ class OnsetForcer:
             copy = episode.fork(run, observed=False)
             return copy.answer(patience_s), copy.no_answer
 
-        answer = self._questions.ask(attempt)
+        answer = self.questions.ask(attempt)
         if answer is None:
             return
         if lost := answer.get("lost"):
-            self._questions.skip(str(lost), is_from_outside=bool(answer["is_from_outside"]))
+            self.questions.skip(str(lost), is_from_outside=bool(answer["is_from_outside"]))
             return
         for end in cast("list[JsonObject]", answer["ends"]):
             self._note(onset, end)
@@ -175,7 +169,7 @@ class OnsetForcer:
         branched = cast(int, end["branched"])
         self._steps += step - branched
         if outcome in (Outcome.SIMULATOR_ERROR, Outcome.INVALID):
-            self._questions.skip(f"a copy ended by {outcome}")  # perhaps because it is a copy
+            self.questions.skip(f"a copy ended by {outcome}")  # perhaps because it is a copy
             return
         crashed = outcome in self._crashes
         planned = cast("list[JsonObject]", end["planned"])

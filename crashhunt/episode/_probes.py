@@ -127,6 +127,9 @@ class Prober:
         delay: called with the wall time that copies have taken, in s.
         budget: steps that copies may take for each step of their trial.
         tell: called with messages for the user.
+
+    Attributes:
+        questions: runs the copies, and counts those without a result.
     """
 
     def __init__(
@@ -141,19 +144,10 @@ class Prober:
         self._budget = budget
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
-        self._questions = Questions("probes", tell)
+        self.questions = Questions("probes", tell)
         self._stress = Stress(1.0)
         self._moment = 0  # of those at which there was something to ask
         self._goes_on = False  # without any disturbance, from the present moment on: that is asked once
-
-    @property
-    def why_not(self) -> str:
-        """The reason why probes cannot run any more, in words; empty if they can."""
-        return self._questions.why_not
-
-    def stop(self, why_not: str) -> None:
-        """Run no more probes."""
-        self._questions.stop(why_not)
 
     def is_due(self, episode: Episode) -> bool:
         """Return whether probes run after the completed step."""
@@ -161,9 +155,9 @@ class Prober:
 
     def ask(self, episode: Episode) -> None:
         """Find the mildest disturbance of each kind with which the episode crashes soon, if there is a milder one."""
-        before = self._questions.unanswered
+        before = self.questions.unanswered
         self._ask(episode)
-        asked = self._questions.unanswered == before
+        asked = self.questions.unanswered == before
         stress = self._stress
         self._stress = replace(stress, moments=stress.moments + 1, moments_asked=stress.moments_asked + asked)
 
@@ -171,23 +165,23 @@ class Prober:
         self._goes_on = False
         if self._find_mildest <= 1 / _STRENGTH_LEVELS:
             return
-        if self._questions.is_over:
-            self._questions.skip()
+        if self.questions.is_over:
+            self.questions.skip()
             return
         try:
             asked = self._questions_at(episode)
             turn = self._moment % max(1, len(asked))  # if the budget is too small, each moment skips other questions
             self._moment += 1
             for question in asked[turn:] + asked[:turn]:
-                if self._questions.is_over:
+                if self.questions.is_over:
                     return
                 if self._is_spent(episode):
                     self._stress = replace(self._stress, left_out=self._stress.left_out + 1)
                 elif not self._mildest(episode, question):
                     return
         except CrashhuntError as error:
-            self._questions.stop(error.message)
-            self._questions.skip()
+            self.questions.stop(error.message)
+            self.questions.skip()
 
     @property
     def _find_mildest(self) -> float:
@@ -220,7 +214,7 @@ class Prober:
             }
 
         there = self._in_copy(episode, look).get("there", []) if others else []
-        if others and not self._questions.has_answer:
+        if others and not self.questions.has_answer:
             return []
         absent = {one for one, is_there in zip(others, cast("list[bool]", there), strict=False) if not is_there}
         return [one for one in every if one not in absent]
@@ -228,8 +222,8 @@ class Prober:
     def result(self, result: TrialResult) -> TrialResult:
         """Return the result of the trial with the results of its copies, and begin the next one."""
         stress, self._stress, self._moment = self._stress, Stress(1.0), 0
-        why, may_be_answered = self._questions.why_unanswered, self._questions.may_be_answered
-        self._questions.begin_trial()
+        why, may_be_answered = self.questions.why_unanswered, self.questions.may_be_answered
+        self.questions.begin_trial()
         if str(result.outcome) in self._crashes:
             stress = replace(stress, margin=0.0, disturbance=None, outcome="", step=0)
         elif stress.moments_asked < stress.moments:
@@ -254,13 +248,13 @@ class Prober:
         while at > low:
             disturbance = kind.disturbance(shares[at], question.who, question.agent, step)
             outcome, ended = self._copy(episode, disturbance)
-            if not self._questions.has_answer:
+            if not self.questions.has_answer:
                 break
             if not outcome:
                 low = at
             elif not self._goes_on and self._copy(episode, None)[0]:
                 return False  # it is about to crash anyway
-            elif not self._questions.has_answer:
+            elif not self.questions.has_answer:
                 break  # it may be about to crash anyway
             else:
                 self._goes_on, high = True, at
@@ -306,4 +300,4 @@ class Prober:
             finally:
                 self._delay(time.monotonic() - began)
 
-        return self._questions.ask(attempt) or {}
+        return self.questions.ask(attempt) or {}

@@ -39,6 +39,7 @@ class Questions:
         tell: called with messages for the user.
 
     Attributes:
+        what: as given.
         why_not: why this process runs no more copies, in words; empty if it does.
         unanswered: number of questions of this trial without a result.
         why_unanswered: the reason for the first missing result, in words; empty if all have a result.
@@ -47,7 +48,7 @@ class Questions:
     """
 
     def __init__(self, what: str, tell: Callable[[str], None] = lambda _: None) -> None:
-        self._what = what
+        self.what = what
         self._tell = tell
         self._failures = 0  # questions in turn, of this process
         self.why_not = ""
@@ -96,7 +97,7 @@ class Questions:
             reason = _shortened(no_answer or NoAnswer("did not answer"))
             if not reason.is_from_outside or not can_retry():
                 break
-            self._tell(f"{self._what}: a copy of a trial {reason.why}, and another is asked")
+            self._tell(f"{self.what}: a copy of a trial {reason.why}, and another is asked")
         self.miss(reason)
         return None
 
@@ -108,7 +109,7 @@ class Questions:
             if self._killed >= _MAX_CONSECUTIVE_FAILURES:
                 self._paused_because = why
         else:
-            self._tell(f"{self._what}: {why}; what it was asked has no answer")
+            self._tell(f"{self.what}: {why}; what it was asked has no answer")
             self._failures += 1
             if self._failures >= _MAX_CONSECUTIVE_FAILURES:
                 self.stop(f"{_MAX_CONSECUTIVE_FAILURES} copies in turn failed; the last {reason.why}")

@@ -108,6 +108,9 @@ class Splitter:
         delay: called with the wall time that copies have taken, in s.
         tell: called with what the user should know.
         refuse: called with the reason, where the simulator has no noise to draw again.
+
+    Attributes:
+        questions: runs the copies, and counts those without a result.
     """
 
     def __init__(
@@ -122,19 +125,10 @@ class Splitter:
         self._patience_s = patience_s
         self._delay = delay
         self._refuse = refuse
-        self._questions = Questions("rare", tell)
+        self.questions = Questions("rare", tell)
         self._path: _EpisodePath | None = None
         self._copies: list[ForcedCopy] = []
         self._peak = 0.0
-
-    @property
-    def why_not(self) -> str:
-        """Why no copies can be made any more, in words; empty if they can."""
-        return self._questions.why_not
-
-    def stop(self, why_not: str) -> None:
-        """Make no copies any more."""
-        self._questions.stop(why_not)
 
     def is_due(self, episode: Episode) -> bool:
         """Whether the trial is a root of splitting: the peak is that of every step."""
@@ -144,21 +138,21 @@ class Splitter:
         """Make the copies that leave the root after the step that is complete; also called before the first step."""
         assert episode.spec.forcing is not None
         if self._path is None:
-            self._path = _EpisodePath(episode, self._crashes, self._patience_s, (), questions=self._questions)
+            self._path = _EpisodePath(episode, self._crashes, self._patience_s, (), questions=self.questions)
             if why_not := _why_no_noise(episode):
-                self._questions.stop(why_not)
+                self.questions.stop(why_not)
                 self._refuse(why_not)
         self._peak = max(self._peak, self._path.measure)
-        if self._questions.why_not and not self._questions.unanswered:
-            self._questions.skip()
-        if self._questions.unanswered:
+        if self.questions.why_not and not self.questions.unanswered:
+            self.questions.skip()
+        if self.questions.unanswered:
             return  # the tree is incomplete anyway
         began = time.monotonic()
         try:
             self._copies += split_path(self._path, episode.spec.forcing.levels or ())
         except CrashhuntError as error:
-            self._questions.stop(error.message)
-            self._questions.skip()
+            self.questions.stop(error.message)
+            self.questions.skip()
         finally:
             if self._path.has_forked:
                 self._path.has_forked = False
@@ -166,7 +160,7 @@ class Splitter:
 
     def result(self, result: TrialResult) -> TrialResult:
         """Return the result of the root with what its copies have found; the next trial begins."""
-        path, copies, peak, asked = self._path, tuple(self._copies), self._peak, self._questions
+        path, copies, peak, asked = self._path, tuple(self._copies), self._peak, self.questions
         self._path, self._copies, self._peak = None, [], 0.0
         if path is None:
             return result
