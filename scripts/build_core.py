@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -105,7 +106,9 @@ def _compile(folder: Path, source: str, interface: str, built: Path) -> Path:
     if match is None:
         raise ValueError(f"{interface} does not say which interface it has")
     words = [*shlex.split(compiler), *FLAGS, *shlex.split(os.environ.get("CXXFLAGS", ""))]
-    words += [f"-DCRASHHUNT_INTERFACE={match[1]}", f"-I{sysconfig.get_path('include')}", str(folder / source)]
+    build_id = runpy.run_path(str(folder.parent / "native" / "_build_id.py"))["build_id"](folder)
+    words += [f"-DCRASHHUNT_INTERFACE={match[1]}", f"-Wl,--build-id=0x{build_id}"]
+    words += [f"-I{sysconfig.get_path('include')}", str(folder / source)]
     done = subprocess.run([*words, "-o", str(built), "-ldl"], capture_output=True, text=True, timeout=600, check=False)
     if done.returncode:
         raise subprocess.SubprocessError(f"the compiler says: {done.stderr.strip()[-2000:]}")

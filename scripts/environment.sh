@@ -18,7 +18,7 @@ find_python() {
 
 environment() {
     extra=$1
-    wanted=$(cat "$root/pyproject.toml" "$root/scripts/build_core.py" "$root"/crashhunt/native/{_core.py,_link_order.py,*.?pp} \
+    wanted=$(cat "$root/pyproject.toml" "$root/scripts/build_core.py" "$root"/crashhunt/native/{_build_id.py,_core.py,_link_order.py,*.?pp} \
         "$root"/crashhunt/accelerator/{_kernel.py,*.?pp} | cksum)
     # A development environment serves users too.
     for have in dev "$extra"; do

@@ -7,8 +7,6 @@ import contextlib
 import fcntl
 import functools
 import gc
-import importlib
-import importlib.util
 import json
 import os
 import secrets
@@ -30,7 +28,7 @@ import pytest
 from commands import CRASHHUNT, Begun, Commands
 
 from crashhunt.base.integrity import describe_files, digest_of_data
-from crashhunt.native import _core
+from crashhunt.native import HOW_TO_REBUILD, _core, outdated_modules
 from crashhunt.snapshots import _take
 from crashhunt.snapshots._snapshot import code_of_manifest
 
@@ -282,13 +280,14 @@ def _group(item: pytest.Item) -> str:
     return "long" if item.get_closest_marker("long") else ""
 
 
+_OUTDATED = functools.cache(outdated_modules)
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """A compiled core that was built from other sources than those that are tested is told in one line."""
-    if item.path.parent.name == "native" and importlib.util.find_spec(_core._MODULE) is not None:
-        built, wanted = importlib.import_module(_core._MODULE).INTERFACE, _core._INTERFACE
-        if built != wanted:
-            what = f"the compiled core of this environment is of another version ({built} instead of {wanted})"
-            pytest.fail(f"{what}: build it again with `pip install --no-deps --editable .`", pytrace=False)
+    """Compiled modules that were built from other sources than those that are tested are told in one line."""
+    if item.path.parent.name in ("native", "simulators") and _OUTDATED():
+        what = f"compiled from other sources than those tested: {', '.join(_OUTDATED())}"
+        pytest.fail(f"{what}. Fix: {HOW_TO_REBUILD}", pytrace=False)
 
 
 @pytest.fixture

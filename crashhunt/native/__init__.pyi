@@ -1,3 +1,4 @@
+from ._build_id import HOW_TO_REBUILD as HOW_TO_REBUILD, outdated_modules as outdated_modules
 from ._core import (
     ANSWERED as ANSWERED,
     ASK as ASK,

@@ -18,6 +18,7 @@ from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, 
 from crashhunt.base.plugins import is_foreign, registered
 from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import ModelApart, disturber_of, locate_model, parse_fixed, parse_rates, word_of
+from crashhunt.native import HOW_TO_REBUILD, outdated_modules
 from crashhunt.oracles import chosen_oracles, outcomes_brought
 from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code
 from crashhunt.plans._run_options import TrialOptions
@@ -340,6 +341,8 @@ def _with_notes(scenario: Scenario, run: RunSettings) -> Scenario:
     load_order = scenario.backend.load_order
     if load_order is not None and (order := load_order_of(scenario)) != FIXED:
         notes.append(f"the order of {load_order.what} is {order}; a trial may differ between processes")
+    if outdated := outdated_modules():
+        notes.append(f"compiled from other sources than those installed: {listed(outdated)}. Fix: {HOW_TO_REBUILD}")
     return replace(scenario, notes=(*scenario.notes, *filter(None, notes)))
 
 

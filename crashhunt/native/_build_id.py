@@ -1,0 +1,42 @@
+"""The check whether compiled modules were built from the C++ sources of this checkout.
+
+Reason: ``git pull`` changes the sources of an editable installation, but not the compiled modules. They load, and
+compute what the older sources say. The linker therefore stores a digest of the sources as the build id, which every
+ELF file has. scripts/build_core.py runs this file by its path, so it imports the standard library only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final
+
+__all__ = ["HOW_TO_REBUILD", "build_id", "outdated_modules"]
+
+HOW_TO_REBUILD: Final = "pip install --no-deps --editable ."
+_MODULES: Final = {"_crashhunt_core": "native", "_crashhunt_link_order": "native", "_crashhunt_highway": "accelerator"}
+"""Compiled module to the folder of its sources in crashhunt."""
+
+
+def build_id(folder: Path) -> str:
+    """Return the digest of the C++ sources in a folder, as hexadecimal digits; empty if there are no sources."""
+    sources = sorted(folder.glob("*.?pp"))
+    digest = hashlib.blake2b(digest_size=20)
+    for source in sources:
+        content = source.read_bytes()
+        digest.update(f"{source.name} {len(content)}\n".encode() + content)
+    return digest.hexdigest() if sources else ""
+
+
+def outdated_modules(package: Path = Path(__file__).parents[1]) -> list[str]:
+    """Return the installed compiled modules that were built from other sources than those of the package.
+
+    A package without sources, such as a snapshot of the code, has no outdated modules.
+    """
+    outdated = []
+    for module, folder in _MODULES.items():
+        wanted, found = bytes.fromhex(build_id(package / folder)), find_spec(module)
+        if wanted and found is not None and found.origin is not None and wanted not in Path(found.origin).read_bytes():
+            outdated.append(module)
+    return outdated
