@@ -28,8 +28,8 @@ PYTEST = (
     "-W", "ignore::pytest.PytestAssertRewriteWarning",
 )  # fmt: skip
 
-_STARTS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn"}
-"""What Python calls it when a process is started (sys.audit)."""
+_STARTS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "socket.sendmsg"}
+"""What Python calls it when a process is started (sys.audit); tests have another process fork by a message."""
 
 
 class Watcher:

@@ -3,6 +3,7 @@
 A slip is put into a copy of the repository, and of the tests nearest to its module those run that reach its line, the
 fastest first, up to the first that fails. Nearest are the tests that lie as the module does: those of
 ``crashhunt/world/_scene.py`` are ``tests/world/test_scene*.py``, and where there are none all of ``tests/world``.
+`_TESTS_ELSEWHERE` lists the modules whose tests lie in another folder.
 
 Each run is a fork of this process, which has imported everything that is not crashhunt: about a second a slip, where a
 process of its own would take four. mutmut and cosmic-ray were looked at: the former chooses among all tests by what it
@@ -36,6 +37,30 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 ENOUGH = 0.2  # the share of survivors that is tolerated
 EQUIVALENT = ROOT / "scripts" / "equivalent_slips.json"
 _SURVEY_S = 900  # of the processor, for all nearest tests of a package; tracing makes them several times slower
+_TESTS_ELSEWHERE = {
+    # Tests of the accelerator compare it with highway-env through the simulator.
+    "accelerator": ("simulators/test_accelerator*.py", "simulators/test_kernel.py", "simulators/test_dynamic_*.py"),
+    "panels": ("render/test_panels.py",),
+    # These are tested as users run them: as commands.
+    "cli/_common.py": ("e2e/test_commands.py",),
+    "cli/_compare.py": ("e2e/test_manage.py",),
+    "cli/_crashes.py": ("e2e/test_types_by_cause.py",),
+    "cli/_dashboard.py": ("dashboard/test_command.py",),
+    "cli/_judge.py": ("e2e/test_judging.py",),
+    "cli/_list.py": ("e2e/test_listing.py",),
+    "cli/_logs.py": ("e2e/test_manage.py",),
+    "cli/_rate.py": ("e2e/test_crash_rates.py",),
+    "cli/_report.py": ("report/test_page.py",),
+    "cli/_run.py": ("e2e/test_run_help.py", "e2e/test_commands.py", "e2e/test_stops.py"),
+    "cli/_split.py": ("training/test_held_out_traffics.py",),
+    "cli/_status.py": ("e2e/test_manage.py",),
+    "cli/_trials.py": ("e2e/test_manage.py",),
+    "cli/_trust.py": ("e2e/test_foreign_hunts.py",),
+    "cli/_whatif.py": ("e2e/test_what_if.py",),
+    "corpus": ("e2e/test_corpus.py",),
+    "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),
+}
+"""Module or package to its nearest tests, as patterns below `tests`."""
 
 
 @dataclass(slots=True)
@@ -107,6 +132,14 @@ def equivalents() -> dict[tuple[str, str], str]:
     return {(one["module"], "\n".join(one["diff"])): one["reason"] for one in listed}
 
 
+def stale_equivalents(listed: dict[tuple[str, str], str]) -> list[str]:
+    """Return the modules of listed slips that cannot be made any more, because the code has changed."""
+    files = {module: ROOT / module for module, _ in listed}
+    sources = {module: file.read_text(encoding="utf-8") if file.is_file() else "" for module, file in files.items()}
+    known = {(module, slip.diff(source)) for module, source in sources.items() for slip in find_slips(source)}
+    return sorted(module for module, diff in listed if (module, diff) not in known)
+
+
 def without_equivalents(
     slips: list[tuple[Target, Slip]], listed: dict[tuple[str, str], str]
 ) -> tuple[list[tuple[Target, Slip]], list[Verdict]]:
@@ -134,6 +167,11 @@ def modules_of(name: str) -> list[Path]:
 
 def nearest_tests(file: Path) -> tuple[Path, ...]:
     """Return the test files that lie as a module does: of its name, or of its folder, or of the folder above that."""
+    inside = file.relative_to("crashhunt")
+    for name in (str(inside), inside.parts[0]):
+        found = [path for pattern in _TESTS_ELSEWHERE.get(name, ()) for path in sorted((ROOT / "tests").glob(pattern))]
+        if found:
+            return tuple(path.relative_to(ROOT) for path in found)
     words = file.stem.strip("_").split("_")
     inner = ROOT / "tests" / file.parent.relative_to("crashhunt")
     end_to_end = ROOT / "tests" / "e2e"
@@ -256,7 +294,7 @@ def shown(facts: dict[str, Any]) -> str:
         reached = "" if slip["reached"] else " (no test reaches it)"
         lines += [f"{slip['where']}: {slip['what']}{reached}", slip["diff"], ""]
     lines += [f"{slip['where']}: {slip['what']}: equivalent: {slip['reason']}" for slip in facts["equivalent"]]
-    lines += [f"{EQUIVALENT.name} lists a slip of {module} that is none any more" for module in facts["stale"]]
+    lines += [f"{EQUIVALENT.name} lists a slip of {module} that its code does not have" for module in facts["stale"]]
     lines.append(f"{'not noticed by the nearest tests':<44}{'slips':>7}{'not':>7}{'share':>8}{'equivalent':>12}")
     for kind in ("modules", "packages"):
         for row in facts[kind]:
@@ -299,26 +337,24 @@ def main() -> int:
     asked = options.module or all_packages()[part - 1 :: parts]
     failed: list[str] = []
     listed = equivalents()
-    seen: set[tuple[str, str]] = set()
     everything = {name: targets_of(name, options.tests) for name in asked}
     with tempfile.TemporaryDirectory(prefix="crashhunt-mutate-") as folder:
         slots = [Slot(Path(folder) / str(number)) for number in range(options.parallel)]
         try:
             for name, targets in everything.items():
+                slips = [(target, slip) for target in targets for slip in find_slips(target.source)]
+                slips, known = without_equivalents(slips, listed)
+                if options.sample is not None and options.sample < len(slips):
+                    slips = random.Random(f"{options.seed} {name}").sample(slips, options.sample)
+                slips.sort(key=lambda found: (found[0].file, found[1].start))
                 say(f"{name}: the tests without any slip")
-                failure = survey(slots[0], targets)
+                chosen = {target.file for target, _ in slips}
+                failure = survey(slots[0], [target for target in targets if target.file in chosen])
                 if failure:  # the other packages can still be measured
                     failed.append(name)
                     print(f"{name}: the tests fail without any slip:\n{failure}", file=sys.stderr)
                     continue
-                slips = [(target, slip) for target in targets for slip in find_slips(target.source)]
-                seen.update((str(target.file), slip.diff(target.source)) for target, slip in slips)
-                slips, known = without_equivalents(slips, listed)
-                verdicts += known
-                if options.sample is not None and options.sample < len(slips):
-                    slips = random.Random(f"{options.seed} {name}").sample(slips, options.sample)
-                slips.sort(key=lambda found: (found[0].file, found[1].start))
-                verdicts += judge(slots, name, slips)
+                verdicts += known + judge(slots, name, slips)
         except KeyboardInterrupt:
             return 130
         finally:
@@ -337,7 +373,7 @@ def main() -> int:
         "failed": failed,
         "survivors": [described(verdict) for verdict in verdicts if not verdict.noticed and not verdict.reason],
         "equivalent": [described(verdict) | {"reason": verdict.reason} for verdict in verdicts if verdict.reason],
-        "stale": sorted(module for module, diff in listed if module in map(str, files) and (module, diff) not in seen),
+        "stale": stale_equivalents(listed),
     }
     print(json.dumps(facts, indent=1) if options.json else shown(facts))
     return int(bool(failed or facts["stale"]) or any(row["share"] > options.at_most for row in facts["packages"]))
