@@ -40,7 +40,7 @@ def test_module_of_other_sources_is_outdated(checkout, change):
     assert _build_id.outdated_modules(checkout) == ["_crashhunt_core"]
 
 
-def test_python_beside_the_sources_does_not_matter(checkout):
+def test_python_file_changes_no_build_id(checkout):
     (checkout / "native" / "part.py").write_text("x = 1")
     assert _build_id.outdated_modules(checkout) == []
 
