@@ -1,8 +1,9 @@
 """The check whether compiled modules were built from the C++ sources of this checkout.
 
 Reason: ``git pull`` changes the sources of an editable installation, but not the compiled modules. They still load,
-and compute what the older sources say. Therefore the linker stores a digest of the sources as the build id of the ELF
-file. scripts/build_core.py runs this file by its path, so it imports the standard library only.
+and compute what the older sources say. So the linker stores a digest of the sources as the build id of the file.
+
+This file imports the standard library only, because scripts/build_core.py runs it by its path.
 """
 
 from __future__ import annotations
