@@ -40,7 +40,6 @@ _TESTS_ELSEWHERE = {
     "accelerator": ("simulators/test_accelerator*.py", "simulators/test_kernel.py", "simulators/test_dynamic_*.py"),
     "panels": ("render/test_panels.py",),
     # These are tested as users run them: as commands.
-    "cli/_common.py": ("e2e/test_commands.py",),
     "cli/_compare.py": ("e2e/test_manage.py",),
     "cli/_crashes.py": ("e2e/test_types_by_cause.py",),
     "cli/_dashboard.py": ("dashboard/test_command.py",),
@@ -187,7 +186,8 @@ def nearest_tests(file: Path) -> tuple[Path, ...]:
                 return tuple(path.relative_to(ROOT) for path in found)
         return tuple(sorted(path.relative_to(ROOT) for path in folder.glob("test_*.py")))
     # Commands, and what is in no package, have tests that run the command line.
-    return tuple(path.relative_to(ROOT) for path in (end_to_end / f"test_{'_'.join(words)}.py",) if path.is_file())
+    own = end_to_end / f"test_{'_'.join(words)}.py"
+    return ((own if own.is_file() else end_to_end / "test_commands.py").relative_to(ROOT),)
 
 
 def targets_of(name: str, tests: Sequence[Path] | None = None) -> list[Target]:
