@@ -75,7 +75,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
     hunt = bundle.hunt
     bundle.recording()  # refuses what is damaged
     snapshot = Snapshot(hunt / layout.SNAPSHOTS / bundle.snapshot)
-    snapshot.verify()
+    snapshot.verify(to_run=False)  # the dashboard exports, and writes nothing into a hunt
     files = [hunt / layout.HUNT, *sorted(bundle.path.rglob("*"))]
     # Export only the snapshot's files that its manifest names, because an agent may have written data into its folder.
     files += [snapshot.path / name for name in snapshot.manifest["files"]]

@@ -191,11 +191,8 @@ class Snapshot:
             found.update(len(content).to_bytes(8, "little") + content)
         return found.hexdigest()
 
-    def faults(self) -> list[str]:
-        """Return the faults: missing files, changed files, and added modules.
-
-        The method first removes compiled files, because they may not match the source files next to them.
-        """
+    def changes(self) -> list[str]:
+        """Return the faults of the files that the manifest lists: missing and changed ones. Nothing is written."""
         manifest = self.manifest
         found = []
         for name, entry in {**manifest["files"], **manifest.get("described", {})}.items():
@@ -205,6 +202,14 @@ class Snapshot:
         digest = digest_of_described(manifest["files"], plain_data=[manifest["paths"], manifest["argument_files"]])
         if digest != self.digest:
             found.append(f"its manifest is that of the snapshot {digest}")
+        return found
+
+    def faults(self) -> list[str]:
+        """Return the faults: missing files, changed files, and added modules.
+
+        The method first removes compiled files, because they may not match the source files next to them.
+        """
+        found = self.changes()
         self.discard_compiled()
         return found + [f"{name} was not there" for name in self._added() if self._may_run(name)]
 
@@ -231,13 +236,16 @@ class Snapshot:
                 found += [f"{below}/{name}" for name in (*files, *links)]
         return sorted(name for name in found if name not in self.manifest["files"])
 
-    def verify(self) -> None:
+    def verify(self, *, to_run: bool = True) -> None:
         """Check that the snapshot is unchanged.
+
+        Args:
+            to_run: whether its code is to run, so that added modules are faults, and compiled files are removed.
 
         Raises:
             BundleError: The snapshot has changed; the message names the first fault.
         """
-        faults = self.faults()
+        faults = self.faults() if to_run else self.changes()
         if faults:
             more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
             raise BundleError(

@@ -189,6 +189,19 @@ def test_what_is_damaged_is_not_exported(crash, tmp_path):
         export_crash(crash, tmp_path / "gone" / "crash.zip")
 
 
+def test_an_export_writes_nothing_into_the_hunt_and_leaves_out_what_was_added(crash, tmp_path):
+    folder = crash.hunt / layout.SNAPSHOTS / crash.snapshot / "code" / "__pycache__"
+    folder.mkdir()
+    added = folder / "agent.cpython-311.pyc"
+    added.write_bytes(b"x")
+    try:
+        export_crash(crash, tmp_path / "crash.zip")
+        assert added.exists()
+    finally:
+        shutil.rmtree(folder)
+    assert not any(name.endswith(".pyc") for name in entries(tmp_path / "crash.zip"))
+
+
 def test_a_link_next_to_a_crash_is_not_followed(crash, tmp_path):
     link = crash.path / "secret"
     link.symlink_to("/etc/hostname")
