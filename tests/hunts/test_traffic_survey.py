@@ -12,12 +12,12 @@ import tomllib
 
 import pytest
 from conftest import mostly_nightly
-from crashhunt.plans._options import HuntOptions
 
 from crashhunt.base.processes import children_of
 from crashhunt.base.reaper import Kept
 from crashhunt.hunts import TrafficSurveyor, _preflight
 from crashhunt.plans import plan, request_of, write_settings
+from crashhunt.plans._run_options import HuntOptions
 from crashhunt.scenario import as_plain_data, shipped_folder
 from crashhunt.snapshots import SnapshotOptions, take_snapshot
 from crashhunt.suites._processes import _planned
