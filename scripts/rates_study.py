@@ -3,7 +3,7 @@
 Prints the tables of crashhunt/guide/reference/evaluation/rates-evaluation.md.
 usage: scripts/rates_study.py intervals [REPETITIONS]   certain intervals, looked at after every trial (2000)
        scripts/rates_study.py hunts [REPETITIONS]       the same, of hunts that end in different ways (2000)
-       scripts/rates_study.py rare [REPETITIONS] [CASE] rare mode, with 200 and 400 roots (500); minutes for each case
+       scripts/rates_study.py rare [REPETITIONS] [CASE] rare mode, with 200 and 400 roots (500); a minute for each case
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from crashhunt.rates import (
 from crashhunt.trial import CRASHES, Forced
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "rates"))
 
@@ -205,52 +205,69 @@ CASES: dict[str, dict[str, Any]] = {
 ROOTS = 200
 
 
-def rare_run(case: dict[str, Any], seed: int, *, roots: int) -> list[RareEstimate]:
-    """Return the estimates after 200 roots, and after all of them.
+REPETITIONS_AT_ONCE = 50
+
+
+def rare_runs(case: dict[str, Any], roots: Sequence[int], seed: int) -> list[list[RareEstimate]]:
+    """Return the estimates of some hunts, each after 200 roots and after all of its roots.
 
     The plain trials are drawn with the known probabilities, because nothing else counts of them.
+
+    Args:
+        case: the model.
+        roots: number of roots of each hunt.
+        seed: of all of them.
     """
-    from markov import Model, run_root  # type: ignore[import-not-found]
+    from markov import Model  # type: ignore[import-not-found]
+    from markov_arrays import Arrays, run_roots
 
     model = Model(**case)
-    sampler, (undisturbed, disturbed) = model.sampler(), model.truth()
+    arrays, (undisturbed, disturbed) = Arrays(model), model.truth()
     rng = np.random.default_rng([28, seed])
-    start = first_forcing(sampler, model.steps)
-    counter = RareCounter(min(1.0, model.hazard * model.steps))
-    earlier: list[Forced] = []
-    found, forcing = [], start
-    for number in range(roots):
-        if number % BLOCK == 0:
-            forcing = learn_forcing(earlier[: max(0, number // BLOCK - 1) * BLOCK], start)
-        result = run_root(model, sampler, forcing, int(rng.integers(2**40)))
-        earlier.append(result.forced)
-        root = root_of(result, CRASHES, model.hazard)
-        assert root is not None
-        plain = rng.random(TRIALS_PER_ROOT - 1)
-        alone = int((plain < undisturbed).sum())
-        root = replace(
-            root,
-            undisturbed=(root.undisturbed + alone) / TRIALS_PER_ROOT,
-            counted=(root.counted + alone) / TRIALS_PER_ROOT,
-            plain=len(plain),
-            plain_undisturbed=alone,
-            plain_crashes=int((plain < undisturbed + disturbed).sum()),
-            plain_steps=model.steps * len(plain),
-        )
-        counter.add(root)
-        if number + 1 in (ROOTS, roots):
-            found.append(counter.estimate())
+    start = first_forcing(model.sampler(), model.steps)
+    counters = [RareCounter(min(1.0, model.hazard * model.steps)) for _ in roots]
+    earlier: list[list[Forced]] = [[] for _ in roots]
+    found: list[list[RareEstimate]] = [[] for _ in roots]
+    for first in range(0, max(roots), BLOCK):
+        here = [range(first, min(first + BLOCK, count)) for count in roots]
+        learned = [
+            learn_forcing(known[: max(0, first // BLOCK - 1) * BLOCK], start) if numbers else start
+            for known, numbers in zip(earlier, here, strict=True)
+        ]
+        forcings = [forcing for forcing, numbers in zip(learned, here, strict=True) for _ in numbers]
+        results = iter(run_roots(arrays, forcings, rng.integers(2**31, size=len(forcings)), rng))
+        for hunt, numbers in enumerate(here):
+            for number in numbers:
+                result = next(results)
+                assert result.forced is not None
+                earlier[hunt].append(result.forced)
+                root = root_of(result, CRASHES, model.hazard)
+                assert root is not None
+                plain = rng.random(TRIALS_PER_ROOT - 1)
+                alone = int((plain < undisturbed).sum())
+                root = replace(
+                    root,
+                    undisturbed=(root.undisturbed + alone) / TRIALS_PER_ROOT,
+                    counted=(root.counted + alone) / TRIALS_PER_ROOT,
+                    plain=len(plain),
+                    plain_undisturbed=alone,
+                    plain_crashes=int((plain < undisturbed + disturbed).sum()),
+                    plain_steps=model.steps * len(plain),
+                )
+                counters[hunt].add(root)
+                if number + 1 in (ROOTS, roots[hunt]):
+                    found[hunt].append(counters[hunt].estimate())
     return found
 
 
 def rare(repetitions: int, name: str) -> None:
     """Run a case of rare mode, and print its line of the table after every 50 repetitions."""
     runs: list[list[RareEstimate]] = []
-    for seed in range(repetitions):
+    while len(runs) < repetitions:
         # Every fifth run has 400 roots.
-        runs.append(rare_run(CASES[name], seed, roots=2 * ROOTS if seed % 5 == 0 else ROOTS))
-        if (seed + 1) % 50 == 0 or seed + 1 == repetitions:
-            _print_rare(name, runs)
+        numbers = range(len(runs), min(len(runs) + REPETITIONS_AT_ONCE, repetitions))
+        runs += rare_runs(CASES[name], [2 * ROOTS if one % 5 == 0 else ROOTS for one in numbers], numbers[0])
+        _print_rare(name, runs)
 
 
 def _print_rare(name: str, runs: list[list[RareEstimate]]) -> None:

@@ -20,6 +20,7 @@ from ._onsets import (
     SECONDS_PER_COPY as SECONDS_PER_COPY,
     FirstOnsets as FirstOnsets,
     Onset as Onset,
+    cell_of as cell_of,
     first_forcing as first_forcing,
 )
 from ._protocol import DisturbanceModel as DisturbanceModel, Drawn as Drawn, Enumerates as Enumerates
