@@ -24,8 +24,8 @@ def add_check(commands: Commands) -> None:
         "check",
         help="check that the files on disk are complete and unchanged",
         description="Check that the files on disk are complete, unchanged and consistent: every trial of the ledger, "
-        "every crash with its log, and every snapshot of code. The command changes nothing and "
-        "runs no code. Exits with 1 if something is damaged, and reports what is lost and how to recover the rest.",
+        "every crash with its log, and every snapshot of code. The command changes nothing and runs no code. Exits "
+        "with 1 if something is damaged, and reports what is lost and how to recover the rest.",
     )
     check.add_argument(
         "directory", metavar="DIR", type=Path,
@@ -33,8 +33,8 @@ def add_check(commands: Commands) -> None:
     )  # fmt: skip
     check.add_argument(
         "--salvage", metavar="TO", type=Path,
-        help="copy the intact parts of a hunt into this new directory, where the hunt can resume. Damaged trials are "
-        "excluded, and the resumed hunt runs them again. If this command was killed, run it again",
+        help="copy the intact parts of a hunt into this new directory, in which the hunt can resume. Damaged trials "
+        "are not copied, and the resumed hunt runs these trials again. If this command was killed, run it again",
     )  # fmt: skip
     add_json(check)
     check.set_defaults(command=_check)

@@ -114,7 +114,7 @@ def add_crash(parser: argparse.ArgumentParser) -> None:
         "--crash",
         metavar="ID",
         default="",
-        help="id of the crash, or number of its trial; default: the crash with the fewest steps",
+        help="the id of a crash, or the number of its trial; default: the crash with the fewest steps",
     )
 
 
@@ -220,7 +220,8 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     """Add ``--trust``, the same for every command that runs code of a crash."""
     parser.add_argument(
         "--trust", action="store_true",
-        help="run code from another machine without a question; crashhunt trust DIR trusts it permanently",
+        help="run the code of a hunt or crash from another machine without asking; crashhunt trust DIR trusts this "
+        "code permanently",
     )  # fmt: skip
 
 

@@ -24,13 +24,13 @@ def add_compare(commands: Commands) -> None:
         "compare",
         help="report which of several hunts crashes less",
         description="Compare the crash rates of hunts, with confidence intervals. For trials with the same seeds, "
-        "report whether a hunt crashes less than the first one. Run two versions of an agent with the same "
-        "--seed and --keep-going.",
+        "report whether a hunt crashes less than the first one. Run two versions of an agent with the same --seed and "
+        "--keep-going.",
     )
     compare.add_argument(
         "directories", metavar="DIR", type=Path, nargs="+", help="directories of at least two hunts, or of suites"
     )
-    compare.add_argument("--csv", action="store_true", help="print a line per hunt as CSV")
+    compare.add_argument("--csv", action="store_true", help="print the table as CSV, with a line for each hunt")
     compare.add_argument("--html", metavar="FILE", type=Path, help="write an HTML page with plots")
     add_json(compare)
     compare.set_defaults(command=_compare)

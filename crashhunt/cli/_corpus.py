@@ -53,8 +53,9 @@ def _add_add(commands: Commands) -> None:
     add = commands.add_parser(
         "add",
         help="put crashes into a corpus",
-        description="Put crashes into a corpus: seed, arguments, scenario, and the log, which is compact if it would "
-        "be large. The code of crashhunt and of the agent is excluded, because a corpus tests the current code.",
+        description="Add crashes to a corpus. A crash in a corpus consists of its seed, its arguments, its scenario "
+        "and its log, which is shortened if it would be large. The code of crashhunt and of the agent is excluded, "
+        "because a corpus tests the current code.",
     )
     add.add_argument(
         "bundles", metavar="BUNDLE", type=Path, nargs="+",
@@ -75,15 +76,21 @@ def _add_run(commands: Commands) -> None:
     run = commands.add_parser(
         "run",
         help="run every case again with today's code",
-        description="Run every case again with today's code, and report whether it still crashes, is fixed, or is "
-        "now another crash. Exits with 1 if a result is not the expected one.",
+        description="Run every case again with today's code, and report whether the case still crashes, is fixed, or "
+        "has another crash now. Exits with 1 if a result is not the expected one.",
     )
     _add_places(run)
     run.add_argument(
         "--keep", metavar="DIR", type=Path,
-        help="save every crash in this folder, each as the directory of a hunt, for crashhunt show, replay and report",
+        help="save every crash in this folder, in the form of a hunt that crashhunt show, replay and report accept",
     )  # fmt: skip
-    run.add_argument("--parallel", metavar="N", type=integer, default=0, help="cases at a time; default: one per core")
+    run.add_argument(
+        "--parallel",
+        metavar="N",
+        type=integer,
+        default=0,
+        help="number of cases that run at a time; default: one per core",
+    )
     add_trust(run)
     add_ci_options(run)
     add_json(run)

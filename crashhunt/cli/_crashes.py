@@ -30,22 +30,22 @@ def add_crashes(commands: Commands) -> None:
     crashes = commands.add_parser(
         "crashes",
         help="list the different crash types",
-        description="Group the crashes of hunts by crash type: crashes of one type share the kind of encounter and "
-        "the role of the agent, or the function that raised the exception. Prints one line for each type, the "
-        "most frequent first.",
+        description="Group the crashes of hunts by crash type: crashes of one type share the kind of encounter and the "
+        "role of the agent, or the function that raised the exception. Prints one line for each type, the most "
+        "frequent first.",
     )
     crashes.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="directories of hunts or suites")
     crashes.add_argument(
         "--known", metavar="CORPUS", type=Path,
-        help="show which crash types a corpus already contains, as cases that are expected to reproduce",
+        help="mark the crash types that this corpus contains as cases that are expected to reproduce",
     )  # fmt: skip
     crashes.add_argument(
         "--sarif", metavar="FILE", type=Path, help="write the crash types as SARIF 2.1.0, for code scanning and editors"
     )
     crashes.add_argument(
         "--by-cause", metavar="N", type=integer, nargs="?", const=_DEFAULT_RUNS, default=None,
-        help="divide each type by cause: analyse up to N of its crashes as crashhunt judge does, and give the others "
-            "the cause of the most similar crash; default: 8",
+        help="divide each crash type by cause: analyse up to N crashes of each type as crashhunt judge does, and give "
+        "each other crash the cause of the most similar analysed crash; default: 8",
     )  # fmt: skip
     add_trust(crashes)
     add_ci_options(crashes)

@@ -25,14 +25,14 @@ def add_dashboard(commands: Commands) -> None:
     dashboard = commands.add_parser(
         "dashboard",
         help="show hunts live in the browser",
-        description="Show hunts live in the browser: a table of all hunts, a page per hunt with curves, arguments "
-        "and crash types, and an animation of each crash. Prints the address and runs until Ctrl-C. Without "
+        description="Show hunts live in the browser: a table of all hunts, a page per hunt with curves, arguments and "
+        "crash types, and an animation of each crash. Prints the address and runs until Ctrl-C. Without "
         "--allow-control, the dashboard writes nothing into the folders of hunts and runs no code of a bundle.",
     )
     dashboard.add_argument(
         "paths", metavar="PATH", type=Path, nargs="*",
-        help="hunts, suites, folders with hunts below them, or files that crashhunt export wrote; default: the current "
-        "folder",
+        help="hunts, suites, folders that contain hunts at any depth, or files that crashhunt export wrote; default: "
+        "the current folder",
     )  # fmt: skip
     dashboard.add_argument(
         "--port", metavar="N", type=integer, default=8642, help="port to listen on; 0: any free port; default: 8642"
@@ -45,12 +45,12 @@ def add_dashboard(commands: Commands) -> None:
         "--token",
         metavar="TEXT",
         default="",
-        help="token that each reader must send; default: a random token if --host needs one",
+        help="secret token that the browser of each reader must send; default: a random token if --host needs a token",
     )
     dashboard.add_argument("--no-browser", action="store_true", help="do not open a browser")
     dashboard.add_argument(
         "--allow-control", action="store_true",
-        help="let the page stop running hunts, and replay, judge and minimize crashes",
+        help="allow readers of the dashboard to stop running hunts, and to replay, judge and minimize crashes",
     )  # fmt: skip
     add_json(dashboard)
     dashboard.set_defaults(command=_dashboard)

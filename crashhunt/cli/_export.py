@@ -34,14 +34,15 @@ def add_export(commands: Commands) -> None:
         "--as",
         dest="form",
         choices=_FORMATS,
-        help="commonroad: a CommonRoad scenario (2020a), FILE.xml: the other actors as recorded, the agent as "
-        "planning problem; openscenario: FILE.xosc (OpenSCENARIO 1.0) with FILE.xodr (OpenDRIVE): the other "
-        "actors as recorded, the agent at its start",
+        help="the format of the scenario. commonroad: a CommonRoad 2020a scenario (FILE.xml), in which the agent is a "
+        "planning problem; openscenario: an OpenSCENARIO 1.0 scenario (FILE.xosc) with its roads (FILE.xodr), in which "
+        "the agent starts as recorded",
     )
     export.add_argument(
         "--recorded-agent",
         action="store_true",
-        help="with --as: also write the recorded path of the agent, as an obstacle or as the path that it follows",
+        help="with --as: also write the recorded path of the agent, in commonroad as an obstacle, in openscenario as "
+        "the path that the agent follows",
     )
     add_json(export)
     export.set_defaults(command=_export)

@@ -50,33 +50,39 @@ def add_gate(commands: Commands) -> None:
         "gate",
         help="give a verdict on a change: better, worse, no difference or undecided",
         description="Compare HEAD with BASE in the same traffic, trial by trial, until the verdict is certain. BASE "
-        "and HEAD are commits of the repository that contains this folder, or agents. Exit code 0: HEAD is "
-        "better, or there is no "
-        "difference above --margin; 1: HEAD is worse; 3: undecided.",
+        "and HEAD are commits of the repository that contains this folder, or agents. Exit code 0: HEAD is better, or "
+        "there is no difference above --margin; 1: HEAD is worse; 3: undecided.",
     )
     gate.add_argument("base", metavar="BASE", help="a commit, or an agent as [ID=]MODULE:ATTR or by its name")
-    gate.add_argument("head", metavar="HEAD", help="the version with the change, in the same form")
+    gate.add_argument(
+        "head", metavar="HEAD", help="the version with the change: a commit or an agent, in the same form as BASE"
+    )
     what = gate.add_argument_group("what is compared")
     what.add_argument(
-        "--suite", metavar="FILE", type=Path, help="compare in every hunt of a suite.toml, instead of --scenario"
+        "--suite",
+        metavar="FILE",
+        type=Path,
+        help="compare both versions in every hunt of this suite.toml, instead of in --scenario",
     )
     what.add_argument(
         "--corpus", metavar="CORPUS", type=Path,
-        help="first run the crashes of this corpus of HEAD; HEAD is worse if a fixed crash reproduces; default: "
-            "crashes, if HEAD is a commit with such a folder",
+        help="first run the cases of this corpus in HEAD; HEAD is worse if a fixed crash reproduces; default: the "
+        "folder crashes, if HEAD is a commit with this folder",
     )  # fmt: skip
     how = gate.add_argument_group("how it is compared")
     how.add_argument(
         "--most", metavar="N", type=integer, default=_MOST, help=f"maximum number of pairs of trials; default: {_MOST}"
     )
-    how.add_argument("--for", metavar="TIME", dest="duration", default="", help="stop after this time, such as 30m")
+    how.add_argument(
+        "--for", metavar="TIME", dest="duration", default="", help="stop the gate after this time, such as 30m"
+    )
     how.add_argument(
         "--max-steps", metavar="N", type=integer, default=None,
         help=f"maximum number of steps of a trial; default: {_MAX_STEPS}, or as in the suite",
     )  # fmt: skip
     how.add_argument(
         "--margin", metavar="SHARE", default=str(_MARGIN),
-        help="the greatest difference in crashes per trial that counts as no difference, such as 0.01 or 1%%; 0: "
+        help="the greatest difference in crashes per trial that still counts as no difference, such as 0.01 or 1%%; 0: "
             f"never report that verdict; default: {_MARGIN}",
     )  # fmt: skip
     how.add_argument(
@@ -88,11 +94,12 @@ def add_gate(commands: Commands) -> None:
     )
     how.add_argument(
         "--parallel", metavar="N", type=integer, default=0,
-        help="trials at a time, BASE and HEAD together, at least 2; default: one per core",
+        help="number of trials of BASE and HEAD together that run at a time, at least 2; default: one per core",
     )  # fmt: skip
     how.add_argument(
         "--keep", metavar="DIR", type=Path,
-        help="keep both hunts in this folder, for crashhunt compare, rate and report; the same command resumes them",
+        help="keep the hunts of BASE and HEAD in this folder, for crashhunt compare, rate and report; the same command "
+        "resumes the gate",
     )  # fmt: skip
     add_options(defaultdict(lambda: how, what=what), _HUNT_OPTIONS)
     add_trust(gate)

@@ -36,22 +36,32 @@ def add_init(commands: Commands) -> None:
     )
     init.add_argument("directory", metavar="DIR", type=Path, help="folder of the scenario; must be new or empty")
     maps = init.add_argument_group("the map (exactly one)").add_mutually_exclusive_group(required=True)
-    maps.add_argument("--osm", metavar="FILE", type=Path, help="OpenStreetMap: .osm, .osm.gz, .pbf")
-    maps.add_argument("--opendrive", metavar="FILE", type=Path, help="OpenDRIVE: .xodr")
-    maps.add_argument("--net", metavar="FILE", type=Path, help="a network of SUMO: .net.xml, .net.xml.gz")
+    maps.add_argument("--osm", metavar="FILE", type=Path, help="a map of OpenStreetMap: .osm, .osm.gz or .pbf")
+    maps.add_argument("--opendrive", metavar="FILE", type=Path, help="an OpenDRIVE map: .xodr")
+    maps.add_argument("--net", metavar="FILE", type=Path, help="a network of SUMO: .net.xml or .net.xml.gz")
     maps.add_argument("--grid", metavar="NxM", default="", help="a generated grid of N by M junctions, such as 4x4")
     maps.add_argument("--spider", metavar="NxM", default="", help="a generated web of N arms and M rings, such as 5x3")
     how = init.add_argument_group("what is made of it")
-    how.add_argument("--bbox", metavar="W,S,E,N", help="only this part of the map, in degrees; write --bbox=W,S,E,N")
+    how.add_argument(
+        "--bbox",
+        metavar="W,S,E,N",
+        help="use only the part of the map between longitudes W and E and latitudes S and N, in degrees; write "
+        "--bbox=W,S,E,N",
+    )
     how.add_argument(
         "--demand", metavar="LOW:HIGH", default="0.2:1.5",
-        help="range of the factor that scales the traffic (default: %(default)s); the traffic does not jam at HIGH",
+        help="range LOW:HIGH of the factor that multiplies the traffic (default: %(default)s); init ensures that the "
+        "traffic does not jam at HIGH",
     )  # fmt: skip
     how.add_argument("--people", action="store_true", help="add persons on foot, on sidewalks and crossings")
     how.add_argument("--bicycles", action="store_true", help="add cyclists, and lanes for bicycles")
-    how.add_argument("--lefthand", action="store_true", help="traffic keeps to the left")
-    how.add_argument("--agent", metavar="NAME", help="the agent that drives (default: car-following)")
-    how.add_argument("--workflow", choices=["github"], default="", help="add a workflow file for this CI service")
+    how.add_argument("--lefthand", action="store_true", help="make the traffic drive on the left")
+    how.add_argument(
+        "--agent", metavar="NAME", help="the agent that drives in hunts without --agent (default: car-following)"
+    )
+    how.add_argument(
+        "--workflow", choices=["github"], default="", help="add a workflow file that hunts in this CI service"
+    )
     add_json(how)
     init.set_defaults(command=_init)
 

@@ -36,30 +36,39 @@ def add_judge(commands: Commands) -> None:
     judge = commands.add_parser(
         "judge",
         help="find the last avoidable step and the causes of a crash, by running it again",
-        description="Find the last avoidable step and the causes of a crash. First run the collision many times, "
-        "each time with the agent overruled from another step: full braking, or a lane change and braking. Other "
-        "vehicles react. Report the last step from which such a maneuver avoids the collision. Then run the crash "
-        "with one element removed at a time: a decision of the agent, a maneuver of another vehicle, the "
-        "value of an argument. Report the causes. Crashes other than collisions get the second analysis "
-        "only. The result is written to crash.json, and crashhunt show prints it.",
+        description="Find the last avoidable step and the causes of a crash. First run the trial of a collision many "
+        "times, and override the agent from another step each time: full braking, or a lane change and braking. "
+        "Report the last step from which such a maneuver avoids the collision. Then run the trial again and "
+        "remove one element each time: a decision of the agent, a maneuver of another vehicle, or the value of an "
+        "argument. For crashes that are not collisions, only the causes are analysed. The results are "
+        "written to crash.json, and crashhunt show prints them.",
     )
     add_crash(judge)
     judge.add_argument(
         "--all", action="store_true", help="analyse all crashes of the hunt that have not been analysed, except hangs"
     )
     judge.add_argument(
-        "--runs", metavar="N", type=integer, default=60, help="maximum number of trials for one collision; default: 60"
+        "--runs",
+        metavar="N",
+        type=integer,
+        default=60,
+        help="maximum number of trials to find the last avoidable step of one collision; default: 60",
     )
     judge.add_argument(
         "--why", metavar="N", type=integer, default=80,
-        help="maximum number of trials for the causes of one crash; 0: none; default: 80",
+        help="maximum number of trials to find the causes of one crash; 0: none; default: 80",
     )  # fmt: skip
     judge.add_argument(
         "--reference", metavar="N", type=integer, default=20,
-        help="maximum number of trials with a reference driver, to find omissions of the agent; 0: none; default: 20",
+        help="maximum number of trials with a reference driver, to find what the agent omitted to do; 0: none; "
+        "default: 20",
     )  # fmt: skip
     judge.add_argument(
-        "--parallel", metavar="N", type=integer, default=0, help="trials at a time; default: one per core"
+        "--parallel",
+        metavar="N",
+        type=integer,
+        default=0,
+        help="number of trials that run at a time; default: one per core",
     )
     add_trust(judge)
     add_json(judge)

@@ -24,13 +24,17 @@ def add_logs(commands: Commands) -> None:
     logs = commands.add_parser(
         "logs",
         help="show the output and the errors of hunts and trials",
-        description="Show the output of hunts and trials (run), why they failed (error), and when the state of a "
-        "hunt changed (state). Only crashes and kept trials have logs.",
+        description="Show the output of hunts and trials (run), why they failed (error), and when the state of a hunt "
+        "changed (state). Only crashes and kept trials have logs.",
     )
     logs.add_argument("directory", metavar="DIR", type=Path, help="directory of a hunt or a suite")
-    logs.add_argument("--run", metavar="ID", default="", help="of a suite: only this run, such as town/0")
-    logs.add_argument("--trial", metavar="N", type=integer, help="only this trial")
-    logs.add_argument("--type", choices=("run", "error", "state"), help="show only this kind of output; default: all")
+    logs.add_argument("--run", metavar="ID", default="", help="show only this run of a suite, such as town/0")
+    logs.add_argument("--trial", metavar="N", type=integer, help="show only the logs of this trial")
+    logs.add_argument(
+        "--type",
+        choices=("run", "error", "state"),
+        help="show only the output of trials (run), only errors (error) or only state changes (state); default: all",
+    )
     logs.add_argument("--errors-only", action="store_true", help="the same as --type error")
     logs.add_argument("--follow", action="store_true", help="keep printing while the hunt is running")
     logs.set_defaults(command=_logs)

@@ -27,16 +27,15 @@ def add_rate(commands: Commands) -> None:
     rate = commands.add_parser(
         "rate",
         help="report how often an agent crashes, with a guarantee",
-        description="Report how often an agent crashes: per trial, per hour and per 1,000 km in its traffic. "
-        "The interval is valid at any time, also for a hunt that is running, was killed, or stopped at its first "
-        "crash.",
+        description="Report how often an agent crashes: per trial, per hour and per 1,000 km in its traffic. The "
+        "interval is valid at any time, also for a hunt that is running, was killed, or stopped at its first crash.",
     )
     rate.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="directories of hunts or suites")
     rate.add_argument(
         "--per",
         metavar="UNIT",
         choices=RATE_PERS,
-        help="unit: trial, hour or 1000km; default: all three, or as in --bar",
+        help="the unit of the rate: trial, hour or 1000km; default: all three units, or the unit of --bar",
     )
     rate.add_argument(
         "--confidence",
@@ -47,14 +46,15 @@ def add_rate(commands: Commands) -> None:
     )
     rate.add_argument(
         "--by", metavar="PART", default="",
-        help="divide the rate by kind, fault, disturbance or ARG[:BINS], an argument in BINS bins (default: 4)",
+        help="report the rate for each group of trials or crashes: by kind, fault, disturbance, or the value of "
+        "argument ARG in BINS bins (default: 4)",
     )  # fmt: skip
     rate.add_argument(
         "--bar", metavar="RATE", default="",
-        help="compare with a rate, such as 1e-3/trial, 2/hour or 5/1000km: exit with 0 if the rate is certainly below, "
-        "1 if it is certainly above, 3 if it is undecided",
+        help="compare the crash rate with this rate, such as 1e-3/trial, 2/hour or 5/1000km: exit with 0 if the crash "
+        "rate is certainly below, 1 if it is certainly above, 3 if undecided",
     )  # fmt: skip
-    rate.add_argument("--csv", action="store_true", help="print a line per rate as CSV")
+    rate.add_argument("--csv", action="store_true", help="print the table as CSV, with a line for each rate")
     rate.add_argument("--html", metavar="FILE", type=Path, help="write an HTML page with the rates")
     add_json(rate)
     rate.set_defaults(command=_rate)

@@ -69,19 +69,25 @@ def add_film_options(parser: argparse.ArgumentParser) -> None:
     film.add_argument("--gif", metavar="FILE", type=Path, help="write an animated GIF")
     film.add_argument("--frames", metavar="DIR", type=Path, help="write a folder of PNG files")
     film.add_argument(
-        "--fps", metavar="N", type=number, default=0.0, help="pictures per second; default: one picture per step"
+        "--fps",
+        metavar="N",
+        type=number,
+        default=0.0,
+        help="number of pictures per second; default: one picture per step",
     )
-    film.add_argument("--size", metavar="WxH", default="960x540", help="size of the scene, in pixels; default: 960x540")
+    film.add_argument(
+        "--size", metavar="WxH", default="960x540", help="size of the drawn scene, in pixels; default: 960x540"
+    )
     film.add_argument(
         "--last-seconds", metavar="S", type=number, default=0.0,
-        help="only the last S seconds; for a near miss, the S seconds around its closest moment (default: 10)",
+        help="show only the last S seconds; of a near miss, the S seconds around its closest moment (default: 10)",
     )  # fmt: skip
     film.add_argument(
         "--last-step-repeats",
         metavar="N",
         type=integer,
         default=10,
-        help="number of repeats of the last picture; default: 10",
+        help="how often the film repeats its last picture; default: 10",
     )
     film.add_argument(
         "--blank-frames",
@@ -90,7 +96,9 @@ def add_film_options(parser: argparse.ArgumentParser) -> None:
         default=10,
         help="number of blank pictures between two crashes; default: 10",
     )
-    film.add_argument("--no-panels", action="store_true", help="do not show the panels of the agent")
+    film.add_argument(
+        "--no-panels", action="store_true", help="do not show the pictures that the agent returns from panels()"
+    )
 
 
 def film_options(options: argparse.Namespace) -> FilmOptions | None:
@@ -233,53 +241,55 @@ def add_replay(commands: Commands) -> None:
     who = replay.add_mutually_exclusive_group()
     who.add_argument(
         "--code", choices=("snapshot", "current"), default="snapshot",
-        help="drive with the code of the snapshot (the default), or with today's code, to see whether a fix works",
+        help="run the agent's code from the snapshot (the default), or today's code, to see whether a fix works",
     )  # fmt: skip
     who.add_argument(
-        "--from-log", action="store_true", help="drive with the recorded actions, without the agent's code"
+        "--from-log", action="store_true", help="repeat the recorded actions instead of running the agent's code"
     )
     replay.add_argument(
         "--set", metavar="NAME=VALUE", action="append", default=[], dest="sets",
-        help="another value for an argument of the agent (ID.NAME for one of several) or of the scenario",
+        help="another value for an argument of the agent or of the scenario; if there are several agents, ID.NAME "
+        "names the agent",
     )  # fmt: skip
     replay.add_argument(
         "--scenario", metavar="NAME|PATH", default="",
-        help="run the same agents, arguments and seed in another scenario, also of another simulator, to see whether "
-            "they crash there as well",
+        help="run the same agents with the same arguments and seed in another scenario, also of another simulator, to "
+        "see whether they crash there too",
     )  # fmt: skip
+    replay.add_argument("--no-accelerate", action="store_true", help="run highway-env without the accelerator")
     replay.add_argument(
-        "--no-accelerate", action="store_true", help="run the simulator as it is, without the accelerator"
-    )
-    replay.add_argument(
-        "--times", metavar="N", type=integer, default=1, help="number of replays, to see whether all agree; default: 1"
+        "--times",
+        metavar="N",
+        type=integer,
+        default=1,
+        help="number of replays; several replays show whether all have the same verdict; default: 1",
     )
     replay.add_argument(
         "--expect", choices=("reproduced", "fixed"), default="reproduced",
-        help="the verdict for which the exit code is 0; default: reproduced",
+        help="the expected verdict, for which the exit code is 0; default: reproduced",
     )  # fmt: skip
     look = replay.add_argument_group(
         "to look into it",
         "With these options, the agent runs attached to the terminal, so breakpoints in its code work.",
     )
     stop = look.add_mutually_exclusive_group()
-    stop.add_argument("--until", metavar="STEP", type=integer, help="stop after this step")
+    stop.add_argument("--until", metavar="STEP", type=integer, help="stop the replay after this step")
     stop.add_argument(
         "--before",
         metavar="N",
         type=integer,
-        help="stop N steps before the crash, or before the closest moment of a near miss",
+        help="stop the replay N steps before the crash, or before the closest moment of a near miss",
     )
     look.add_argument(
         "--pdb", action="store_true",
-        help="start the debugger in the agent's act in the last step; agent, observation, scene and step are local "
-            "variables",
+        help="start the debugger in the agent's method act at the last step of the replay; agent, observation, scene "
+        "and step are local variables",
     )  # fmt: skip
     look.add_argument(
         "--print", metavar="FIELD,…", default="", dest="fields",
-        help="print a table of the steps: x, y, heading, speed, reward, time_to_collision_s, gap_m and "
-        "required_deceleration (to the nearest actor), gap_to_other_m, time_to_other_s, closing_speed, action or its "
-        "parts, "
-        "observation[ROW,NAME]",
+        help="print a table with these values of each step: x, y, heading, speed, reward, time_to_collision_s, gap_m "
+        "and required_deceleration (to the nearest actor), gap_to_other_m, time_to_other_s, closing_speed, action or "
+        "its parts, observation[ROW,NAME]",
     )  # fmt: skip
     look.add_argument(
         "--gui", action="store_true",
@@ -293,7 +303,7 @@ def add_replay(commands: Commands) -> None:
     add_trust(replay)
     replay.add_argument(
         "--force", action="store_true",
-        help="replay even from a damaged snapshot; needs --trust, or --from-log, which runs no code of it",
+        help="replay even if the snapshot is damaged; needs --trust, or --from-log, which runs no code of the snapshot",
     )  # fmt: skip
     add_json(replay)
     replay.set_defaults(command=_replay)

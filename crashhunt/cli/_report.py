@@ -26,17 +26,19 @@ def add_report(commands: Commands) -> None:
     report = commands.add_parser(
         "report",
         help="write one HTML file that shows a hunt and animates its crashes",
-        description="Write one HTML file that needs no network and no other file. It has the numbers of the hunt, "
-        "plots of arguments against outcomes, and an animated replay of each crash. Runs no code of the bundle.",
+        description="Write one HTML file that needs no network and no other file. The file shows the numbers of the "
+        "hunt, plots of arguments against outcomes, and an animated replay of each crash. Runs no code of the bundle.",
     )
     add_crash(report)
-    report.add_argument("--output", "-o", metavar="FILE", type=Path, help="the file; default: DIR/report.html")
+    report.add_argument(
+        "--output", "-o", metavar="FILE", type=Path, help="the HTML file to write; default: DIR/report.html"
+    )
     report.add_argument(
         "--crashes",
         metavar="N",
         type=integer,
         default=20,
-        help="maximum number of crashes to animate, and of near misses; default: 20",
+        help="maximum number of crashes to animate, and maximum number of near misses; default: 20",
     )
     add_json(report)
     report.set_defaults(command=_report)

@@ -89,15 +89,17 @@ def add_run(commands: Commands) -> None:
     run.add_argument("-h", "--help", action=_ShortHelp, **hidden, help="show the most used options")
     run.add_argument("--help-all", action="help", help="show all options")
     run.add_argument("directory", metavar="DIR", type=Path, help="directory of the hunt; created if it does not exist")
-    run.add_argument("parallel", metavar="PARALLEL", type=integer, help="trials at a time; 0: one per core")
     run.add_argument(
-        "trials", metavar="TRIALS", type=integer, help="maximum number of trials; 0: no limit, needs --for"
+        "parallel", metavar="PARALLEL", type=integer, help="number of trials that run at a time; 0: one per core"
+    )
+    run.add_argument(
+        "trials", metavar="TRIALS", type=integer, help="maximum number of trials; 0: no limit, which needs --for"
     )
     run.add_argument("max_steps", metavar="MAX_STEPS", type=integer, help="maximum number of steps of a trial")
     groups = {name: run.add_argument_group(title) for name, title in _GROUPS.items()}
     add_options(groups)
     groups["kept"].add_argument(
-        "--overwrite", action="store_true", help="start a new hunt, even if DIR holds another one"
+        "--overwrite", action="store_true", help="start a new hunt even if DIR contains another hunt"
     )
     groups["output"].add_argument("--fail-on-crash", action="store_true", help="exit with 1 if a crash was found")
     add_json(groups["output"])

@@ -23,12 +23,18 @@ def add_show(commands: Commands) -> None:
         "show",
         help="describe the last seconds of a crash or a near miss",
         description="Describe the last seconds before a crash, in words and a table. For a near miss, describe the "
-        "seconds around its closest moment. The table has the positions, speeds and closing speeds of the "
-        "vehicles, and the decisions of the agent. The text gives the last step from which braking avoids the "
-        "crash, which the hunt determined by simulation. Runs no code of the bundle.",
+        "seconds around its closest moment. The table has the positions, speeds and closing speeds of the vehicles, "
+        "and the decisions of the agent. The text also names the last step from which braking avoids the crash. The "
+        "hunt has found this step by simulation. Runs no code of the bundle.",
     )
     add_crash(show)
-    show.add_argument("--last-seconds", metavar="S", type=number, default=5.0, help="seconds to describe; default: 5")
+    show.add_argument(
+        "--last-seconds",
+        metavar="S",
+        type=number,
+        default=5.0,
+        help="number of seconds before the crash to describe; default: 5",
+    )
     show.add_argument(
         "--braking",
         metavar="A",

@@ -37,12 +37,11 @@ def add_shrink(commands: Commands) -> None:
     shrink = commands.add_parser(
         "shrink",
         help="minimize a crash while its crash type stays the same",
-        description="Minimize a crash while its crash type stays the same: remove other actors, drop disturbances, "
-        "and set arguments to their defaults and to round numbers. If the crash needs many other actors, "
-        "move them along their recorded paths, remove the unnecessary ones, and cut off the beginning. "
-        "Each candidate is run with the code of the snapshot. The result is a new crash next to the "
-        "first, ID.small. If you interrupt the command, it keeps the best result, and the same command "
-        "resumes. Exits with 1 if the crash does not reproduce.",
+        description="Minimize a crash while its crash type stays the same: remove other actors, drop disturbances, and "
+        "set arguments to their defaults and to round numbers. If the crash needs many other actors, move them along "
+        "their recorded paths, remove the unnecessary ones, and cut off the beginning. Each candidate is run with the "
+        "code of the snapshot. The result is a new crash next to the first, ID.small. If you interrupt the command, it "
+        "keeps the best result, and the same command resumes. Exits with 1 if the crash does not reproduce.",
     )
     add_crash(shrink)
     shrink.add_argument(
@@ -51,15 +50,19 @@ def add_shrink(commands: Commands) -> None:
     )  # fmt: skip
     shrink.add_argument(
         "--for", metavar="TIME", dest="time", default="",
-        help="time limit, such as 1m or 90s; two runs that confirm the result are additional",
+        help="time limit, such as 1m or 90s; after this time, two more runs confirm the result",
     )  # fmt: skip
     shrink.add_argument(
         "--form", choices=("either", "traffic", "scripted"), default="either",
         help="whether other actors keep driving (traffic), or are moved along their recorded paths (scripted); "
-            "default: traffic if few actors remain, else scripted",
+            "default: traffic if few actors remain, otherwise scripted",
     )  # fmt: skip
     shrink.add_argument(
-        "--parallel", metavar="N", type=integer, default=0, help="trials at a time; default: one per core"
+        "--parallel",
+        metavar="N",
+        type=integer,
+        default=0,
+        help="number of trials that run at a time; default: one per core",
     )
     add_trust(shrink)
     add_json(shrink)

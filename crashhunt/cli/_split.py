@@ -30,9 +30,15 @@ def add_split(commands: Commands) -> None:
     )
     split.add_argument("places", metavar="DIR", type=Path, nargs="+", help="folders of hunts, corpora or crashes")
     split.add_argument(
-        "--test", metavar="SHARE", type=float, default=0.5, help="share of the traffics in the test part (%(default)s)"
+        "--test",
+        metavar="SHARE",
+        type=float,
+        default=0.5,
+        help="share of the traffics that belong to the test part (default: %(default)s)",
     )
-    split.add_argument("--part", choices=_PARTS, help="print the folders of the crashes of one part, a line each")
+    split.add_argument(
+        "--part", choices=_PARTS, help="print only the folders of the crashes in this part, one in each line"
+    )
     add_json(split)
     split.set_defaults(command=_split)
 

@@ -34,7 +34,9 @@ def add_status(commands: Commands) -> None:
         description="Show the progress and results of hunts: running, finished, interrupted or killed ones.",
     )
     status.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="directory of a hunt or a suite")
-    status.add_argument("--watch", action="store_true", help="refresh every second, until all have ended")
+    status.add_argument(
+        "--watch", action="store_true", help="refresh the output every second until all hunts have ended"
+    )
     add_json(status)
     status.set_defaults(command=_status)
 

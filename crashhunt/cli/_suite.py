@@ -44,13 +44,14 @@ def add_suite(commands: Commands) -> None:
     run = verbs.add_parser(
         "run",
         help="run what has not ended",
-        description="Plan every run as a folder of DIR, and run all that have not ended, even if some fail. The same "
-        "command resumes the suite. Exits with 1 if a hunt could not run.",
+        description="Make a folder of DIR for every run of a hunt, and run all runs that have not ended, even if some "
+        "runs fail. The same command resumes the suite. Exits with 1 if a hunt could not run.",
     )
     run.add_argument("file", metavar="FILE", type=Path, help="the file that lists the hunts, such as suite.toml")
     run.add_argument("directory", metavar="DIR", type=Path, help="directory of the suite; created if it does not exist")
     run.add_argument("parallel", metavar="PARALLEL", type=integer, nargs="?", default=0,
-                     help="trials at a time, of all hunts together; default: one per core")  # fmt: skip
+                     help="number of trials of all hunts together that "
+                     "run at a time; default: one per core")  # fmt: skip
     add_options_of_machine(run)
     add_trust(run)
     add_json(run)
@@ -58,7 +59,7 @@ def add_suite(commands: Commands) -> None:
     defaults = verbs.add_parser(
         "defaults",
         help="print a suite of every shipped scenario",
-        description="Print a suite of every shipped scenario, ready to be edited.",
+        description="Print a suite file with a hunt for every shipped scenario, which you can edit.",
     )
     defaults.set_defaults(command=_defaults)
 
@@ -69,28 +70,29 @@ def add_rerun(commands: Commands) -> None:
         "rerun",
         help="run failed hunts again, or a hunt with other settings in another directory",
         description="Run failed hunts again: restart hunts that ended in an error, resume interrupted and killed "
-        "hunts, and repeat trials with a failed setup. The command keeps replaced files next to the new ones. "
-        "With --to, "
-        "run one hunt with other settings in another directory.",
+        "hunts, and repeat trials with a failed setup. The command keeps replaced files next to the new "
+        "files. With --to, run one hunt with other settings in another directory.",
     )
     rerun.add_argument("directory", metavar="DIR", type=Path, help="directory of a hunt or a suite")
     rerun.add_argument("--run", metavar="ID", action="append", default=[],
-                       help="in a suite: only this run, such as town/0, or all of town; may be repeated")  # fmt: skip
+                       help="in a suite: repeat only this run, such as town/0, or all runs of a hunt, such as town; "
+                       "may be repeated")  # fmt: skip
     which = rerun.add_mutually_exclusive_group()
     which.add_argument("--failed", action="store_true", help="run only failed hunts and trials again (the default)")
     which.add_argument("--all", action="store_true", help="run all hunts again from the start")
     rerun.add_argument("--set", metavar="NAME=SPEC", action="append", default=[], dest="sets",
-                       help="with --to or --all: new values for an argument (ID.NAME for one of several agents), "
-                       "or a new number for trials, max_steps or seed")  # fmt: skip
+                       help="with --to or --all: new values for an argument (of several agents, ID.NAME names one), or "
+                       "a new number for trials, max_steps or seed")  # fmt: skip
     rerun.add_argument(
         "--to",
         metavar="DIR",
         type=Path,
-        help="keep DIR as it is, and run in this directory: a new one, or one in which the same command was "
-        "interrupted or killed",
+        help="keep DIR as it is, and run the hunt in this new directory; a directory in which the same command was "
+        "interrupted or killed is also possible",
     )
     rerun.add_argument("--parallel", metavar="N", type=integer, default=0,
-                       help="trials at a time, of all hunts together; default: one per core")  # fmt: skip
+                       help="number of trials of all hunts together that "
+                       "run at a time; default: one per core")  # fmt: skip
     add_options_of_machine(rerun)
     add_trust(rerun)
     add_json(rerun)

@@ -38,7 +38,7 @@ def add_trials(commands: Commands) -> None:
         "--outcome",
         metavar="KIND,…",
         default="",
-        help=f"only trials with these outcomes: {', '.join(str(kind) for kind in Outcome)}",
+        help=f"write only trials with these outcomes: {', '.join(str(kind) for kind in Outcome)}",
     )
     trials.set_defaults(command=_trials)
 

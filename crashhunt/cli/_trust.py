@@ -37,7 +37,7 @@ def add_trust_command(commands: Commands) -> None:
     )  # fmt: skip
     trust.add_argument(
         "--remove", metavar="ORIGIN", action="append", default=[],
-        help="stop trusting an origin, given by its fingerprint or its DIR; may be repeated",
+        help="stop trusting an origin, which is named by its fingerprint or its directory; may be repeated",
     )  # fmt: skip
     add_json(trust)
     trust.set_defaults(command=_trust)

@@ -37,61 +37,66 @@ def add_whatif(commands: Commands) -> None:
         "whatif",
         help="run a saved crash again with a change, many times, and count how often it crashes",
         description="Run the trial of a crash again with other arguments, with another agent from a step on, or with "
-        "other random numbers from a step on, and count the outcomes. Each run starts at step 0. Where the change "
-        "begins at a step, a run counts only if it is bit-identical to the recording up to this step.",
+        "other random numbers from a step on, and count the outcomes. Each run starts at step 0. If the change "
+        "begins at a later step, a run counts only if it is bit-identical to the recording up to this step.",
     )
     add_crash(whatif)
     whatif.add_argument(
         "--set", metavar="NAME=VALUE", action="append", default=[], dest="sets",
-        help="another value for an argument, as with crashhunt replay; with --from-step or --before, only for the "
-            "agent and only from that step",
+        help="another value for an argument, as with crashhunt replay; with --from-step or --before, an argument of "
+        "the agent that changes only from that step on",
     )  # fmt: skip
     moment = whatif.add_mutually_exclusive_group()
     moment.add_argument(
-        "--from-step", metavar="K", type=integer, help="the first K steps stay as recorded, and the change follows"
+        "--from-step",
+        metavar="K",
+        type=integer,
+        help="the step K after which the change begins: the first K steps stay as recorded",
     )
     moment.add_argument(
         "--before",
         metavar="SECONDS",
         type=number,
-        help="the step this many seconds of simulation before the crash, in place of --from-step",
+        help="in place of --from-step: the change begins this many seconds of simulation before the crash",
     )
     whatif.add_argument(
         "--agent", metavar="MODULE:NAME", default="",
-        help="an agent that takes over after step K, where it is reset. Up to step K the recorded actions are "
-            "played. ID=MODULE:NAME for one of several vehicles; without --from-step, K is 0",
+        help="another agent that drives after step K. Up to step K, the recorded actions are repeated, and then the "
+        "agent is reset. ID=MODULE:NAME for one of several vehicles; without --from-step, K is 0",
     )  # fmt: skip
     whatif.add_argument(
         "--arg",
         metavar="NAME=VALUE",
         action="append",
         default=[],
-        help="an argument of the agent of --agent; may be repeated",
+        help="an argument of the agent that --agent names; may be repeated",
     )
     whatif.add_argument(
         "--futures", action="store_true",
-        help="give the simulator's random generators a new seed after step K, different in each run",
+        help="after step K, give the simulator's random generators a new seed, which is different in each run",
     )  # fmt: skip
     whatif.add_argument(
         "--overrule", metavar="HOW", choices=get_args(Manoeuvre), default="",
-        help="from step K on, override the vehicle: brake, change lanes and brake, keep its lane or its speed. Or "
-            "let a reference driver correct its unsafe speed, lane changes, or both",
-    )  # fmt: skip
-    whatif.add_argument("--leave-out", metavar="ID,…", default="", help="actors to remove from the start")
-    whatif.add_argument(
-        "--code", choices=("snapshot", "current"), default=None,
-        help="drive with the code of the snapshot or with today's code; default: current with --agent, else "
-            "snapshot. With --code current and a step, today's code takes over after it",
+        help="from step K on, override the agent: brake, change lanes and brake, keep the lane, or keep the speed. Or "
+        "let a reference driver correct unsafe speeds, unsafe lane changes, or both",
     )  # fmt: skip
     whatif.add_argument(
-        "--times", metavar="N", type=integer, default=0, help="number of runs; default: 50 with --futures, else 1"
+        "--leave-out", metavar="ID,…", default="", help="ids of actors that are removed from the start of the run"
     )
     whatif.add_argument(
-        "--parallel", metavar="N", type=integer, default=0, help="runs at a time; default: one per core"
+        "--code", choices=("snapshot", "current"), default=None,
+        help="run the agent's code from the snapshot, or today's code; default: current with --agent, otherwise "
+        "snapshot. With --code current and --from-step K, today's code drives after step K",
+    )  # fmt: skip
+    whatif.add_argument(
+        "--times", metavar="N", type=integer, default=0, help="number of runs; default: 50 with --futures, otherwise 1"
+    )
+    whatif.add_argument(
+        "--parallel", metavar="N", type=integer, default=0, help="number of runs at a time; default: one per core"
     )
     whatif.add_argument(
         "--for", metavar="TIME", default="", dest="time",
-        help="stop after this time; only runs before the first unfinished run count",
+        help="stop after this time; then only the runs before the first unfinished run count",
     )  # fmt: skip
     add_trust(whatif)
     add_json(whatif)

@@ -72,27 +72,29 @@ class Subject(_Options):
     )  # fmt: skip
     ego: str = option(
         "", "controlled vehicle of a bare ``.sumocfg``",
-        help="for a .sumocfg: the vehicle to control; route=ID or edges=FROM,TO adds a vehicle; any: a random "
-            "vehicle in each trial",
+        help="for a .sumocfg: the id of the vehicle that the agent controls; route=ID or edges=FROM,TO adds a vehicle; "
+        "any: a random vehicle in each trial",
         unset="any",
         flag="--ego", metavar="VEHICLE", group="what",
     )  # fmt: skip
     action: str = option(
         "", "form of the actions on SUMO, ``continuous`` or ``meta``",
-        help="on SUMO: continuous (a speed and a lane change) or meta (highway-env's five actions)",
-        unset="as in the scenario, and continuous for a .sumocfg",
+        help="the form of the agent's actions on SUMO: continuous (a target speed and a lane change) or meta "
+        "(highway-env's five actions)",
+        unset="as the scenario file says, and continuous for a .sumocfg",
         flag="--action", metavar="FORM", group="what",
     )  # fmt: skip
     agents: Mapping[str, Driver] | None = option(
         {}, "vehicle to its agent, for several controlled vehicles",
-        help="the agent that drives: a class or function, or a name that crashhunt agents lists; ID= if the scenario "
-            "has several controlled vehicles",
+        help="the agent that drives: a class or function, or a name that crashhunt agents lists; with ID=, the agent "
+        "of the controlled vehicle ID, if the scenario has several",
         brief="the class, function or listed name that drives",
         flag="--agent", metavar="[ID=]MODULE:ATTR", group="what", named=False,
     )  # fmt: skip
     arguments: Mapping[str, Spec] | None = option(
         {}, '``NAME`` or ``AGENT.NAME`` to a value or a specification such as ``"5:40"``',
-        help=f"values to try for an argument of the agent: {_SPEC}; ID.NAME=SPEC for one of several agents",
+        help=f"values to try for an argument of the agent: {_SPEC}; if there are several agents, ID.NAME=SPEC names "
+        "the agent",
         brief="values of an argument of the agent: 20, 5:40, log:1e-3:1, a|b|c",
         flag="--arg", metavar="NAME=SPEC", group="what",
     )  # fmt: skip
@@ -104,8 +106,8 @@ class Subject(_Options):
     )  # fmt: skip
     oracles: Sequence[str] = option(
         (), "additional oracles, next to those for reported collisions, overlaps and the edge of the road",
-        help="an additional oracle that detects crashes, with its arguments; crashhunt oracles lists all; none: "
-            "without the default oracles; may be repeated",
+        help="an additional oracle that detects crashes, with its arguments; crashhunt oracles lists all oracles; "
+        "none: no default oracles; may be repeated",
         flag="--oracle", metavar="NAME[:KEY=VALUE,…]", group="what",
     )  # fmt: skip
 
@@ -116,13 +118,14 @@ class TrialOptions(_Options):
 
     sampler: str = option(
         "random", "name of the sampler",
-        help="random, halton, sobol, grid or sweep; or one that learns from results: guided, cross-entropy, "
-            "mutation, cma-es, optuna:NAME, as in optuna:tpe",
+        help="the sampler that chooses the arguments of trials: random, halton, sobol, grid or sweep; or a sampler "
+        "that learns from results: guided, cross-entropy, mutation, cma-es or optuna:NAME, such as optuna:tpe",
         brief="random, grid, guided and others: how arguments are chosen",
         flag="--sampler", group="search", metavar="NAME",
     )  # fmt: skip
     points: int = option(
-        10, "number of values that grid and sweep try in a range without a step", flag="--points", group="search",
+        10, "number of values that the samplers grid and sweep try in a range "
+        "without a step", flag="--points", group="search",
         metavar="N",
         check=at_least(1),
     )  # fmt: skip
@@ -132,19 +135,18 @@ class TrialOptions(_Options):
     )  # fmt: skip
     crash_on: Sequence[str] = option(
         CRASHES, "outcomes that count as a crash",
-        help="the outcomes that count as a crash: collision, off_road, agent_error, simulator_error, process_died, "
-        "hang, which are the default; and traffic events: red_light, wrong_way, off_route, not_moving (for 60 s, or "
-        "not_moving:S), others_collided, hard_braking (or hard_braking:M/S²), teleport",
+        help="the outcomes that count as a crash. By default: collision, off_road, agent_error, simulator_error, "
+        "process_died, hang. Also possible are traffic events: red_light, wrong_way, off_route, not_moving (for 60 s, "
+        "or not_moving:S), others_collided, hard_braking (or hard_braking:M/S²), teleport",
         flag="--crash-on", group="what", metavar="KIND,…", separator=",",
     )  # fmt: skip
     disturb: Sequence[str] = option(
         (), "faults of the vehicles around the agent, or of its sensors and actuators: ``NAME=RATE`` with a rate per"
             " second, or ``KIND@STEP=PLACE:STRENGTH:DURATION`` in every trial",
-        help="inject faults of the vehicles around the agent, or of its sensors and actuators, with rates per "
-            "second, as in brake=0.02,cut_in=0.01: brake, stop, dawdle, speed, cut_in, late_merge, step_out, "
-            "ignore_priority, unseen, "
-        "late_observation, noisy_observation, late_action or module:attribute; or in every trial from a given step, "
-        "as in brake@124=ahead:4:2 for 4 m/s² and 2 s; none: no disturbances",
+        help="inject faults of other vehicles or of the agent's sensors and actuators, each with its rate per second, "
+        "such as brake=0.02,cut_in=0.01. The faults: brake, stop, dawdle, speed, cut_in, late_merge, step_out, "
+        "ignore_priority, unseen, late_observation, noisy_observation, late_action or module:attribute. A fault at a "
+        "given step of every trial: brake@124=ahead:4:2 (the vehicle ahead, 4 m/s², 2 s). none: no faults",
         unset="those of the scenario, if it has any",
         brief="faults of other actors or of sensors, such as brake=0.02",
         flag="--disturb", group="faults", metavar="NAME=RATE,…", separator=",",
@@ -152,32 +154,34 @@ class TrialOptions(_Options):
     probe: str = option(
         "", "interval at which copies of a trial search for the mildest disturbance that makes it crash, such as "
             "``4s``",
-        help="at this interval of simulation time, such as 4s, search copies of the trial for the mildest "
-            "disturbance with which it crashes", unset="never", flag="--probe", group="faults", metavar="TIME",
+        help="at this interval of simulation time, such as 4s, try disturbances in forks of the running trial, and "
+        "find the mildest disturbance with "
+        "which it crashes", unset="never", flag="--probe", group="faults", metavar="TIME",
         check=check_probe,
     )  # fmt: skip
     branch: bool = option(
         False, "whether copies of a trial continue with other disturbances when another actor is near",
-        help="when another actor is near, continue copies of the trial with several disturbances, from this moment "
-            "and from some seconds earlier; needs --disturb",
+        help="when another actor is near, fork the running trial and continue the forks with several disturbances, "
+        "from this moment and from some seconds earlier; needs --disturb",
         flag="--branch", group="faults",
     )  # fmt: skip
     rare: bool = option(
         False, "whether to estimate the rate of rare crashes from copies of trials with forced disturbances",
-        help="estimate how often rare crashes happen: one of five trials runs undisturbed, and copies of it begin with "
-        "a first disturbance, weighted by its probability; needs --disturb with rates and implies --keep-going",
+        help="estimate how often rare crashes happen: one of five trials runs undisturbed, and its forks begin with "
+        "one forced disturbance each, weighted by its probability; needs --disturb with rates "
+        "and implies --keep-going",
         flag="--rare", group="faults",
     )  # fmt: skip
     splitting: bool = option(
         False, "with ``rare``, whether copies of a trial differ by the noise of other drivers, and not by disturbances",
-        help="with --rare: copy trials that come close to the vehicle ahead, each with other noise of the drivers; "
-        "the same as --rare splitting; needs no --disturb",
+        help="with --rare: fork trials that come close to the vehicle ahead, each fork with other random numbers of "
+        "SUMO's drivers; the same as --rare splitting; needs no --disturb",
         flag="--splitting", group="faults",
     )  # fmt: skip
     seeds: int = option(
         0, "number of traffics, each used for many arguments of the agents; 0: a new traffic in each trial",
-        help="draw this many traffics (a seed and the scenario's arguments), and use each for many arguments of the "
-            "agents after one warm-up; 0: a new traffic in each trial",
+        help="use only N traffics (a traffic is a seed and the scenario's arguments): simulate the warm-up of a "
+        "traffic once, then run trials with different arguments of the agents in it; 0: a new traffic in each trial",
         unset="every trial has its own",
         flag="--seeds", group="search", metavar="N", check=at_least(0, zero="every trial has its own"),
     )  # fmt: skip
@@ -200,15 +204,16 @@ class RunOptions(_Options):
     )  # fmt: skip
     distinct: int = option(
         0, "number of crash types after which the hunt ends; it collects all crashes until then; 0: no limit",
-        help="collect all crashes until N crash types have been found, as crashhunt crashes counts them; 0: no such "
-            "limit",
+        help="collect all crashes, and stop when N different crash types (see crashhunt crashes) have been found; 0: "
+        "no such limit",
         flag="--distinct", group="search", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
     until_rate: str = option(
         "", "a rate, such as ``1e-3/trial``, ``2/hour`` or ``5/1000km``: the hunt ends when the crash rate is "
             "certainly below or above it",
-        help="stop when the crash rate is certainly below or above this rate, such as 1e-3/trial, 2/hour or "
-            "5/1000km; collects all crashes, and TRIALS may be 0; exit code 0: below, 1: above, 3: undecided",
+        help="stop when the crash rate is certainly below or above this rate, such as 1e-3/trial, 2/hour or 5/1000km; "
+            "the hunt collects all crashes, and TRIALS may be 0; exit code 0: the crash rate is below, 1: above, 3: "
+            "undecided",
         unset="run all trials", flag="--until-rate", group="search", metavar="RATE", check=check_rate,
     )  # fmt: skip
     most: int = option(
@@ -226,14 +231,14 @@ class RunOptions(_Options):
     by_cause: int = option(
         0, "with ``distinct`` or ``keep``, number of crashes of each type to judge, so that each cause counts; 0: "
            "none",
-        help="with --distinct or --keep: count each cause of a crash type on its own. Runs up to N crashes of each "
-        "type again, as crashhunt crashes --by-cause does; 0: count types",
+        help="with --distinct or --keep: count crashes of one type with different causes as different types. To find "
+        "the causes, up to N crashes of each type run again; 0: do not search for causes",
         flag="--by-cause", group="search", metavar="N", check=at_least(0, zero="count types"),
     )  # fmt: skip
     only_at_fault: bool = option(
         False, "stop only at a crash that is the agent's fault; other crashes are saved, and the hunt continues",
-        help="stop only at a crash that is the agent's fault according to the rules; crashes that are not its fault, "
-            "or undecided, are saved and do not end the hunt",
+        help="stop only at a crash that is the agent's fault according to the fault rules; other crashes are saved and "
+        "do not end the hunt",
         flag="--only-at-fault", group="search",
     )  # fmt: skip
     until_error: str = option(
@@ -243,7 +248,7 @@ class RunOptions(_Options):
             "0.3", unset="all trials", flag="--until-error", group="faults", metavar="SHARE", check=check_share,
     )  # fmt: skip
     deterministic: bool = option(
-        False, "at a crash, let running trials of lower numbers finish: the same seed gives the same crash",
+        False, "after a crash, wait for the running trials with lower numbers, so the same seed gives the same crash",
         flag="--deterministic", group="run",
     )  # fmt: skip
     timeout_s: float = option(
@@ -265,32 +270,33 @@ class RunOptions(_Options):
     )  # fmt: skip
     recycle_after: int = option(
         1000, "no effect, because every trial has its own process",
-        help="no effect, because every trial has its own process",
+        help="this option has no effect, because every trial has its own process",
         flag="--recycle-after", group="run", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
     warm_copies: int = option(
         8, "with ``seeds``, the number of warmed-up traffics of which each worker keeps a suspended fork; 0: none",
-        help="with --seeds: the number of warmed-up traffics of which each worker keeps a suspended fork; 0: none",
+        help="with --seeds: number of traffics whose warmed-up simulation each worker keeps in memory as a suspended "
+        "process; 0: none",
         flag="--warm-copies", group="run", metavar="N", check=at_least(0, zero="none"),
     )  # fmt: skip
     audit: float = option(
         0.0, "share of the trials without a crash that run again in a new process, to check that they are bit-"
              "identical",
         help="replay this share of the trials without a crash, each in a new process, and report every difference; "
-            "0.02 is one trial in fifty",
+        "with 0.02, one of fifty trials",
         flag="--audit", group="run", metavar="SHARE", check=within(0, 1, "give a share of the trials, from 0 to 1"),
     )  # fmt: skip
     near_misses: int = option(
         0, "number of trials without a crash to save as bundles, those with the highest criticality first",
-        help="save the N most critical trials without a crash as bundles, for replay and show; each is run once more "
-            "at the end",
+        help="save the N most critical trials without a crash as bundles, for replay and show; these trials run once "
+        "more at the end of the hunt",
         flag="--near-misses", group="kept", metavar="N", check=at_least(0, zero="none"),
     )  # fmt: skip
     executor: str = option(
         "pool", "executor that runs the trials, by its name; ``:ARG`` appends an argument",
-        help="where trials run: pool (warm processes on this machine), fresh (a new process for each), "
-        "ray[:HOST:PORT] (all machines of a Ray cluster) or module:attribute; append :ARG to pass an argument to the "
-        "executor",
+        help="where trials run: pool (worker processes on this machine), fresh (a new process for each "
+        "trial), ray[:HOST:PORT] (all machines of a Ray cluster) or module:attribute; append :ARG to pass an argument "
+        "to the executor",
         flag="--executor", group="run", metavar="NAME[:ARG]", anywhere=True,
     )  # fmt: skip
 
@@ -337,7 +343,7 @@ class SnapshotChoices(_Options):
     )  # fmt: skip
     snapshot_code: bool = option(
         True, "whether the snapshot contains code; without it, a replay runs the current code",
-        help="save no code; a replay then runs today's code", flag="--no-snapshot", group="kept",
+        help="do not save the code; a replay then runs today's code", flag="--no-snapshot", group="kept",
     )  # fmt: skip
 
 
