@@ -1,4 +1,4 @@
-"""Archives: a crash in one file with everything that its replay needs on another machine."""
+"""Archives: one file that contains a crash and everything that a replay on another machine needs."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Archive:
     """An archive that has been unpacked and checked.
 
     Args:
-        directory: where its hunt is now.
+        directory: directory of the unpacked hunt.
         made_by: name of the tool that made it, according to the file.
         made_at: time of the export, as recorded in the archive.
         made_here: whether this user made it on this machine, which its signature proves.
@@ -58,18 +58,18 @@ class Archive:
 
 
 def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) -> int:
-    """Write a crash, its hunt's settings and its snapshot into one zip file; the file is never incomplete.
+    """Write a crash, the settings of its hunt and its snapshot into one zip file. The file is never incomplete.
 
     Args:
-        bundle: the crash.
-        target: the file; an existing one is replaced.
-        watch: called after each file with the number of finished files, and the number of all files.
+        bundle: the crash to export.
+        target: path of the zip file; an existing file is replaced.
+        watch: function called after each file, with the number of finished files and the number of all files.
 
     Returns:
-        Its size in bytes.
+        The size of the zip file in bytes.
 
     Raises:
-        BundleError: something of the crash is missing or damaged.
+        BundleError: a file of the crash is missing or damaged.
         HuntDirectoryError: the file cannot be written.
     """
     hunt = bundle.hunt
@@ -103,12 +103,12 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
 
 @contextmanager
 def open_archive(path: Path) -> Iterator[Archive]:
-    """Unpack an archive into a folder that is removed afterwards.
+    """Unpack an archive into a temporary folder, which is deleted afterwards.
 
     The archive is not trusted: names, sizes and hashes are checked, and no code runs.
 
     Raises:
-        BundleError: it is not one, or it has something that it should not have.
+        BundleError: the file is not an archive, or contains entries that an archive may not contain.
     """
     with temporary_folder("archive") as directory:
         try:
@@ -153,7 +153,7 @@ def _read_index(archive: zipfile.ZipFile, path: Path) -> ArchiveIndex:
 
 
 def _checked(archive: zipfile.ZipFile, index: ArchiveIndex, path: Path) -> list[zipfile.ZipInfo]:
-    """The entries to unpack, or a refusal."""
+    """Return the entries to unpack, or refuse the archive."""
     entries = [entry for entry in archive.infolist() if entry.filename != layout.ARCHIVE_INDEX]
     names = [entry.filename for entry in entries]
     if len(entries) > _MAX_FILES or sum(entry.file_size for entry in entries) > _MAX_BYTES:

@@ -1,4 +1,4 @@
-"""Crash bundles: the folder with everything that the replay of one crash needs, and the metadata of its log."""
+"""Crash bundles: each is a folder that contains everything needed to replay one crash, and the metadata of its log."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ __all__ = [
 
 
 class Protected(TypedDict):
-    """The keys with the digests of a file itself and of the other files in its folder."""
+    """The keys that protect a JSON file: the digests of the file itself and of the other files in its folder."""
 
     schema: int
     files: dict[str, FileEntry]
@@ -89,7 +89,7 @@ class Protected(TypedDict):
 
 
 class CrashData(Protected):
-    """``crash.json``."""
+    """The contents of ``crash.json``."""
 
     id: str
     hunt_seed: int
@@ -127,7 +127,7 @@ class CrashData(Protected):
 
 
 class CrashSummary(TypedDict):
-    """A crash as ``run --json`` prints it."""
+    """The form in which ``run --json`` prints a crash."""
 
     id: str
     trial: int
@@ -146,7 +146,7 @@ class CrashSummary(TypedDict):
 
 
 class ArchiveIndex(TypedDict):
-    """The index of an archive."""
+    """The index of an archive: its version, its origin and its files."""
 
     schema: int
     crash: str
@@ -160,10 +160,10 @@ class ArchiveIndex(TypedDict):
 
 
 def refuse_damaged(data: Protected) -> None:
-    """Check that the description of a crash is unchanged.
+    """Raise an error if the description of a crash has changed since it was written.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the description has changed.
     """
     typed(data, {"integrity": str, "files": FILES})
     said = data.pop("integrity")
@@ -176,7 +176,7 @@ def refuse_damaged(data: Protected) -> None:
 
 
 def files_of(folder: Path) -> dict[str, FileEntry]:
-    """Return the recorded size and digest of each file of a crash or kept trial; empty if they cannot be read."""
+    """Return the recorded size and digest of each file of a crash or kept trial; empty if the record cannot be read."""
     for name in (layout.CRASH, layout.PARAMS):
         with suppress(OSError, ValueError):
             data = read_object(folder / name, Protected)
@@ -187,7 +187,7 @@ def files_of(folder: Path) -> dict[str, FileEntry]:
 
 
 def describe_other_files(folder: Path) -> dict[str, FileEntry]:
-    """Return size and digest of every file of a folder, except of the file that holds this list."""
+    """Return size and digest of every file in a folder, except the file that stores this list."""
     found = describe_files(folder)
     return {
         name: entry for name, entry in found.items() if name not in (layout.CRASH, layout.PARAMS) and name[0] != "."
@@ -195,7 +195,7 @@ def describe_other_files(folder: Path) -> dict[str, FileEntry]:
 
 
 def read_params(folder: Path) -> list[str]:
-    """Return the saved files of a trial that have changed since they were written."""
+    """Return the names of a trial's saved files that have changed since they were written."""
     try:
         data = read_object(folder / layout.PARAMS, Protected)
         if "integrity" in data:  # which earlier versions did not write
@@ -207,7 +207,7 @@ def read_params(folder: Path) -> list[str]:
 
 
 def collect_output(result: TrialResult, scratch: Path, target: Path) -> None:
-    """Copy what a trial has printed, and write down how it failed."""
+    """Copy the output of a trial to a folder, and write its failure to ``error.log``."""
     run_log = scratch / layout.RUN_LOG
     if run_log.is_file():
         shutil.copyfile(run_log, target / layout.RUN_LOG)
@@ -251,19 +251,20 @@ _DAMAGE_FIX = "get an undamaged copy, or see with crashhunt check what can be sa
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """A crash on disk.
+    """A crash that is stored on disk.
 
     Args:
-        path: path of its folder.
-        result: the crash.
+        path: path of the folder of the bundle.
+        result: result of the trial that crashed.
         hunt_seed: seed of the hunt that found it.
-        snapshot: the digest of the code that it ran.
+        snapshot: digest of the code that the trial ran.
         confirmed: Whether a replay in a new process was bit-identical; None if no replay has finished.
-        divergence: Where the replay deviated, if it did.
-        files: Size and digest of the other files of the bundle; empty in bundles of earlier versions.
-        added: Keys that a later version has added, which are written back.
-        why_unconfirmed: Why no replay has run to its end; empty if one has, or if none was started.
-        authentication_code: Proves to the user who made the bundle that its trial is unchanged; may be empty.
+        divergence: The point where the replay deviated from the recording; None if it did not.
+        files: Size and digest of each other file of the bundle; empty in bundles of earlier versions.
+        added: JSON keys of later versions of crashhunt, which are kept when the bundle is written.
+        why_unconfirmed: The reason why no replay was completed; empty if a replay was completed, or if none was
+            started.
+        authentication_code: Code that proves to the user who made the bundle that its trial is unchanged; may be empty.
     """
 
     path: Path
@@ -284,26 +285,26 @@ class Bundle:
 
     @property
     def hunt(self) -> Path:
-        """The hunt's directory."""
+        """The directory of the hunt."""
         return self.path.parent.parent
 
     @property
     def is_near_miss(self) -> bool:
-        """Whether the trial has no crash, and was kept because of its high criticality."""
+        """Whether the bundle is a near miss: a trial without a crash that was kept because of its high criticality."""
         return self.result.outcome.category == "no crash"
 
     @property
     def driver(self) -> str:
-        """The agent of the crash; the first agent if the crash belongs to none."""
+        """The identifier of the agent that crashed; the first agent if the crash belongs to no agent."""
         result = self.result
         about = next((found.agent for found in (result.collision, result.event, result.failure) if found), "")
         return about or next(iter(self.result.spec.arguments), "")
 
     def recording(self) -> Recording:
-        """Read the log.
+        """Read the log of the bundle and return its recording.
 
         Raises:
-            BundleError: the log is missing, damaged, or that of another crash.
+            BundleError: the log is missing, damaged, or belongs to another crash.
         """
         from crashhunt.recording import read_log  # MCAP and protobuf take longer than a hunt that is refused
 
@@ -324,7 +325,7 @@ class Bundle:
         return found
 
     def faults(self) -> list[str]:
-        """Return the changed, missing and added files of the bundle."""
+        """Return descriptions of the changed, missing and added files of the bundle."""
         found = [
             f"{name} {wrong}" for name, entry in self.files.items() if (wrong := changed_file(self.path / name, entry))
         ]
@@ -334,7 +335,7 @@ class Bundle:
         return found
 
     def summary(self) -> CrashSummary:
-        """Return the shape that ``run --json`` prints."""
+        """Return the crash in the form that ``run --json`` prints."""
         plain = self.result.to_json()
         spec = plain["spec"]
         found: CrashSummary = {
@@ -359,7 +360,7 @@ class Bundle:
         return found
 
     def write(self, into: Path | None = None) -> None:
-        """Write ``crash.json`` atomically; into another folder if the bundle is still being built."""
+        """Write ``crash.json`` atomically into the bundle's folder, or into another one while the bundle is built."""
         folder = into or self.path
         result = self.result
         plain = result.to_json()
@@ -416,7 +417,7 @@ class Bundle:
 
 
 def _schema_of(spec: TrialSpec) -> int:
-    """The first version that knows everything that determines the trial."""
+    """Return the first schema version that can express everything that determines the trial."""
     if spec.script is not None:
         return SCHEMA
     if spec.only is not None:
@@ -425,10 +426,10 @@ def _schema_of(spec: TrialSpec) -> int:
 
 
 def read_bundle(path: Path) -> Bundle:
-    """Read a crash bundle.
+    """Read a crash bundle from its folder.
 
     Raises:
-        BundleError: it is not one, or it is damaged.
+        BundleError: the folder is not a crash bundle, or the bundle is damaged.
     """
     file = path / layout.CRASH
     try:
@@ -511,7 +512,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
 
 
 def _added(data: CrashData) -> dict[str, object]:
-    """Return the keys that a later version has added to the crash and its parts."""
+    """Return the JSON keys that a later version of crashhunt added to the crash and its parts."""
     added: dict[str, object] = {name: value for name, value in data.items() if name not in _KEYS}
     for name, kind in _PARTS.items():
         _, rest = known_part(kind, data.get(name))
@@ -526,14 +527,14 @@ _PURPOSE = "crash bundle"
 
 
 def snapshot_of(bundle: Bundle) -> Snapshot:
-    """Return the snapshot of the code that a bundle ran."""
+    """Return the snapshot of the code that the trial of a bundle ran."""
     return Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot)
 
 
 def authenticate_bundle(bundle: Bundle) -> str:
-    """Return the authentication code of a bundle that this process makes; empty if its code is not of this user.
+    """Return the authentication code of a bundle that this process writes; empty if the code is not from this user.
 
-    Without that condition, a crash that was minimized or confirmed in a stranger's hunt would pass for one made here.
+    Without this condition, a crash that was minimized or confirmed in another person's hunt would count as made here.
     """
     try:
         made_here = snapshot_of(bundle).is_made_here
@@ -543,7 +544,7 @@ def authenticate_bundle(bundle: Bundle) -> str:
 
 
 def is_bundle_made_here(bundle: Bundle) -> bool:
-    """Return whether this user made a bundle and its snapshot on this machine; files of the snapshot are not read.
+    """Return whether this user made a bundle and its snapshot on this machine. The files of the snapshot are not read.
 
     Raises:
         BundleError: the manifest of the snapshot is missing or damaged.
@@ -552,7 +553,7 @@ def is_bundle_made_here(bundle: Bundle) -> bool:
 
 
 def _statement(bundle: Bundle) -> dict[str, object]:
-    """Everything of a bundle that determines what runs, and the digest of what was recorded."""
+    """Return everything in a bundle that determines what runs, and the recording's digest, as text to authenticate."""
     spec = bundle.result.spec.to_json()
     return {
         "number": spec["number"],
@@ -581,19 +582,20 @@ def write_bundle(
     confirmed: bool | None = None,
     authenticate: bool = True,
 ) -> Bundle:
-    """Make the bundle of a crash, or of a near miss, from what its trial left behind.
+    """Write the bundle of a crash or near miss from the files that its trial left in its scratch folder.
 
     Args:
         directory: directory of the hunt.
-        result: the crash.
-        scratch: the trial's scratch folder; it is emptied.
+        result: result of the trial that crashed.
+        scratch: scratch folder of the trial; it is emptied.
         hunt_seed: seed of the hunt.
-        snapshot: the digest of the code that ran.
+        snapshot: digest of the code that the trial ran.
         lanes: The lanes of the map, for viewers of the log.
-        name: name of its folder, if it differs from the number and the outcome of the trial.
-        place: the folder of the hunt's directory in which the bundle is written.
+        name: name of the bundle's folder, if it differs from the number and outcome of the trial.
+        place: subfolder of the hunt's directory in which the bundle is written.
         confirmed: whether a replay in a new process was bit-identical; None if unknown.
-        authenticate: whether to write down the proof that this user made it; only where the snapshot is this user's.
+        authenticate: whether to add the code that proves that this user made the bundle; only if the snapshot is from
+            this user.
     """
     from crashhunt.recording import foxglove_layout, write_log
 
@@ -627,7 +629,7 @@ def write_bundle(
 
 
 def write_trial(directory: Path, result: TrialResult, scratch: Path) -> None:
-    """Keep what a trial printed that is no crash; its scratch folder is emptied."""
+    """Keep the output of a trial that did not crash; its scratch folder is emptied."""
     target = directory / layout.TRIALS / f"{result.spec.number:06d}"
     target.mkdir(parents=True, exist_ok=True)
     collect_output(result, scratch, target)
@@ -653,11 +655,11 @@ def list_near_misses(directory: Path) -> list[Bundle]:
 
 
 def crash_folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
-    """Return the folders of crashes, also without a ``crash.json``, but not the folders of minimized crashes.
+    """Return the folders of crashes, also without ``crash.json``, but not the folders of minimized crashes.
 
     Args:
         directory: directory of the hunt.
-        place: the folder there that has them.
+        place: subfolder of the hunt's directory that contains the crashes.
     """
     folders = (directory / place).glob(layout.SHOWN)
     found = (path for path in folders if path.is_dir() and not path.name.endswith(layout.SMALL))
@@ -665,18 +667,18 @@ def crash_folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
 
 
 def find_bundle(directory: Path, crash: str = "") -> Bundle:
-    """Return one crash or near miss of a hunt: the one that is named, or the crash with the fewest steps.
+    """Return one crash or near miss of a hunt: the one that the user names, or else the crash with the fewest steps.
 
-    A hunt without crashes gives its most critical near miss. Without near misses, it gives a crash of a fork, or else a
-    minimized crash, as in an exported file.
+    If the hunt has no crash, its most critical near miss is returned. Without near misses, a crash found by a fork is
+    returned, or else a minimized crash, as in an exported file.
 
     Args:
-        directory: directory of the hunt, or of the bundle itself.
-        crash: The id of a crash, of a near miss, or of a crash that probes or branches have found. The beginning of an
-            id suffices, or the number of the trial. A minimized crash needs its whole id.
+        directory: directory of the hunt, or of one bundle.
+        crash: The id of a crash, of a near miss, or of a crash found by a robustness probe or a branch. The beginning
+            of an id or the number of the trial suffices. A minimized crash needs its whole id.
 
     Raises:
-        BundleError: there is no such crash.
+        BundleError: the hunt has no such crash.
     """
     if (directory / layout.CRASH).is_file() and not crash:
         return read_bundle(directory)
@@ -727,7 +729,7 @@ def _may_be(bundle: Bundle, crash: str) -> bool:
 
 
 def _readable(directory: Path, crash: str, places: Sequence[str]) -> list[Bundle]:
-    """Return the readable crashes of a hunt; a damaged crash raises an error only if the user names it."""
+    """Return the crashes of a hunt that can be read; a damaged crash raises an error only if the user names it."""
     found = []
     for path in (folder for place in places for folder in crash_folders(directory, place)):
         try:
@@ -740,7 +742,7 @@ def _readable(directory: Path, crash: str, places: Sequence[str]) -> list[Bundle
 
 
 def _named(bundles: Sequence[Bundle], crash: str, directory: Path) -> Bundle:
-    """Return the crash that the user names: by its id, else by its number, else by the beginning of its id."""
+    """Return the crash that the user names by its id, its trial number or the beginning of its id, in this order."""
     number = int(crash) if crash.isdecimal() else None
     for meant in (
         [bundle for bundle in bundles if bundle.id == crash],

@@ -1,4 +1,4 @@
-"""The cause of a crash in a form that can be counted, and the crash types of one cause."""
+"""The cause of a crash, in a form that can be counted, and the groups of crashes with the same cause."""
 
 from __future__ import annotations
 
@@ -25,15 +25,17 @@ _RELEVANT_DIFFERENCES = {"speed": 5.0, "gap": 5.0, "length": 4.0}  # m/s, m, m: 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Cause(Serializable):
-    """The cause of a crash, as determined by runs. No speeds, identifiers and times: they differ from trial to trial.
+    """The cause of a crash, as determined by runs.
+
+    It contains no speeds, identifiers or times, because these differ between trials.
 
     Args:
         kind: ``omission``, ``decision``, ``disturbance``, ``argument``, ``traffic``, ``software fault`` or ``unknown``.
-        what: of an omission, what was disregarded, as in `Omission`. For a lane change into a gap that is not safe it
-            is ``gap left`` or ``gap right``. Of a decision it is what the agent did, of a disturbance its type, of an
-            argument its name.
+        what: For an omission, what the agent disregarded, as in `Omission`. For a lane change into an unsafe gap, ``gap
+            left`` or ``gap right``. For a decision, the action of the agent; for a disturbance, its type; for an
+            argument, its name.
         instead: the action of the agent in place of the omitted one.
-        actor: ``long`` where the disregarded actor is longer than a car, else empty.
+        actor: ``long`` if the disregarded actor is longer than a car, else empty.
     """
 
     kind: str
@@ -56,12 +58,13 @@ class Cause(Serializable):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CauseGroup:
-    """Crashes of one crash type with one cause.
+    """Crashes of the same crash type with the same cause.
 
     Args:
-        cause: cause of all of them.
-        members: the crashes, the first one found first.
-        judged: the crashes whose cause was found by runs; the other crashes have the cause of the most similar one.
+        cause: the common cause of the crashes.
+        members: the crashes, in the order in which they were found.
+        judged: the crashes whose cause was determined by runs. Every other crash is given the cause of the most similar
+            one.
     """
 
     cause: Cause
@@ -70,11 +73,11 @@ class CauseGroup:
 
     @property
     def shortest(self) -> Bundle:
-        """The one with the fewest steps."""
+        """The crash with the fewest steps."""
         return min(self.members, key=lambda bundle: bundle.result.steps)
 
     def to_json(self) -> JsonObject:
-        """Return the shape that ``crashes --by-cause --json`` prints."""
+        """Return the group in the form that ``crashes --by-cause --json`` prints."""
         return {
             "cause": self.cause.to_json(),
             "words": str(self.cause),
@@ -86,11 +89,11 @@ class CauseGroup:
 
 
 def cause_of(bundle: Bundle, judgement: Judgement | None) -> Cause:
-    """Return the cause of a crash from what its runs have shown; ``unknown`` where they do not say.
+    """Return the cause of a crash from the results of its runs; ``unknown`` if they do not show a cause.
 
     Args:
-        bundle: the crash.
-        judgement: what its runs have shown; None if it has not been judged.
+        bundle: the crash whose cause is determined.
+        judgement: results of the crash's runs; None if its causes were not analysed.
     """
     if bundle.result.outcome.is_software_fault:
         return Cause("software fault")
@@ -102,7 +105,10 @@ def cause_of(bundle: Bundle, judgement: Judgement | None) -> Cause:
 
 
 def _of_omission(bundle: Bundle, omission: Omission) -> Cause:
-    """For a lane change only the side counts, because it is chance whether a vehicle is ahead, behind or alongside."""
+    """Return the cause for an omission.
+
+    For a lane change, only the side counts, because the vehicle's position is chance.
+    """
     relation, _, side = omission.kind.rpartition(" ")
     if omission.instead == "changed lanes" and relation != "no lane":
         return Cause("omission", f"gap {side}", omission.instead)
@@ -111,7 +117,7 @@ def _of_omission(bundle: Bundle, omission: Omission) -> Cause:
 
 
 def _of_factors(why: Why) -> Cause:
-    """Return the first kind of factor, in a fixed order, without which no run crashed."""
+    """Return the cause for the first factor, in a fixed order of factor kinds, without which no run crashed."""
     needed = [factor for factor in why.factors if factor.needed and factor.clear > 1]
     # An agent with another value meets the same traffic, so its default counts though there is only one such run.
     needed += [one for one in why.factors if one.needed and one.clear == 1 and one.what == "default" and _is_own(one)]
@@ -124,10 +130,11 @@ def _of_factors(why: Why) -> Cause:
 
 
 def _is_own(factor: Factor) -> bool:
-    """Whether a factor is an argument of an agent, whose name begins with that of the agent.
+    """Return whether a factor is an argument of an agent; the name of such an argument begins with the agent's name.
 
-    Another value of a scenario argument changes the traffic from the start, as another seed does. It is a cause only
-    where other seeds crash as well: otherwise, any other traffic would have avoided the crash.
+    Changing a scenario argument changes the traffic from the start, as another seed does. A scenario argument is
+    therefore a cause only if runs with other seeds crash as well; otherwise, any other traffic would have avoided the
+    crash.
     """
     return factor.kind == "argument" and "." in factor.name
 
@@ -137,16 +144,16 @@ def _length(recording: Recording, actor: str) -> float:
 
 
 def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[float, ...]:
-    """Return what distinguishes crashes of one type without runs, in units of a difference that matters.
+    """Return numbers that distinguish crashes of one type without runs, each divided by a difference that matters.
 
-    Speeds and gap 0.2 s, 1 s and 2 s before the crash, and the length of the collision partner.
+    The numbers are the speeds and the gap 0.2 s, 1 s and 2 s before the crash, and the length of the collision partner.
 
     Args:
-        bundle: the crash.
+        bundle: the crash to describe.
         recording: recording of the crash, if it has already been read.
 
     Raises:
-        BundleError: its log is missing or damaged.
+        BundleError: the log of the crash is missing or damaged.
     """
     hit = bundle.result.collision
     if hit is None or not hit.other:
@@ -171,11 +178,11 @@ def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[flo
 
 
 class Division:
-    """The crashes of one type, some of which are judged; the others have the cause of the nearest judged one.
+    """The crashes of one type; some are judged by runs, each other one has the cause of the nearest judged crash.
 
-    The crashes to judge differ as much as possible: the shortest comes first, then always the crash that is furthest
-    from all those chosen (farthest-first traversal: T. F. Gonzalez, Clustering to minimize the maximum intercluster
-    distance, Theoretical Computer Science 38, 1985). Crashes may be added in between.
+    The crashes chosen for judgement differ as much as possible. The shortest crash is chosen first, then always the
+    crash furthest from all chosen crashes (farthest-first traversal: T. F. Gonzalez, Clustering to minimize the maximum
+    intercluster distance, Theoretical Computer Science 38, 1985). Crashes may be added between two choices.
 
     Args:
         most: maximum number of crashes to judge.
@@ -190,17 +197,17 @@ class Division:
         self._known: dict[int, Cause] = {}
 
     def add(self, number: int, steps: int, features: tuple[float, ...]) -> None:
-        """Add a crash.
+        """Add a crash to the division.
 
         Args:
-            number: identifies it.
-            steps: steps of its trial.
-            features: as `features_of` returns them.
+            number: number that identifies the crash.
+            steps: number of steps of the crash's trial.
+            features: features of the crash, as `features_of` returns them.
         """
         self._steps[number], self._features[number] = steps, features
 
     def choose(self) -> int | None:
-        """Return the number of the next crash to judge; None if enough are chosen, or all."""
+        """Return the number of the next crash to judge; None if enough crashes, or all of them, have been chosen."""
         left = [number for number in self._features if number not in self._chosen]
         if not left or len(self._chosen) >= self._most:
             return None
@@ -213,11 +220,12 @@ class Division:
         return found
 
     def settle(self, number: int, cause: Cause | None) -> None:
-        """Note the cause of a crash.
+        """Store the cause of a crash.
 
         Args:
             number: number of the crash.
-            cause: according to its runs; None if it cannot be run again. Then the nearest judged crash decides.
+            cause: cause found by the crash's runs. None if the crash cannot be run again; it then gets the cause of the
+                nearest judged crash.
         """
         self._open.discard(number)
         if number not in self._chosen:
@@ -226,7 +234,7 @@ class Division:
             self._known[number] = cause
 
     def postpone(self, number: int) -> None:
-        """Take a crash back that was chosen and has not been judged; it may be chosen again."""
+        """Withdraw a crash that was chosen but not judged; it may be chosen again."""
         self._open.remove(number)
         self._chosen.remove(number)
 
@@ -246,7 +254,7 @@ class Division:
         return not self._open and len(self._chosen) >= self._most
 
     def causes(self) -> dict[int, Cause]:
-        """Return number to cause, for all crashes."""
+        """Return the cause of each crash, by the number of the crash."""
         if not self._known:
             return dict.fromkeys(self._features, Cause("unknown"))
         # That an actor was long counts only where all of them were: where cars were hit as well, length is no cause.

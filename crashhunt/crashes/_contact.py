@@ -1,7 +1,7 @@
-"""The record of a contact: when, where and with which sides two actors touched, and how they had moved before.
+"""The record of a contact: its time, the sides that touched, and the motion of the two actors before it.
 
-Everything that describes a collision reads this record: its type, the fault, the lane, the speeds and the words. The
-contact itself is that of `crashhunt.world.contact_at`, by which the oracles determine the role of the agent as well.
+Everything that describes a collision reads this record: its type, the fault, the lane, the speeds and the text. The
+contact is computed by `crashhunt.world.contact_at`, from which the oracles also determine the role of the agent.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ _BESIDE_M = 1.2  # of the path that another one drives; less is in its way
 
 @dataclass(frozen=True, slots=True)
 class ApproachPath:
-    """How an actor moved before the contact, a row for each of the times of a `ContactRecord`.
+    """The motion of an actor before the contact, with one row for each of the times of a `ContactRecord`.
 
     Args:
         id: identifier of the actor.
         points: x and y of its front bumper, shape (n, 2), in m.
-        headings: shape (n,), in rad.
-        speeds: shape (n,), in m/s.
-        length: length in m.
-        width: width in m.
+        headings: headings of the actor, shape (n,), in rad.
+        speeds: speeds of the actor, shape (n,), in m/s.
+        length: length of the actor, in m.
+        width: width of the actor, in m.
     """
 
     id: str
@@ -70,26 +70,26 @@ class ApproachPath:
 
     @property
     def centers(self) -> NDArray[np.float64]:
-        """The centre of its outline, shape (n, 2), in m."""
+        """The centre of the actor's outline, shape (n, 2), in m."""
         return self.points - self.length / 2 * np.stack((np.cos(self.headings), np.sin(self.headings)), axis=1)
 
 
 @dataclass(frozen=True)
 class ContactRecord:
-    """The contact of an agent with another actor, and the seconds before it.
+    """The contact of an agent with another actor, and the seconds before the contact.
 
     Args:
-        agent: the controlled vehicle.
-        other: The collision partner.
-        scenes: scenes to the end of the step in which they touched.
-        time_s: time of the first contact.
-        began_s: when the episode began.
-        lanes: lanes around the place.
+        agent: identifier of the controlled vehicle.
+        other: Identifier of the collision partner.
+        scenes: scenes up to the end of the step in which the actors touched.
+        time_s: simulation time of the first contact.
+        began_s: simulation time at which the episode began.
+        lanes: lanes around the place of the contact.
         events: events of the last seconds, each with its simulation time.
         right_of_way: right of way of the map; None if the map has none.
         lane: The lane of the agent at the contact; empty if it is unknown.
-        swept: whether actors drive from scene to scene, and change lanes in an instant, as in `Scene`.
-        reported: The collision in the result of the trial; None if it is unknown.
+        swept: whether actors move continuously between scenes and change lanes instantly, as in `Scene`.
+        reported: The collision that the result of the trial contains; None if it is unknown.
     """
 
     agent: str
@@ -106,10 +106,10 @@ class ContactRecord:
 
     @cached_property
     def before(self) -> list[Scene]:
-        """The last scenes before the contact with both actors, over at least 4 s if the recording is that long.
+        """The last scenes before the contact with both actors; they cover at least 4 s if the recording is that long.
 
-        The first scene is the last one that is 4 s or more before the contact. Otherwise the part of a long step in
-        which they touch would decide how long the rules can look back.
+        The first scene is the last scene that is at least 4 s before the contact. Otherwise, the time of the contact
+        within a long step would decide how much time the fault rules examine.
         """
         found: list[Scene] = []
         for scene in reversed(self.scenes):
@@ -127,7 +127,7 @@ class ContactRecord:
 
     @cached_property
     def through(self) -> list[Scene]:
-        """The scenes before the contact and the scene after it."""
+        """The scenes before the contact and the first scene after it."""
         last = self.scenes[-1]
         there = self.agent in last.roster.index and self.other in last.roster.index
         return [*self.before, last] if there and last is not self.before[-1] else self.before
@@ -137,7 +137,7 @@ class ContactRecord:
         """The times at which the movement before the contact is sampled, in s before the contact, the earliest first.
 
         The times are relative to the contact, not to the scenes. Otherwise the results of the rules would depend on the
-        part of a long step in which the actors touch.
+        time of the contact within a long step.
         """
         first, last = (self.time_s - self.before[place].time_s for place in (0, -1))
         first = min(first, max(_WINDOW_S, last))
@@ -145,7 +145,7 @@ class ContactRecord:
         return np.append(samples, last)
 
     def way(self, actor: str) -> ApproachPath:
-        """Return how one of them moved before the contact."""
+        """Return how an actor moved before the contact."""
         return self._ways[actor]
 
     @cached_property
@@ -190,9 +190,9 @@ class ContactRecord:
 
     @cached_property
     def _bend_m(self) -> float:
-        """The greatest height of a bend above its chord between two scenes, in m.
+        """The greatest distance between a bend and its chord from one scene to the next, in m.
 
-        Between the scenes, the way in a bend is an estimate, whose error is a part of this height.
+        Between two scenes, the path in a bend is an estimate. Its error is a fraction of this distance.
         """
         found = 0.0
         for before, after in pairwise(self.through):
@@ -203,12 +203,12 @@ class ContactRecord:
         return found
 
     def partner(self, actor: str) -> str:
-        """Return the other actor of the contact."""
+        """Return the identifier of the other actor in the contact."""
         return self.other if actor == self.agent else self.agent
 
     @cached_property
     def touch(self) -> Touch:
-        """The contact, with the agent as the first actor."""
+        """The contact of the two outlines, with the agent as the first actor."""
         last = self.scenes[-1]
         previous = self.scenes[-2] if len(self.scenes) > 1 else None
         index = last.roster.index
@@ -216,16 +216,18 @@ class ContactRecord:
 
     @property
     def collider(self) -> str:
-        """The actor that drove into the other."""
+        """The identifier of the actor that drove into the other actor."""
         return self.agent if self.touch.drives_into else self.other
 
     @cached_property
     def is_disputed(self) -> bool:
-        """Whether the scenes contradict the collision that the simulator reported. No rule can decide then.
+        """Whether the scenes contradict the collision that the simulator reported.
 
-        Either the outlines did not touch, and by the positions the other actor would be the collider. Or the simulator
-        collided within a step, after which the scene shows what followed: another collider, or a slower vehicle that
-        drives into the back of a faster one.
+        In that case no fault rule can decide.
+
+        There are two such cases. In the first, the outlines did not touch, and their positions make the other actor the
+        collider. In the second, the simulator detected a collision within a step, and the next scene already shows the
+        consequences: another collider, or a slower vehicle that drives into the back of a faster one.
         """
         hit = self.reported
         if hit is None:
@@ -237,14 +239,14 @@ class ContactRecord:
 
     @property
     def jumpers(self) -> tuple[str, ...]:
-        """The actors whose instantaneous lane change made the contact."""
+        """The actors whose instantaneous lane change caused the contact."""
         jumps = ((self.agent, self.touch.jumps), (self.other, self.touch.other_jumps))
         return tuple(actor for actor, jumped in jumps if jumped)
 
     def speed_at_contact(self, actor: str) -> float:
         """Return the speed of an actor at the contact, in m/s.
 
-        highway-env slows crashed vehicles down within the step. The scene after it has their later speeds.
+        highway-env slows crashed vehicles down within the step of the crash, so the next scene has lower speeds.
         """
         hit = self.reported
         if not self.swept and hit is not None:
@@ -269,7 +271,7 @@ class ContactRecord:
 
     @property
     def turn(self) -> float:
-        """The angle between their headings at the contact, in rad, within 0 and pi."""
+        """The angle between the headings of both actors at the contact, in rad, from 0 to pi."""
         return abs(self.touch.turn)
 
     @property
@@ -278,31 +280,31 @@ class ContactRecord:
         return self.turn < SAME_WAY
 
     def turned(self, since_s: float) -> float:
-        """The greatest angle between the headings of both actors in the last seconds before the contact, in rad."""
+        """Return the greatest angle between the headings of both actors in the seconds before the contact, in rad."""
         own, other = self.way(self.agent), self.way(self.other)
         turns = np.abs((own.headings - other.headings + math.pi) % math.tau - math.pi)
         return float(turns[self.times <= since_s + 1e-6].max(initial=self.turn))
 
     def ahead_m(self, actor: str, back: int = -1) -> float:
-        """How far an actor's centre is ahead of the other's, along the other's heading, in m."""
+        """Return how far an actor's centre is ahead of the other's centre, along the other's heading, in m."""
         own, other = self.way(actor), self.way(self.partner(actor))
         dx, dy = own.centers[back] - other.centers[back]
         return float(dx * math.cos(other.headings[back]) + dy * math.sin(other.headings[back]))
 
     def gap_m(self, actor: str, back: int = -1) -> float:
-        """Return how far an actor's rear is ahead of the other's front in a scene, along the other's heading, in m."""
+        """Return the distance from the other actor's front to an actor's rear, along the other's heading, in m."""
         own, other = self.way(actor), self.way(self.partner(actor))
         return self.ahead_m(actor, back) - (own.length + other.length) / 2
 
     def aside_m(self, actor: str, back: int = -1) -> float:
-        """How far an actor's centre is to the left of the other's, across the other's heading, in m."""
+        """Return how far an actor's centre is to the left of the other's centre, across the other's heading, in m."""
         own, other = self.way(actor), self.way(self.partner(actor))
         dx, dy = own.centers[back] - other.centers[back]
         return float(dy * math.cos(other.headings[back]) - dx * math.sin(other.headings[back]))
 
     @cached_property
     def follower(self) -> str:
-        """The actor whose front touched the other's rear, in the same direction; empty if there was none."""
+        """The actor whose front touched the other actor's rear, in the same direction; empty for other contacts."""
         return "" if self.is_disputed else self._follower
 
     @cached_property
@@ -313,7 +315,7 @@ class ContactRecord:
         return self.agent if faces == ("front", "rear") else self.other if faces == ("rear", "front") else ""
 
     def in_its_way_s(self, leader: str) -> float:
-        """Return for how long a leader had been in the follower's path, in s."""
+        """Return for how long the leader had been in the path of the follower, in s."""
         lead, follow = self.way(leader), self.way(self.partner(leader))
         # The leader is the last point: where the road bends, the follower would not have gone straight on.
         ends = [self._at_contact(actor)[0] for actor in (follow.id, leader)]
@@ -327,9 +329,9 @@ class ContactRecord:
         return found
 
     def turns_off_s(self, leader: str) -> float | None:
-        """Return when a leader left the path of a straight follower, in s before the contact; None if never.
+        """Return when a leader left the path of a follower that drove straight on, in s before the contact, or None.
 
-        The actor had been in the way in all recorded steps before.
+        Before that, the leader was in the follower's path in every recorded step.
         """
         lead, follow = self.way(leader), self.way(self.partner(leader))
         headings = np.unwrap(np.append(follow.headings, self._at_contact(follow.id)[1]))
@@ -343,7 +345,7 @@ class ContactRecord:
         return float(self.times[left - 1]) if left > 0 and parting else None
 
     def changed_s(self, actor: str) -> float | None:
-        """Return how long before the contact an actor last changed lanes or began to; None if it did not."""
+        """Return how long before the contact an actor last changed lanes, or began to, in s; None if it never did."""
         return self._changes[actor]
 
     @cached_property
@@ -363,12 +365,12 @@ class ContactRecord:
         return None if left is None else self.time_s - self.before[left].time_s
 
     def until_contact(self, actor: str) -> list[Scene]:
-        """Return the scenes before the contact and the one after it, without a lane change after the contact."""
+        """Return the scenes before the contact and the first scene after it, without lane changes after the contact."""
         jumped = self.swept and len(self.through) > 1 and lane_jump(self.through[-2], self.through[-1], actor)
         return self.before if jumped and actor not in self.jumpers else self.through
 
     def lane_changers(self, within_s: float) -> tuple[str, ...]:
-        """Return the actors that changed lanes at the contact, or up to a time in s before it."""
+        """Return the actors that changed lanes at the contact, or at most the given time before it."""
         found = []
         for actor in (self.agent, self.other):
             scenes = [scene for scene in self.until_contact(actor) if scene.time_s >= self.time_s - within_s]
@@ -388,7 +390,7 @@ class ContactRecord:
         return self.changed_s(actor) is not None
 
     def meets_sideways(self, actor: str) -> bool:
-        """Whether an actor moved towards the other's side."""
+        """Return whether an actor moved towards the side of the other actor."""
         if self.touch.is_sideways:
             return actor in self.jumpers
         last = self.through[-1]
@@ -399,7 +401,7 @@ class ContactRecord:
         return max(lately, default=0.0) - abs(float(aside)) > _SIDEWAYS_M
 
     def was_off_path(self, actor: str, back: int) -> bool:
-        """Whether an actor was off the path of the other actor just before a scene."""
+        """Return whether an actor was off the path of the other actor just before a scene."""
         return any(
             abs(self.aside_m(actor, place)) > _BESIDE_M
             for place in range(back + 1)
@@ -407,7 +409,7 @@ class ContactRecord:
         )
 
     def is_between_junctions(self, *actors: str) -> bool:
-        """Return whether all given actors were on roads of SUMO in the last seconds, and not in junctions."""
+        """Return whether all given actors were on SUMO roads, outside junctions, in the seconds before the contact."""
         lanes = {
             actor: [
                 scene.lanes[scene.roster.index[actor]]
@@ -421,7 +423,7 @@ class ContactRecord:
         )
 
     def was_in_junction(self, actor: str, before_s: float) -> bool:
-        """Whether an actor was in a junction of SUMO a given time before the contact."""
+        """Return whether an actor was inside a junction of SUMO at the given time before the contact."""
         lanes = [
             scene.lanes[scene.roster.index[actor]]
             for scene in self.scenes
@@ -430,11 +432,11 @@ class ContactRecord:
         return bool(lanes) and lanes[-1].startswith(":")
 
     def is_past(self, event: Event, time_s: float) -> bool:
-        """Whether the actor of an event at a junction had already left the junction.
+        """Return whether the actor of an event at a junction had already left the junction.
 
         Args:
-            event: the event on the first of the junction's lanes.
-            time_s: when.
+            event: the event, recorded on the first lane of the junction.
+            time_s: simulation time for which the answer holds.
         """
         after = [scene for scene in self.scenes if scene.time_s >= time_s and event.agent in scene.roster.index]
         points = [scene.points[scene.roster.index[event.agent]] for scene in after]
@@ -450,11 +452,11 @@ class ContactRecord:
         return len(junctions) > 1
 
     def speed_mps(self, actor: str, before_s: float) -> float:
-        """Speed of an actor a given time before the contact, or at its first recorded step."""
+        """Return the speed of an actor the given time before the contact, or at its first recorded step."""
         return float(self.way(actor).speeds[int(np.argmin(np.abs(self.times - before_s)))])
 
     def stood_s(self, actor: str) -> float:
-        """For how long an actor had stood until the contact, in s; 0 if it moved when they touched."""
+        """Return how long an actor had stood still until the contact, in s; 0 if it moved when the actors touched."""
         if self.speed_at_contact(actor) >= STANDS_MPS:
             return 0.0
         found, place = 0.0, None
@@ -475,20 +477,20 @@ class ContactRecord:
         return found
 
     def slowed(self, actor: str, since_s: float) -> float:
-        """Average deceleration of an actor in the last seconds before the contact, in m/s²."""
+        """Return the average deceleration of an actor in the last seconds before the contact, in m/s²."""
         way = self.way(actor)
         back = int(np.argmin(np.abs(self.times - since_s)))
         took = float(self.times[back] - self.times[-1])
         return float(way.speeds[back] - way.speeds[-1]) / took if took > 0 else 0.0
 
     def hardest_braking(self, actor: str) -> float:
-        """The greatest deceleration of an actor between two scenes, in m/s²."""
+        """Return the greatest deceleration of an actor between two scenes, in m/s²."""
         way = self.way(actor)
         steps = -np.diff(self.times)
         return float((-np.diff(way.speeds) / np.maximum(steps, 1e-9)).max(initial=0.0))
 
     def links(self, actor: str) -> tuple[int, ...]:
-        """The places of the ways across a junction that an actor may have been on."""
+        """Return the indices of the connections across a junction that an actor may have used."""
         assert self.right_of_way is not None
         lanes = [
             scene.lanes[scene.roster.index[actor]]
@@ -502,7 +504,7 @@ class ContactRecord:
 
 
 def record_in(scenes: Sequence[Scene], hit: Collision) -> ContactRecord | None:
-    """Return the record of a contact at the end of some scenes, without a map; None if an actor is missing there."""
+    """Return the record of a contact at the end of the given scenes, without a map; None if an actor is missing."""
     agent, other = hit.agent, hit.other
     if not scenes or not all(name in scenes[-1].roster.index for name in (agent, other)):
         return None
@@ -521,17 +523,17 @@ def record_in(scenes: Sequence[Scene], hit: Collision) -> ContactRecord | None:
 
 
 def contact_record(bundle: Bundle, recording: Recording | None = None) -> ContactRecord | None:
-    """Return the record of a collision of two actors; no code of the bundle is run.
+    """Return the record of a collision of two actors; no code of the bundle runs.
 
     Args:
-        bundle: the crash.
-        recording: recording of it, where it has been read already.
+        bundle: the crash to read.
+        recording: recording of the crash, if it has already been read.
 
     Returns:
-        None if there was no contact, or where the last scene lacks one of the two.
+        None if there was no contact, or if one of the two actors is missing in the last scene.
 
     Raises:
-        BundleError: the log is missing or damaged.
+        BundleError: the log of the crash is missing or damaged.
     """
     hit = bundle.result.collision
     if hit is None or not hit.other:

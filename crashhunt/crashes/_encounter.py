@@ -1,4 +1,4 @@
-"""Two actors of a recording: how they stood to each other, and how long the crash could still have been avoided."""
+"""Two actors of a recording: their relative motion, and the time until which the crash could have been avoided."""
 
 from __future__ import annotations
 
@@ -58,14 +58,17 @@ class Moment:
     """The position and speed of the other actor relative to the agent after one step.
 
     Args:
-        step: step of the episode.
-        time_s: simulation time.
+        step: number of the step in the episode.
+        time_s: simulation time after the step, in s.
         speed: speed of the agent, in m/s.
         other_speed: speed of the other actor, in m/s.
-        gap_m: gap between the outlines.
-        closing_speed: speed at which their centres approach each other, in m/s; negative when they part.
-        time_to_collision_s: time to collision at constant velocities; infinite if they would miss each other.
-        required_deceleration: that the agent would need, v / (2 TTC) with v the relative speed, in m/s².
+        gap_m: gap between the outlines of the two actors, in m.
+        closing_speed: speed at which the centres of the actors approach each other, in m/s; negative if they move
+            apart.
+        time_to_collision_s: time to collision at constant velocities, in s; infinite if the actors would miss each
+            other.
+        required_deceleration: deceleration that the agent would need to avoid a collision, v / (2 TTC) with v the
+            relative speed, in m/s².
     """
 
     step: int
@@ -83,8 +86,8 @@ class Position:
     """The position of the other actor relative to the agent.
 
     Args:
-        place: place on which side of it.
-        turn: its heading less the agent's, in rad, within -pi and pi.
+        place: side of the agent on which the other actor is.
+        turn: heading of the other actor minus the heading of the agent, in rad, from -pi to pi.
     """
 
     place: Literal["ahead", "behind", "left", "right"]
@@ -92,7 +95,7 @@ class Position:
 
     @property
     def faces(self) -> Literal["same", "other", "left", "right"]:
-        """The direction of the other actor: same, opposite, or to the agent's left or right."""
+        """The direction of the other actor relative to the agent: same, opposite, or towards its left or right."""
         if abs(self.turn) > math.radians(135):
             return "other"
         if abs(self.turn) > math.radians(45):
@@ -101,12 +104,12 @@ class Position:
 
 
 class Encounter:
-    """The steps of a recording in which two actors were both there.
+    """The steps of a recording in which both of two actors were present.
 
     Args:
         recording: recording of the episode.
-        agent: one of them.
-        other: the other.
+        agent: identifier of the first actor.
+        other: identifier of the second actor.
     """
 
     def __init__(self, recording: Recording, agent: str, other: str) -> None:
@@ -141,7 +144,7 @@ class Encounter:
         return Position("ahead" if ahead > 0 else "behind", turn)
 
     def manner(self, step: int) -> Manner | None:
-        """Return the kind of encounter, as seen at a step; None if one of the actors was absent."""
+        """Return the type of encounter at a step; None if one of the actors was absent."""
         found = self.position(step)
         if found is None:
             return None
@@ -191,7 +194,7 @@ class Encounter:
         ]
 
     def _bent(self, scene: Scene, rows: tuple[int, int], straight_m: float) -> tuple[float, float]:
-        """Return time to collision and gap of a bent and another vehicle; a distant vehicle is treated as straight."""
+        """Return time to collision and gap between an articulated and another vehicle; distant ones are straight."""
         pair = Scene(
             scene.time_s,
             Roster(tuple(scene.roster.actors[row] for row in rows)),
@@ -205,20 +208,20 @@ class Encounter:
 
 
 def last_escape(recording: Recording, agent: str, other: str, *, braking: float) -> int | None:
-    """Return the last step after which full braking would have avoided the crash, as calculated.
+    """Return the last step after which full braking would have avoided the crash, according to a calculation.
 
     The agent follows its recorded path and brakes from that step on. The collision partner repeats its recorded motion,
     and keeps its last velocity after the end of the recording. In reality other actors react, so the result is only an
-    estimate. `crashhunt.escape` runs the trial again.
+    estimate. `find_escape` determines the step by runs.
 
     Args:
         recording: recording of the crash.
-        agent: The agent that brakes.
-        other: The collision partner.
-        braking: deceleration, in m/s².
+        agent: Identifier of the agent that brakes.
+        other: Identifier of the collision partner.
+        braking: deceleration of the braking agent, in m/s².
 
     Returns:
-        None if there was no such step, or if the calculation has no collision even without braking.
+        None if there is no such step, or if no collision is calculated even without braking.
     """
     model = _Model(recording, agent, other)
     if not model.collides_without_braking():
@@ -229,7 +232,7 @@ def last_escape(recording: Recording, agent: str, other: str, *, braking: float)
 
 
 class _Model:
-    """A model of a crash: the other actor moves as recorded, and the agent follows its recorded path."""
+    """A model of a crash: the other actor moves as recorded, and the agent follows its path at another speed."""
 
     def __init__(self, recording: Recording, agent: str, other: str) -> None:
         found = Encounter(recording, agent, other)._scenes
@@ -250,7 +253,7 @@ class _Model:
         ] if scenes else []  # fmt: skip
 
     def collides_without_braking(self) -> bool:
-        """Return whether the recorded actors touch up to the last step, or would touch in the next step."""
+        """Return whether the recorded actors touch up to the last step, or would touch within the next step."""
         last = len(self.steps) - 1
         if last < 1:
             return False
@@ -259,7 +262,7 @@ class _Model:
         return self._touch_on_the_way(last - 1, before, end) or self._touch_on_the_way(last, end, beyond)
 
     def avoids(self, start: int, braking: float) -> bool:
-        """Return whether braking from a scene on avoids every contact until the agent stands."""
+        """Return whether braking from the given scene on avoids every contact until the agent stands still."""
         speed, driven, index = max(0.0, self._speeds[start]), self._path.distances[start], start
         if self._touch(driven, float(index)):
             return False
@@ -273,7 +276,7 @@ class _Model:
         return True
 
     def _touch_on_the_way(self, index: int, driven: float, after: float) -> bool:
-        """Whether the two touch within a step, after its beginning."""
+        """Return whether the two actors touch within a step, after the beginning of the step."""
         (x, y, _), (x_after, y_after, _) = self._other(float(index)), self._other(float(index + 1))
         way = after - driven + math.hypot(x_after - x, y_after - y)
         parts = min(_MOST_PARTS, max(1, math.ceil(way / _PART_M)))
@@ -292,7 +295,7 @@ class _Model:
 
 
 class _Path:
-    """A driven path, and its straight continuation."""
+    """The driven path of an actor, continued in a straight line."""
 
     def __init__(self, poses: list[tuple[float, float, float]]) -> None:
         self._poses = np.array(poses).reshape(-1, 3)
@@ -312,7 +315,7 @@ class _Path:
         return self.between(index - 1, (distance - self.distances[index - 1]) / max(length, 1e-9))
 
     def between(self, index: int, share: float) -> tuple[float, float, float]:
-        """The pose a share of the way from one recorded pose to the next."""
+        """Return the pose at a fraction of the way from one recorded pose to the next."""
         before, after = self._poses[index], self._poses[index + 1]
         x, y = before[:2] + share * (after[:2] - before[:2])
         heading = before[2] + share * math.remainder(after[2] - before[2], math.tau)
@@ -320,7 +323,7 @@ class _Path:
 
 
 def _turned(vectors: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vectors of the map in frames with these headings."""
+    """Return vectors of the map in coordinate frames with the given headings."""
     c, s = np.cos(heading), np.sin(heading)
     return np.stack((vectors[:, 0] * c + vectors[:, 1] * s, vectors[:, 1] * c - vectors[:, 0] * s), axis=1)
 
@@ -338,22 +341,24 @@ _UNKNOWN_S = 4.0  # before the end, a criticality of 0 is unknown: later actors 
 
 @dataclass(frozen=True, slots=True)
 class DangerCourse:
-    """The danger of a recorded trial over time, measured after the fact.
+    """The criticality of a recorded trial over time, computed after the trial.
 
     The criticality is NaN in steps without the agent. It is also NaN if it would be 0 within the last 4 s, because
     it depends on later steps, which were not recorded.
 
     Args:
-        agent: whose.
-        steps: the steps that have a scene.
-        own: The criticality in each of them towards actors ahead of the agent or crossing its path.
-        behind: The rear criticality in each of them: by actors that approach the agent from behind.
-        greatest: the moment of the greatest own danger.
-        greatest_behind: the greatest criticality caused by an actor behind; ``other`` is this actor.
-        nearest: the actor that came nearest to the agent, the gap in m, and the step; None if none came within 50 m.
-        own_total: the integral over the trial, from 0 to below 1: for a trial without a crash and with one agent that
-            is what trials are ranked by.
-        behind_total: likewise.
+        agent: identifier of the agent.
+        steps: numbers of the steps that have a scene.
+        own: The agent's criticality in each of these steps, towards actors ahead of it or crossing its path.
+        behind: The rear criticality in each of these steps, caused by actors that approach the agent from behind.
+        greatest: the moment of the agent's greatest own criticality.
+        greatest_behind: the moment of the greatest criticality caused by an actor behind the agent; ``other`` is this
+            actor.
+        nearest: identifier of the actor that came nearest to the agent, the gap in m, and the step; None if no actor
+            came within 50 m.
+        own_total: integral of the agent's own criticality over the trial, from 0 to below 1. Trials without a crash and
+            with one agent are ranked by this number.
+        behind_total: integral of the rear criticality over the trial, from 0 to below 1.
     """
 
     agent: str
@@ -367,7 +372,7 @@ class DangerCourse:
     nearest: tuple[str, float, int] | None = None
 
     def of_step(self, step: int) -> tuple[float, float] | None:
-        """Return the agent's own criticality of a step and the rear criticality; None if the step has no scene."""
+        """Return the criticality of a trial over time; None if the agent is in no scene."""
         if step not in self.steps:
             return None
         place = self.steps.index(step)
@@ -406,11 +411,11 @@ def danger_course(recording: Recording, agent: str) -> DangerCourse | None:
 def _with_lane_changes(
     scenes: Sequence[Scene], agent: str, own: NDArray[np.float64], greatest: DangerousMoment
 ) -> tuple[NDArray[np.float64], DangerousMoment]:
-    """Return the criticality with that of lane changes towards the vehicles behind in the target lane.
+    """Return the criticality, including lane changes in front of vehicles that approach in the target lane.
 
-    The way of an agent after a lane change does not lead through the vehicles behind it, so `dangers` does not count
-    them. Here the post-encroachment time is the time from the lane change until the vehicle behind reaches the agent's
-    position.
+    After a lane change, the agent's path does not lead through the vehicles behind it, so `dangers` does not count
+    them. In this case, the post-encroachment time is the time from the lane change until the vehicle behind reaches the
+    agent's position.
     """
     own = own.copy()
     for number, (before, after) in enumerate(pairwise(scenes), 1):
@@ -435,13 +440,13 @@ def _with_lane_changes(
 
 
 def _ahead_m(scene: Scene, row: int, other: int) -> float:
-    """Return how far the centre of another actor is ahead of that of an actor, along its heading, in m."""
+    """Return how far the centre of the other actor is ahead of an actor's centre, along that actor's heading, in m."""
     dx, dy = scene.centers[other] - scene.centers[row]
     return float(dx * math.cos(scene.headings[row]) + dy * math.sin(scene.headings[row]))
 
 
 def _behind_in_its_way(scene: Scene, row: int) -> list[int]:
-    """Return the actors behind an actor that drive in its direction, and whose path leads over its position."""
+    """Return the actors that are behind an actor, drive in its direction, and have a path over its position."""
     half = np.array(scene.roster.half_sizes)
     c, s = math.cos(scene.headings[row]), math.sin(scene.headings[row])
     dx, dy = (scene.centers - scene.centers[row]).T
@@ -490,7 +495,7 @@ def _nearest(scenes: Sequence[Scene], steps: Sequence[int], agent: str) -> tuple
 
 
 def closest_actors(recording: Recording, agent: str) -> list[tuple[str, str]]:
-    """Return for each scene the actors with the least time to collision and with the least gap to an agent.
+    """Return for each scene the actor with the least time to collision and the actor with the least gap to an agent.
 
     Args:
         recording: recording of the episode.
@@ -514,7 +519,7 @@ def closest_actors(recording: Recording, agent: str) -> list[tuple[str, str]]:
 
 
 def _to_all(scene: Scene, row: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return time to collision (s) and gap (m) of one actor to each actor of a scene, NaN to itself."""
+    """Return time to collision (s) and gap (m) from one actor to each actor of a scene; NaN for the actor itself."""
     headings, speeds, half = np.array(scene.headings), np.array(scene.speeds), np.array(scene.roster.half_sizes)
     velocities = speeds[:, None] * np.stack((np.cos(headings), np.sin(headings)), axis=1)
     own = np.full(len(headings), headings[row])
@@ -527,7 +532,7 @@ def _to_all(scene: Scene, row: int) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def _only(scene: Scene, measured: NDArray[np.float64], least: float) -> str:
-    """Return the only actor with a measured value; empty if none or several have it."""
+    """Return the only actor with the least measured value; empty if several actors or no actor has it."""
     if not math.isfinite(least):
         return ""
     rows = np.flatnonzero(np.abs(measured - least) <= _EQUAL_TOLERANCE)
@@ -545,7 +550,7 @@ def _outline_gap(one: Rectangle, two: Rectangle) -> float:
 
 
 def most_dangerous(recording: Recording) -> DangerousMoment | None:
-    """Return when which of the controlled vehicles was in the greatest danger; None if none ever was in any."""
+    """Return the moment of the greatest criticality of any controlled vehicle; None if the criticality was always 0."""
     steps = [step.step for step in recording.all_steps if step.scene is not None]
     frames = [scene.frame for scene in recording.scenes()]
     if not frames:
@@ -561,15 +566,15 @@ _REQUIRED_COLUMNS = ("presence", "x", "y")
 
 
 def visible_from(recording: Recording, agent: str, other: str) -> int | None:
-    """Return the first step after which an agent's observation had an actor; None if it never had, or if unknown.
+    """Return the first step after which an agent's observation contained an actor; None if never or unknown.
 
-    The step is known if the observation is a table with a row per actor and positions as in `Kinematics`: x ahead and y
-    to the right, in m. If a row matches no actor, as with noise or delays, the step is unknown.
+    The step is known if the observation is a table with one row per actor and positions as in `Kinematics`: x ahead and
+    y to the right, in m. If a row matches no actor, for example because of noise or delays, the step is unknown.
 
     Args:
         recording: recording of the episode.
-        agent: The agent whose observations are examined.
-        other: The actor to look for.
+        agent: Identifier of the agent whose observations are examined.
+        other: Identifier of the actor to look for.
     """
     names = next((list(one.observation_names) for one in recording.prologue.agents if one.id == agent), [])
     if not all(name in names for name in _REQUIRED_COLUMNS):

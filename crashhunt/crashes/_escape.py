@@ -1,4 +1,4 @@
-"""Until when braking would have avoided a crash, found out by runs as it is confirmed; `judge` is in `replays`."""
+"""The last time at which braking would have avoided a crash, determined by runs when the crash is confirmed."""
 
 from __future__ import annotations
 
@@ -58,22 +58,24 @@ def find_escape(
     run: Callable[[TrialSpec], tuple[TrialResult, Recording]],
     borders: Callable[[], Iterable[Borders]] = tuple,
 ) -> Escape | None:
-    """Return until when braking would have avoided a collision of two actors, or why that is unknown.
+    """Return until when braking would have avoided a collision of two actors, or why that time is unknown.
 
-    Only runs count, no calculation: the same trial once more, in which the agent brakes as hard as it can after some
-    step, and the others react as they then do. The result rests on two runs, one step apart: the first ends without a
+    The result comes from runs, not from a calculation. The same trial runs again, the agent brakes with full force
+    after some step, and the other actors react. The result rests on two runs that differ by one step. The first run
+    ends without a crash, the second in the same crash. If another vehicle drove into the agent from behind, there are
+    no such runs.
         crash, the second in the same crash. If another vehicle drove into the agent from behind, there are no runs.
 
     Args:
-        result: result of the trial.
-        recording: recording of it.
-        braking: how the vehicle brakes; None if it is unknown.
-        run: runs a trial in the same way.
-        borders: returns the borders of the map's lanes, as `LaneMap` needs them, to describe further differences of a
-            run.
+        result: result of the crashed trial.
+        recording: recording of the crashed trial.
+        braking: how the agent's vehicle brakes; None if that is unknown.
+        run: function that runs a trial in the same way as the crashed trial.
+        borders: function that returns the borders of the map's lanes, as `LaneMap` needs them; used to describe further
+            differences of a run.
 
     Returns:
-        None if it was no collision of two actors.
+        The result; None if the crash was not a collision of two actors.
     """
     hit = result.collision
     if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
@@ -96,7 +98,7 @@ def find_escape(
 
 
 def _is_from_behind(recording: Recording, hit: Collision) -> bool:
-    """Whether the front of another actor drove into the rear of the agent, in the same direction."""
+    """Return whether the front of another actor drove into the rear of the agent, in the same direction."""
     record = record_in(recording.scenes(), hit)
     return hit.role == "victim" and record is not None and record.follower == hit.other
 
@@ -114,7 +116,7 @@ class _Search:
     why_not: str = ""
 
     def last(self) -> tuple[int | None, int | None] | None:
-        """Return the last step after which braking helps, and the next, after which it does not."""
+        """Return the last step after which braking avoids the crash, and the next step, after which it does not."""
         assert self.result.collision is not None
         end = self.result.steps
         dt = self.recording.prologue.step_length_s
@@ -151,7 +153,7 @@ class _Search:
         return None
 
     def how(self, deceleration: float) -> str:
-        """A description of the braking, which contains only decelerations that the vehicle reached in a run."""
+        """Return a description of the braking; it contains only decelerations that the vehicle reached in a run."""
         said = self.braking.deceleration
         if said is None:
             return self.braking.how
@@ -162,7 +164,7 @@ class _Search:
         )
 
     def changed(self, lanes: LaneMap) -> tuple[str, ...]:
-        """Return the further differences of the agent in the run from the last step from which braking helps."""
+        """Return the agent's further differences in the run with the latest braking that avoids the crash."""
         if self.latest is None:
             return ()
         assert self.result.collision is not None
@@ -178,7 +180,7 @@ class _Search:
         return Encounter(recording, self.result.collision.agent, self._other)
 
     def _ending(self, after: int) -> Ending:
-        """Run the trial with the agent overruled after a step, and say what became of the crash."""
+        """Run the trial with the agent overruled after a step, and return what happened to the crash."""
         if after in self.endings:
             return self.endings[after]
         if len(self.endings) >= _MAX_RUNS:
@@ -205,14 +207,14 @@ class _Search:
 def overruled_trial(
     result: TrialResult, recording: Recording, after: int, deceleration: float | None, manoeuvre: str = "brake"
 ) -> TrialSpec:
-    """Return the trial of a collision with its agent overruled after a step, long enough to see the result.
+    """Return the trial of a collision with its agent overruled after a step, with enough steps to see the result.
 
     Args:
-        result: result of the trial.
-        recording: recording of it.
-        after: the step.
+        result: result of the crashed trial.
+        recording: recording of the crashed trial.
+        after: the step after which the agent is overruled.
         deceleration: The deceleration with which the vehicle stops, in m/s²; None if it is unknown.
-        manoeuvre: as in `Overruled`.
+        manoeuvre: manoeuvre of the agent, as in `Overruled`.
     """
     assert result.collision is not None
     agent, scene = result.collision.agent, recording.scene(after)
@@ -231,14 +233,14 @@ def ending_of(
     *,
     deceleration: float | None = None,
 ) -> Ending:
-    """Return what became of a collision in a run with its agent overruled after a step.
+    """Return what happened to a collision in a run with its agent overruled after a step.
 
     Args:
-        result: result of the trial.
-        recording: recording of it.
-        after: the step.
-        rerun: what the run came to.
-        rerun_recording: recording of the run.
+        result: result of the crashed trial.
+        recording: recording of the crashed trial.
+        after: the step after which the agent is overruled.
+        rerun: result of the run with the overruled agent.
+        rerun_recording: recording of the run with the overruled agent.
         deceleration: deceleration with which the vehicle can brake, in m/s²; None if it is unknown.
     """
     hit = result.collision
@@ -260,7 +262,7 @@ def ending_of(
 
 
 def _is_over(recording: Recording, agent: str, other: str) -> bool:
-    """Return whether the danger is over: one of the actors has left, stands, or drives elsewhere."""
+    """Return whether the danger is over: one of the two actors has left, stands still, or drives elsewhere."""
     scene = recording.scenes()[-1]
     row = scene.roster.index.get(agent)
     if row is None or other not in scene.roster.index or scene.speeds[row] < _MAX_STANDING_SPEED_MPS:
@@ -269,14 +271,14 @@ def _is_over(recording: Recording, agent: str, other: str) -> bool:
 
 
 def changes_of(recorded: Recording, rerun: Recording, agent: str, lanes: LaneMap, step: int) -> tuple[str, ...]:
-    """Return what else an agent does otherwise in a run: lane changes that are dropped or added after a step.
+    """Return further differences of an agent in a run: lane changes that are missing or new after a step.
 
     Args:
-        recorded: the recorded crash.
-        rerun: the recording of the run.
+        recorded: recording of the crash.
+        rerun: recording of the run.
         agent: identifier of the agent.
-        lanes: around the place of the crash.
-        step: the last step that both have in common.
+        lanes: lanes around the place of the crash.
+        step: the last step that both recordings have in common.
     """
     if not lanes:
         return ()
@@ -287,7 +289,7 @@ def changes_of(recorded: Recording, rerun: Recording, agent: str, lanes: LaneMap
 
 
 def slowing(agent: str, after: int, result: TrialResult, recording: Recording) -> float:
-    """Return how hard a vehicle braked after a step, in m/s², without what a collision itself does to the speed."""
+    """Return how hard a vehicle braked after a step, in m/s², without the change of speed caused by a collision."""
     crashed = result.outcome is not Outcome.SURVIVED and result.outcome is not Outcome.FINISHED
     scenes = recording.scenes()[after : -1 if crashed else None]
     speeds = [scene.speeds[scene.roster.index[agent]] for scene in scenes if agent in scene.roster.index]

@@ -1,4 +1,4 @@
-"""The fault of a collision, by rules with names and sources; undecided if no rule applies or rules contradict."""
+"""The party at fault for a collision, by named rules with sources; undecided if no rule applies or rules disagree."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ _RED_S = 8.0  # after a red light, a junction is left by then
 
 @dataclass(frozen=True, slots=True)
 class FaultFinding:
-    """The verdict of a rule.
+    """The verdict of a fault rule.
 
     Args:
-        rule: its name.
-        blames: The party at fault.
-        words: the evidence, a clause.
-        source: where the rule is from.
+        rule: name of the rule.
+        blames: The party at fault: ``ego``, the other actor, or both.
+        words: the evidence, as a clause of a sentence.
+        source: source of the rule, such as a law or a paper.
     """
 
     rule: str
@@ -85,7 +85,7 @@ def _name_of(case: ContactRecord, actor: str) -> Blame:
 
 
 def _red_light(case: ContactRecord) -> FaultFinding | None:
-    """Blame the party that ran a red light at a junction with traffic from another side; blame both if both did."""
+    """Blame the actor that ran a red light at a junction with traffic from another side; blame both if both did."""
     if case.same_way:
         return None
     ran: dict[str, str] = {}
@@ -103,7 +103,7 @@ def _red_light(case: ContactRecord) -> FaultFinding | None:
 
 
 def _wrong_way(case: ContactRecord) -> FaultFinding | None:
-    """The vehicle that drove against the direction of its lane."""
+    """Blame the vehicle that drove against the direction of its lane."""
     for time_s, event in reversed(case.events):
         if event.kind == "wrong_way" and event.agent in (case.agent, case.other) and case.time_s - time_s <= _RED_S:
             return FaultFinding(
@@ -116,7 +116,7 @@ def _wrong_way(case: ContactRecord) -> FaultFinding | None:
 
 
 def _lane_change(case: ContactRecord) -> FaultFinding | None:
-    """A vehicle changed lanes into an occupied gap, or into a gap too short for the vehicle behind."""
+    """Blame a vehicle that changed lanes into an occupied gap, or into a gap too short for the vehicle behind."""
     if not case.lanes or not case.same_way:
         return None
     changed = {actor: case.changed_s(actor) for actor in (case.agent, case.other)}
@@ -157,7 +157,7 @@ def _lane_change(case: ContactRecord) -> FaultFinding | None:
 
 
 def _into_changed_vehicle(case: ContactRecord, changer: str, source: str) -> FaultFinding | None:
-    """Return the fault of an actor that moves sideways into one that completed its lane change a response time ago."""
+    """Blame an actor that moved sideways into a vehicle whose lane change was complete a response time before."""
     other = case.partner(changer)
     since = case.changed_s(other)
     if since is None or since < _RESPONSE_S - 1e-6 or case.turned(since) > SAME_WAY:
@@ -167,7 +167,7 @@ def _into_changed_vehicle(case: ContactRecord, changer: str, source: str) -> Fau
 
 
 def _cut_in(case: ContactRecord, changer: str, before: float, source: str) -> FaultFinding | None:
-    """Blame a cut-in, by its gap and by what the driver behind could do."""
+    """Blame a vehicle that cut in, by the size of its gap and by what the driver behind could do."""
     other = case.partner(changer)
     back = int(np.argmin(np.abs(case.times - before)))
     if not case.was_off_path(changer, back):
@@ -188,7 +188,7 @@ def _cut_in(case: ContactRecord, changer: str, before: float, source: str) -> Fa
 
 
 def _rear_end(case: ContactRecord) -> FaultFinding | None:
-    """Blame the follower that drove into the back of a vehicle that had been ahead for long."""
+    """Blame the follower that drove into the back of a vehicle that had been ahead of it for long."""
     follower = case.follower
     if not follower or is_person(case.partner(follower)):
         return None
@@ -212,7 +212,7 @@ def _rear_end(case: ContactRecord) -> FaultFinding | None:
 
 
 def _turns_off(case: ContactRecord) -> FaultFinding | None:
-    """Blame the follower that drove straight on into a vehicle that had been ahead for long and was turning off."""
+    """Blame the follower that drove straight on into a turning vehicle that had been ahead of it for long."""
     if _rear_end(case) is not None:
         return None  # it says the same
     for leader in (case.agent, case.other):
@@ -234,7 +234,7 @@ def _turns_off(case: ContactRecord) -> FaultFinding | None:
 
 
 def _steps_out(case: ContactRecord) -> FaultFinding | None:
-    """Blame a person that stepped onto the road too late for any driver to stop, except at junctions and crossings."""
+    """Blame a pedestrian who stepped onto the road too late for drivers to stop, except at junctions and crossings."""
     person, driver = (case.agent, case.other) if is_person(case.agent) else (case.other, case.agent)
     if not is_person(person) or is_person(driver) or not case.is_between_junctions(person, driver):
         return None
@@ -255,7 +255,7 @@ def _steps_out(case: ContactRecord) -> FaultFinding | None:
 
 
 def _standing(case: ContactRecord) -> FaultFinding | None:
-    """Blame the party that drove into an actor that had stood still for longer than stopping takes."""
+    """Blame the actor that drove into an actor that had stood still for longer than the stopping time."""
     mover = case.collider
     actor = case.partner(mover)
     its = case.way(mover)
@@ -270,7 +270,7 @@ def _standing(case: ContactRecord) -> FaultFinding | None:
 
 
 def _right_of_way(case: ContactRecord) -> FaultFinding | None:
-    """The vehicle that had to give way according to the map, at junctions without traffic lights."""
+    """Blame the vehicle that had to yield according to the map, at junctions without traffic lights."""
     rights = case.right_of_way
     if rights is None or case.turn < _MAX_MERGE_ANGLE_RAD or not case.before:
         return None
@@ -317,8 +317,8 @@ class Fault:
     """The vehicle at fault for a crash.
 
     Args:
-        verdict: ``ego`` is the controlled vehicle that it happened to.
-        findings: The findings of the rules; they may contradict each other if the fault is undecided.
+        verdict: the vehicle at fault; ``ego`` is the controlled vehicle that crashed.
+        findings: The verdicts of the rules; they contradict each other in some undecided cases.
     """
 
     verdict: Verdict
@@ -326,11 +326,11 @@ class Fault:
 
     @property
     def is_egos(self) -> bool:
-        """Return whether the agent, or both actors, were at fault."""
+        """Return whether the agent was at fault, alone or together with the other actor."""
         return self.verdict in ("ego", "both")
 
     def to_json(self) -> JsonObject:
-        """Return plain data."""
+        """Return the fault as JSON-compatible data."""
         return {
             "verdict": self.verdict,
             "findings": [
@@ -341,15 +341,15 @@ class Fault:
 
 
 def fault_of(bundle: Bundle, recording: Recording | None = None, record: ContactRecord | None = None) -> Fault:
-    """Return the vehicle at fault for a crash; no code of the bundle is run.
+    """Return the vehicle at fault for a crash; no code of the bundle runs.
 
     Args:
-        bundle: the crash.
+        bundle: the crash to examine.
         recording: recording of the crash, if it has already been read.
         record: record of the contact, if it has already been made.
 
     Raises:
-        BundleError: its log is missing or damaged.
+        BundleError: the log of the crash is missing or damaged.
     """
     result = bundle.result
     hit = result.collision
@@ -378,7 +378,7 @@ def fault_of(bundle: Bundle, recording: Recording | None = None, record: Contact
 
 
 def fault_in(case: ContactRecord) -> Fault:
-    """Return what the rules say of a collision."""
+    """Return the fault for a collision according to the rules."""
     if case.time_s - case.began_s < 1.0 or len(case.before) < 2:
         return Fault("nobody can tell")  # it was put there
     if case.is_disputed:

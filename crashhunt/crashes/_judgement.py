@@ -1,4 +1,4 @@
-"""Results of runs of a collision with its agent overridden: until when and how the collision could be avoided."""
+"""Results of runs in which the agent of a collision is overruled: until when and how the collision could be avoided."""
 
 from __future__ import annotations
 
@@ -41,13 +41,14 @@ _Z = 1.959963984540054  # of 95 % confidence
 
 @dataclass(frozen=True, slots=True)
 class LeftOut(Serializable):
-    """One run.
+    """One run without a suspected cause.
 
     Args:
-        given: The other value of an argument or seed; for every other cause, the step after which it was suppressed.
-        ending: The result of the run.
-        into: The actor into which a vehicle with held speed drove itself; empty if there was none.
-        changed: Further differences of the agent in the run, such as ``ego does not change lanes``.
+        given: The other value of an argument or seed; for every other factor, the step after which the factor was
+            suppressed.
+        ending: The outcome of the run.
+        into: The actor that was hit by a vehicle whose speed was held constant; empty if there was none.
+        changed: Further differences in the agent's behaviour in the run, such as ``ego does not change lanes``.
     """
 
     given: Value
@@ -58,16 +59,17 @@ class LeftOut(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Factor(Serializable):
-    """Something that may be why, and the runs without it.
+    """A possible cause of a crash, and the runs without it.
 
     Args:
         kind: ``argument``, ``seed``, ``disturbance``, ``other`` (a manoeuvre of another actor) or ``agent``.
         name: name of the argument or actor.
-        what: of an argument ``default`` or ``drawn``; of a disturbance its kind; of the others ``braked``, ``sped up``,
-            ``changed lanes``, and ``there`` for that it was there at all.
-        step: after which it did that, or at which the disturbance began; None of arguments and seeds.
-        was: the value of an argument or a seed; the speed in m/s to which a vehicle was held; None for nothing.
-        runs: runs without it.
+        what: for an argument ``default`` or ``drawn``; for a disturbance its type; else ``braked``, ``sped up``,
+            ``changed lanes``, or ``there`` if the presence of the actor is the factor.
+        step: the step after which the actor did this, or at which the disturbance began; None for arguments and seeds.
+        was: the value of an argument or a seed, or the speed in m/s at which a vehicle was held; None if neither
+            applies.
+        runs: the runs without the factor.
     """
 
     kind: str
@@ -81,41 +83,41 @@ class Factor(Serializable):
 
     @property
     def clear(self) -> int:
-        """The number of runs with a clear result."""
+        """The number of runs with a clear outcome."""
         return sum(run.ending != "unclear" for run in self.runs)
 
     @property
     def crashed(self) -> int:
-        """Number of these runs that crashed, in any way."""
+        """The number of runs with a clear outcome that crashed in any way."""
         return sum(run.ending in ("same", "other") for run in self.runs)
 
     @property
     def same(self) -> int:
-        """In how many the same two collided."""
+        """The number of runs in which the same two actors collided."""
         return sum(run.ending == "same" for run in self.runs)
 
     @property
     def needed(self) -> bool | None:
-        """True if no run without the factor crashed, False if all crashed; None if runs differ or are unclear."""
+        """Whether the crash needs the factor: True if no run without it crashed, False if all did, else None."""
         if not self.clear:
             return None
         return True if self.crashed == 0 else False if self.crashed == self.clear else None
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """The interval of the share of such runs that crash, with 95 % confidence (Wilson's)."""
+        """The 95 % confidence interval (Wilson) for the share of runs without the factor that crash."""
         return wilson(self.crashed, self.clear) if self.clear else None
 
 
 @dataclass(frozen=True, slots=True)
 class Why(Serializable):
-    """The results of an analysis.
+    """The results of a counterfactual analysis.
 
     Args:
-        factors: factors in the order in which they were looked at.
+        factors: the factors, in the order in which they were examined.
         steps: number of steps after which a run with other arguments or seeds ended if it did not crash.
-        left: number of further runs that the limit prevented.
-        why_not: why there is no answer, or not a whole one; empty if there is.
+        left: number of further runs that were skipped because of the limit.
+        why_not: why the answer is missing or incomplete; empty if the answer is complete.
     """
 
     factors: tuple[Factor, ...] = ()
@@ -127,15 +129,15 @@ class Why(Serializable):
 
     @property
     def runs(self) -> int:
-        """Number of trials that were run, without the unchanged one."""
+        """Number of trials that were run, not counting the unchanged trial."""
         return sum(len(factor.runs) for factor in self.factors)
 
 
 def why_from(data: Any) -> Why | None:
-    """Return the `Why` of the data of `Why.to_json`; None for no data.
+    """Return the `Why` that `Why.to_json` converted to data; None if there is no data.
 
     Raises:
-        ValueError, KeyError, TypeError: it is damaged.
+        ValueError, KeyError, TypeError: the data is damaged.
     """
     if data is None:
         return None
@@ -158,16 +160,16 @@ def why_from(data: Any) -> Why | None:
 
 
 def wilson(found: int, of: int) -> tuple[float, float]:
-    """Return the interval of a share, with 95 % confidence.
+    """Return the 95 % confidence interval of a proportion by Wilson's method.
 
-    E. B. Wilson, *Probable inference, the law of succession, and statistical inference*, 1927.
+    Source: E. B. Wilson, *Probable inference, the law of succession, and statistical inference*, 1927.
 
     >>> low, high = wilson(3, 20)
     >>> f"{low:.3f} to {high:.3f}"
     '0.052 to 0.360'
 
     Args:
-        found: how many.
+        found: number of runs with the outcome.
         of: number of all runs; at least 1.
     """
     share, spread = found / of, _Z * _Z / of
@@ -189,14 +191,15 @@ avoidable, so the trial says nothing about the agent. The verdict ``unknown`` me
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One manoeuvre, tried from several steps on.
+    """One evasive manoeuvre, tried from several steps on.
 
     Args:
-        manoeuvre: as in `Overruled`.
-        end: the step of the crash.
-        endings: step to what became of it where the agent was overruled after that step.
-        deceleration: the greatest in the runs that avoided the crash, in m/s²; None if it never slowed down.
-        changed: What else the agent does otherwise in the run from the last step that avoids the crash.
+        manoeuvre: name of the manoeuvre, as in `Overruled`.
+        end: number of the step in which the crash happened.
+        endings: what happened to the crash, by the step after which the agent was overruled.
+        deceleration: the greatest deceleration in the runs that avoided the crash, in m/s²; None if the vehicle never
+            slowed down.
+        changed: Further differences in the agent's behaviour, in the run from the last step that avoids the crash.
     """
 
     manoeuvre: str
@@ -207,12 +210,12 @@ class Attempt:
 
     @property
     def last_step(self) -> int | None:
-        """The last step after which a run avoided it; None if none did."""
+        """The last step from which a run avoided the crash; None if no run avoided it."""
         return max((step for step, ending in self.endings.items() if ending == "avoided"), default=None)
 
     @property
     def too_late_step(self) -> int | None:
-        """The step after the last avoidable step, if its run crashed; else the first crashed one."""
+        """The step after the last avoidable step, if its run crashed; otherwise the first step whose run crashed."""
         last = self.last_step
         crashed = [step for step, ending in self.endings.items() if ending in ("hit", "other")]
         if last is None:
@@ -221,15 +224,15 @@ class Attempt:
 
     @property
     def all_later_run(self) -> bool:
-        """Whether a run from every later step up to the crash was made, and crashed."""
+        """Whether runs from all later steps up to the crash were made and all of them crashed."""
         return self.in_vain_from(0 if self.last_step is None else self.last_step + 1)
 
     def in_vain_from(self, step: int) -> bool:
-        """The step from which on every run up to the crash was made, and crashed; None if there is none."""
+        """The first step from which on runs from all steps up to the crash crashed; None if there is no such step."""
         return all(self.endings.get(each) in ("hit", "other") for each in range(step, self.end))
 
     def to_json(self) -> JsonObject:
-        """Return plain data."""
+        """Return the attempt as JSON-compatible data."""
         return {
             "manoeuvre": self.manoeuvre,
             "endings": {str(step): self.endings[step] for step in sorted(self.endings)},
@@ -243,14 +246,15 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """The results of all manoeuvres; every result is from a run.
+    """The results for all evasive manoeuvres of the agent; every result comes from a run.
 
     Args:
-        attempts: a manoeuvre each.
-        why_not: why there is no answer, or not a whole one; empty if there is.
+        attempts: the results, one for each manoeuvre.
+        why_not: why the answer is missing or incomplete; empty if the answer is complete.
         why: The causes of the collision; None if they were not examined.
-        visible_step: The step after which an observation first had the collision partner; None if it is unknown.
-        reference: What runs with a reference driver have shown; None if there were none.
+        visible_step: The step after which an observation of the agent first contained the collision partner; None if
+            that is unknown.
+        reference: The results of runs with a reference driver; None if there were no such runs.
     """
 
     attempts: tuple[Attempt, ...] = ()
@@ -261,7 +265,7 @@ class Judgement:
 
     @property
     def verdict(self) -> JudgementVerdict:
-        """The verdict: whether the agent could avoid the crash after it could observe the other vehicle."""
+        """The verdict: whether the agent could have avoided the crash after it first observed the other vehicle."""
         best, visible = self.best, self.visible_step
         if self.avoidable is False and self.attempts[0].endings[0] == "hit":
             return "invalid"
@@ -273,7 +277,7 @@ class Judgement:
 
     @property
     def is_interrupted(self) -> bool:
-        """Whether the user interrupted the analysis, so that another run may add results."""
+        """Whether the user interrupted the analysis; running it again may then add results."""
         parts = (self.why, self.reference)
         return INTERRUPTED in (self.why_not, *(part.why_not for part in parts if part is not None))
 
@@ -284,13 +288,13 @@ class Judgement:
 
     @property
     def best(self) -> Attempt | None:
-        """The manoeuvre that helps longest; braking, where another helps no longer."""
+        """The manoeuvre that avoids the crash from the latest step; the first of several that are equally good."""
         helping = [attempt for attempt in self.attempts if attempt.last_step is not None]
         return max(helping, key=lambda attempt: attempt.last_step or 0, default=None)
 
     @property
     def avoidable(self) -> bool | None:
-        """Whether a run avoided the crash; False if no run did, even from the first step; None if it is unknown."""
+        """Whether the crash was avoidable: True if a run avoided it, False if all runs crashed, else None."""
         if self.best is not None:
             return True
         from_the_first = [attempt.endings.get(0) in ("hit", "other") for attempt in self.attempts]
@@ -298,7 +302,7 @@ class Judgement:
         return False if from_the_first and all(from_the_first) and settled and not self.why_not else None
 
     def to_json(self) -> JsonObject:
-        """Return plain data."""
+        """Return the judgement as JSON-compatible data."""
         best = self.best
         found: JsonObject = {
             "avoidable": self.avoidable,
@@ -318,7 +322,7 @@ class Judgement:
 
 
 def judgement_of(bundle: Bundle) -> Judgement | None:
-    """Return the result of `judge` in a bundle; None if there is none, or if it cannot be read."""
+    """Return the stored result of `judge` for a bundle; None if it is missing or cannot be read."""
     data: Any = bundle.added.get(_CRASH_JSON_KEY)
     try:
         attempts = []
@@ -349,5 +353,5 @@ def judgement_of(bundle: Bundle) -> Judgement | None:
 
 
 def with_judgement(bundle: Bundle, judgement: Judgement) -> Bundle:
-    """Return a bundle with a judgement, to be written."""
+    """Return a copy of a bundle that contains a judgement, to be written."""
     return replace(bundle, added={**bundle.added, _CRASH_JSON_KEY: judgement.to_json()})

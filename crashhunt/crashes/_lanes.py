@@ -1,4 +1,4 @@
-"""The lanes around the place of a crash: lane changes of its actors, and whether lanes cross there."""
+"""The lanes around the place of a crash: finds lane changes of the actors, and places where lanes cross."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class _Place:
 
 
 class _Lane:
-    """The centre line of a lane."""
+    """The centre line and the borders of a lane."""
 
     def __init__(self, right: NDArray[np.float64], left: NDArray[np.float64]) -> None:
         self.points = (right + left) / 2
@@ -58,7 +58,7 @@ class _Lane:
         self._high_x, self._high_y = map(float, self.points.max(axis=0) + margin)
 
     def may_hold(self, point: NDArray[np.float64]) -> bool:
-        """Whether a point is in the box around the lane; outside of it, a point is not in the lane either."""
+        """Return whether a point is in the bounding box of the lane; a point outside of it is never in the lane."""
         x, y = map(float, point)
         return self._low_x <= x <= self._high_x and self._low_y <= y <= self._high_y
 
@@ -80,7 +80,7 @@ class _Lane:
 
 
 class LaneMap:
-    """The lanes around a place.
+    """The lanes around a place of the map.
 
     Args:
         borders: borders of each lane of the map, right and left, shape (n, 2) each, in m; as
@@ -103,7 +103,7 @@ class LaneMap:
         return bool(self._lanes)
 
     def cross(self, point: tuple[float, float]) -> bool:
-        """Whether lanes of different directions lie over each other there, in m."""
+        """Return whether lanes of different directions overlap at a point; coordinates are in m."""
         spot = np.array(point)
         headings = [
             place.heading
@@ -117,14 +117,14 @@ class LaneMap:
         )
 
     def leaves_sideways(self, scenes: Sequence[Scene], actor: str) -> bool:
-        """Whether an actor leaves a lane over its side, and continues next to it.
+        """Return whether an actor leaves a lane over its side border, and then drives next to the lane.
 
         An actor that drives over the end of its lane, or turns off, does not count.
         """
         return self.left_sideways(scenes, actor) is not None
 
     def left_sideways(self, scenes: Sequence[Scene], actor: str) -> int | None:
-        """Return the place of the last scene before which an actor left a lane over its side; None if it did not."""
+        """Return the index of the last scene before an actor left a lane over its side; None if it did not."""
         poses = _poses(scenes, actor)
         return next(
             (
@@ -136,9 +136,9 @@ class LaneMap:
         )
 
     def change_began(self, scenes: Sequence[Scene], actor: str) -> int | None:
-        """Return the place of the scene after which an actor began its last lane change; None if it made none.
+        """Return the index of the scene after which an actor began its last lane change; None if it made none.
 
-        One that is not complete in the end counts as well.
+        A lane change that is incomplete in the last scene counts as well.
         """
         poses = _poses(scenes, actor)
         left = self.left_sideways(scenes, actor)
@@ -157,7 +157,7 @@ class LaneMap:
         return places[begin]
 
     def reaches_over(self, scenes: Sequence[Scene], actor: str) -> bool:
-        """Whether an actor at the end reaches into a neighbouring lane after moving towards it."""
+        """Return whether, in the last scene, an actor reaches into a neighbouring lane after moving towards it."""
         poses = _poses(scenes, actor)
         if not poses:
             return False
@@ -181,7 +181,7 @@ class LaneMap:
         return False
 
     def _driven(self, pose: tuple[NDArray[np.float64], float]) -> _Lane | None:
-        """The lane along which it drives: of several that lie over each other, the one whose middle is nearest."""
+        """Return the lane on which an actor drives; of overlapping lanes, the lane with the nearest centre line."""
         point, heading = pose
         found = [
             (abs(place.aside_m), number, lane)
@@ -203,7 +203,7 @@ class LaneMap:
         return self._is_in_parallel_lane(lane, point, place.heading)
 
     def _is_in_parallel_lane(self, lane: _Lane, point: NDArray[np.float64], heading: float) -> bool:
-        """Whether a point lies in another lane that leads the same way."""
+        """Return whether a point lies in another lane that leads in the same direction."""
         return any(
             abs(other.aside_m) <= near.half_width
             and abs(math.remainder(other.heading - heading, math.tau)) < _MAX_DRIVING_ANGLE_RAD
@@ -214,7 +214,7 @@ class LaneMap:
 
 
 def _poses(scenes: Sequence[Scene], actor: str) -> list[tuple[int, tuple[NDArray[np.float64], float]]]:
-    """Return the positions and headings of an actor, each with the index of its scene."""
+    """Return the poses (position and heading) of an actor, each with the index of its scene."""
     return [
         (place, (np.array(scene.points[row]), scene.headings[row]))
         for place, scene in enumerate(scenes)

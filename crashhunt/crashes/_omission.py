@@ -1,4 +1,4 @@
-"""Results of runs with a reference driver: what the agent omitted, since when, and for which actor."""
+"""Results of runs with a reference driver: what the agent failed to do, since when, and for which actor."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Without = Literal["same", "other", "none", "unclear"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReferenceRun(Serializable):
-    """One run in which a reference driver takes a faculty over.
+    """One run in which a reference driver controls a part of the agent's driving.
 
     Args:
-        faculty: ``longitudinal``, ``lateral`` or ``both``.
-        step: the step after which the reference driver takes over.
-        ending: what became of the crash: ``none``, ``same``, ``other`` or ``unclear``.
+        faculty: the controlled part: ``longitudinal``, ``lateral`` or ``both``.
+        step: the step after which the reference driver takes control.
+        ending: what happened to the crash: ``none``, ``same``, ``other`` or ``unclear``.
         changed: further differences from the recorded crash, such as ``ego does not change lanes``.
     """
 
@@ -32,20 +32,23 @@ class ReferenceRun(Serializable):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Omission(Serializable):
-    """An omission of an agent. Without the omission there is no crash, in every run.
+    """An omission: something that the agent failed to do. In every run without the omission, there is no crash.
 
     Args:
-        faculty: faculty with which a reference driver avoids the crash: ``longitudinal``, ``lateral`` or ``both``.
-        kind: what the agent disregarded. On its path: ``vehicle``, ``red light`` or ``crossing``, an actor whose path
-            crosses. In a lane change: ``ahead``, ``behind``, ``alongside`` or ``no lane``, followed by the side.
-        actor: the actor that it disregarded; empty for a red light and a missing lane.
+        faculty: the part of the driving with which a reference driver avoids the crash: ``longitudinal``, ``lateral``
+            or ``both``.
+        kind: what the agent disregarded. On its path: ``vehicle``, ``red light`` or ``crossing`` (an actor with a
+            crossing path). In a lane change: ``ahead``, ``behind``, ``alongside`` or ``no lane``, followed by the side.
+        actor: identifier of the disregarded actor; empty for a red light and for a missing lane.
         step: the step after which the omission began.
-        instead: what the agent did: ``sped up``, ``kept its speed``, ``braked too little`` or ``changed lanes``.
+        instead: what the agent did instead: ``sped up``, ``kept its speed``, ``braked too little`` or ``changed
+            lanes``.
         speed_mps: speed of the agent after that step, in m/s.
-        actor_speed_mps: actor speed of the actor, in m/s; None without an actor.
-        gap_m: gap between them, in m; negative alongside each other; None without an actor or a stop line.
-        safe: the safe speed for that gap in m/s; in a lane change the safe gap in m; None for a missing lane.
-        visible_step: the step after which an observation first had the actor; None if that is unknown.
+        actor_speed_mps: speed of the disregarded actor, in m/s; None if there is no such actor.
+        gap_m: gap between the agent and the actor or stop line, in m; negative if the vehicles are side by side. None
+            without an actor or a stop line.
+        safe: the safe speed for that gap, in m/s; for a lane change, the safe gap in m; None for a missing lane.
+        visible_step: the step after which an observation first contained the actor; None if the step is unknown.
     """
 
     faculty: str
@@ -65,8 +68,8 @@ class Reference(Serializable):
     """The results of the runs with a reference driver.
 
     Args:
-        omission: the cause; None if no run says so.
-        runs: all runs with a reference driver that acts.
+        omission: the omission that caused the crash; None if the runs show none.
+        runs: all runs in which a reference driver acted.
         why_not: why the result is missing or incomplete; empty if it is complete.
     """
 
@@ -76,7 +79,7 @@ class Reference(Serializable):
 
     @property
     def deciding(self) -> tuple[ReferenceRun, ...]:
-        """The runs on which the omission rests: those with its faculty, from its step or up to 1 s earlier."""
+        """The runs on which the omission rests: of the same part of the driving, from its step or up to 1 s earlier."""
         omission = self.omission
         if omission is None:
             return ()

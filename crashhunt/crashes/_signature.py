@@ -1,4 +1,4 @@
-"""The signature of a crash: what makes two crashes the same one."""
+"""The signature of a crash: the properties by which two crashes count as the same crash type."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ _LIBRARY_PATH = re.compile(r"(site|dist)-packages|python3\.\d+")
 
 @dataclass(frozen=True, slots=True)
 class StackFrame:
-    """A call.
+    """A function call in a traceback.
 
     Args:
-        file: file in which it is.
-        line: line of the file, counted from 1.
-        function: function in which it is.
+        file: path of the source file.
+        line: line in the source file, counted from 1.
+        function: name of the function.
     """
 
     file: PurePath
@@ -55,7 +55,7 @@ class StackFrame:
 
 
 def own_frames(failure: Failure) -> list[StackFrame]:
-    """Return the calls in the agent's own code, the innermost first; without any, the calls in libraries."""
+    """Return the calls in the agent's own code, the innermost first; if there are none, the calls in libraries."""
     frames = _frames(failure.traceback) or _frames(failure.last_output)
     ours = [
         number
@@ -67,7 +67,7 @@ def own_frames(failure: Failure) -> list[StackFrame]:
 
 
 def _frames(text: str) -> list[StackFrame]:
-    """Each call, the innermost first."""
+    """Return each call of a traceback, the innermost first."""
     found = [
         StackFrame(PurePath(match["file"]), int(match["line"]), match["function"])
         for match in _FRAME_LINE.finditer(text)
@@ -92,20 +92,21 @@ _NUMBERS = re.compile(r"0x[0-9a-fA-F]+|-?\d+(\.\d+)?")
 
 @dataclass(frozen=True, slots=True, order=True)
 class Signature(Serializable):
-    """The properties that define a crash type. No speeds, ids and times: they differ from trial to trial.
+    """The properties that define a crash type. Speeds, ids and times are excluded because they differ between trials.
 
     Args:
-        outcome: how the trial ended.
-        role: the agent's: ``collider``, ``victim``, ``alone``; empty if it is no collision.
+        outcome: outcome of the trial.
+        role: role of the agent: ``collider``, ``victim`` or ``alone``; empty if the crash is not a collision.
         manner: The manner of a collision: ``rear end``, ``side swipe``, ``crossing from the left`` (the side of the
-            collision partner), ``crossing from the right``, ``head-on``, ``pedestrian`` or ``off road``. Of a Gymnasium
-            environment, the kind that it names, or its crash rule. For a traffic event, its type. For a software fault,
-            the exception, signal or exit code.
-        lane_change: the actors that were changing lanes: ``agent``, ``other``, ``both`` or empty.
-        place: ``crossing`` where lanes of different directions lie over each other, ``road`` elsewhere; empty if
-            the map is not known, or it is no matter of place.
-        where: of a software fault, the innermost functions of the agent's, or what is said where there are none.
-        disturbed: whether disturbances took place before it; in undisturbed traffic it is another crash.
+            collision partner), ``crossing from the right``, ``head-on``, ``pedestrian`` or ``off road``. For a
+            Gymnasium environment, the crash type that it reports, or its crash rule. For a traffic event, the type of
+            the event. For a software fault, the exception, signal or exit code.
+        lane_change: which of the two actors were changing lanes: ``agent``, ``other``, ``both`` or empty.
+        place: ``crossing`` where lanes of different directions overlap, ``road`` elsewhere; empty if the map is
+            unknown, or if the place does not matter.
+        where: for a software fault, the innermost functions of the agent's code; without any, the text of the message.
+        disturbed: whether the agent was disturbed before the crash; a crash in undisturbed traffic is a different crash
+            type.
     """
 
     outcome: str
@@ -126,15 +127,15 @@ class Signature(Serializable):
 
 
 def signature_of(bundle: Bundle, recording: Recording | None = None, record: ContactRecord | None = None) -> Signature:
-    """Return the signature of a crash; no code of the bundle is run.
+    """Return the signature of a crash; no code of the bundle runs.
 
     Args:
-        bundle: the crash.
+        bundle: the crash to describe.
         recording: recording of the crash, if it has already been read.
         record: record of the contact, if it has already been made.
 
     Raises:
-        BundleError: its log is missing or damaged.
+        BundleError: the log of the crash is missing or damaged.
     """
     result = bundle.result
     hit = result.collision
@@ -173,7 +174,7 @@ def _place(lanes: LaneMap, hit: Collision) -> str:
 
 
 def signature_of_fault(result: TrialResult) -> Signature:
-    """Return the signature of a crash that is no collision, from what its trial came to; disturbances do not count."""
+    """Return the signature of a crash that is not a collision, from its trial's result; disturbances do not count."""
     outcome, failure, event = str(result.outcome), result.failure, result.event
     if event is not None:
         return Signature(outcome, manner=event.kind)
@@ -183,12 +184,12 @@ def signature_of_fault(result: TrialResult) -> Signature:
 
 
 def _failure_type(failure: Failure) -> str:
-    """The exception's type; of a process that died, of what."""
+    """Return the type of a failure: the exception's type, or how the process died."""
     return f"{failure.kind} {failure.exit_code}" if failure.exit_code is not None else failure.kind
 
 
 def _innermost_frames(failure: Failure) -> str:
-    """Return the innermost functions of the agent, or without any, the message without its numbers."""
+    """Return the innermost functions of the agent; if there are none, the message without its numbers."""
     chosen = own_frames(failure)
     if chosen:
         return " < ".join(f"{frame.file.name}:{frame.function}" for frame in chosen[:_MAX_FRAMES])

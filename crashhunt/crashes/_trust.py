@@ -1,4 +1,4 @@
-"""Decides whether the code of a crash may run: it was made here, is trusted, or is in this repository."""
+"""Decide whether the code of a crash may run: code made here, trusted code, or code of this repository."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ _MIN_FINGERPRINT_CHARACTERS = 6  # characters of a fingerprint that name an orig
 
 @dataclass(frozen=True, slots=True)
 class TrustedOrigin:
-    """Code that this user trusts.
+    """Code that this user has decided to trust.
 
     Args:
         fingerprint: SHA-256 of everything that determines the code that would run, in hexadecimal.
-        path: its path when the user trusted it.
-        runs: what would run, in words.
-        trusted_at: when, as UTC.
+        path: path of the code when the user trusted it.
+        runs: a description of what would run, in words.
+        trusted_at: time (UTC) at which the user trusted the code.
     """
 
     fingerprint: str
@@ -78,20 +78,20 @@ class TrustedOrigin:
 
     @property
     def id(self) -> str:
-        """The beginning of the fingerprint, which names the origin."""
+        """The beginning of the fingerprint, which identifies the trusted code."""
         return self.fingerprint[:_FINGERPRINT_CHARACTERS]
 
 
 def add_trusted(fingerprint: str, *, path: str, runs: str) -> TrustedOrigin:
-    """Trust code from now on, and return the entry.
+    """Mark code as trusted from now on, and return the new entry.
 
     Args:
         fingerprint: fingerprint of the code.
-        path: its present path.
-        runs: what would run, in words.
+        path: present path of the code.
+        runs: a description of what would run, in words.
 
     Raises:
-        HuntDirectoryError: no folder can keep the entry.
+        HuntDirectoryError: the entry cannot be stored in any folder.
     """
     now = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
     origin = TrustedOrigin(fingerprint=fingerprint, path=path, runs=runs, trusted_at=now)
@@ -112,7 +112,7 @@ def add_trusted(fingerprint: str, *, path: str, runs: str) -> TrustedOrigin:
 
 
 def list_trusted() -> list[TrustedOrigin]:
-    """Return everything that this user trusts, the oldest first."""
+    """Return all code that this user trusts, the oldest entry first."""
     names = {field.name for field in fields(TrustedOrigin)}
     found: dict[str, TrustedOrigin] = {}
     for folder in _folders():
@@ -131,13 +131,13 @@ def is_fingerprint_trusted(fingerprint: str) -> bool:
 
 
 def remove_trusted(names: Sequence[str]) -> list[TrustedOrigin]:
-    """Trust some origins no longer, and return them.
+    """Remove entries from the trusted code, and return the removed entries.
 
     Args:
-        names: for each, the beginning of its fingerprint, or the path that it was trusted at.
+        names: for each entry, the beginning of its fingerprint, or the path at which the code was trusted.
 
     Raises:
-        UsageError: a name matches no trusted origin, or several; then none is removed.
+        UsageError: a name matches no entry, or several entries; then no entry is removed.
         HuntDirectoryError: an entry cannot be removed.
     """
     known = list_trusted()
@@ -168,11 +168,11 @@ def _folders() -> list[Path]:
 
 
 def is_bundle_trusted(bundle: Bundle, *, faults: Sequence[str] | None = None) -> bool:
-    """Return whether the code of a crash may run without asking.
+    """Return whether the code of a crash may run without a confirmation by the user.
 
     Args:
-        bundle: the crash.
-        faults: the faults of its snapshot, if they are already known.
+        bundle: the crash whose code would run.
+        faults: the faults of the crash's snapshot, if they are already known.
     """
     try:
         snapshot = snapshot_of(bundle)
@@ -195,7 +195,7 @@ def is_bundle_trusted(bundle: Bundle, *, faults: Sequence[str] | None = None) ->
 
 
 def is_snapshot_trusted(snapshot: Snapshot) -> bool:
-    """Return whether the code of a snapshot may run without asking."""
+    """Return whether the code of a snapshot may run without a confirmation by the user."""
     try:
         if snapshot.faults():
             return False
@@ -205,11 +205,11 @@ def is_snapshot_trusted(snapshot: Snapshot) -> bool:
 
 
 def is_hunt_trusted(hunt: Path, snapshot: Snapshot) -> bool:
-    """Return whether what the settings of a hunt name may run without asking.
+    """Return whether the code that a hunt's settings name may run without a confirmation by the user.
 
     Args:
-        hunt: its directory.
-        snapshot: the latest of the hunt.
+        hunt: directory of the hunt.
+        snapshot: latest snapshot of the hunt.
     """
     try:
         settings = read_settings(hunt / layout.HUNT)
@@ -222,11 +222,11 @@ def is_hunt_trusted(hunt: Path, snapshot: Snapshot) -> bool:
 
 
 def trust_snapshot(snapshot: Snapshot, path: Path) -> TrustedOrigin:
-    """Trust the code of a snapshot from now on, and return the entry.
+    """Mark the code of a snapshot as trusted from now on, and return the new entry.
 
     Args:
         snapshot: snapshot of a hunt or a corpus.
-        path: what the user named.
+        path: path that the user gave.
 
     Raises:
         BundleError: the snapshot is damaged.
@@ -238,7 +238,7 @@ def trust_snapshot(snapshot: Snapshot, path: Path) -> TrustedOrigin:
 
 
 def describe_code(snapshot: Snapshot, settings: HuntSettings) -> str:
-    """Return in words what would run: the agents and crashhunt, and from where."""
+    """Return a description of the code that would run: the agents and crashhunt, with their paths."""
     names = {agent.agent for agent in settings.agents.values()}
     names |= {oracle for oracle in settings.oracles if ":" in oracle}
     with suppress(CrashhuntError):  # a scenario that cannot be read runs nothing
@@ -251,12 +251,12 @@ def describe_code(snapshot: Snapshot, settings: HuntSettings) -> str:
 
 
 def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> UntrustedError:
-    """Return the refusal to run the code of a crash.
+    """Return the error that refuses to run the code of a crash.
 
     Args:
-        bundle: the crash.
+        bundle: the crash whose code is not trusted.
         where: the path that the user gave; empty for the folder of the crash.
-        made_by: name of the tool that made it, according to the file.
+        made_by: name of the tool that made the file, according to the file itself.
     """
     place = where or str(bundle.path)
     fix = f"if you trust that code, run crashhunt trust {shlex.quote(place)} once, or add --trust"
@@ -286,7 +286,7 @@ def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> U
 
 
 def _first_change(settings: HuntSettings, snapshot: Snapshot) -> str:
-    """Return the first difference between a bundle and its snapshot, in words; empty if there is none."""
+    """Return the first difference between a bundle and its snapshot as text; empty if there is none."""
     faults = snapshot.faults()
     if faults:
         return f"the snapshot is damaged: {faults[0]}"
@@ -299,7 +299,7 @@ def _first_change(settings: HuntSettings, snapshot: Snapshot) -> str:
 
 
 def _has_known_texts(spec: TrialSpec, settings: HuntSettings, snapshot: Snapshot) -> bool:
-    """Return whether its hunt or its scenario names every text among the arguments of a trial."""
+    """Return whether all texts among a trial's arguments also occur in its hunt's settings or in its scenario."""
     scenario = with_settings(snapshot.scenario(), settings)
     arguments = [*scenario.scenario_arguments().values()]
     for agent in scenario.agents:
@@ -311,9 +311,9 @@ def _has_known_texts(spec: TrialSpec, settings: HuntSettings, snapshot: Snapshot
 
 
 def _unknown_names(settings: HuntSettings, snapshot: Snapshot) -> list[str]:
-    """Return the names in settings that may be imported or opened, and that the settings in a snapshot lack.
+    """Return the names in the settings that could be imported or opened, and that the snapshot's settings lack.
 
-    Numbers may differ, so that the user can edit them and replay the crash.
+    Numbers may differ, so that the user can change them and replay the crash.
     """
     known = snapshot.settings()
     agents = {agent.agent for agent in known.agents.values()}
@@ -328,7 +328,7 @@ def _unknown_names(settings: HuntSettings, snapshot: Snapshot) -> list[str]:
 
 
 def _texts(distributions: Iterable[Distribution | None]) -> set[str]:
-    """The texts among the values of arguments, such as names of files."""
+    """Return the texts, such as names of files, among the values of arguments."""
     values: list[object] = []
     for distribution in distributions:
         if isinstance(distribution, Constant):
@@ -339,10 +339,10 @@ def _texts(distributions: Iterable[Distribution | None]) -> set[str]:
 
 
 def _is_of_this_repository(files: Iterable[Path]) -> bool:
-    """Whether files belong to the project that the user works in: its tests could run the same code.
+    """Return whether files belong to the project in which the user works, whose tests could run the same code anyway.
 
-    They are tracked by git in the work tree of the current folder. Where there is no work tree, as in a container
-    without ``.git``, they are below the current folder of a job of a CI, which runs what its repository holds.
+    Such files are tracked by git in the work tree of the current folder. Without a work tree, as in a container without
+    ``.git``, such files are below the current folder of a CI job.
     """
     resolved = [Path(os.path.realpath(file)) for file in files]
     here = Path(os.path.realpath(os.curdir))
@@ -375,15 +375,15 @@ def signature(index: ArchiveIndex) -> str:
 
 
 def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapping[str, Any]) -> None:
-    """Refuse a scenario with known side effects, and a scenario whose side effects are unknown.
+    """Refuse a scenario that has side effects, or whose side effects are unknown.
 
     Args:
         scenario: scenario of the crash.
         settings: settings of its hunt.
-        values: values of the scenario's arguments in the trial.
+        values: values of the scenario's arguments in the crashed trial.
 
     Raises:
-        UsageError: the scenario has side effects; the message names them.
+        UsageError: the scenario has side effects; the message names the side effects.
     """
     names: list[tuple[Group, str]] = [("simulators", scenario.simulator)]
     names += [("oracles", oracle_name(text)) for text in settings.oracles]

@@ -1,4 +1,4 @@
-"""Crashes that are the same one, over one hunt or many, and their order."""
+"""Groups of crashes of the same type, from one hunt or several hunts."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ __all__ = ["Group", "Groups", "group_crashes", "groups_of"]
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Crashes with one signature.
+    """Crashes with the same signature.
 
     Args:
-        signature: signature of all of them.
+        signature: the common signature of all crashes.
         bundles: bundles in the order in which they were given; at least one.
-        faults: vehicle at fault in each of these; empty if that was not requested.
-        dropped: number of further crashes, whose bundles were deleted (``--keep``).
+        faults: vehicle at fault in each of these crashes; empty if that was not requested.
+        dropped: number of further crashes whose bundles were deleted (``--keep``).
     """
 
     signature: Signature
@@ -52,7 +52,7 @@ class Group:
 
     @property
     def avoidable(self) -> bool | None:
-        """Whether runs have avoided all crashes (True) or none (False); None if they differ or are not all judged."""
+        """True if runs avoided all crashes, False if they avoided none; None if crashes differ or are not judged."""
         if self.dropped:
             return None
         said = {_avoidable(bundle) for bundle in self.bundles}
@@ -60,16 +60,16 @@ class Group:
 
     @property
     def first(self) -> Bundle:
-        """The one that was found first, by its trial's number; over several hunts, in the first of them."""
+        """The crash that was found first, by trial number; with several hunts, the first crash of the first hunt."""
         return self.bundles[0]
 
     @property
     def shortest(self) -> Bundle:
-        """The one with the fewest steps, and of several the first."""
+        """The crash with the fewest steps; if several crashes have as few, the first of them."""
         return min(self.bundles, key=lambda bundle: bundle.result.steps)
 
     def to_json(self) -> JsonObject:
-        """Return the shape that ``crashes --json`` prints; crashes are given by their paths."""
+        """Return the group in the form that ``crashes --json`` prints; crashes are given by their paths."""
         return {
             "words": str(self.signature),
             "signature": self.signature.to_json(),
@@ -90,8 +90,8 @@ class Groups:
     """The result of grouping crashes.
 
     Args:
-        groups: the largest first.
-        left_out: The crashes without a type, each with the reason, such as a missing or damaged log.
+        groups: the groups, the largest first.
+        left_out: The crashes without a crash type, each with the reason, such as a missing or damaged log.
     """
 
     groups: tuple[Group, ...]
@@ -101,11 +101,11 @@ class Groups:
 def group_crashes(
     bundles: Iterable[Bundle], dropped: Mapping[str, int] | None = None, *, faults: bool = True
 ) -> Groups:
-    """Group crashes by their signatures.
+    """Group crashes by their signatures, and return the groups.
 
     Args:
         bundles: bundles of one hunt or several; the log of each is read.
-        dropped: description of each crash type to the number of its crashes without a bundle.
+        dropped: number of crashes without a bundle, by the description of their crash type.
         faults: whether to find the vehicle at fault for each crash.
     """
     signed, unsigned = [], []
@@ -134,7 +134,7 @@ def group_crashes(
 
 
 def _avoidable(bundle: Bundle) -> bool | None:
-    """The runs of a crash: by `judge`, or by the hunt that found it."""
+    """Return the runs of a crash that show whether it was avoidable: those of `judge`, or those of its hunt."""
     judgement, escape = judgement_of(bundle), bundle.result.escape
     if judgement is not None and judgement.avoidable is not None:
         return judgement.avoidable
@@ -147,8 +147,8 @@ def groups_of(
     """Return the groups of crashes whose signatures are known, the largest first.
 
     Args:
-        signed: the crashes.
-        dropped: description of each crash type to the number of its crashes without a bundle.
+        signed: the crashes, each with its signature.
+        dropped: number of crashes without a bundle, by the description of their crash type.
     """
     found: dict[Signature, list[Bundle]] = {}
     for signature, bundle in signed:
