@@ -1,4 +1,4 @@
-"""Several hunts side by side: a table for the terminal, and a page with plots."""
+"""Several hunts side by side: a table for the terminal, and an HTML page with plots."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ svg .axis { stroke: var(--line); fill: none; }
 
 
 def describe_comparison(found: Comparison) -> str:
-    """Return a comparison for people."""
+    """Return a comparison of hunts as text."""
     header = ("hunt", "trials", "crashes", "crash rate", "95 % interval", "median step", "median TTC")
     rows = [
         (
@@ -90,10 +90,10 @@ def describe_comparison(found: Comparison) -> str:
 
 
 def comparison_page(found: Comparison, path: Path) -> None:
-    """Write a page that works without a network: rates with intervals, outcomes, crash rate against each argument.
+    """Write an HTML page that works without a network: crash rates with intervals, outcomes, and plots per argument.
 
     Raises:
-        HuntDirectoryError: it cannot be written.
+        HuntDirectoryError: the page cannot be written.
     """
     colors = {hunt.dir: _COLORS[place % len(_COLORS)] for place, hunt in enumerate(found.hunts)}
     answers = "".join(
@@ -118,7 +118,7 @@ def comparison_page(found: Comparison, path: Path) -> None:
 
 
 def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
-    """Return a bar with its interval for each hunt, in percent of the width, so that it also fits small screens."""
+    """Return a bar with its interval for each hunt as HTML; lengths are in percent of the width of the page."""
     most = max([hunt.interval[1] if hunt.interval else _drawn_rate(hunt) for hunt in hunts] or [1.0])
     scale, parts = 100 / max(most, 1e-9), []
     for hunt in hunts:
@@ -142,7 +142,7 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
 
 
 def _drawn_rate(hunt: HuntFigures) -> float:
-    """Return the length of a hunt's bar; 0 if there is no rate."""
+    """Return the crash rate that a hunt's bar shows; 0 if the hunt has no rate."""
     return hunt.crash_rate if np.isfinite(hunt.crash_rate) else 0.0
 
 
@@ -172,7 +172,7 @@ def _argument_plots(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> lis
 def _arguments(
     hunt: HuntResults, held_out: HeldOutTraffics
 ) -> dict[str, tuple[NDArray[np.generic], NDArray[np.generic]]]:
-    """Every argument that varies: its values, and whether the trial crashed."""
+    """Return the values of every argument that varies, and whether the trial with each value crashed."""
     names = [name for name in columns_of(hunt.settings) if name not in FACTS]
     columns: dict[str, list[Cell]] = {name: [] for name in names}
     crashed: list[bool] = []

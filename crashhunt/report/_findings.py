@@ -1,4 +1,4 @@
-"""Crash types as findings at a line of the agent's code: CI annotations, SARIF alerts and Markdown summaries."""
+"""Crash types as findings at a line of the agent's code: for CI annotations, SARIF alerts and Markdown summaries."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class CrashFinding:
-    """A crash type, and the line of code to which an annotation belongs.
+    """A crash type, and the line of code at which an annotation for it is shown.
 
     Args:
-        rule: the outcome, such as ``collision``.
+        rule: outcome of the crashes, such as ``collision``.
         title: title of the crash type.
         message: summary of the shortest crash, and the command that shows it.
         file: the agent's file, relative to its project; empty if unknown.
-        line: line in the file, from 1: of the failure, otherwise of the agent's definition.
-        fingerprint: identifier of the crash type, equal in every hunt.
-        known: the case of a corpus with the same crash type; empty for none.
-        group: the crashes.
+        line: line in the file, counted from 1: of the failure, or else of the agent's definition.
+        fingerprint: identifier of the crash type, which is the same in every hunt.
+        known: name of the corpus case with the same crash type; empty if there is no such case.
+        group: the crashes of the crash type.
     """
 
     rule: str
@@ -64,11 +64,11 @@ class CrashFinding:
 
 
 def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> list[CrashFinding]:
-    """Return the crash types in the order of their groups. Runs no code of the bundles.
+    """Return the crash types in the order of their groups; no code of the bundles runs.
 
     Args:
-        groups: groups of the crashes.
-        known: crash type to the case of a corpus.
+        groups: groups of the crashes, one for each crash type.
+        known: name of the corpus case for each crash type that the corpus contains.
     """
     found = []
     for group in groups:
@@ -97,7 +97,7 @@ def _fingerprint(signature: Signature) -> str:
 
 
 def _place(bundle: Bundle) -> tuple[str, int]:
-    """Return file and line of the agent's project to which a crash belongs."""
+    """Return the file and the line of the agent's project to which a crash belongs."""
     failure = bundle.result.failure
     for frame in own_frames(failure) if failure is not None else ():
         if name := _in_project(frame.file):
@@ -107,7 +107,7 @@ def _place(bundle: Bundle) -> tuple[str, int]:
 
 @cache
 def _definition(snapshot: Path, driver: str) -> tuple[str, int]:
-    """Return file and line of the class or function that drives."""
+    """Return the file and the line of the class or function of the agent that drives."""
     kept = Snapshot(snapshot)
     try:
         agents = kept.settings().agents
@@ -132,7 +132,7 @@ def _line_of(file: Path, attribute: str) -> int:
 
 
 def _in_project(file: PurePath) -> str:
-    """Return the path of a file relative to its project; empty for a file of no project."""
+    """Return the path of a file relative to its project; empty if the file belongs to no project."""
     parts = file.parts
     for place in range(len(parts) - 1, 2, -1):
         if parts[place - 1] == layout.CODE and parts[place - 3] == layout.SNAPSHOTS:
@@ -151,11 +151,11 @@ _ICONS = {"still": "💥", "changed": "🔀", "fixed": "✅", "cannot_run": "�
 
 
 def crashes_summary(findings: Sequence[CrashFinding], *, compared: bool = False) -> str:
-    """Return the crash types as Markdown, one row each.
+    """Return the crash types as a Markdown table, with one row for each crash type.
 
     Args:
-        findings: one for each crash type.
-        compared: whether they were compared with a corpus.
+        findings: one finding for each crash type.
+        compared: whether the crash types were compared with a corpus.
     """
     if not findings:
         return "### crashhunt: no crash was saved\n"
@@ -178,7 +178,7 @@ def crashes_summary(findings: Sequence[CrashFinding], *, compared: bool = False)
 def crash_annotations(findings: Sequence[CrashFinding]) -> list[str]:
     """Return a GitHub annotation command for each new crash type, at its line of code.
 
-    Of more than ten, GitHub shows ten; a notice then has both numbers.
+    GitHub shows at most ten annotations. If there are more, a notice gives the number shown and the total.
     """
     found = [
         _command("error", finding.title, finding.message, finding.file, finding.line)
@@ -189,7 +189,7 @@ def crash_annotations(findings: Sequence[CrashFinding]) -> list[str]:
 
 
 def corpus_summary(reports: Sequence[CaseReport]) -> str:
-    """Return the results of a corpus as Markdown; the cases that are not as expected come first."""
+    """Return the results of a corpus as Markdown. Unexpected results come first."""
     wrong = sum(not report.ok for report in reports)
     said = f"{_count(wrong, 'is', 'are')} not as expected" if wrong else "all as expected"
     lines = [f"### crashhunt corpus: {_count(len(reports), 'case', 'cases')}, {said}", ""]
@@ -207,9 +207,10 @@ def corpus_summary(reports: Sequence[CaseReport]) -> str:
 
 
 def corpus_annotations(reports: Sequence[CaseReport]) -> list[str]:
-    """Return a GitHub annotation command for each case that is not as expected, or that is newly fixed.
+    """Return a GitHub annotation command for each corpus case with an unexpected result, and for each newly fixed case.
 
-    Of more than ten, GitHub shows ten of each level; a notice then has both numbers.
+    GitHub shows at most ten annotations of each level. If there are more, a notice gives the number shown and the
+    total.
     """
     found, tighter = [], []
     for report in sorted(reports, key=lambda report: report.ok):
@@ -224,7 +225,7 @@ def corpus_annotations(reports: Sequence[CaseReport]) -> list[str]:
 
 
 def _limited(annotations: Sequence[str], what: str) -> list[str]:
-    """Return at most ten annotations, with a notice if there are more."""
+    """Return at most ten annotations, and a notice if there were more."""
     shown, count = list(annotations[:_MAX_ANNOTATIONS]), len(annotations)
     if count <= _MAX_ANNOTATIONS:
         return shown
@@ -272,7 +273,7 @@ _RULES = {
 
 
 def write_sarif(findings: Sequence[CrashFinding], target: Path) -> None:
-    """Write crash types as a SARIF file. A file that exists is replaced; the file is never incomplete.
+    """Write crash types as a SARIF file. An existing file is replaced. The file is never incomplete.
 
     Each alert belongs to a line of the agent's code. If that line is unknown, the alert belongs to the settings of the
     hunt. The fingerprint identifies the crash type, so that a comparison of two files shows which alerts are new. The
@@ -324,6 +325,6 @@ def _result(finding: CrashFinding, rule: int) -> dict[str, object]:
 
 
 def _settings(hunt: Path) -> str:
-    """Return the settings file of a hunt: relative to the current directory, or as a URI if it lies elsewhere."""
+    """Return the settings file of a hunt: a path relative to the current directory, or a URI if it lies elsewhere."""
     file, here = (hunt / layout.HUNT).resolve(), Path.cwd().resolve()
     return quote(file.relative_to(here).as_posix()) if file.is_relative_to(here) else file.as_uri()

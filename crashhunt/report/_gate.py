@@ -1,4 +1,4 @@
-"""The verdict of a gate: lines for the terminal, Markdown for a pull request, JUnit for CI, and an annotation."""
+"""The verdict of a gate as lines for the terminal, Markdown for a pull request, JUnit for CI, and an annotation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ICONS = {"better": "✅", "no_difference": "✅", "worse": "❌", "undecided": 
 
 
 def describe_gate(found: GateReport) -> str:
-    """Return a verdict as text: the answer first, then the evidence, then the next command."""
+    """Return the verdict of a gate as text: the answer first, then the evidence, then the next command."""
     lines = [_answer(found)]
     if found.why:
         lines.append(f"  {found.why}")
@@ -103,7 +103,7 @@ def _corpus(found: GateReport) -> list[str]:
 
 
 def gate_summary(found: GateReport) -> str:
-    """Return a verdict as Markdown, for a pull request or the summary of a job."""
+    """Return the verdict of a gate as Markdown, for a pull request or the summary of a CI job."""
     lines = [f"### {_ICONS[found.verdict]} crashhunt gate: {_plain(_answer(found))}", ""]
     if found.why:
         lines += [f"{_plain(found.why)}.", ""]
@@ -136,7 +136,7 @@ def gate_summary(found: GateReport) -> str:
 
 
 def gate_annotations(found: GateReport) -> list[str]:
-    """Return a GitHub annotation command, where HEAD is worse or nothing is decided."""
+    """Return a GitHub annotation command if HEAD is worse, or if the verdict is undecided."""
     if found.verdict in ("better", "no_difference"):
         return []
     level = "error" if found.verdict == "worse" else "warning"
@@ -147,12 +147,12 @@ def gate_annotations(found: GateReport) -> list[str]:
 
 
 def write_gate_junit(found: GateReport, path: Path) -> None:
-    """Write a verdict as JUnit's XML: a test for the pairs, and one for each case of the corpus.
+    """Write the verdict of a gate as JUnit XML: one test for the pairs of trials, and one for each case of the corpus.
 
-    *Worse* is a failure, *undecided* an error. A case that cannot run is an error as well.
+    The verdict *worse* is a failure, *undecided* is an error. A case that cannot run is an error as well.
 
     Raises:
-        HuntDirectoryError: it cannot be written.
+        HuntDirectoryError: the file cannot be written.
     """
     suite = Xml.Element("testsuite", name="crashhunt gate")
     for case in found.corpus or ():
@@ -181,7 +181,7 @@ def write_gate_junit(found: GateReport, path: Path) -> None:
 
 
 def _text(text: str) -> str:
-    """Return text that XML can hold."""
+    """Return text without the characters that XML does not allow."""
     return visible(text)
 
 

@@ -1,4 +1,4 @@
-"""Lists of what there is: agents and scenarios, with their arguments, ranges and units."""
+"""Lists of the registered agents, oracles, disturbances and scenarios, with their arguments, ranges and units."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _IMPORT_S = 60.0
 
 
 class ArgumentEntry(TypedDict):
-    """An argument; null for unknown values."""
+    """An argument of an entry; its unknown values are null."""
 
     name: str
     kind: Kind | None
@@ -113,7 +113,7 @@ def list_scenarios() -> list[ListingEntry]:
 
 
 def describe(entries: Sequence[ListingEntry]) -> str:
-    """Return a list for people."""
+    """Return a list of agents, oracles or scenarios as text."""
     blocks = []
     for entry in entries:
         lines = [f"{entry['name']}  ({entry['locator']})", f"    {entry['title']}"]

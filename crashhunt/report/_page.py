@@ -1,6 +1,7 @@
-"""The report's data: one HTML file that shows a hunt and animates its crashes; its looks are in `page.html`.
+"""The data of the report: one HTML file that shows a hunt and animates its crashes. The layout is in `page.html`.
 
-The dashboard has the same player: `player_parts` returns its style, controls and script, `player_data` a crash for it.
+The dashboard uses the same player: `player_parts` returns its style, controls and script, and `player_data` the data of
+one crash.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class Importance(TypedDict):
 
 
 def values_of(row: TrialRow) -> dict[str, Value]:
-    """Return all arguments of a trial by the names that the page has for them."""
+    """Return all arguments of a trial by the names that the page uses for them."""
     values = {
         f"{agent}.{name}" if len(row.arguments) > 1 else name: value
         for agent, given in row.arguments.items()
@@ -94,17 +95,18 @@ def values_of(row: TrialRow) -> dict[str, Value]:
 
 
 def importance_of(trials: Sequence[tuple[Mapping[str, Value], float]]) -> list[Importance]:
-    """Return what each argument contributes to danger, the most important first.
+    """Return the contribution of each argument to the criticality, the most important argument first.
 
-    It is the correlation ratio of the ranks of danger over five parts of a range, or over the words of a choice. The
-    part that chance alone would give is subtracted (Kelley's epsilon squared, 1935). The result is the share of the
-    variance that an argument explains without any other. The interval is of a bootstrap over trials.
+    The contribution is the correlation ratio of the ranks of criticality over five parts of a range, or over the
+    options of a choice. The value expected by chance alone is subtracted (Kelley's epsilon squared, 1935). The result
+    is the share of the variance that an argument explains without the other arguments. The interval comes from a
+    bootstrap over trials.
 
     Args:
-        trials: arguments and danger, 1 for a crash, of trials that were chosen without learning.
+        trials: arguments and criticality (1 for a crash) of trials that the search did not guide.
 
     Returns:
-        Nothing where there are fewer than 40.
+        The contributions; an empty list for fewer than 40 trials.
     """
     if len(trials) > _MOST:
         trials = [trials[place * len(trials) // _MOST] for place in range(_MOST)]
@@ -129,7 +131,7 @@ def importance_of(trials: Sequence[tuple[Mapping[str, Value], float]]) -> list[I
 
 
 def _range_parts(values: Sequence[Value | None]) -> NDArray[np.intp]:
-    """Return in which part of its range each value is, from 0; of words, which one it is."""
+    """Return for each value the part of the range that contains the value, counted from 0; for text, its index."""
     kinds = list(dict.fromkeys(values))
     if len(kinds) <= _IMPORTANCE_PARTS or not all(isinstance(value, int | float) for value in kinds):
         return np.array([kinds.index(value) for value in values])
@@ -151,11 +153,11 @@ def _explained(ranks: NDArray[np.intp], parts: NDArray[np.intp]) -> float:
 
 
 def lineage_of(number: int, trial: Callable[[int], TrialResult | None]) -> list[TrialResult]:
-    """Return the trials that a trial was made from: its parent, that one's parent, and so on.
+    """Return the ancestors of a trial: its parent, the parent of its parent, and so on.
 
     Args:
         number: number of the trial.
-        trial: returns one by its number, None if it is missing.
+        trial: function that returns a trial by its number; None if the trial is missing.
     """
     found: list[TrialResult] = []
     result = trial(number)
@@ -182,19 +184,19 @@ def write_report(
     name: str = "",
     watch: Watch | None = None,
 ) -> int:
-    """Write the report of a hunt; the file is never incomplete.
+    """Write the report of a hunt. The file is never incomplete.
 
     Args:
         directory: directory of the hunt; its ledger may be missing, as in an exported crash.
         bundles: the crashes and near misses to animate.
-        target: the file; an existing one is replaced.
-        found: all crashes of the hunt; by default those of the directory.
-        near_misses: number of near misses of the hunt, of which `bundles` has some.
-        name: name of the hunt, for the title; its directory's by default.
-        watch: called after each crash with the number of finished crashes, and the number of all crashes.
+        target: path of the report; an existing file is replaced.
+        found: groups of all crashes of the hunt; by default those of the crashes in the directory.
+        near_misses: total number of near misses of the hunt; `bundles` contains some of them.
+        name: name of the hunt for the title; by default the name of its directory.
+        watch: function called after each crash, with the number of finished crashes and the number of all crashes.
 
     Returns:
-        Its size in bytes.
+        The size of the report in bytes.
 
     Raises:
         BundleError: a crash is damaged.
@@ -219,12 +221,13 @@ def write_report(
 
 
 class PlayerParts(NamedTuple):
-    """The player of a crash, in the parts that a page needs.
+    """The player of a crash, split into the parts that a page needs.
 
     Args:
-        style: CSS: the colours of both schemes, and the looks of the controls.
+        style: CSS: the colours of both colour schemes, and the style of the controls.
         controls: HTML of the scene, the controls and the curves.
-        script: JavaScript, for the end of the page; ``load`` and ``show`` take what `player_data` returns.
+        script: JavaScript for the end of the page; its functions ``load`` and ``show`` take the data that `player_data`
+            returns.
     """
 
     style: str
@@ -233,7 +236,7 @@ class PlayerParts(NamedTuple):
 
 
 def player_parts() -> PlayerParts:
-    """Return the player that the report and the dashboard have."""
+    """Return the player that the report and the dashboard use."""
     return PlayerParts(_read("page.css"), _read("player.html"), _read("player.js"))
 
 
@@ -242,14 +245,14 @@ def _read(name: str) -> str:
 
 
 def player_data(bundle: Bundle, story: Story | None = None) -> dict[str, object]:
-    """Return the data of a crash or near miss for the player, with its texts.
+    """Return the data and the texts of a crash or near miss for the player.
 
     Args:
-        bundle: the crash; its log is read.
-        story: the story of the crash, if it has already been made.
+        bundle: the crash or near miss; its log is read.
+        story: the story of the crash, if it has already been created.
 
     Raises:
-        BundleError: it is damaged.
+        BundleError: the crash is damaged.
     """
     return _crash(bundle, story or Story(bundle))
 
@@ -287,7 +290,7 @@ def report_data(
 
 
 def _lineages(directory: Path, bundles: Sequence[Bundle]) -> dict[str, list[list[object]]]:
-    """Return for each crash the trials from which the sampler derived it: number, origin and danger."""
+    """Return for each crash the trials from which the sampler derived it, with their number, origin and criticality."""
     path = directory / layout.LEDGER
     if not bundles or not has_begun(path):
         return {}
@@ -302,7 +305,7 @@ def _lineages(directory: Path, bundles: Sequence[Bundle]) -> dict[str, list[list
 
 
 def _crashes(bundles: Sequence[Bundle], found: FoundCrashes, watch: Watch | None) -> dict[str, object]:
-    """Return the crashes in the order of the page, and the types of all crashes with the places of those shown."""
+    """Return the crashes in the order of the page, and all crash types with the positions of the crashes shown."""
     crashes: list[dict[str, object]] = []
     members: dict[str, list[int]] = {}
     crashed = [bundle for bundle in bundles if not bundle.is_near_miss]
@@ -338,14 +341,14 @@ def _category(crash: str) -> str:
 
 
 def _shown_name(agent: str, name: str, settings: HuntSettings) -> str:
-    """Return the name of an argument on the page; with several agents, it includes the agent."""
+    """Return the name of an argument on the page; it includes the agent if there are several agents."""
     return f"{agent}.{name}" if agent and len(settings.agents) > 1 else name
 
 
 def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
-    """Return the outcomes of all trials, and for the plots their arguments and criticality.
+    """Return the outcomes of all trials; for the plots, also the arguments and the criticality of trials.
 
-    A plot has at most 4,000 crashes and 4,000 other trials, which are drawn evenly over the hunt.
+    A plot shows at most 4,000 crashes and 4,000 other trials, selected evenly over the hunt.
     """
     path = directory / layout.LEDGER
     if not has_begun(path):
@@ -403,7 +406,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
 
 
 def _rate(rate: RunningRate | None) -> dict[str, object] | None:
-    """Return the crash rate that the hunt has recorded; None if there is none, as in hunts of earlier versions."""
+    """Return the crash rate that the hunt has recorded; None if there is no rate, as in hunts of earlier versions."""
     if rate is None:
         return None
     words = f"The bounds have {rate['confidence']:g} % confidence, valid whenever you look."
@@ -420,15 +423,16 @@ def _rate(rate: RunningRate | None) -> dict[str, object] | None:
 def _plot_counts(
     trials: Sequence[Mapping[str, object]], total: int, crashes: int, settings: HuntSettings
 ) -> dict[str, int]:
-    """Return how many crashes and other trials the plots show, and how many there are."""
+    """Return how many crashes and other trials the plots show, and how many the hunt has."""
     shown = sum(trial["outcome"] in settings.crash_on for trial in trials)
     return {"crashes": shown, "allCrashes": crashes, "others": len(trials) - shown, "allOthers": total - crashes}
 
 
 def _is_drawn(number: int, share: float) -> bool:
-    """Whether a trial is among a share of all, evenly over the hunt.
+    """Return whether a trial belongs to a given share of all trials, selected evenly over the hunt.
 
-    The choice is not periodic: every fifth trial of a guided hunt is random, so a periodic choice would be biased.
+    The selection is not periodic. Every fifth trial of a guided hunt is random, so a periodic selection would be
+    biased.
     """
     return number * _GOLDEN_RATIO % 1.0 < share
 
@@ -479,7 +483,7 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
 
 
 def _badges(story: Story) -> list[str]:
-    """Return the few facts that stand below the verdict."""
+    """Return the few facts that the page shows below the verdict."""
     result = story.bundle.result
     found: list[str] = [result.outcome.category if story.nearest is None else "near miss"]
     if story.encounter is not None and story.nearest is None:
@@ -510,7 +514,7 @@ def _disturbances(result: TrialResult) -> dict[str, str]:
 
 
 def _scenes(recording: Recording, agent: str) -> dict[str, object]:
-    """All scenes as columns: float32, shape (steps, actors, 4), x and y from the first position of the agent."""
+    """Return all scenes as columns: float32, shape (steps, actors, 4); x and y start at the agent's first position."""
     scenes = recording.scenes()
     names: dict[str, Actor] = {}
     highest: dict[str, float] = {}
@@ -559,7 +563,7 @@ def _scenes(recording: Recording, agent: str) -> dict[str, object]:
 
 
 def _to_other(encounter: Encounter, recording: Recording) -> dict[str, str]:
-    """Return gap and time to collision to the actor of the text, not to the nearest actor."""
+    """Return gap and time to collision to the actor that the text names, not to the nearest actor."""
     moments = {moment.step: moment for moment in encounter.moments}
     steps = [step.step for step in recording.all_steps if step.scene is not None]
     found = {"gap": "gap_m", "ttc": "time_to_collision_s"}
@@ -570,7 +574,7 @@ def _to_other(encounter: Encounter, recording: Recording) -> dict[str, str]:
 
 
 def _to_closest(story: Story) -> dict[str, object]:
-    """Return, for each step, the actors to which the least time to collision and the least gap belong."""
+    """Return for each step the actor with the least time to collision and the actor with the least gap."""
     closest = closest_actors(story.recording, story.agent) if story.recording.compact is None else []
     return {"closest": [list(one) for one in closest]}
 
@@ -594,5 +598,5 @@ def _origin(recording: Recording) -> NDArray[np.float64]:
 
 
 def _packed(array: NDArray[np.float64]) -> str:
-    """Little-endian float32, deflated, base64."""
+    """Return an array as text: little-endian float32, compressed by deflate, encoded as base64."""
     return base64.b64encode(zlib.compress(np.ascontiguousarray(array, "<f4").tobytes(), 6)).decode("ascii")

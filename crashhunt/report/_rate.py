@@ -1,4 +1,4 @@
-"""Rates of crashes for people: lines for the terminal, a line per rate as CSV, and a page."""
+"""Crash rates as lines for the terminal, as CSV with a line for each rate, and as an HTML page."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ th, td { text-align: left; padding: .4rem .7rem; border: 1px solid #ccc; }
 
 
 def format_rate(rate: float) -> str:
-    """Return a rate with two significant digits: ``0.36``, ``1,200``, ``1.0e-3``.
+    """Return a rate as text with two significant digits: ``0.36``, ``1,200``, ``1.0e-3``.
 
     >>> format_rate(0.0010014)
     '1.0e-3'
@@ -65,18 +65,18 @@ def format_rate(rate: float) -> str:
 
 
 def count_training_trials(count: int) -> str:
-    """Return how many trials do not count, because an agent was trained on their traffic."""
+    """Return text on the trials that are not counted because an agent was trained on their traffic."""
     return f"{_count(count, 'trial', 'trials')} on training traffic {'is' if count == 1 else 'are'} excluded"
 
 
 def format_interval(interval: Interval) -> str:
-    """Return an interval in words: ``at least 0.19, at most 0.52``."""
+    """Return an interval as text, such as ``at least 0.19, at most 0.52``."""
     least = f"at least {format_rate(interval.low)}, " if interval.low > 0 else ""
     return f"{least}at most {format_rate(interval.high)}"
 
 
 def describe_running(rate: RunningRate) -> str:
-    """Return the rate of a running hunt in one line: the answer, then the evidence."""
+    """Return the rate of a running hunt as one line: the answer, then the evidence."""
     if rate["method"] == "rare":
         return _describe_rare(rate)
     bar = (
@@ -194,7 +194,7 @@ _COLUMNS = (
 
 
 def write_rates_csv(rates: Sequence[CrashRate], out: TextIO) -> None:
-    """Write a line per rate, and one per part."""
+    """Write one CSV line for each rate, and one for each part of the trials."""
     writer = csv.DictWriter(out, _COLUMNS, restval="")
     writer.writeheader()
     for rate in rates:
@@ -214,10 +214,10 @@ def _cells(data: dict[str, object], certain: Interval | None) -> dict[str, objec
 
 
 def rates_page(rates: Sequence[CrashRate], path: Path) -> None:
-    """Write a page that works without a network: the rates of all hunts in a table.
+    """Write an HTML page that works without a network: the rates of all hunts in a table.
 
     Raises:
-        HuntDirectoryError: it cannot be written.
+        HuntDirectoryError: the page cannot be written.
     """
     rows = []
     for rate in rates:

@@ -1,4 +1,4 @@
-"""The last seconds of a crash, or those around a near miss, in plain words and a table."""
+"""The last seconds of a crash, or the seconds around a near miss, as sentences and as a table."""
 
 from __future__ import annotations
 
@@ -54,13 +54,14 @@ _WIDTH = 80  # characters of a line of the table, as on an ordinary terminal
 
 
 class Story:
-    """The last seconds of a crash, or the seconds around a near miss. Runs no code of the bundle.
+    """The last seconds of a crash, or the seconds around a near miss. No code of the bundle runs.
 
     Args:
         bundle: the crash or near miss.
-        last_s: duration to describe, in s. For a near miss, half of it lies before the nearest moment and half after.
-        braking: a deceleration, in m/s². The story then contains the calculated last step at which it would have
-            avoided the crash. If None, the story contains the result of the hunt's own runs.
+        last_s: duration to describe, in s. For a near miss, half of this duration lies before the nearest moment and
+            half after.
+        braking: a deceleration, in m/s². The story then contains the calculated last step at which braking with it
+            would have avoided the crash. If it is None, the story contains the result of the hunt's own runs.
     """
 
     def __init__(self, bundle: Bundle, *, last_s: float = 5.0, braking: float | None = None) -> None:
@@ -86,7 +87,7 @@ class Story:
             self.escape = last_escape(self.recording, self.agent, self.other, braking=braking) if drove_into else None
 
     def to_json(self) -> dict[str, object]:
-        """Return the shape that ``show --json`` prints."""
+        """Return the story in the form that ``show --json`` prints."""
         nearest: list[Mapping[str, TableCell]] = [dict.fromkeys(NEAREST)] * (self.recording.steps + 1)
         if self.encounter and self._is_whole:
             nearest = list(steps_table(self.recording, NEAREST, self.agent))
@@ -125,7 +126,7 @@ class Story:
         }
 
     def words(self) -> list[str]:
-        """Return what happened, a sentence each."""
+        """Return a description of the events, one sentence each."""
         result, recording = self.bundle.result, self.recording
         end = recording.steps
         scenes = recording.scenes()
@@ -159,7 +160,7 @@ class Story:
         return sentences
 
     def describe(self) -> str:
-        """Return words and table."""
+        """Return the sentences and the table of the story."""
         lines = [f"{self.bundle.id}  ({self.bundle.result.outcome.category})"]
         lines.append(f"  {format_inputs(self.bundle.result)}")
         lines += _shrunk(self.bundle)
@@ -172,7 +173,7 @@ class Story:
         return in_lines(lines)
 
     def table(self) -> list[str]:
-        """Return the last steps as a table."""
+        """Return the last steps of the recording as a table."""
         names = self._names()
         hit = self.bundle.result.collision
         drives_into = hit is not None and hit.role == "collider"  # the agent had the other in front of it
@@ -202,7 +203,7 @@ class Story:
         return [step for step in self.recording.all_steps if self._first <= step.step <= self._last]
 
     def _steps_shown(self) -> list[StepRecord]:
-        """Return the steps of the table, a selection of those that are described."""
+        """Return the steps that the table shows, a selection of the described steps."""
         steps, near = self._steps(), self.nearest
         return (
             _thinned(steps, _MAX_TABLE_ROWS, always=self.escape)
@@ -256,7 +257,7 @@ class Story:
         return [*sentences, *self._about_escape()]
 
     def _about_fault(self) -> list[str]:
-        """Return the vehicle at fault, and the rule."""
+        """Return a sentence on the vehicle at fault, and the rule that blames it."""
         verdict, found = self.fault.verdict, self.fault.findings
         if verdict == "nobody can tell":
             return [f"At fault: {verdict}{', as rules contradict each other' if found else ''}."]
@@ -287,7 +288,7 @@ class Story:
         return [f"{braking} could have avoided it until {until}: {runs}.{also}"]
 
     def about_judgement(self) -> list[str]:
-        """Return until when the crash could have been avoided, according to the runs of `judge`."""
+        """Return sentences on until when the crash could have been avoided, according to the runs of `judge`."""
         if self.judgement is None:
             return []
         why = about_why(self.judgement.why, self._at) if self.judgement.why is not None else []
@@ -365,7 +366,7 @@ class Story:
         return channel.action_names or tuple(f"action[{n}]" for n in range(math.prod(channel.action_shape)))
 
     def _opaque_action(self, step: int) -> str:
-        """The text of an action that is no array of numbers; empty for other actions."""
+        """Return the text of an action that is not an array of numbers; empty for other actions."""
         channel = next((agent for agent in self.recording.prologue.agents if agent.id == self.agent), None)
         if channel is None or not is_opaque(channel.action_shape) or not 0 <= step < len(self.recording.all_steps):
             return ""
@@ -403,7 +404,10 @@ def _cells(moment: Moment) -> list[str]:
 
 
 def _named(moment: Moment, nearest: Mapping[str, TableCell]) -> dict[str, object]:
-    """Return a moment under the names of all tables: some columns are on the nearest actor, some on the partner."""
+    """Return the values of a moment under the column names of all tables.
+
+    Some columns refer to the nearest actor, others to the collision partner.
+    """
     facts = asdict(moment)
     return {
         **{name: facts[name] for name in ("step", "time_s", "speed", "other_speed", "closing_speed")},
@@ -420,7 +424,7 @@ def _words(action: Sequence[float] | None, names: Sequence[str]) -> str:
 
 
 def _shrunk(bundle: Bundle) -> list[str]:
-    """Return lines on the crash from which `shrink` made this one; an empty list for other crashes."""
+    """Return lines on the crash from which `shrink` made the given crash; an empty list for crashes of other origin."""
     shrunk = bundle.added.get("shrunk")
     if not isinstance(shrunk, dict):
         return []
@@ -436,7 +440,7 @@ def _shrunk(bundle: Bundle) -> list[str]:
 
 
 def _thinned(steps: list[StepRecord], rows: int, *, always: int | None) -> list[StepRecord]:
-    """Return about `rows` of the steps: all of the last ones, and evenly spaced earlier ones."""
+    """Return about `rows` of the steps: all of the last steps, and evenly spaced earlier steps."""
     if len(steps) <= rows:
         return steps
     recent = steps[-rows // 2 :]

@@ -40,12 +40,12 @@ _STYLES = {
 
 
 class Watcher:
-    """Shows the progress of a hunt.
+    """Shows the progress of a running hunt.
 
     Args:
-        console: a terminal shows the screen, any other console plain lines.
+        console: where to print: a terminal shows the status screen, any other console plain lines.
         title: first line of the screen.
-        notes: lines to print before the first status, when the hunt can no longer be refused.
+        notes: lines to print before the first status, once the hunt can no longer be refused.
     """
 
     def __init__(self, console: Console, title: str, notes: Sequence[str] = ()) -> None:
@@ -68,7 +68,7 @@ class Watcher:
             self._live.stop()
 
     def __call__(self, status: HuntStatus) -> None:
-        """Show a status."""
+        """Show a status of the hunt."""
         self.tell_notes()
         if self._live is not None:
             self._live.update(self._screen(status), refresh=True)
@@ -77,11 +77,11 @@ class Watcher:
             self._console.print(_line(status), soft_wrap=True, highlight=False)
 
     def _is_new_phase(self, status: HuntStatus) -> bool:
-        """Whether a phase with its own progress begins."""
+        """Return whether a phase with its own progress begins."""
         return status.progress is not None and status.phase != self._last_phase
 
     def tell_notes(self) -> None:
-        """Print the notes, once."""
+        """Print the notes, only once."""
         for note in self._notes:
             self._console.print(one_line(note), markup=False, soft_wrap=True, highlight=False)
         self._notes = ()
@@ -134,7 +134,7 @@ class Watcher:
         return Group(*rows, *nodes, _workers(status, width, max(1, left - len(nodes))))
 
     def _folded(self, text: Text) -> Text:
-        """Return a text of at most two lines; a longer one, or one on a low screen, is cut to one line."""
+        """Return a text in at most two lines; on a low screen, or if it is longer, it is cut to one line."""
         folds = self._console.height > _MIN_SCREEN_LINES and len(self._console.render_lines(text)) <= 2
         return text if folds else Text(text.plain, no_wrap=True, overflow="ellipsis")
 
@@ -186,7 +186,7 @@ def _nodes(status: HuntStatus, lines: int) -> list[RenderableType]:
 
 
 def _workers(status: HuntStatus, width: int, lines: int) -> RenderableType:
-    """Return the state of each worker: one line each, or several workers a line if the screen is too small."""
+    """Return the state of each worker, one line each; on a small screen, one line for several workers."""
     doing = [
         (header.pid, number, {Phase.SETUP: "setting up", Phase.DONE: "done"}.get(header.phase, f"step {header.step}"))
         for number, header in sorted(status.workers.items())
@@ -207,7 +207,7 @@ def _workers(status: HuntStatus, width: int, lines: int) -> RenderableType:
 
 
 def format_arguments(result: TrialResult) -> str:
-    """Return the arguments of a trial in one line."""
+    """Return the arguments of a trial as one line."""
     spec = result.spec
     alone = len(spec.arguments) == 1
     pairs = [
@@ -220,7 +220,7 @@ def format_arguments(result: TrialResult) -> str:
 
 
 def format_inputs(result: TrialResult) -> str:
-    """Return the seed and the arguments of a trial in one line."""
+    """Return the seed and the arguments of a trial as one line."""
     return ", ".join(filter(None, (f"seed {result.spec.seed}", format_arguments(result))))
 
 
@@ -231,7 +231,7 @@ def _short(value: Value) -> str:
 
 
 def format_pace(rate_per_s: float) -> str:
-    """Return a rate of trials as ``4.6/s``, or as ``12 s/trial`` below one per second."""
+    """Return the pace of a hunt as text: ``4.6/s``, or ``12 s/trial`` below one trial per second."""
     if rate_per_s >= 0.95:
         return f"{rate_per_s:.1f}/s"
     if not rate_per_s:
@@ -253,7 +253,7 @@ _PHASES = {
 
 
 def describe_phase(name: str, done: int, total: int, seconds_left: float | None) -> str:
-    """Return the progress after the last trial, such as ``confirming 24 of 60, 0:40 left``."""
+    """Return the progress of a phase after the last trial, such as ``confirming 24 of 60, 0:40 left``."""
     said = f"{_PHASES.get(name, name)} {done} of {total}"
     return said if seconds_left is None else f"{said}, {format_seconds(seconds_left)} left"
 
@@ -263,7 +263,7 @@ def _share(phase: PhaseStatus) -> float:
 
 
 def format_seconds(seconds: float) -> str:
-    """Return a duration as ``M:SS`` or ``H:MM:SS``."""
+    """Return a duration as text: ``M:SS`` or ``H:MM:SS``."""
     if not math.isfinite(seconds):
         return "?"
     minutes, rest = divmod(round(seconds), 60)
@@ -272,22 +272,22 @@ def format_seconds(seconds: float) -> str:
 
 
 def describe_types(count: int, by_cause: int | None, noun: str = "type") -> str:
-    """Return the number of crash types, and of causes if the hunt counts these, in words.
+    """Return as text the number of crash types, and the number of causes if the hunt counts causes.
 
     >>> describe_types(4, 6)
     '4 types, 6 by cause'
 
     Args:
-        count: number of types.
-        by_cause: number of causes, each type on its own; None if types count.
-        noun: for a type.
+        count: number of crash types.
+        by_cause: number of causes, counted separately for each crash type; None if the hunt counts types.
+        noun: word for a crash type in the text.
     """
     words = f"{count} {noun}{'' if count == 1 else 's'}"
     return words if by_cause is None else f"{words}, {by_cause} by cause"
 
 
 def describe_kinds(status: HuntStatus) -> str:
-    """Return the number of crash types, and of causes if they count, and the age of the last new type."""
+    """Return as text the number of crash types, of causes if these count, and the age of the last new type."""
     words = describe_types(len(status.kinds or ()), status.types_by_cause, "crash type")
     if status.newest_kind_s is None:
         return words
@@ -334,7 +334,7 @@ def _describe_stress(result: TrialResult) -> str:
 
 
 def _strategies(search: SearchStatus) -> str:
-    """Return the strategies of the search, with the mean criticality of their trials."""
+    """Return the strategies of the search, with the mean criticality of the trials of each strategy."""
     parts = []
     for one in search.strategies:
         came = [] if one.danger is None else [f"mean danger {one.danger:.2f}"]
@@ -344,7 +344,7 @@ def _strategies(search: SearchStatus) -> str:
 
 
 def _describe_growth(search: SearchStatus) -> str:
-    """Return how long ago the greatest criticality rose."""
+    """Return as text how long ago the greatest criticality of the hunt rose."""
     if search.grown_trials is None or search.grown_s is None:
         return ""
     count = search.grown_trials

@@ -1,4 +1,4 @@
-"""The report at the end of a hunt and of a replay, as text for a terminal."""
+"""The text that the terminal shows at the end of a hunt and of a replay."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def describe_groups(
     """Return one line for each crash type, with its shortest crash.
 
     Args:
-        groups: one for each crash type.
-        known: crash type to the case of a corpus; None if no corpus was given.
-        by_cause: number of causes, each type on its own; None if they do not count.
+        groups: the groups of crashes, one for each crash type.
+        known: name of the corpus case for each known crash type; None if no corpus was given.
+        by_cause: number of causes, counted separately for each crash type; None if the hunt does not count causes.
     """
     if not groups:
         return "No crash was saved."
@@ -76,7 +76,7 @@ def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGrou
     """Return the causes of each crash type, one line each.
 
     Args:
-        groups: one for each crash type.
+        groups: the groups of crashes, one for each crash type.
         causes: the crashes of each type, divided by cause.
     """
     rows = [["crashes", "type and cause", "judged", "shortest", "steps"]]
@@ -116,7 +116,7 @@ _SOURCE_WORDS = {
 
 
 def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
-    """Return the result of a hunt: each crash, how it came about, its directory, and the command that replays it."""
+    """Return the result of a hunt as text: each crash, its cause, its directory, and the command that replays it."""
     ran = sum(report.outcomes.values())
     outcomes = ", ".join(f"{name} {count}" for name, count in report.outcomes.items()) or "none"
     total = f" ({report.steps_total} simulated in all)" if report.steps_total > report.trial_steps else ""
@@ -183,7 +183,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
 
 
 def _near_misses(report: HuntReport, program: str) -> list[str]:
-    """Return the saved near misses, one line each."""
+    """Return the saved near misses as text, one line each."""
     if not report.near_misses:
         return []
     lines = ["", f"Near misses, saved in {report.directory / layout.NEAR_MISSES}:"]
@@ -197,7 +197,7 @@ def _near_misses(report: HuntReport, program: str) -> list[str]:
 
 
 def _describe_events(report: HuntReport) -> list[str]:
-    """Return the traffic events that do not count as crashes in this hunt, and the option that makes them count."""
+    """Return as text the traffic events that are not crashes in this hunt, and the option that makes them crashes."""
     others = {kind: found for kind, found in report.events.items() if kind not in report.settings.crash_on}
     if not others:
         return []
@@ -209,7 +209,7 @@ def _describe_events(report: HuntReport) -> list[str]:
 
 
 def describe_replay(report: ReplayReport) -> str:
-    """Return the result of a replay."""
+    """Return the result of a replay as text."""
     bundle, rerun = report.bundle, report.rerun
     drivers = {
         "log": "the recorded actions",

@@ -1,4 +1,4 @@
-"""Chosen fields of every step of a recording, as a table."""
+"""A table with selected fields of every step of a recording."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ _PARTNER_FIELDS = {
 
 
 def check_fields(recording: Recording, fields: Sequence[str], agent: str) -> list[str]:
-    """Return the columns of fields: observations and actions of an agent of a recording.
+    """Return the table columns for the names of fields: observations and actions of an agent of a recording.
 
     Raises:
-        UsageError: a field does not exist, with those that do.
+        UsageError: a field does not exist; the message lists the existing fields.
     """
     channel = next(found for found in recording.prologue.agents if found.id == agent)
     actions, observed = _actions(channel), _observed(channel)
@@ -76,19 +76,19 @@ def check_fields(recording: Recording, fields: Sequence[str], agent: str) -> lis
 
 
 def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: str = "") -> list[TableRow]:
-    """Return one row a step: the step, the time and the fields; None if there is no value.
+    """Return one row for each step: the step, the time and the fields; None for a missing value.
 
     Args:
         recording: recording of the episode.
         fields: ``x``, ``y``, ``heading``, ``speed``, ``reward``, ``time_to_collision_s``, ``gap_m``,
             ``required_deceleration`` (relative to the nearest actor), ``gap_to_other_m``, ``time_to_other_s``,
-            ``closing_speed`` (relative to the collision partner), ``observation[ROW,NAME]``, the parts of the
-            action by name, or ``action`` for all of them.
-        agent: whose.
-        other: the one that it crashed with.
+            ``closing_speed`` (relative to the collision partner), ``observation[ROW,NAME]``, the components of the
+            action by name, or ``action`` for all components.
+        agent: identifier of the agent whose values are listed.
+        other: identifier of the collision partner.
 
     Raises:
-        UsageError: a field does not exist, with those that do.
+        UsageError: a field does not exist; the message lists the existing fields.
     """
     channel = next(found for found in recording.prologue.agents if found.id == agent)
     actions, observed = _actions(channel), _observed(channel)
@@ -119,19 +119,21 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
 
 
 def format_table(rows: Sequence[TableRow]) -> list[str]:
-    """Return rows as aligned lines under a heading."""
+    """Return rows of a table as aligned lines below a heading."""
     if not rows:
         return []
     return aligned([list(rows[0])] + [[_format(value) for value in row.values()] for row in rows])
 
 
 def aligned(rows: Sequence[Sequence[str]], *, left: int = 0, width: int = 0) -> list[str]:
-    """Return rows as lines of columns, which are two spaces apart.
+    """Return rows of a table as lines with columns that are two spaces apart.
 
     Args:
-        rows: the heading first; cells of a row beyond the heading follow without alignment.
-        left: number of columns that are aligned to the left; the others are aligned to the right.
-        width: number of characters of a line; wider columns are only one space apart. 0 for no limit.
+        rows: rows of the table, the heading first; cells beyond the columns of the heading are appended without
+            alignment.
+        left: number of columns that are aligned to the left; the other columns are aligned to the right.
+        width: maximum number of characters in a line; if the columns need more, they are only one space apart. 0 for no
+            limit.
     """
     count = len(rows[0])
     widths = [max(len(row[column]) for row in rows) for column in range(count)]
@@ -147,7 +149,7 @@ def aligned(rows: Sequence[Sequence[str]], *, left: int = 0, width: int = 0) -> 
 
 
 def stacked(heading: Sequence[str]) -> list[list[str]]:
-    """Return a heading as several rows, one for each word of the longest name, so that columns stay narrow.
+    """Return a heading as several rows, one for each word of the longest column name, so that columns stay narrow.
 
     >>> stacked(["step", "target_speed", "gap m"])
     [['', 'target_', 'gap'], ['step', 'speed', 'm']]
@@ -158,7 +160,7 @@ def stacked(heading: Sequence[str]) -> list[list[str]]:
 
 
 def _item(array: NDArray[np.generic], place: tuple[int, ...], shape: tuple[int, ...]) -> Any:
-    """Return a number of an action, flattened, or of an observation; the text of a value of any length."""
+    """Return one number of an action, flattened, or of an observation; for a value of any length, its text."""
     if is_opaque(shape):
         return describe_value(array)
     return (array.reshape(-1) if len(place) == 1 else array)[place].item()
@@ -206,9 +208,9 @@ def _format(value: TableCell) -> str:
 
 
 def argument_units(directory: Path, settings: HuntSettings) -> dict[tuple[str, str], str]:
-    """Return the units that are known: (agent, or empty for the scenario; name of the argument) to unit.
+    """Return the known units of arguments. The keys are (agent, or empty for the scenario; name of the argument).
 
-    The units come from the scenario of the snapshot and the signatures of crashhunt's agents; no code of a bundle runs.
+    The units come from the snapshot's scenario and from the signatures of crashhunt's agents. No code of a bundle runs.
     """
     try:
         found = latest_snapshot(directory)

@@ -1,7 +1,7 @@
-"""The verdict of a crash page: one sentence, built only from the recorded contact and from runs.
+"""The verdict of a crash page: one sentence that uses only the recorded contact and the results of runs.
 
-Clauses are separated by semicolons: what happened at the contact, the gap where a lane change made it, and which run
-avoided it. A clause whose facts are unknown, or contradict each other, is omitted.
+The clauses of the sentence are separated by semicolons: what happened at the contact, the gap if a lane change caused
+the contact, and the run that avoided the contact. A clause with unknown or contradictory facts is omitted.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ _MANEUVER_WORDS = {
 
 
 class CrashFacts(Protocol):
-    """The facts of a crash from which a verdict is made; a `Story` has these.
+    """The facts of a crash on which the verdict is based; a `Story` provides them.
 
     Attributes:
         bundle: the crash or near miss.
         agent: the controlled vehicle.
         other: the collision partner; empty if there is none.
-        contact: of the two; None if they did not touch.
+        contact: contact of the agent and the collision partner; None if they did not touch.
         nearest: the moment of the greatest criticality; None for a crash.
-        encounter: of the two; None without a collision partner.
-        judgement: what `judge` has found; None if it has not run.
+        encounter: encounter of the agent and the collision partner; None without a collision partner.
+        judgement: result of `judge`; None if `judge` has not run.
     """
 
     bundle: Bundle
@@ -59,7 +59,7 @@ class CrashFacts(Protocol):
 
 
 def verdict_of(story: CrashFacts) -> str:
-    """Return one sentence on a crash or near miss: what happened, and which run avoids it.
+    """Return one sentence on a crash or near miss: what happened, and which run avoided the crash.
 
     Args:
         story: story of the crash or near miss.
@@ -90,11 +90,11 @@ def _of_a_near_miss(story: CrashFacts) -> str:
 
 
 def describe_contact(contact: ContactRecord, omission: Omission | None = None) -> str:
-    """Return what happened at a contact, without a period.
+    """Return a description of a contact, without a final period.
 
     Args:
-        contact: contact of the agent with the other actor.
-        omission: the lane change that is the cause according to runs; None if there is none.
+        contact: contact of the agent with the collision partner.
+        omission: the lane change that caused the contact according to runs; None if there is no such lane change.
     """
     changers = contact.lane_changers(_CHANGE_S) if contact.same_way else ()
     if len(changers) != 1:
@@ -118,7 +118,7 @@ def describe_contact(contact: ContactRecord, omission: Omission | None = None) -
 
 
 def _what_touched(contact: ContactRecord) -> str:
-    """Return which actor drove into which, and with which sides."""
+    """Return which actor drove into which actor, and which sides touched."""
     agent, manner, mover = contact.agent, contact.manner, contact.collider
     met = contact.partner(mover)
     if manner == "rear end":
@@ -145,7 +145,7 @@ def _touches_a_side(contact: ContactRecord, met: str) -> bool:
 
 
 def _side(contact: ContactRecord, changer: str) -> str:
-    """Return to which side an actor changed lanes; empty if its path does not show it."""
+    """Return the side to which an actor changed lanes; empty if its path does not show the side."""
     if changer in contact.jumpers and len(contact.through) > 1:
         jump = lane_jump(contact.through[-2], contact.through[-1], changer)
         return ("left" if jump > 0 else "right") if jump else ""
@@ -161,7 +161,7 @@ def _side(contact: ContactRecord, changer: str) -> str:
 
 
 def _gap_at(contact: ContactRecord, changer: str) -> str:
-    """Return the gap between the two when one changed lanes; empty if it is unknown."""
+    """Return as text the gap between the two actors when one of them changed lanes; empty if the gap is unknown."""
     since = 0.0 if changer in contact.jumpers else contact.changed_s(changer)
     if since is None:
         return ""
@@ -184,7 +184,7 @@ def _gap_of(omission: Omission) -> str:
 
 
 def _gap_words(gap_m: float, speed_mps: float) -> str:
-    """Return a gap as the time in which the vehicle behind covers it, and in m."""
+    """Return a gap as text: the time in which the vehicle behind covers the gap, and the distance in m."""
     gap_m = max(0.0, gap_m)
     if speed_mps < _MOVES_MPS or gap_m < _SHORT_S * speed_mps:
         return f"the gap was {gap_m:.1f} m"
@@ -192,14 +192,14 @@ def _gap_words(gap_m: float, speed_mps: float) -> str:
 
 
 def _omission(story: CrashFacts) -> Omission | None:
-    """Return the omission found by runs, if it concerns the collision partner or no actor."""
+    """Return the omission found by runs, if it concerns the collision partner or no actor at all."""
     reference = story.judgement.reference if story.judgement is not None else None
     found = reference.omission if reference is not None else None
     return found if found is not None and found.actor in ("", story.other) else None
 
 
 def _avoided(story: CrashFacts, omission: Omission | None) -> str:
-    """Return which run avoided the crash, or that no run did; empty if that is unknown."""
+    """Return which run avoided the crash, or that no run did; empty if this is unknown."""
     judgement, tried = story.judgement, story.bundle.result.escape
     if omission is not None:
         return f"{_omitted(story.agent, omission)}with a reference driver there is no crash"
@@ -222,13 +222,13 @@ def _avoided(story: CrashFacts, omission: Omission | None) -> str:
 
 
 def _if_it(story: CrashFacts, how: str, step: int, changed: tuple[str, ...]) -> str:
-    """Return that a run from a step on avoids the crash, with what else the agent does otherwise in the run."""
+    """Return that a run with changes from a step on avoids the crash, and the agent's other changes in that run."""
     also = "".join(f" and {each.removeprefix(f'{story.agent} ')}" for each in changed)
     return f"if {story.agent} {how} {story.before_contact_s(step):.1f} s before{also}, there is no crash"
 
 
 def _omitted(agent: str, omission: Omission) -> str:
-    """Return what the agent omitted as a clause that ends with a semicolon; empty for a lane change."""
+    """Return the agent's omission as a clause that ends with a semicolon; empty for a lane change."""
     if omission.kind.startswith("no lane"):
         return f"{agent} changed to the {omission.kind.rpartition(' ')[2]}, where it has no lane; "
     if omission.instead == "changed lanes":

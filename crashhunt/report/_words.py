@@ -1,4 +1,4 @@
-"""The criticality of a crash or near miss in words and numbers: the agent's own and the rear criticality."""
+"""The criticality of a crash or near miss as text and numbers: the agent's own and the rear criticality."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ _DIRECTION_WORDS = {
 
 
 def about_gap(encounter: Encounter, moment: Moment) -> str:
-    """Return the distance between two actors, and their speeds."""
+    """Return the distance between two actors and their speeds as text."""
     return (
         f"they were {moment.gap_m:.1f} m apart, {_closing(moment.closing_speed)}; {encounter.agent} at "
         f"{moment.speed:.1f} m/s, {encounter.other} at {moment.other_speed:.1f} m/s"
@@ -79,7 +79,7 @@ def about_gap(encounter: Encounter, moment: Moment) -> str:
 
 
 def about_place(encounter: Encounter, moment: Moment) -> str:
-    """Return the position of the other actor relative to the agent, and its direction."""
+    """Return as text the position of the other actor relative to the agent, and its direction."""
     position = encounter.position(moment.step)
     assert position is not None
     going = _DIRECTION_WORDS[position.faces] if abs(moment.other_speed) >= MAX_STANDING_SPEED_MPS else "standing"
@@ -97,7 +97,7 @@ COLUMNS = ("danger", "from behind")
 
 
 def window_of(recording: Recording, last_s: float, nearest: DangerousMoment | None) -> tuple[int, int]:
-    """Return the first and the last step to describe: the end of a crash, or the surroundings of a near miss."""
+    """Return the first and the last step to describe: the end of a crash, or the steps around a near miss."""
     dt, end = recording.prologue.step_length_s, recording.steps
     if nearest is None:
         return end - round(last_s / dt), end
@@ -106,7 +106,7 @@ def window_of(recording: Recording, last_s: float, nearest: DangerousMoment | No
 
 
 def about_nearest(encounter: Encounter, nearest: DangerousMoment) -> list[str]:
-    """Return sentences on the most dangerous moment of a trial without a crash: when it was, and the other actor."""
+    """Return sentences on the most critical moment of a trial without a crash: its time, and the other actor."""
     moment = next((one for one in encounter.moments if one.step == nearest.step), None)
     if moment is None:
         return []
@@ -118,15 +118,15 @@ def about_nearest(encounter: Encounter, nearest: DangerousMoment) -> list[str]:
 
 
 def about_danger(course: DangerCourse, *, touched: bool = False) -> str:
-    """Return the greatest criticality of both kinds, and their sums over the trial.
+    """Return the greatest own criticality, the greatest rear criticality, and their sums over the trial as text.
 
     Args:
-        course: course of the recording.
-        touched: whether the agent touched another actor. That no actor was near is then not reported: an actor that
-            jumps into another lane is on no way before the contact.
+        course: criticality of the trial over time.
+        touched: whether the agent touched another actor. In that case, "no actor was near" is never reported, because
+            an actor that jumps into another lane has no path to the contact.
 
     Returns:
-        A sentence; empty if it would say nothing.
+        A sentence; empty if there is nothing to report.
     """
     parts = []
     for heading, moment, total, relation, absent in (
@@ -149,7 +149,7 @@ def _no_danger(course: DangerCourse) -> str:
 
 
 def danger_cells(course: DangerCourse, step: int) -> list[str]:
-    """Return the two numbers of a step, for a table."""
+    """Return the two numbers (own and rear criticality) of a step for a table."""
     found = course.of_step(step)
     return ["-"] * len(COLUMNS) if found is None else [f"{one:.2f}" if math.isfinite(one) else "-" for one in found]
 
@@ -158,7 +158,7 @@ def danger_to_json(course: DangerCourse | None, bundle: Bundle, first: int, last
     """Return the object under ``danger`` of ``show --json``; None if the recording has no criticality.
 
     Args:
-        course: course of the recording.
+        course: criticality of the recording over time.
         bundle: bundle of the trial.
         first: first step of the table.
         last: last step of the table.
@@ -178,7 +178,7 @@ def danger_to_json(course: DangerCourse | None, bundle: Bundle, first: int, last
 
 
 def nearest_to_json(nearest: DangerousMoment | None) -> dict[str, object] | None:
-    """Return the shape under ``nearest`` of ``show --json``; None of a crash."""
+    """Return the object under ``nearest`` of ``show --json``; None for a crash."""
     if nearest is None:
         return None
     return {"step": nearest.step, "danger": nearest.danger, "agent": nearest.agent, "other": nearest.other}
@@ -202,12 +202,12 @@ def _summary(moment: DangerousMoment, total: float) -> dict[str, object]:
 
 
 def about_disturbances(recording: Recording, result: TrialResult, first_step: int) -> list[str]:
-    """Return what disturbed a trial in its last steps, a sentence each, and how often anything did before.
+    """Return the disturbances in the last steps of a trial, one sentence each, and the number of earlier ones.
 
     Args:
         recording: recording of the episode.
-        result: result of it.
-        first_step: step from which on it holds.
+        result: result of the episode's trial.
+        first_step: first step to describe.
     """
     step_length_s = recording.prologue.step_length_s
     recent = [one for one in result.disturbances if one.step + one.how_long / step_length_s >= first_step]
@@ -223,7 +223,7 @@ def about_disturbances(recording: Recording, result: TrialResult, first_step: in
 
 
 def list_disturbances(result: TrialResult) -> list[str]:
-    """Return one line for each disturbance of a trial, and one line with the log-likelihood of all of them."""
+    """Return one line for each disturbance of a trial, and one line with the log-likelihood of all disturbances."""
     if not may_be_disturbed(result):
         return []
     lines = [f"disturbed from step {one.step} on: {one.words}{_place_words(one)}" for one in result.disturbances]
@@ -234,7 +234,7 @@ def list_disturbances(result: TrialResult) -> list[str]:
 
 
 def describe_disturbances(report: HuntReport) -> list[str]:
-    """Return the number of crashes with disturbances in a hunt, and the likeliest of them."""
+    """Return as text the number of a hunt's crashes with disturbances, and the likeliest of these crashes."""
     found = report.tally
     if not (report.settings.disturb and found.found):
         return []
@@ -248,11 +248,11 @@ def describe_disturbances(report: HuntReport) -> list[str]:
 
 
 def traffic_of(bundle: Bundle, likeliest: str) -> str:
-    """Return which traffic a crash took place in, in words; empty if its hunt has no disturbances.
+    """Return a text on whether the traffic of a crash was disturbed; empty if its hunt has no disturbances.
 
     Args:
         bundle: the crash.
-        likeliest: identifier of the likeliest crash with disturbances of the hunt.
+        likeliest: identifier of the likeliest of the hunt's crashes with disturbances.
     """
     if not may_be_disturbed(bundle.result):
         return ""
@@ -263,12 +263,12 @@ def traffic_of(bundle: Bundle, likeliest: str) -> str:
 
 
 def by_likelihood(crashes: Sequence[Bundle]) -> list[Bundle]:
-    """Return crashes in order: those in undisturbed traffic as they are, then the others, the likeliest first."""
+    """Return crashes in order: first those in undisturbed traffic, unsorted, then the others, the likeliest first."""
     return sorted(crashes, key=lambda bundle: (1, -_likelihood_words(bundle)) if bundle.result.disturbed else (0, 0.0))
 
 
 def may_be_disturbed(result: TrialResult) -> bool:
-    """Return whether the hunt of a crash has disturbances, even if none took place."""
+    """Return whether the hunt of a crash has disturbances, even if none occurred in the crash's trial."""
     return result.log_likelihood is not None or bool(result.spec.disturbances)
 
 
@@ -287,12 +287,12 @@ _MAX_LISTED_EVENTS = 5  # a jam has many
 
 
 def about_events(recording: Recording, first_step: int, *, besides: Event | None) -> list[str]:
-    """Return what else happened in the traffic in the last steps, a sentence each.
+    """Return other traffic events of the last steps, one sentence each.
 
     Args:
         recording: recording of the episode.
-        first_step: step from which on it holds.
-        besides: the event that ended the trial, which is described elsewhere.
+        first_step: first step to describe.
+        besides: the event that ended the trial; it is excluded because another text describes it.
     """
     end = recording.steps * recording.prologue.step_length_s
     found = [
@@ -322,9 +322,9 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
 
     Args:
         judgement: judgement of the crash.
-        ago: returns the time of a step as words, such as ``0.4 s before, after step 68``.
-        agent: the controlled vehicle.
-        other: the collision partner.
+        ago: function that returns the time of a step as text, such as ``0.4 s before, after step 68``.
+        agent: identifier of the controlled vehicle.
+        other: identifier of the collision partner.
     """
     best, runs = judgement.best, f"{judgement.runs} {'run' if judgement.runs == 1 else 'runs'}"
     sentences = []
@@ -363,12 +363,12 @@ _FACULTY_WORDS = {
 
 
 def about_reference(reference: Reference, ago: Callable[[int], str], agent: str) -> list[str]:
-    """Return what the agent omitted, in sentences; empty if no run says so.
+    """Return sentences on what the agent failed to do; empty if no run shows it.
 
     Args:
-        reference: the runs with a reference driver.
-        ago: as in `about_judgement`.
-        agent: the controlled vehicle.
+        reference: results of the runs with a reference driver.
+        ago: function that returns the time of a step as text, as in `about_judgement`.
+        agent: identifier of the controlled vehicle.
     """
     if reference.omission is None:
         return []
@@ -385,7 +385,7 @@ def about_reference(reference: Reference, ago: Callable[[int], str], agent: str)
 
 
 def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
-    """What an agent omitted, as a sentence without its period."""
+    """Return what an agent failed to do, as a sentence without its period."""
     actor, kind = omission.actor, omission.kind
     seen = ""
     if omission.visible_step is not None and omission.visible_step <= omission.step:
@@ -417,7 +417,7 @@ def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
 
 
 def about_changes(changed: Sequence[str]) -> str:
-    """Return the further differences of the agent in a run, as a sentence with a leading space; empty for none."""
+    """Return further differences of the agent in a run, as a sentence with a leading space; empty if there are none."""
     return f" In addition, {' and '.join(changed)} in that run." if changed else ""
 
 
@@ -445,11 +445,11 @@ _MANEUVER_NOUNS = {"braked": "braking", "sped up": "speeding up", "changed lanes
 
 
 def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
-    """Return the causes of a crash, one sentence each, then the elements that make no difference.
+    """Return the causes of a crash, one sentence each, then the factors without influence.
 
     Args:
-        why: the runs.
-        when: returns the time of a step as words, such as ``61.3 s``.
+        why: the results of the runs.
+        when: function that returns the time of a step as text, such as ``61.3 s``.
     """
     defaults = {factor.name: factor for factor in why.factors if (factor.kind, factor.what) == ("argument", "default")}
     drawn = {
@@ -540,7 +540,7 @@ def _number(value: Value | None) -> str:
 
 
 def describe_probes(report: HuntReport) -> list[str]:
-    """Return the stress margins of trials, and the crashes of copies that reproduce from the start."""
+    """Return as text the robustness margins of trials, and the crashes of forks that reproduce from the start."""
     found = report.probes
     if found is None or not (found.margins or found.not_fully_asked):
         return []
@@ -566,7 +566,7 @@ def describe_probes(report: HuntReport) -> list[str]:
 
 
 def describe_branches(report: HuntReport) -> list[str]:
-    """Return the results of branches, and which of their crashes reproduce from the start."""
+    """Return as text the results of branches, and which of their crashes reproduce from the start."""
     found = report.branches
     if found is None or not found.trials:
         return []
@@ -591,7 +591,7 @@ def describe_branches(report: HuntReport) -> list[str]:
 
 
 def _not_fully_asked(count: int, why: str) -> list[str]:
-    """Return a line on the trials with incomplete answers; an empty list where there is no such trial."""
+    """Return a line on the trials with incomplete answers; an empty list if there are no such trials."""
     if not count:
         return []
     return [f"  {_count_words(count, 'trial')} {'was' if count == 1 else 'were'} not fully probed: {why}"]

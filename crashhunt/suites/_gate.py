@@ -1,10 +1,10 @@
-"""A gate: a verdict on a change, from hunts of two versions in the same traffic.
+"""A gate: compares two versions by hunts in the same traffic, and returns a verdict on the change.
 
 BASE and HEAD are two commits of a Git repository, each imported from a temporary work tree, or two agents. Their hunts
-run at the same time, each in its own process, with the same seed. Trials, traffic and disturbances follow from the
-seed and the number of a trial, and not from what the agent does. The hunts end as soon as `PairWatch` decides.
+run at the same time, each in its own process, with the same seed. The traffic and the disturbances of a trial follow
+from the seed and the number of the trial, not from the agent's actions. The hunts end as soon as `PairWatch` decides.
 
-The hunts of a suite run one pair after the other: the order of all pairs must not depend on results.
+The hunts of a suite run one pair after another, because the order of all pairs must not depend on results.
 """
 
 from __future__ import annotations
@@ -66,12 +66,12 @@ _ORIGIN_SCRIPT = "import importlib.util, sys; print(importlib.util.find_spec(sys
 
 @dataclass(frozen=True, slots=True)
 class GateVersion:
-    """BASE or HEAD.
+    """One of the two versions that a gate compares: BASE or HEAD.
 
     Args:
-        word: as the user gave it.
-        agents: vehicle to its agent, as in ``--agent``; empty if the version is a commit.
-        commit: its digits; empty if the version is an agent.
+        word: the version as the user named it.
+        agents: target of the agent of each vehicle, as in ``--agent``; empty if the version is a commit.
+        commit: hexadecimal digits of the commit; empty if the version is an agent.
     """
 
     word: str
@@ -80,10 +80,10 @@ class GateVersion:
 
     @classmethod
     def of(cls, word: str, folder: Path) -> GateVersion:
-        """Return the version that a word names: an agent, or else a commit of the repository of a folder.
+        """Return the version that a word names: an agent, or else a commit of the folder's repository.
 
         Raises:
-            UsageError: it is neither.
+            UsageError: the word names neither an agent nor a commit.
         """
         vehicle, equals, locator = word.rpartition("=")
         if ":" in locator or locator in registered("agents"):
@@ -97,7 +97,7 @@ class GateVersion:
             raise UsageError(f"{word!r} is neither an agent nor a commit: {error.message}", fix=fix) from None
 
     def __str__(self) -> str:
-        """The name of the agent, or the revision with the first digits of its commit."""
+        """Return the name of the agent, or the revision with the first digits of its commit."""
         if not self.commit:
             return self.word
         return self.word if self.commit.startswith(self.word) else f"{self.word} ({self.commit[:10]})"
@@ -105,15 +105,15 @@ class GateVersion:
 
 @dataclass(frozen=True, slots=True)
 class GateProgress:
-    """Progress of a gate, for display.
+    """Progress of a running gate, for display.
 
     Args:
-        name: name of the hunt that runs.
-        done: pairs of trials that have ended, of all hunts.
-        most: largest number.
+        name: name of the running hunt.
+        done: number of finished pairs of trials in all hunts.
+        most: maximum number of pairs.
         only_base: number of pairs in which only BASE crashes.
         only_head: number of pairs in which only HEAD crashes.
-        evidence: e-value that they do not crash equally often.
+        evidence: e-value against the hypothesis that both versions crash equally often.
     """
 
     name: str
@@ -126,23 +126,25 @@ class GateProgress:
 
 @dataclass(frozen=True, kw_only=True)
 class Gate:
-    """The versions that a gate compares, and its limits.
+    """The two versions that a gate compares, and the limits of the comparison.
 
     Args:
         base: the version before the change.
-        head: the version with it.
-        hunts: name to what a hunt of either version is; its ``trials`` do not count.
+        head: the version that contains the change.
+        hunts: name and request of each hunt that both versions run; the ``trials`` of a request are ignored.
         folder: folder from which the user imports agents.
-        most: maximum number of pairs of trials, of all hunts together.
-        duration_s: the most wall time, in s; infinite for no limit.
-        margin: the greatest difference in crashes per trial that counts as no difference; 0 for no such verdict.
+        most: maximum number of pairs of trials in all hunts together.
+        duration_s: maximum wall time, in s; infinite for no limit.
+        margin: the greatest difference in crashes per trial that counts as equivalent; 0 to disable the verdict of
+            equivalence.
         confidence: confidence of the verdict, in percent.
-        corpus: corpus of HEAD, as a path from the folder; where it is None, ``crashes``, if HEAD is a commit that has
-            it.
-        parallel: trials at a time, of both versions together; 0 for one per core.
-        is_suite: whether there may be several hunts; then only *worse* ends the gate before the last of them.
-        trusted: whether hunts that are there already, and the corpus, may run in any case.
-        machine: options such as ``executor`` that apply to all hunts.
+        corpus: path of HEAD's corpus, relative to the folder. If it is None, ``crashes`` is used if HEAD is a commit
+            that contains it.
+        parallel: number of trials at a time, of both versions together; 0 for one per core.
+        is_suite: whether there may be several hunts; in that case, only the verdict *worse* ends the gate before the
+            last hunt.
+        trusted: whether existing hunts and the corpus may run even if they are not trusted.
+        machine: execution options, such as ``executor``, that apply to all hunts.
     """
 
     base: GateVersion
@@ -160,15 +162,16 @@ class Gate:
     machine: Given | None = None
 
     def run(self, directory: Path | None = None, watch: Callable[[GateProgress], None] | None = None) -> GateReport:
-        """Compare the two until the verdict is certain, the last pair, the end of the time, or an interrupt.
+        """Compare the two versions until the verdict is certain, the pairs or the time are used up, or an interrupt.
 
         Args:
-            directory: folder of the hunts; ended trials in it are not run again. None for a temporary folder.
-            watch: called about once a second.
+            directory: folder of the hunts; finished trials in this folder are not run again. None for a temporary
+                folder.
+            watch: function called about once a second with the progress.
 
         Raises:
-            UsageError: an agent was trained on all traffics, or an option is out of range.
-            CrashhuntError: a hunt cannot be run, or the directory is of another gate.
+            UsageError: an agent was trained on all traffic seeds, or an option is out of range.
+            CrashhuntError: a hunt cannot be run, or the directory belongs to another gate.
         """
         self._check()
         with ExitStack() as stack:
@@ -177,7 +180,7 @@ class Gate:
             return _Run(self, place, stack, watch, is_kept=directory is not None).report()
 
     def cautions(self) -> Iterator[str]:
-        """Yield what a user of two commits may not expect."""
+        """Yield warnings on facts about the two commits that the user may not expect."""
         if self.base.commit and self.base.commit == self.head.commit:
             yield f"BASE and HEAD are the same commit ({self.head.commit[:10]})"
         status = ("--no-optional-locks", "status", "--porcelain", "--untracked-files=no")
@@ -204,10 +207,10 @@ class Gate:
 
 @contextmanager
 def _locked(place: Path) -> Iterator[None]:
-    """Keep other gates out of a folder, by a lock that dies with this process; the folder is made.
+    """Create a folder and lock it against other gates; the lock ends with this process.
 
     Raises:
-        HuntDirectoryError: another gate runs there, or the folder is of something else, or unwritable.
+        HuntDirectoryError: another gate runs there, the folder has other contents, or the folder is not writable.
     """
     try:
         place.mkdir(exist_ok=True)
@@ -228,7 +231,7 @@ def _locked(place: Path) -> Iterator[None]:
 
 
 def _check_request(run: RunRequest, where: str) -> None:
-    """Refuse hunts whose trials are no pairs, or whose end depends on crashes."""
+    """Refuse hunts whose trials cannot be paired, or whose end depends on crashes."""
     request = run.request
     options: dict[str, object] = {
         f"the sampler {request.sampler}": request.sampler != "random", "--seeds": request.seeds, "--rare": request.rare,
@@ -240,7 +243,7 @@ def _check_request(run: RunRequest, where: str) -> None:
 
 
 class _Run:
-    """One run of a gate in a directory."""
+    """One run of a gate in its directory."""
 
     def __init__(
         self, gate: Gate, place: Path, stack: ExitStack, watch: Callable[[GateProgress], None] | None, *, is_kept: bool
@@ -282,7 +285,7 @@ class _Run:
     # What is compared.
 
     def _begin(self) -> int:
-        """Write the description of the gate, or check that the folder has the same gate; return its seed."""
+        """Write the description of the gate, or check that the folder belongs to the same gate; return its seed."""
         gate, file = self._gate, self._place / GATE
         given = next(iter(gate.hunts.values())).request.seed
         asked = {
@@ -321,7 +324,7 @@ class _Run:
             yield paired
 
     def _request(self, run: RunRequest, side: str, most: int, number: int) -> RunRequest:
-        """Return the hunt of one version; ``number`` is its place among the hunts."""
+        """Return the request of the hunt of one version; ``number`` is its position among the hunts."""
         asked = run.request
         settings = replace(asked.run, keep_going=True, keep=_BUNDLES_PER_TYPE, parallel=1)
         seed = asked.seed
@@ -335,7 +338,7 @@ class _Run:
         return replace(run, request=request, folder=str(folder))
 
     def _folder_of(self, side: str, folder: Path) -> Path:
-        """Return where a version is imported from, instead of from a folder of the user's."""
+        """Return the folder from which a version is imported: a work tree, or the user's folder."""
         tree = self._trees.get(side)
         if tree is None:
             return folder
@@ -343,7 +346,7 @@ class _Run:
         return tree / resolved.relative_to(self._top) if resolved.is_relative_to(self._top) else tree
 
     def _plan(self, place: Path, request: RunRequest) -> None:
-        """Write what a hunt will be, or see that the one that is there is the same; its folder may have moved."""
+        """Write the request of a hunt, or check that the existing request is the same; its folder may have moved."""
         try:
             if (place / REQUEST).exists():
                 before = RunRequest.read(place / REQUEST)
@@ -367,7 +370,7 @@ class _Run:
         """Check that the agents are imported from the work trees.
 
         Raises:
-            UsageError: it does not, so that both versions would be the same.
+            UsageError: an agent is imported from elsewhere, so that both versions would be the same.
         """
         modules = sorted({module for run in self._gate.hunts.values() for module in _modules_of(run)})
         for side, tree in self._trees.items():
@@ -386,7 +389,7 @@ class _Run:
     # The corpus.
 
     def _run_corpus(self) -> tuple[GateCase, ...] | None:
-        """Run the cases of HEAD with its code, in its own process; None if there is no corpus."""
+        """Run the corpus cases of HEAD with HEAD's code, in a separate process; None if there is no corpus."""
         gate = self._gate
         given = gate.corpus or Path(_DEFAULT_CORPUS)
         folder = self._folder_of(HEAD, gate.folder)
@@ -484,11 +487,11 @@ class _Run:
         )
 
     def _refuse_failed(self, paired: PairedHunts) -> bool:
-        """Raise the error of a hunt that could not run; return whether no more hunts are to run.
+        """Raise the error of a hunt that could not run; return whether the gate must start no more hunts.
 
         Raises:
-            NoValidTrialError: no trial of it was valid.
-            HuntDirectoryError: any other failure.
+            NoValidTrialError: no trial of the hunt was valid.
+            HuntDirectoryError: the hunt failed for any other reason.
         """
         if paired.is_hopeless:
             self._why = f"{paired.name}: {paired.why_not}"
@@ -553,7 +556,7 @@ class _Run:
         return report
 
     def _rates(self) -> tuple[CrashRate, CrashRate] | None:
-        """Return the rates of the only two hunts; None if there are several, or one has not begun."""
+        """Return the rates of the only two hunts; None if there are several pairs, or if a hunt has not begun."""
         (paired, *others) = self._hunts
         if others or not all((folder / layout.HUNT).exists() for folder in paired.folders) or not paired.counts.pairs:
             return None
@@ -573,10 +576,10 @@ class _Run:
 
 
 def _wait_until_free(hunt: Path) -> None:
-    """Wait for the process of a hunt whose gate was killed: it stops on its own, and saves what has ended.
+    """Wait for the process of a hunt whose gate was killed. The process stops on its own, and saves finished trials.
 
     Raises:
-        BusyError: it is still there after some seconds.
+        BusyError: the process still runs after some seconds.
     """
     deadline = time.monotonic() + _BUSY_S
     while True:
@@ -590,7 +593,7 @@ def _wait_until_free(hunt: Path) -> None:
 
 
 def _ended_early(paired: PairedHunts) -> str:
-    """Return which hunt ended without all its trials, and the last line that it printed; empty if neither did."""
+    """Return which hunt ended before its last trial, and the last line of its output; empty if both are complete."""
     for side, folder in zip((BASE, HEAD), paired.folders, strict=True):
         state = hunt_state(folder).state
         if state not in ("finished", "crashed"):
@@ -602,7 +605,7 @@ def _ended_early(paired: PairedHunts) -> str:
 
 
 def _modules_of(run: RunRequest) -> set[str]:
-    """Return the modules that drive in a hunt, where they are not crashhunt's own."""
+    """Return the modules of the agents that drive in a hunt, except crashhunt's own modules."""
     agents = dict(run.request.agents)
     if not agents:
         try:
@@ -615,7 +618,7 @@ def _modules_of(run: RunRequest) -> set[str]:
 
 
 def _origin_of(module: str, folder: Path, environment: Mapping[str, str]) -> Path:
-    """Return the file of a module as a work tree finds it; the tree's own folder where it cannot be found there."""
+    """Return the file from which a module is imported in a work tree; the tree's folder if it cannot be found."""
     done = run_to_end([sys.executable, "-c", _ORIGIN_SCRIPT, module], folder, environment)
     return Path(done.stdout.strip()).resolve() if done.returncode == 0 else folder
 

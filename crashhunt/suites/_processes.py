@@ -1,4 +1,4 @@
-"""Hunts in their own processes, several at a time: a failure of one does not affect the others."""
+"""Hunts that run at the same time, each in its own process, so that a failure of one does not affect the others."""
 
 from __future__ import annotations
 
@@ -72,11 +72,11 @@ _PR_SET_PDEATHSIG = 1
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
-    """The request of a run of a suite: `request.json` in its folder.
+    """The request for one run of a suite, stored as `request.json` in the folder of the run.
 
     Args:
         request: request of the hunt.
-        folder: folder from where agents are imported.
+        folder: folder from which agents are imported.
         snapshot: options of the snapshot.
     """
 
@@ -85,19 +85,19 @@ class RunRequest:
     snapshot: SnapshotChoices = field(default_factory=SnapshotChoices)
 
     def to_json(self) -> dict[str, object]:
-        """Return plain data: the request, and the options of the snapshot."""
+        """Return JSON-compatible data: the request, and the options of the snapshot."""
         return {"request": asdict(self.request), "folder": self.folder, **asdict(self.snapshot)}
 
     def to_plain(self) -> object:
-        """Return the object as read from its file."""
+        """Return the request as read from its file."""
         return json.loads(json.dumps(self.to_json(), default=str))
 
     @classmethod
     def read(cls, file: Path) -> RunRequest:
-        """Read one.
+        """Read a request from its file.
 
         Raises:
-            HuntDirectoryError: it is missing or damaged.
+            HuntDirectoryError: the file is missing or damaged.
         """
         try:
             data = json.loads(file.read_text(encoding="utf-8"))
@@ -110,7 +110,7 @@ class RunRequest:
 
 
 def write_request(folder: Path, request: RunRequest) -> None:
-    """Write ``request.json``; the file is never incomplete."""
+    """Write ``request.json``. The file is never incomplete."""
     data = json.loads(json.dumps(request.to_json(), default=str))
     data["authentication_code"] = authentication_code(PURPOSE_OF_REQUEST, data)
     with whole_file(folder / REQUEST) as temporary:
@@ -121,7 +121,7 @@ def slots_of(parallel: int) -> int:
     """Return the number of trials that run at a time; 0 means one per core.
 
     Raises:
-        UsageError: it is negative.
+        UsageError: ``parallel`` is negative.
     """
     if parallel < 0:
         raise UsageError(f"PARALLEL is {parallel}", fix="give at least 0 (0: one per core)")
@@ -129,10 +129,10 @@ def slots_of(parallel: int) -> int:
 
 
 def check_machine(parallel: int, machine: Given | None) -> None:
-    """Refuse what no hunt could run with, before any of them starts.
+    """Refuse invalid execution options before any hunt starts.
 
     Raises:
-        UsageError: ``parallel`` is negative, or an option is none.
+        UsageError: ``parallel`` is negative, or an option does not exist.
         PluginError: the executor does not exist.
     """
     slots_of(parallel)
@@ -148,19 +148,19 @@ def run_all(
     is_enough: Callable[[], bool] = lambda: False,
     environments: Mapping[Path, Mapping[str, str]] | None = None,
 ) -> None:
-    """Run hunts, each in its own process, until all have ended, are no longer needed, or are interrupted.
+    """Run hunts, each in its own process, until all have ended, no more are needed, or the user interrupts.
 
     Args:
-        folders: folders of the runs, each with its ``request.json``.
-        parallel: trials at a time, of all hunts together; 0 for one per core.
-        watch: called about once a second, and at the end.
-        machine: options that hold for all of them, whatever each says.
-        is_enough: called after each `watch`; if it returns true, the hunts stop as after an interrupt.
-        environments: folder to the environment variables of its process; that of this process where there is none.
+        folders: folders of the runs; each contains a ``request.json``.
+        parallel: number of trials at a time, of all hunts together; 0 for one per core.
+        watch: function called about once a second, and at the end, with the states of the hunts.
+        machine: execution options for all hunts, which replace the options of each request.
+        is_enough: function called after each `watch`; if it returns true, the hunts stop as after an interrupt.
+        environments: environment variables of the process of each folder; by default the variables of this process.
 
     Raises:
         UsageError: ``parallel`` is negative.
-        KeyboardInterrupt: interrupted; what has finished is kept, and the hunts have stopped.
+        KeyboardInterrupt: the user interrupted the run; finished trials are kept, and all hunts have stopped.
     """
     slots = slots_of(parallel)
     waiting = deque(folders)
@@ -204,16 +204,16 @@ def run_all(
 
 
 def set_aside(folder: Path, planned: Callable[[Path], RunRequest]) -> Path:
-    """Move the results of a run to a folder next to it, so that it can run again; return that folder.
+    """Move the results of a run to a folder next to it, so that the run can start again; return the new folder.
 
-    A process that is killed meanwhile leaves the folder either unchanged, or planned again.
+    If the process is killed during the move, the folder is either unchanged or contains the new request.
 
     Args:
         folder: folder of the run.
-        planned: called with where its content will be; returns what the run will be.
+        planned: function called with the new path of the folder's contents; it returns the new request of the run.
 
     Raises:
-        OSError: the folders cannot be made or renamed.
+        OSError: a folder cannot be created or renamed.
     """
     number = 0
     while (aside := folder.with_name(f"{folder.name}{layout.REPLACED}{number}")).exists():
@@ -235,7 +235,7 @@ def set_aside(folder: Path, planned: Callable[[Path], RunRequest]) -> Path:
 
 
 def _is_same_plan(aside: Path, request: RunRequest) -> bool:
-    """Return whether a folder has only the plan that an earlier call made before it was killed."""
+    """Return whether a folder contains only the request that an earlier, killed call wrote."""
     if not aside.is_dir() or [path.name for path in aside.iterdir()] != [REQUEST]:
         return False
     return RunRequest.read(aside / REQUEST).to_plain() == request.to_plain()
@@ -295,9 +295,9 @@ def _main(folder: Path, run: Given, parent: int) -> None:
 
 
 def _planned(folder: Path, request: Request, machine: Given) -> tuple[Scenario, HuntSettings, ImportedModules | None]:
-    """The hunts to run: existing ones or new ones; ``trials`` in the options replaces their number of trials.
+    """Return scenario and settings of an existing or new hunt; ``trials`` in the options replaces its trials.
 
-    The last value is the modules that trials import, where they are known.
+    The last returned value is the modules that trials import; None if they are unknown.
     """
     run = dict(machine)
     trials = run.pop("trials", None)
@@ -318,7 +318,7 @@ def _planned(folder: Path, request: Request, machine: Given) -> tuple[Scenario, 
 
 
 def _fail(folder: Path, message: str, trace: str) -> None:
-    """Write down why a hunt could not run."""
+    """Write the reason why a hunt could not run to its folder."""
     with suppress(CrashhuntError, OSError), HuntDirectory(folder).locked():  # where another runs, that one has the word
         (folder / layout.ERROR_LOG).write_text(f"{message}\n{trace}", encoding="utf-8", errors="replace")
         with closing(Ledger(folder / layout.LEDGER, writable=True)) as ledger:
@@ -337,7 +337,7 @@ def refuse_untrusted_hunt(hunt: Path) -> None:
     """Refuse to run a hunt again that is neither made here nor trusted.
 
     Raises:
-        UntrustedError: with what would be imported.
+        UntrustedError: the hunt is not trusted; the message names the code that would be imported.
     """
     requested = (hunt / REQUEST).exists()
     begun = (hunt / layout.HUNT).exists()
@@ -366,11 +366,11 @@ def refuse_untrusted_hunt(hunt: Path) -> None:
 
 
 def trust_hunt(hunt: Path, path: Path) -> list[TrustedOrigin]:
-    """Trust all code of a hunt from now on, and return the entries.
+    """Trust all code of a hunt from now on, and return the new entries.
 
     Args:
-        hunt: its directory.
-        path: what the user named.
+        hunt: directory of the hunt.
+        path: path as the user named it.
 
     Raises:
         BundleError: a snapshot is damaged.

@@ -1,4 +1,4 @@
-"""Hunts that run again: what failed in place, or another version of one elsewhere."""
+"""Reruns: failed hunts run again in place, or a changed version of a hunt runs in another directory."""
 
 from __future__ import annotations
 
@@ -50,25 +50,27 @@ def rerun(
     machine: Given | None = None,
     trusted: bool = False,
 ) -> tuple[list[HuntState], list[Path]]:
-    """Run hunts again; return their states, and the folders with the replaced files.
+    """Run hunts again; return their states, and the folders to which replaced files were moved.
 
     A hunt that ended in an error runs again. A hunt that was interrupted or killed resumes. A hunt with trials that
-    could not be set up resumes with these trials. Finished hunts stay unchanged.
+    could not be set up repeats these trials. Finished hunts stay unchanged.
 
     Args:
-        hunts: their directories.
-        everything: run all of them again, including finished ones.
-        changes: ``NAME`` or ``AGENT.NAME`` of an argument, ``trials``, ``max_steps`` or ``seed`` to what it shall be.
-        to: run one hunt in this directory instead; its own directory does not change.
-        parallel: trials at a time, of all hunts together; 0 for one per core.
-        watch: called about once a second.
-        machine: options such as ``executor`` that apply to all hunts, in place of their own.
-        trusted: whether what the hunts name may run; otherwise each has to be trusted, before the first one runs.
+        hunts: directories of the hunts.
+        everything: whether to run all hunts again, including finished hunts.
+        changes: new value by name: ``NAME`` or ``AGENT.NAME`` of an argument, ``trials``, ``max_steps`` or ``seed``.
+        to: directory in which a changed version of a single hunt runs; the directory of the original hunt does not
+            change.
+        parallel: number of trials at a time, of all hunts together; 0 for one per core.
+        watch: function called about once a second with the states of the hunts.
+        machine: execution options, such as ``executor``, that replace the options of all hunts.
+        trusted: whether the code that the hunts name may run; otherwise every hunt must be trusted before the first
+            hunt starts.
 
     Raises:
-        UsageError: a change cannot be meant.
+        UsageError: a change names an unknown argument or an invalid value.
         UntrustedError: a hunt is neither made here nor trusted.
-        HuntDirectoryError: a directory cannot be used.
+        HuntDirectoryError: a directory cannot be read or written.
     """
     check_machine(parallel, machine)
     for hunt in () if trusted else hunts:
@@ -106,7 +108,7 @@ def rerun(
 
 
 def _request_of(settings: HuntSettings) -> Request:
-    """The request that results in these settings."""
+    """Return the request that would result in the given settings."""
     arguments = {
         f"{agent}.{name}": spec.spec
         for agent, chosen in settings.agents.items()
@@ -172,7 +174,7 @@ def _changed(asked: RunRequest, changes: Mapping[str, str], hunt: Path) -> RunRe
 
 
 class _Names:
-    """Whose arguments names mean in a hunt that has run, or is planned."""
+    """Resolves names of arguments to agents, for a hunt that has run or is planned."""
 
     def __init__(self, asked: RunRequest, hunt: Path) -> None:
         request = asked.request
@@ -199,7 +201,7 @@ class _Names:
 
 
 def _replace_invalid(hunt: Path, state: HuntState) -> int:
-    """Run trials again that could not be set up, unless the hunt has reached its goal."""
+    """Run the trials again that could not be set up, unless the hunt has reached its goal."""
     run = read_settings(hunt / layout.HUNT).run
     done = (state.crashes and not run.keep_going) or 0 < run.distinct <= len(state.kinds or ())
     if not state.outcomes.get(Outcome.INVALID):
@@ -240,10 +242,10 @@ def _run_copies(
 
 
 def _require_same_request(to: Path, request: RunRequest) -> None:
-    """Check that a directory is that of the same command, which was killed or interrupted.
+    """Check that a directory belongs to the same command, which was killed or interrupted.
 
     Raises:
-        HuntDirectoryError: it is something else, it runs, or it ended in an error.
+        HuntDirectoryError: the directory has other contents, its hunt is running, or its hunt ended in an error.
     """
     try:
         same = RunRequest.read(to / REQUEST).to_plain() == request.to_plain()

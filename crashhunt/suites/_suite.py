@@ -1,4 +1,4 @@
-"""`suite.toml`: many hunts, each several times with its own seeds; its keys are the options of hunts and a few more."""
+"""`suite.toml`: a list of hunts; each runs several times with different seeds. Most keys are the options of hunts."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ class SuiteEntry(HuntOptions):
     """``[[hunts]]``: one hunt of a suite; ``[defaults]`` has the same keys. The fields are the options of hunts.
 
     Args:
-        id: names its folder; unique in the suite.
+        id: name of the hunt's folder; unique in the suite.
         agent: the agent that drives, if the scenario has one controlled vehicle.
-        agents: vehicle to its agent, if there are several.
+        agents: agent of each vehicle, if the scenario has several controlled vehicles.
         runs: number of runs, each with its own seed.
-        trials: trials of each run, at most.
-        max_steps: the bound on each trial, in steps.
+        trials: maximum number of trials of each run.
+        max_steps: maximum number of steps of each trial.
     """
 
     # Paths of scenario and snapshot_roots are from the folder of the file; the seeds of the runs come from seed.
@@ -70,11 +70,11 @@ class _File:
 
 @clear_constructor
 class Suite:
-    """Hunts to be run into one directory.
+    """A list of hunts to run in one directory.
 
     Args:
-        entries: the hunts.
-        folder: folder from which relative paths of scenarios start, and from which agents are imported.
+        entries: the hunts of the suite.
+        folder: folder to which relative paths of scenarios refer, and from which agents are imported.
 
     Raises:
         UsageError: an id is missing, is used twice, or is not a valid folder name.
@@ -106,7 +106,7 @@ class Suite:
         """Read a ``suite.toml``.
 
         Raises:
-            UsageError: it is missing or not valid, with the key, its value and the fix.
+            UsageError: the file is missing or not valid; the message names the key, its value and the fix.
         """
         file = Path(path)
         try:
@@ -132,7 +132,7 @@ class Suite:
             raise UsageError(error.message, fix=error.fix, where=str(file)) from None
 
     def plan(self, directory: Path | str) -> list[Path]:
-        """Create a folder for every run, with its request. A second call changes nothing.
+        """Create a folder with a request for every run. A second call changes nothing.
 
         Raises:
             HuntDirectoryError: the directory contains another suite, or cannot be written.
@@ -170,20 +170,21 @@ class Suite:
         machine: Given | None = None,
         trusted: bool = False,
     ) -> list[HuntState]:
-        """Run all hunts that have not ended, even if some fail; return the state of each.
+        """Run all unfinished hunts, even if some fail; return the state of each hunt.
 
         Args:
-            directory: directory of the suite; created if it does not exist. Finished hunts in it stay unchanged.
-            parallel: trials at a time, of all hunts together; 0 for one per core.
-            watch: called about once a second.
-            machine: options such as ``executor`` that apply to all hunts, in place of their own.
-            trusted: whether what hunts name that are there already may run; otherwise each has to be trusted, before
-                the first one runs.
+            directory: directory of the suite; created if it does not exist. Finished hunts in the directory stay
+                unchanged.
+            parallel: number of trials at a time, of all hunts together; 0 for one per core.
+            watch: function called about once a second with the states of the hunts.
+            machine: execution options, such as ``executor``, that replace the options of all hunts.
+            trusted: whether the code that existing hunts name may run; otherwise every hunt must be trusted before the
+                first hunt starts.
 
         Raises:
             UntrustedError: an existing hunt was not made on this machine and is not trusted.
             HuntDirectoryError: the directory contains another suite, or cannot be written.
-            PluginError: there is no such executor.
+            PluginError: the executor does not exist.
         """
         check_machine(parallel, machine)
         folders = self.plan(directory)
@@ -199,11 +200,11 @@ class Suite:
         return [hunt_state(folder) for folder in folders]
 
     def request(self, entry: SuiteEntry, number: int) -> RunRequest:
-        """Return the request of a run of an entry, with its own seed.
+        """Return the request for one run of an entry, with the seed of the run.
 
         Args:
-            entry: entry of this suite.
-            number: number of the run, from 0.
+            entry: entry of the suite.
+            number: number of the run, counted from 0.
 
         Raises:
             UsageError: the agent is not in a module that workers can import.
@@ -239,7 +240,7 @@ class Suite:
 
 
 def default_suite() -> str:
-    """Return a ``suite.toml`` with every shipped scenario, ready to be edited."""
+    """Return the text of a ``suite.toml`` with every shipped scenario, as a template for the user."""
     lines = [
         "# Every scenario that comes with crashhunt. Run it with: crashhunt suite run FILE DIR",
         "schema = 1",
