@@ -1,4 +1,4 @@
-"""The ledger of a hunt: facts about its trials in one SQLite file, its schema and migrations, its writer and reader."""
+"""The ledger of a hunt: facts about its trials in one SQLite file, with schema, migrations, writer and reader."""
 
 import lazy_loader
 

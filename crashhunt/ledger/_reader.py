@@ -1,4 +1,4 @@
-"""Reader of a ledger. Every row that is read is checked against its digest."""
+"""The reader of a ledger. It checks every row against the digest of the row."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = ["Facts", "HuntOwner", "KindData", "LedgerReader", "Noted", "Seal", "T
 
 
 class KindData(TypedDict):
-    """A crash type as in the ledger and in ``--json``."""
+    """A crash type, in the form in which the ledger and ``--json`` have it."""
 
     words: str
     count: int
@@ -39,7 +39,7 @@ class KindData(TypedDict):
 
 
 class HuntOwner(TypedDict):
-    """Identifies a process: ``started`` is in ticks since the start of its machine."""
+    """Identifies a process by host, process id and start time; ``started`` is in ticks since the machine started."""
 
     host: str
     pid: int
@@ -55,11 +55,11 @@ class UntilRate(TypedDict):
 
 
 class RateBounds(TypedDict):
-    """An interval.
+    """A confidence interval of a rate.
 
     Args:
-        low: the least rate.
-        high: the upper bound; None if there is none.
+        low: the lower bound.
+        high: the upper bound; None if there is no upper bound.
     """
 
     low: float
@@ -67,24 +67,24 @@ class RateBounds(TypedDict):
 
 
 class RunningRate(TypedDict):
-    """The rate of a hunt so far, as ``status --json`` reports it.
+    """The current crash rate of a hunt, as ``status --json`` reports it.
 
     Args:
-        method: ``plain``, counted trials; or ``rare``, copies with forced onsets, and plain trials.
-        per: what the rate is per.
+        method: ``plain`` for counted trials, or ``rare`` for forks with forced disturbances together with plain trials.
+        per: the unit of exposure to which the rate refers, such as a trial or a kilometre.
         confidence: confidence of all intervals, in percent.
-        units: independent units that count: trials, traffics or roots.
-        trials: plain trials that count.
+        units: number of independent units that count: trials, traffic seeds, or trials from which forks start.
+        trials: number of plain trials that count.
         crashes: number of crashes in these trials.
-        origin: the origin of the trials that count; empty if all do.
-        certain: interval that is valid whenever you look; None if there is none.
-        estimate: crash probability per trial by the copies; None if there is none.
-        estimated: interval for it; None if the roots cannot carry one.
-        why_not: why there is no certain interval, or no estimated one; empty if there is.
-        bar: rate that the hunt is compared with; None for none.
-        verdict: ``below``, ``above`` or ``undecided``; empty without a bar.
-        trained_on: number of trials that do not count, because an agent was trained on their traffic; missing if all
-            count.
+        origin: the origin of the trials that count; empty if all trials count.
+        certain: interval that is valid whenever the user looks at it; None if there is none.
+        estimate: crash probability per trial, estimated from the forks; None if there is no estimate.
+        estimated: interval of the estimate; None if there are too few trials from which forks start.
+        why_not: why the certain interval or the estimated interval is missing; empty if neither is missing.
+        bar: threshold with which the rate is compared; None if there is no threshold.
+        verdict: ``below``, ``above`` or ``undecided``; empty if there is no threshold.
+        trained_on: number of trials that do not count because an agent was trained on their traffic; missing if all
+            trials count.
     """
 
     method: Literal["plain", "rare"]
@@ -104,47 +104,48 @@ class RunningRate(TypedDict):
 
 
 class Noted(TypedDict, total=False):
-    """The recorded facts about a hunt in addition to its state; None removes a fact.
+    """The facts about a hunt that are recorded in addition to its state; setting a fact to None removes it.
 
     Args:
-        owner: the process that runs it, while it runs.
-        began: when it was begun or resumed, in s since the epoch.
+        owner: the process that runs the hunt; None while no process runs it.
+        began: time at which the hunt was started or resumed, in s since the epoch.
         heartbeat: time of the last sign of life of the hunt, in s since the epoch.
         done_before: number of trials that had ended at the start of this run.
         planned: number of planned trials; 0 if only the time is limited.
-        until: when its time is up, in s since the epoch; None if it has all the time.
-        hunt_seed: what its trials are drawn from.
-        independent: whether they were drawn independently of each other.
-        plain_origin: origin of the independent trials, if its sampler keeps some apart that it does not guide;
+        until: time at which the hunt's time limit ends, in s since the epoch; None if there is no time limit.
+        hunt_seed: seed from which the trials of the hunt are drawn.
+        independent: whether the trials were drawn independently of each other.
+        plain_origin: origin of the independent trials, if the sampler also draws some trials that it does not guide;
             else None.
-        lag: number of trials by which results for a sampler that learns are delayed at most.
-        lag_grows: whether they are delayed by fewer at the beginning; None in hunts of before, where the lag is fixed.
-        sampler_version: version of the proposals of a sampler that learns; None in hunts of before, which have
-            version 1.
-        origins: whether its sampler says where trials come from.
-        core: whether the simulator's compiled core is used; None if it has none.
+        lag: maximum number of trials by which results reach a learning sampler late.
+        lag_grows: whether this delay is shorter at the beginning of the hunt; None in earlier hunts, where the delay is
+            constant.
+        sampler_version: version of the proposals of a learning sampler; None in earlier hunts, which have version 1.
+        origins: whether the sampler reports the origin of each trial.
+        core: whether the compiled core of the simulator is used; None if the simulator has no compiled core.
         disturb: disturbances of the trials with their rates; None without disturbances.
-        copies: which copies of its trials there are to be, some of ``probes`` and ``branches``; None if there are
+        copies: the types of forks that the hunt makes of its trials, of ``probes`` and ``branches``; None if it makes
             none.
-        confirmed: of the trials whose copies crashed, how many were run from the start of what they found, and how many
-            crashed there.
-        nodes: the machines on which it ran last, where there were several: fields of `NodeFigures`.
-        kinds: kinds of crashes, the most frequent first, where it collects them all.
-        kinds_version: version of the rules that say which crashes are of one kind.
-        types_by_cause: number of causes, each type on its own, where the hunt counts causes.
+        confirmed: for the trials whose forks crashed: how many of these crashes were run from the start, and how many
+            of the runs crashed.
+        nodes: the machines of the last run, if there were several, each with the fields of `NodeFigures`.
+        kinds: the crash types, the most frequent first, if the hunt collects all crash types.
+        kinds_version: version of the rules that decide which crashes are of the same type.
+        types_by_cause: number of causes, counted separately for each crash type, if the hunt counts causes.
         crash_on: the outcomes that count as a crash.
-        dropped: for each crash type, in words, the trials whose crashes are in the ledger only, as shorter ones were
-            kept.
-        dropped_at_fault: of these trials, the ones whose crashes are the agent's own fault, where that is
-            asked.
-        newest_kind: when the last new one came, in s since the epoch; None if none or unknown.
-        audits_left: the trials that were to be run again for the audit, and have not been; None if there is none.
-        phase: what the hunt does after its last trial: fields of `PhaseStatus`; None before and at its end.
-        ends_at: when its last trial is expected to end, in s since the epoch; None if that is unknown.
-        failed_steps: number of steps of confirmations that failed.
-        until_rate: ``bar``, as it was given, ``decided_at``, the number of the trial that decided, and ``verdict``;
-            None if the hunt has no bar.
-        running_rate: the crash rate so far: None if no rate is known.
+        dropped: trials of each crash type (in words) whose bundles were not kept because shorter crashes were kept.
+        dropped_at_fault: those of the trials in `dropped` whose crashes are the agent's fault, if the hunt determines
+            the fault.
+        newest_kind: time at which the last new crash type was found, in s since the epoch; None if there is none, or if
+            it is unknown.
+        audits_left: the trials that the audit has not yet run again; None if there are none.
+        phase: phase of the hunt after its last trial, with the fields of `PhaseStatus`; None before these phases and at
+            the end.
+        ends_at: time at which the last trial is expected to end, in s since the epoch; None if it is unknown.
+        failed_steps: number of simulated steps of confirmations that failed.
+        until_rate: ``bar`` (the threshold as the user gave it), ``decided_at`` (number of the deciding trial) and
+            ``verdict``; None if the hunt has no threshold.
+        running_rate: the current crash rate; None if no rate is known.
     """
 
     owner: HuntOwner | None
@@ -181,11 +182,11 @@ class Noted(TypedDict, total=False):
 
 
 class Facts(Noted, total=False):
-    """All facts of a hunt.
+    """All facts about a hunt.
 
     Args:
-        state: as it was entered last, one of ``running``, ``error`` or why it stopped.
-        detail: why.
+        state: the last recorded state: ``running``, ``error``, or the reason why the hunt stopped.
+        detail: the reason for the state, as text.
     """
 
     state: str
@@ -193,7 +194,7 @@ class Facts(Noted, total=False):
 
 
 class Seal(TypedDict):
-    """The content of a ledger when it was closed; earlier versions recorded less."""
+    """The contents of a ledger when it was closed; earlier versions of crashhunt recorded fewer fields."""
 
     outcomes: Mapping[str, int]
     steps: int
@@ -216,11 +217,11 @@ _BY_DANGER = "SELECT outcome, danger, number FROM trials INDEXED BY trials_by_da
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One turn with a sampler that learns.
+    """One exchange with a learning sampler: results that it received, then its proposal.
 
     Args:
-        told: the numbers of the trials whose results it received since its last turn, in that order.
-        spec: the trial that it proposed then.
+        told: numbers of the trials whose results the sampler received since its last proposal, in the order of receipt.
+        spec: the trial that the sampler then proposed.
     """
 
     told: tuple[int, ...]
@@ -228,12 +229,12 @@ class Turn:
 
 
 class LedgerReader:
-    """Reads a ledger.
+    """Reads the trials and facts of a ledger.
 
     Args:
-        database: that is open.
-        path: path of its file.
-        shape: what its tables have.
+        database: open connection to the database.
+        path: path of the ledger file.
+        shape: columns of the ledger's tables.
     """
 
     def __init__(self, database: sqlite3.Connection, path: Path, shape: Shape) -> None:
@@ -243,33 +244,33 @@ class LedgerReader:
 
     @property
     def protected(self) -> bool:
-        """Whether every row has a digest; the earliest ledgers had none."""
+        """Whether every row has a digest; ledgers of the first version have no digests."""
         return self._shape.protected
 
     @property
     def sealed(self) -> bool:
-        """Whether the last writer has closed it."""
+        """Whether the last writer sealed the ledger when it closed the file."""
         return self._seal() is not None
 
     def events(self) -> list[tuple[float, str, str]]:
-        """Return when the hunt got into which state, and why."""
+        """Return the changes of the hunt's state, each with its time and reason."""
         seal = self._seal()
         rows = list(self._select(f"{self._shape.select('events')} ORDER BY rowid"))
         self._compare_seal(seal, "events", len(rows))
         return [self._checked(row, "what it says of its states")[:3] for row in rows]
 
     def replaced(self) -> list[TrialResult]:
-        """Return the trials that ran again, as they were."""
+        """Return the trials that were run again, with their former results."""
         seal = self._seal()
         rows = list(self._select(f"{self._shape.select('replaced')} ORDER BY rowid"))
         self._compare_seal(seal, "replaced", len(rows))
         return [self._result(json.loads(self._checked(row, "a trial that ran again")[2])) for row in rows]
 
     def turns(self) -> Iterator[Turn]:
-        """Yield the proposals of a sampler that learns, in order; nothing for other samplers.
+        """Yield the proposals of a learning sampler, in order; other samplers have none.
 
         Raises:
-            HuntDirectoryError: a proposal is damaged or missing; earlier ones have been yielded.
+            HuntDirectoryError: a proposal is damaged or missing; the proposals before it have been yielded.
         """
         if not self._proposing:
             return
@@ -280,7 +281,7 @@ class LedgerReader:
         self._compare_seal(seal, "proposals", count)
 
     def intact_turns(self) -> list[Turn]:
-        """Return the intact proposals, also if others are damaged."""
+        """Return the intact proposals, even if other proposals are damaged."""
         found: list[Turn] = []
         try:
             for row in self._select(f"{self._shape.select('proposals')} ORDER BY turn") if self._proposing else ():
@@ -293,7 +294,7 @@ class LedgerReader:
         return found
 
     def facts(self) -> Facts:
-        """Return the facts about the hunt itself."""
+        """Return the facts about the hunt as a whole."""
         seal = self._seal()
         rows = [self._checked(row, "a fact") for row in self._select(self._shape.select("hunt"))]
         self._compare_seal(seal, "facts", sum(row[0] != SEAL for row in rows))
@@ -303,7 +304,7 @@ class LedgerReader:
             raise damaged(self._path, f"a fact cannot be read: {error}") from None
 
     def finished(self) -> set[int]:
-        """Return the numbers of the trials that have ended."""
+        """Return the numbers of the finished trials."""
         return {number for (number,) in self._select("SELECT number FROM trials")}
 
     def outcomes(self) -> dict[str, int]:
@@ -314,7 +315,7 @@ class LedgerReader:
         return found
 
     def traffic_events(self) -> dict[str, tuple[int, int]]:
-        """Return how many traffic events of each kind there were, and in how many trials."""
+        """Return for each type of traffic event the number of events, and the number of trials with such events."""
         rows = self._select(
             "SELECT event.key, sum(event.value), count(*) FROM trials, "
             f"json_each(iif(json_valid(result), result, '{{}}'), '$.events') AS event "
@@ -323,21 +324,22 @@ class LedgerReader:
         return {kind: (count, trials) for kind, count, trials in rows}
 
     def summed(self, what: str, of: str) -> list[Row]:
-        """Return sums over all trials, without rows whose data cannot be read.
+        """Return SQL sums over all trials; rows whose data cannot be read are skipped.
 
         Args:
-            what: is selected of them.
-            of: the query for each, in which ``{stress.margin}`` is a value of its plain data and ``data`` all of it.
+            what: SQL expressions to select, such as sums.
+            of: SQL query for one trial. In it, ``{stress.margin}`` is replaced by this value of the trial's JSON data,
+                and ``data`` is the JSON data.
         """
         each = re.sub(r"{([\w.]+)}", r"json_extract(data, '$.\1')", of)
         trials = "(SELECT number, iif(json_valid(result), result, '{}') AS data FROM trials)"
         return list(self._select(f"SELECT {what} FROM ({each} FROM {trials})"))
 
     def disturbed_crashes(self, outcomes: tuple[str, ...]) -> tuple[int, tuple[int, str, float] | None]:
-        """Return how many crashes had disturbances, and of the likeliest its number, outcome and log-likelihood.
+        """Return the number of crashes with disturbances, and number, outcome and log-likelihood of the likeliest one.
 
         Args:
-            outcomes: that count as a crash.
+            outcomes: the outcomes that count as a crash.
         """
         marks = ",".join("?" * len(outcomes))
         (row,) = self._select(
@@ -353,10 +355,10 @@ class LedgerReader:
         return int(count), None if likely is None else (number, outcome, float(likely))
 
     def tried_by_origin(self, outcomes: tuple[str, ...]) -> list[tuple[str, int, int, float, int]]:
-        """Return of each origin of trials its name, trials, trials with a danger, their sum of danger, and crashes.
+        """Return for each trial origin: name, trials, trials with criticality, sum of the criticality, and crashes.
 
         Args:
-            outcomes: that count as a crash, of which each has a danger of 1.
+            outcomes: the outcomes that count as a crash; a trial with such an outcome has criticality 1.
         """
         marks = ",".join("?" * len(outcomes))
         rows = self._select(
@@ -369,7 +371,7 @@ class LedgerReader:
         return [(name, count, measured, danger, int(crashes)) for name, count, measured, danger, crashes in rows]
 
     def trial_steps(self) -> int:
-        """Return the number of steps of the trials."""
+        """Return the total number of steps of the trials, without warm-ups and forks."""
         seal = self._seal()
         found = self._steps()
         self._compare_seal(seal, "steps", found)
@@ -378,8 +380,8 @@ class LedgerReader:
     def steps_total(self) -> int:
         """Return the number of simulated steps.
 
-        They include the steps of trials, of their warm-up and of their copies, and those of confirmations that ended
-        differently. Steps that an older ledger does not record are missing.
+        The number includes the steps of trials, of their warm-ups, of their forks, and of confirmations that ended
+        differently. Steps that an older ledger does not record are not included.
         """
         seal = self._seal()
         other = self._other_steps()
@@ -387,14 +389,14 @@ class LedgerReader:
         return self.trial_steps() + other + (self.facts().get("failed_steps") or 0)
 
     def results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[TrialResult]:
-        """Yield trials in the order of their numbers, all or those that ended in one of some ways."""
+        """Yield trials in the order of their numbers: all trials, or only trials with certain outcomes."""
         return map(self._result, self.plain_results(outcomes=outcomes))
 
     def plain_results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[JsonObject]:
-        """Yield the same as plain data, which takes a third of the time.
+        """Yield the same trials as JSON data, which takes a third of the time.
 
         Raises:
-            HuntDirectoryError: a trial is damaged or missing; earlier ones have been yielded.
+            HuntDirectoryError: a trial is damaged or missing; the trials before it have been yielded.
         """
         where = f"WHERE outcome IN ({','.join('?' * len(outcomes))})" if outcomes else ""
         seal, count = self._seal(), 0
@@ -407,9 +409,9 @@ class LedgerReader:
                 raise damaged(self._path, f"it has {count} such trials, and {sum(said.values())} were written")
 
     def endings(self) -> Iterator[tuple[int, int, str, str, bool]]:
-        """Yield how trials ended, in the order of their numbers, without reading their rows as a whole.
+        """Yield the endings of trials in the order of their numbers, without decoding whole rows.
 
-        Each is number, seed, outcome, origin, and whether its process was killed from outside.
+        An ending consists of number, seed, outcome, origin, and whether the process was killed from outside.
         """
         of = "iif(json_valid(result), result, '{}')"
         rows = self._select(
@@ -423,7 +425,7 @@ class LedgerReader:
         )
 
     def intact_rows(self, numbers: Iterable[int]) -> Iterator[tuple[int, Row | None]]:
-        """Yield the rows of trials, whatever has become of the others: None for one that is not as it was written."""
+        """Yield the rows of some trials, even if other rows are damaged; None for a row that is not intact."""
         for number in numbers:
             try:
                 row = self._row(number)
@@ -434,17 +436,17 @@ class LedgerReader:
                 yield number, None
 
     def check_pages(self) -> None:
-        """Have SQLite look at the file.
+        """Run SQLite's integrity check on the file.
 
         Raises:
-            HuntDirectoryError: it is damaged.
+            HuntDirectoryError: the file is damaged.
         """
         for (found,) in self._select("PRAGMA integrity_check(1)"):
             if found != "ok":
                 raise damaged(self._path, " ".join(str(found).split()))
 
     def result(self, number: int) -> TrialResult | None:
-        """Return one trial, or None if it has not ended."""
+        """Return the result of one trial, or None if the trial has not ended."""
         row = self._row(number)
         if row is None:
             self.outcomes()  # which finds out whether one is missing
@@ -452,28 +454,28 @@ class LedgerReader:
         return self._result(self._plain(row))
 
     def results_where(self, condition: str, *values: float) -> Iterator[TrialResult]:
-        """Yield the trials whose rows fulfil a condition in SQL, in the order of their numbers."""
+        """Yield the trials whose rows satisfy an SQL condition, in the order of their numbers."""
         return map(self._result, self.plain_results_where(condition, *values))
 
     def plain_results_where(self, condition: str, *values: float) -> Iterator[JsonObject]:
-        """Yield the same as plain data."""
+        """Yield the trials whose rows satisfy an SQL condition, as JSON data."""
         rows = self._select(f"{self._shape.select('trials')} WHERE {condition} ORDER BY number", values)
         return map(self._plain, rows)
 
     def result_text(self, number: int) -> str | None:
-        """Return one trial as it is written, or None if it has not ended."""
+        """Return the JSON text of one trial as it was written, or None if the trial has not ended."""
         row = self._row(number)
         return None if row is None else str(self._plain(row) and row[10])
 
     def snapshot_of(self, number: int) -> str:
-        """Return the digest of the snapshot that a trial ran from."""
+        """Return the digest of the snapshot from which a trial ran."""
         row = self._row(number)
         return str(self._plain(row) and row[9]) if row else ""
 
     def nearest_miss(self) -> TrialResult | None:
-        """Return the trial that did not crash and came nearest to it: the most dangerous one.
+        """Return the trial that came nearest to a crash without crashing: the trial with the greatest criticality.
 
-        In a ledger of before danger was measured, that with the least time to collision.
+        For a ledger without criticality, return the trial with the least time to collision.
         """
         most = self.most_dangerous(1)
         if most:
@@ -490,9 +492,10 @@ class LedgerReader:
         return self.result(min(least)[1]) if least else None
 
     def most_dangerous(self, count: int) -> list[int]:
-        """Return the numbers of the trials without a crash that were the most dangerous, the greatest danger first.
+        """Return the numbers of the trials with the greatest criticality but no crash, the greatest criticality first.
 
-        Of several that are equal, the first. Trials without this value are skipped.
+        Of trials with equal criticality, the trial with the lowest number comes first. Trials without a criticality are
+        skipped.
         """
         if "danger" not in self._shape.columns["trials"]:
             return []
@@ -511,7 +514,7 @@ class LedgerReader:
         """Yield number, seed, outcome, steps and least time to collision of every trial, in no particular order.
 
         Raises:
-            HuntDirectoryError: they are not as they were written; they were yielded nevertheless.
+            HuntDirectoryError: the rows have changed since they were written; they have been yielded nevertheless.
         """
         seal = self._seal()
         if seal is None:  # without one, only the whole rows say whether they are as they were written
@@ -529,7 +532,7 @@ class LedgerReader:
 
     @contextmanager
     def one_moment(self) -> Iterator[None]:
-        """Read everything as of one moment, although the hunt writes on."""
+        """Return a context in which all reads show one state of the ledger, although the hunt continues to write."""
         next(self._select("BEGIN"), None)
         try:
             yield
@@ -538,24 +541,24 @@ class LedgerReader:
                 self._database.execute("ROLLBACK")
 
     def last_number(self) -> int:
-        """Return the greatest number of a trial that has ended; -1 where none has."""
+        """Return the greatest number of a finished trial; -1 if no trial has finished."""
         return int(next(self._select("SELECT coalesce(max(number), -1) FROM trials"))[0])
 
     def replaced_count(self) -> int:
-        """Return the number of trials that were moved away to run again."""
+        """Return the number of trials that were replaced because they were to run again."""
         return self._count("replaced")
 
     def steps_by_outcome(self) -> dict[str, tuple[int, int, int]]:
-        """Return for each outcome how many trials had it, and the least and the most steps of one; from an index."""
+        """Return for each outcome the number of trials, and their least and greatest number of steps, from an index."""
         rows = self._select("SELECT outcome, count(*), min(steps), max(steps) FROM trials GROUP BY outcome")
         return {outcome: (trials, least, most) for outcome, trials, least, most in rows}
 
     def parts_of(self, width: int, outcome: str) -> Iterator[tuple[int, int, int]]:
-        """Yield part, trials and steps of all trials that ended in one way, from an index only.
+        """Yield each part of the trials with an outcome: the part, its number of trials and of steps, from an index.
 
         Args:
-            width: numbers of trials in a part; part i begins with trial i * width.
-            outcome: how they ended.
+            width: number of trials in a part; part i begins with trial i * width.
+            outcome: outcome of the trials.
         """
         yield from self._select(
             "SELECT number / ?, count(*), sum(steps) FROM trials WHERE outcome = ? GROUP BY number / ?",
@@ -563,35 +566,35 @@ class LedgerReader:
         )
 
     def ended_between(self, first: int, last: int) -> Iterator[tuple[int, str, int]]:
-        """Yield number, outcome and steps of the trials whose numbers are in a range, both ends included."""
+        """Yield number, outcome and steps of the trials with numbers in a range, including both ends."""
         yield from self._select(
             "SELECT number, outcome, steps FROM trials WHERE number BETWEEN ? AND ? ORDER BY number", (first, last)
         )
 
     def numbers_of(self, outcomes: Iterable[str]) -> list[int]:
-        """Return the numbers of the trials that ended in one of some ways, in order; from an index only."""
+        """Return the numbers of the trials with certain outcomes in order, using only an index."""
         found: list[int] = []
         for outcome in outcomes:
             found += (number for (number,) in self._select("SELECT number FROM trials WHERE outcome = ?", (outcome,)))
         return sorted(found)
 
     def killed_numbers(self, first: int = 0) -> list[int]:
-        """Return the numbers, from one on, of trials that were killed from outside, in order: they run again."""
+        """Return in order the numbers, from `first` on, of trials killed from outside, which run again."""
         sign = f'"kind": "{KILLED}"'
         query = "SELECT number FROM trials WHERE outcome = 'invalid' AND number >= ? AND instr(result, ?) > 0"
         return sorted(number for (number,) in self._select(query, (first, sign)))
 
     def plain_trial(self, number: int) -> JsonObject | None:
-        """Return one trial as plain data; None if it has not ended.
+        """Return one trial as JSON data; None if the trial has not ended.
 
         Raises:
-            HuntDirectoryError: it is not as it was written.
+            HuntDirectoryError: the row has changed since it was written.
         """
         row = self._row(number)
         return None if row is None else self._plain(row)
 
     def last_ended_at(self) -> float | None:
-        """Return when the last trial ended, in s since the epoch; None if none has."""
+        """Return the time at which the last trial ended, in s since the epoch; None if no trial has ended."""
         row = next(self._select(f"{self._shape.select('trials')} ORDER BY number DESC LIMIT 1"), None)
         return float(row[8]) if row and self._plain(row) else None
 
@@ -660,7 +663,7 @@ class LedgerReader:
         return seal
 
     def _fits(self, seal: Seal) -> bool:
-        """Return whether the content equals the sealed content, also if another version has sealed it."""
+        """Return whether the contents match the seal, which another version of crashhunt may have written."""
         found: Plain = self._make_seal()
         said: Plain = seal
         return all(found[name] == said[name] for name in found.keys() & said.keys())

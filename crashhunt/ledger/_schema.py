@@ -125,9 +125,9 @@ class Shape:
     """The columns of the tables of a ledger.
 
     Args:
-        version: version of the tables.
-        columns: table to its columns but the digest, which is made over them in this order. A table of a newer version
-            may have further columns at its end; a table of an older version may lack columns.
+        version: version of the table layout.
+        columns: columns of each table except the digest, in the order in which they are hashed. A table of a newer
+            version may have further columns at its end; a table of an older version may lack columns.
     """
 
     version: int
@@ -135,21 +135,21 @@ class Shape:
 
     @property
     def protected(self) -> bool:
-        """Whether every row has a digest; the earliest ledgers had none."""
+        """Whether every row has a digest; ledgers of the first version have no digests."""
         return self.version >= _FIRST_VERSION_WITH_DIGESTS
 
     def select(self, table: str) -> str:
-        """Return the beginning of a query for whole rows, the digest last."""
+        """Return the beginning of an SQL query for whole rows, with the digest as the last column."""
         return f"SELECT {', '.join((*self.columns[table], *(('digest',) if self.protected else ())))} FROM {table}"
 
 
 def columns_of_trials() -> tuple[str, ...]:
-    """Return the columns of a trial's row in this version, without its digest, in the order of which that is made."""
+    """Return the columns of a trial's row in this version except the digest, in the order in which they are hashed."""
     return (*FIRST["trials"], *_ADDED_COLUMNS["trials"])
 
 
 def create(path: Path) -> None:
-    """Make an empty ledger, atomically: a visible file is always readable."""
+    """Create an empty ledger atomically, so that a visible file is always readable."""
     path.with_name(f"{path.name}-wal").unlink(missing_ok=True)  # SQLite would take that of an earlier one for its own
     with whole_file(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as database:
         database.execute("PRAGMA synchronous = OFF")  # the whole file is synced at once
@@ -158,17 +158,17 @@ def create(path: Path) -> None:
 
 
 def note_reader(database: sqlite3.Connection) -> None:
-    """Record the oldest crashhunt that can read the ledger."""
+    """Record the oldest version of crashhunt that can read the ledger."""
     row = (_READER_FACT, json.dumps(_MIN_READER_VERSION))
     database.execute("INSERT OR REPLACE INTO hunt VALUES (?, ?, ?)", (*row, digest_of_row(row)))
 
 
 def shape_of(database: sqlite3.Connection, path: Path) -> Shape:
-    """Return what the tables have.
+    """Return the columns of the tables of a ledger.
 
     Raises:
         HuntDirectoryError: the tables cannot be read, or do not belong to their version.
-        sqlite3.Error: it is no database.
+        sqlite3.Error: the file is not a database.
     """
     version = int(database.execute("PRAGMA user_version").fetchone()[0])
     names = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
@@ -205,7 +205,7 @@ def _columns(
 
 
 def _refuse_unreadable(database: sqlite3.Connection, path: Path, version: int) -> None:
-    """Refuse a ledger of a newer version that does not say that this one can read it."""
+    """Refuse a ledger of a newer version, unless it records that this version can read it."""
     try:
         row = database.execute("SELECT key, value, digest FROM hunt WHERE key = ?", (_READER_FACT,)).fetchone()
         if row is not None and int(json.loads(checked(row, "what reads it", path)[1])) <= VERSION:
@@ -223,7 +223,7 @@ def _refuse_unreadable(database: sqlite3.Connection, path: Path, version: int) -
 
 
 def _add_digests(database: sqlite3.Connection) -> None:
-    """The digests are computed from the present content."""
+    """Add digests, computed from the present contents."""
     database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
     for table, columns in FIRST.items():
         database.execute(f"ALTER TABLE {table} ADD COLUMN digest INTEGER NOT NULL DEFAULT 0")
@@ -246,7 +246,7 @@ def _add_danger(database: sqlite3.Connection) -> None:
 
 
 def _add_other_steps(database: sqlite3.Connection) -> None:
-    """The steps of copies are in the existing data; the steps of warm-ups are unknown."""
+    """Add the simulated steps outside of trials: steps of forks are in the existing data, steps of warm-ups unknown."""
     database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
     database.execute("ALTER TABLE trials ADD COLUMN other_steps INTEGER")
     was = ", ".join((*FIRST["trials"], "danger"))
@@ -273,7 +273,7 @@ they do not know. A version that older readers would misread raises the version 
 
 
 def migrate(database: sqlite3.Connection, version: int) -> None:
-    """Bring the tables of an earlier version to this one: all the way, or not at all."""
+    """Convert the tables of an earlier version to this version, either completely or not at all."""
     database.execute("BEGIN IMMEDIATE")
     try:
         for earlier in range(version, VERSION):
@@ -295,10 +295,10 @@ _CHECK_FIX = "crashhunt check {} says what can be saved"
 
 
 def checked(row: Row, what: str, path: Path) -> Row:
-    """Return a row, once it is sure that it is what its digest, in the last column, was made of.
+    """Return a row after checking it against its digest, which is the last column.
 
     Raises:
-        HuntDirectoryError: it is not.
+        HuntDirectoryError: the row does not match its digest.
     """
     if digest_of_row(row[:-1]) != row[-1]:
         raise damaged(path, f"{what} is not as it was written")
@@ -306,10 +306,10 @@ def checked(row: Row, what: str, path: Path) -> Row:
 
 
 def plain_trial(row: Row, path: Path, *, trusted: bool) -> JsonObject:
-    """Return the trial of a whole row as plain data.
+    """Return the trial of a whole row as JSON data.
 
     Raises:
-        HuntDirectoryError: it is none; where the row had no digest, also where two places contradict each other.
+        HuntDirectoryError: the row contains no valid trial, or an unprotected row contradicts its own JSON text.
     """
     try:
         data: JsonObject = json.loads(row[10])
@@ -325,12 +325,12 @@ def plain_trial(row: Row, path: Path, *, trusted: bool) -> JsonObject:
 
 
 def damaged(path: Path, message: str) -> HuntDirectoryError:
-    """Return the error for a ledger that is not as it was written."""
+    """Return the error for a ledger that has changed since it was written."""
     return HuntDirectoryError(f"the ledger is damaged: {message}", fix=_CHECK_FIX.format(path.parent), where=str(path))
 
 
 def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
-    """Return the error of crashhunt for an error of SQLite."""
+    """Convert an error of SQLite to an error of crashhunt."""
     where, text = str(path), " ".join(str(error).split())  # which may quote what is damaged
     if "full" in text or "disk I/O" in text:
         return HuntDirectoryError(
@@ -362,7 +362,7 @@ _untouched: ContextVar[bool] = ContextVar("untouched", default=False)
 
 @contextmanager
 def leave_untouched() -> Iterator[None]:
-    """Inside the context, open every ledger read-only, as `opened` does with `read_only`."""
+    """Return a context in which every ledger is opened read-only, as `opened` does with `read_only`."""
     before = _untouched.set(True)
     try:
         yield
@@ -371,7 +371,7 @@ def leave_untouched() -> Iterator[None]:
 
 
 def is_untouched() -> bool:
-    """Whether the caller is within `leave_untouched`."""
+    """Return whether the caller is inside the context of `leave_untouched`."""
     return _untouched.get()
 
 
@@ -379,9 +379,9 @@ def opened(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
     """Open a ledger.
 
     Args:
-        path: path of the file.
-        read_only: leave the folder as it is. SQLite makes two files next to a ledger that is read, and the last reader
-            of a killed hunt moves one of them into the ledger.
+        path: path of the ledger file.
+        read_only: whether to leave the folder unchanged. Otherwise SQLite creates two files next to a ledger that is
+            read, and the last reader of a killed hunt merges one of them into the ledger.
     """
     if not read_only:
         return sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
@@ -393,7 +393,7 @@ def opened(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
 
 
 def has_content(path: Path) -> bool:
-    """Whether a file is there, and not empty."""
+    """Return whether a file exists and is not empty."""
     try:
         return path.stat().st_size > 0
     except OSError:
@@ -401,10 +401,10 @@ def has_content(path: Path) -> bool:
 
 
 def removed(path: Path, was: os.stat_result) -> bool:
-    """Whether the file of a ledger that is open was removed.
+    """Return whether the file of an open ledger was removed.
 
     Raises:
-        HuntDirectoryError: another file is in its place.
+        HuntDirectoryError: another file has replaced it.
     """
     try:
         if os.path.samestat(path.stat(), was):
@@ -419,10 +419,10 @@ def removed(path: Path, was: os.stat_result) -> bool:
 
 
 def rewrite(database: sqlite3.Connection, path: Path) -> None:
-    """Write a ledger that is open, and whose file was removed, to a new one; it is closed.
+    """Write an open ledger whose file was removed to a new file, and close the ledger.
 
     Raises:
-        HuntDirectoryError: the folder is gone or not writable.
+        HuntDirectoryError: the folder was removed or is not writable.
     """
     try:
         with whole_file(path) as temporary:

@@ -1,8 +1,8 @@
-"""The ledger: facts about trials in one SQLite file; one writer, any number of readers, also while the hunt runs.
+"""The writer of a ledger: records facts about trials in one SQLite file. Any number of readers may read meanwhile.
 
 Every row has a digest of its content, and every reader checks it. A writer that closes the file *seals* it. The seal
-has the number of trials of each outcome and a digest over the columns that count and rank them. So readers of single
-columns detect a change, too, and a missing row is detected. During a hunt, and after a kill, there is no seal.
+contains the number of trials of each outcome, and a digest over the columns for counts and rankings. Readers of single
+columns can therefore detect changed and missing rows as well. During a hunt, and after a kill, there is no seal.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _TOGETHER_S = 0.5  # a kill loses no more than this of what was recorded togethe
 
 
 def has_begun(path: Path) -> bool:
-    """Return whether a ledger exists; an empty file, which SQLite creates on opening, does not count."""
+    """Return whether a ledger exists. An empty file, which SQLite creates on opening, does not count."""
     return path.exists() and path.stat().st_size > 0
 
 
@@ -60,8 +60,9 @@ class Ledger(LedgerReader):
 
     Args:
         path: path of ``ledger.sqlite``.
-        writable: the one writer; creates the file, and brings one of an earlier version to this one.
-        read_only: leave even SQLite's own files next to it as they are; for a reader of foreign hunts.
+        writable: whether to write. The only writer creates the file, and migrates a file of an earlier version.
+        read_only: whether to leave SQLite's auxiliary files next to the ledger unchanged; for readers of other users'
+            hunts.
 
     Raises:
         HuntDirectoryError: the file cannot be opened, is not a ledger, or is damaged.
@@ -89,7 +90,7 @@ class Ledger(LedgerReader):
             raise explained(path, error) from error
 
     def record(self, result: TrialResult, *, snapshot: str) -> None:
-        """Add a trial that has ended; one that ran again replaces its row.
+        """Add a finished trial. If the trial was run again, the new row replaces the old row.
 
         Raises:
             HuntDirectoryError: the disk is full.
@@ -114,10 +115,11 @@ class Ledger(LedgerReader):
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Write all records inside the context together, so that thousands of trials can be recorded per second.
+        """Return a context whose records are written together, so that thousands of trials can be recorded per second.
 
-        What was recorded is written half a second later at the latest, with the next trial: the caller may wait
-        for trials in between. Other processes do not see it before, and a kill loses it: those trials run again.
+        A record is written with the first trial that follows at least half a second later, so the caller may wait
+        between trials. Until then, other processes do not see the record, and a kill loses it; the trial then runs
+        again.
 
         Raises:
             HuntDirectoryError: the disk is full.
@@ -135,18 +137,18 @@ class Ledger(LedgerReader):
             raise explained(self._path, error) from error
 
     def copy(self, row: Row) -> None:
-        """Add a row that `intact_rows` of another ledger has yielded, of any version."""
+        """Add a row of any version that `intact_rows` of another ledger has yielded."""
         count = len(_COLUMNS)
         self._insert((*row, *(None,) * count)[:count])
 
     def propose(self, turns: Sequence[Turn]) -> None:
-        """Add the proposals of a sampler that learns, all or nothing, and the results that it received before.
+        """Add proposals of a learning sampler and the results that it received before, all or nothing.
 
-        When this returns, a kill changes nothing about it any more. If the power goes, the last second may be
-        lost; then what depended on it, the trials and their results, is lost with it.
+        After the method has returned, a kill loses no proposal. A power failure may lose the last second. In that case,
+        the trials that depend on it, and their results, are lost as well.
 
         Raises:
-            HuntDirectoryError: the disk is full, or one of the trials was proposed before.
+            HuntDirectoryError: the disk is full, or a trial was proposed twice.
         """
         try:
             with self._database:
@@ -160,10 +162,10 @@ class Ledger(LedgerReader):
             raise explained(self._path, error) from error
 
     def note(self, **facts: Unpack[Facts]) -> None:
-        """Set facts about the hunt itself, such as its state; None removes one.
+        """Set facts about the hunt as a whole, such as its state; the value None removes a fact.
 
-        When this returns, everything that was recorded so far is on the disk, and stays there if the power goes. It is
-        called about once a second; after every trial it would cost more than the trials.
+        After the method has returned, all earlier records are on the disk and survive a power failure. It is called
+        about once a second. A call after every trial would cost more than the trials.
         """
         try:
             with self._lasting():
@@ -173,12 +175,12 @@ class Ledger(LedgerReader):
             raise explained(self._path, error) from error
 
     def enter(self, state: str, detail: str = "", **facts: Unpack[Noted]) -> None:
-        """Set the state of the hunt, and write down when it got there and why."""
+        """Set the state of the hunt, and record the time and the reason."""
         self.note(state=state, detail=detail or None, **facts)
         self._event(state, detail)
 
     def remark(self, detail: str) -> None:
-        """Record an event; the state of the hunt does not change."""
+        """Record an event without a change of the hunt's state."""
         self._event("remark", detail)
 
     def _event(self, state: str, detail: str) -> None:
@@ -190,7 +192,7 @@ class Ledger(LedgerReader):
             raise explained(self._path, error) from error
 
     def replace(self, numbers: Iterable[int]) -> int:
-        """Move trials out of the way so that they run again; return how many there were."""
+        """Remove trials from the results so that they run again, and return the number of removed trials."""
         gone = 0
         try:
             with self._database:
@@ -207,13 +209,13 @@ class Ledger(LedgerReader):
         return gone
 
     def restore(self) -> bool:
-        """Write the file again if it was removed; its content exists as long as it is open.
+        """Write the file again if it was removed; its contents exist as long as the ledger is open.
 
         Returns:
-            Whether it was gone.
+            Whether the file had been removed.
 
         Raises:
-            HuntDirectoryError: another file is in its place, or the folder is gone, or not writable.
+            HuntDirectoryError: another file has replaced it, or the folder was removed or is not writable.
         """
         if not removed(self._path, self._file):
             return False
@@ -223,7 +225,7 @@ class Ledger(LedgerReader):
         return True
 
     def close(self) -> None:
-        """Close the file; a writer seals it before."""
+        """Close the file; a writer seals the ledger first."""
         if self._writable:
             with suppress(sqlite3.Error, HuntDirectoryError):  # on a full disk it stays without
                 self._note(SEAL, self._make_seal())
@@ -250,7 +252,7 @@ class Ledger(LedgerReader):
 
     @contextmanager
     def _lasting(self) -> Iterator[None]:
-        """Make one commit wait for the disk; this also makes all earlier commits durable."""
+        """Return a context whose commit waits for the disk, which also makes all earlier commits durable."""
         self._database.execute("PRAGMA synchronous = FULL")
         try:
             with self._database:
@@ -260,10 +262,10 @@ class Ledger(LedgerReader):
             self._database.execute("PRAGMA synchronous = NORMAL")
 
     def _begin_to_write(self) -> None:
-        """Check that the existing content is intact before anything is added, and migrate it to this version.
+        """Check that the existing contents are intact before the first write, and migrate them to this version.
 
         Raises:
-            HuntDirectoryError: it is not, or it is of a newer version.
+            HuntDirectoryError: the contents are damaged, or are of a newer version.
         """
         if self._shape.version > VERSION:  # its columns are unknown here
             raise HuntDirectoryError(
@@ -289,7 +291,7 @@ class Ledger(LedgerReader):
         self._writable = True
 
     def _prepare(self) -> None:
-        """Make what follows last: a reader never blocks the writer, and a kill leaves a file that opens."""
+        """Configure SQLite so that readers never block the writer, and a killed writer leaves a readable file."""
         self._database.execute("PRAGMA journal_mode = WAL")
         self._database.execute("PRAGMA synchronous = NORMAL")
         self._file = self._path.stat()

@@ -1,4 +1,4 @@
-"""Replays: a crash run again, compared with its recording, edited, or looked at in a debugger or a window."""
+"""Replays: run a crash again, compare the run with the recording, edit it, or examine it in a debugger or a window."""
 
 import lazy_loader
 

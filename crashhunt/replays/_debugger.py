@@ -1,4 +1,4 @@
-"""Debugging of a replay up to a step: pdb inside the agent, the window (``--gui``), and panels."""
+"""Debugging of a replay up to a step: pdb inside the agent, the simulator's window (``--gui``), and agent panels."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ _TARGET = "back"
 
 
 class Backwards(Observer):
-    """Observer that keeps a copy of the process before each of the last steps; it must come before the debugger.
+    """Observer that forks the process before each of the last steps; it must be registered before the debugger.
 
     Args:
-        stop: what stops.
-        step: in which it does; 0 for none.
-        folder: where the copies tell each other how far to go back.
+        stop: the observer that stops the replay.
+        step: the step in which the replay stops; 0 for none.
+        folder: folder through which the forks exchange the step to go back to.
     """
 
     def __init__(self, stop: _Stop, step: int, folder: Path) -> None:
@@ -83,7 +83,7 @@ class Backwards(Observer):
             self._leave_behind(step + 1)
 
     def go(self, step: int) -> str:
-        """Go back to a step; return the reason if that is impossible."""
+        """Go back to a step; if that is impossible, return the reason."""
         if not self._first or step < self._first:
             how = f"to step {self._first} at most" if self._first else "nowhere from here"
             return f"it goes back {how}"
@@ -92,7 +92,7 @@ class Backwards(Observer):
         os._exit(_BACK_EXIT_CODE)
 
     def _leave_behind(self, step: int) -> None:
-        """Continue in a copy of this process; return in this process only if the user goes back to this step."""
+        """Continue in a fork; return in this process only if the user goes back to the given step."""
         torch = sys.modules.get("torch")
         if len(threads()) > 1 or (torch is not None and torch.cuda.is_initialized()):
             self._first = 0  # they have no copy, and what was left behind before is not missed by anybody
@@ -121,12 +121,12 @@ class Backwards(Observer):
 
 
 class OneLine:
-    """Standard input that is read line by line, so that the next process gets the rest."""
+    """Replacement for standard input that reads one line at a time, so that the next process can read the rest."""
 
     encoding = "utf-8"
 
     def readline(self) -> str:
-        """Return the next line; nothing at the end."""
+        """Return the next line; empty at the end of the input."""
         line = b""
         while not line.endswith(b"\n") and (byte := os.read(0, 1)):
             line += byte
@@ -134,7 +134,7 @@ class OneLine:
 
 
 def _file_positions() -> dict[int, int]:
-    """Return the positions of this process in the files that it reads."""
+    """Return the read positions of this process in its open files."""
     found = {}
     for name in os.listdir("/proc/self/fd") if sys.platform == "linux" else ():  # noqa: PTH208 - names are enough
         with suppress(OSError):
@@ -145,7 +145,7 @@ def _file_positions() -> dict[int, int]:
 
 
 def _exit_with(code: int) -> NoReturn:
-    """End as the copy did."""
+    """End this process as the fork ended: with the same exit code or signal."""
     if code < 0:
         with suppress(OSError, ValueError):
             signal.signal(-code, signal.SIG_DFL)
@@ -158,22 +158,22 @@ _MAX_ATTEMPTS = 3  # of a replay that is killed from outside
 
 
 class _ReplayKilledError(CrashhuntError):
-    """Another process, or the kernel, ended the process of a replay."""
+    """Another process or the kernel killed the process of a replay."""
 
 
 def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
-    """Run the first steps of a crash in a fresh process that has this one's terminal.
+    """Run the first steps of a crash in a new process that uses this process's terminal.
 
-    Breakpoints in the agent's code work there, and what it prints is seen at once.
+    Breakpoints in the agent's code work in the new process, and its output appears immediately.
 
     Args:
-        rerun: the crash.
-        look: what to look at.
+        rerun: the crash to run.
+        look: what the user wants to examine.
 
     Raises:
         UsageError: there is no display for a window.
-        CrashhuntError: it could not be run.
-        KeyboardInterrupt: the debugger was left, or the window closed.
+        CrashhuntError: the crash could not be run.
+        KeyboardInterrupt: the user left the debugger or closed the window.
     """
     if look.window is not None and sys.platform == "linux" and not os.environ.get("DISPLAY"):
         raise UsageError("a window needs a display, and DISPLAY is not set", fix="log in with ssh -X, or give --video")
@@ -188,12 +188,12 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
 
 
 def _run_once(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
-    """Run the first steps of a crash in a fresh process.
+    """Run the first steps of a crash in a new process, without another attempt.
 
     Raises:
         _ReplayKilledError: the process was killed from outside.
-        CrashhuntError: it could not be run.
-        KeyboardInterrupt: the debugger was left, or the window closed.
+        CrashhuntError: the crash could not be run.
+        KeyboardInterrupt: the user left the debugger or closed the window.
     """
     collision = rerun.bundle.result.collision
     involved = {collision.collider, collision.victim} if collision is not None else set()
@@ -239,11 +239,11 @@ def _run_once(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
 
 
 class _Stop(Observer):
-    """Has the debugger drive in place of an agent, for one step.
+    """Observer that replaces an agent, for one step, by an agent in which the debugger stops.
 
     Args:
         name: name of the vehicle.
-        step: the step in which to stop; 0 for none.
+        step: the step in which the debugger stops; 0 for none.
     """
 
     def __init__(self, name: str, step: int) -> None:
@@ -255,7 +255,7 @@ class _Stop(Observer):
         self._episode = episode
 
     def stop_at(self, step: int) -> None:
-        """Stop in another step."""
+        """Choose another step in which the debugger stops."""
         self._step = step
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
@@ -272,14 +272,14 @@ class _Stop(Observer):
 
 
 class _Stopped:
-    """An agent in whose next ``act`` the debugger stops.
+    """An agent whose next call of ``act`` stops in the debugger.
 
     Args:
-        agent: who drives.
+        agent: the agent that drives.
         name: name of the vehicle.
-        step: which one it is.
-        scene: scene before it.
-        backwards: goes back.
+        step: number of the step in which the debugger stops.
+        scene: scene before this step.
+        backwards: observer that goes back to earlier steps.
     """
 
     def __init__(self, agent: Agent, name: str, step: int, scene: Scene, backwards: Backwards | None) -> None:
@@ -305,11 +305,11 @@ class _Stopped:
 
 
 class _Panels(Observer):
-    """Draws the agents' panels after every action.
+    """Draws the panels of the agents after every action.
 
     Args:
-        first: the first step to draw.
-        folder: folder for the pictures.
+        first: the first step whose panels are drawn.
+        folder: folder for the pictures of the panels.
     """
 
     def __init__(self, first: int, folder: Path) -> None:
@@ -342,17 +342,17 @@ class _Done(TypedDict):
 
 
 class _Job(TypedDict):
-    """The job of the process of a debugged replay.
+    """The description of a debugged replay that its process reads from a file.
 
     Args:
         settings: settings of the worker.
-        spec: the trial, to the step up to which it runs.
+        spec: the trial, shortened to the steps that run.
         stop_at: the step in which the debugger stops; 0 for none.
-        agent: who is looked at.
-        other: the other party of a collision; empty if there was none.
-        panels: the step of which panels are shown, and the folder for them.
-        window: how long a step takes in a window, in s; None for none.
-        pause_before: the step before which a window waits.
+        agent: the agent that the window follows.
+        other: the collision partner; empty if there was none.
+        panels: the first step whose panels are drawn, and the folder for the pictures.
+        window: wall time of a step in the window, in s; None if no window is shown.
+        pause_before: the step before which the window waits.
     """
 
     settings: JsonObject
@@ -369,8 +369,8 @@ class _Window(Observer):
     """Slows down a simulator with its own window, and lets the window follow the crashing vehicle.
 
     Args:
-        simulator: the simulator.
-        job: who is followed, how long a step takes, and before which step to pause.
+        simulator: the simulator with the window.
+        job: the job, which contains the agent to follow, the time of a step, and the step before which to pause.
     """
 
     def __init__(self, simulator: HasWindow, job: _Job) -> None:
@@ -394,7 +394,7 @@ class _Window(Observer):
         return result
 
     def leave(self) -> None:
-        """Wait until everything has been looked at."""
+        """Wait until the user closes the window."""
         self._pause("Press Enter to close the window: ")
 
     def _follow(self) -> None:
@@ -420,7 +420,7 @@ class _Debugger(pdb.Pdb):
     backwards: Backwards | None = None
 
     def do_back(self, arg: str) -> None:
-        """Go back by so many steps of the simulation, or one: ``back 5``."""
+        """Go back by a number of steps of the simulation, such as ``back 5``; by one step without a number."""
         steps = int(arg) if arg.strip().isdecimal() else 1
         why_not = (
             self.backwards.go(self.step - max(1, steps))
@@ -436,13 +436,13 @@ class _Debugger(pdb.Pdb):
 
 
 def _module_in(code: Sequence[str]) -> str:
-    """The name of this module in the crashhunt of a snapshot, which may be an older one."""
+    """Return the name of this module in the crashhunt of a snapshot, which may be an older version."""
     of_it = next((path for folder in code if (path := Path(folder) / "crashhunt").is_dir()), None)
     return "crashhunt.debugger" if of_it is not None and (of_it / "debugger.py").is_file() else __name__
 
 
 def main() -> None:
-    """Run the trial that a file in a folder describes, attached to the terminal."""
+    """Run the trial that is described by a file in a folder, attached to the terminal."""
     folder = Path(sys.argv[1])
     job: _Job = json.loads((folder / layout.JOB).read_text(encoding="utf-8"))
     if not job["stop_at"]:  # only the debugger handles Ctrl-C; without it, a traceback of the replay helps no user

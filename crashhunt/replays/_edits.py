@@ -1,4 +1,4 @@
-"""Changes of a recorded trial by the user: in ``hunt.toml`` or on the command line."""
+"""Changes that the user makes to a recorded trial, in ``hunt.toml`` or on the command line."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ _NONE = "none"
 
 
 def is_about_disturbances(name: str) -> bool:
-    """Whether ``--set NAME=…`` is about the disturbances of the trial."""
+    """Return whether ``--set NAME=…`` changes the disturbances of the trial."""
     return name == NAME or name.startswith(f"{NAME}.")
 
 
 def edited_disturbances(
     planned: Sequence[Disturbance], name: str, text: str, agents: Sequence[str] = ()
 ) -> tuple[tuple[Disturbance, ...], list[str]]:
-    """Return the disturbances with one change, and a description of the change.
+    """Return the disturbances of a trial after one change, and a description of the change.
 
     Args:
-        planned: plan of the trial.
-        name: ``disturbances`` for all; ``disturbances.STEP`` or ``disturbances.KIND@STEP`` for one, and perhaps a dot
-            and one of its fields.
-        text: ``none``, the words that fix others, or the value of the field.
-        agents: the controlled vehicles; those that are disturbed already by default.
+        planned: the planned disturbances of the trial.
+        name: ``disturbances`` for all of them, or ``disturbances.STEP`` or ``disturbances.KIND@STEP`` for one of them,
+            optionally followed by a dot and a field.
+        text: ``none``, a description of other disturbances, or the new value of the field.
+        agents: the controlled vehicles; by default, the vehicles that are already disturbed.
 
     Raises:
-        ArgumentError: it cannot be meant.
+        ArgumentError: the name or the text is invalid.
     """
     where, agents = f"--set {name}", agents or tuple(dict.fromkeys(one.agent for one in planned))
     if name == NAME:
@@ -90,22 +90,22 @@ def edited_disturbances(
 def with_other_words(
     planned: Sequence[Disturbance], before: Sequence[str], after: Sequence[str], agents: Sequence[str]
 ) -> tuple[tuple[Disturbance, ...], list[str], list[str]]:
-    """Return the disturbances of a trial where ``disturb`` of its ``hunt.toml`` has been edited.
+    """Return the disturbances of a trial after an edit of ``disturb`` in its ``hunt.toml``.
 
-    Disturbances at given steps are those of the new words. Drawn disturbances are removed if their kind no longer has a
-    rate. They are not drawn again with another rate.
+    Disturbances at given steps are replaced by those of the new text. Drawn disturbances are removed if their kind no
+    longer has a rate. They are not drawn again if their rate has changed.
 
     Args:
-        planned: plan of the trial.
-        before: ``disturb`` as the hunt had it.
-        after: as it is.
+        planned: the planned disturbances of the trial.
+        before: value of ``disturb`` when the trial ran.
+        after: present value of ``disturb``.
         agents: the controlled vehicles.
 
     Returns:
-        The disturbances, the changes, and the edits without an effect, in words.
+        The disturbances, the changes, and the edits without an effect, as text.
 
     Raises:
-        UsageError: a word cannot be meant.
+        UsageError: a part of ``disturb`` is invalid.
     """
     if tuple(before) == tuple(after):
         return tuple(planned), [], []
@@ -128,12 +128,12 @@ def with_other_words(
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """The disturbances that an edit selects.
+    """The disturbances that an edit by the user selects.
 
     Args:
-        kind: perhaps with the agent before it; empty for whatever begins there.
-        step: as it was written.
-        field: what of it; empty for all.
+        kind: the kind of disturbance, optionally preceded by the agent; empty for every kind.
+        step: the step as the user wrote it.
+        field: the field to change; empty for the whole disturbance.
     """
 
     kind: str
@@ -202,12 +202,13 @@ Values = dict[tuple[str, str], Value]  # (agent, or empty for the scenario; name
 
 @dataclass(frozen=True, slots=True)
 class Edits:
-    """The differences from the recorded trial, in words.
+    """The differences between a trial and its recording, as text.
 
     Args:
-        agents: who drives, and with which arguments.
-        others: everything else: traffic, length, what counts. They may explain why a crash does not reproduce.
-        ignored: edits in ``hunt.toml`` that have no effect on a replay.
+        agents: differences in the agents and their arguments.
+        others: all other differences, such as traffic, length and crash criteria. They may explain why a crash does not
+            reproduce.
+        ignored: changes in ``hunt.toml`` that have no effect on a replay.
     """
 
     agents: tuple[str, ...] = ()
@@ -216,7 +217,7 @@ class Edits:
 
     @property
     def all(self) -> tuple[str, ...]:
-        """All edits that change the trial."""
+        """All differences that change the trial."""
         return (*self.agents, *self.others)
 
 
@@ -231,15 +232,15 @@ def edited_spec(
     """Return the trial to replay, and its differences from the recorded trial.
 
     Args:
-        recorded: the trial.
-        settings: ``hunt.toml`` as it is now.
-        original: ``hunt.toml`` as it was when the trial ran.
-        changes: ``NAME`` or ``AGENT.NAME`` to value, applied last.
-        code: the folders of the code that is to drive, which is asked what an agent takes where the record is silent;
-            None if none of it may run.
+        recorded: the recorded trial.
+        settings: the present ``hunt.toml``.
+        original: the ``hunt.toml`` with which the trial ran.
+        changes: new value by name (``NAME`` or ``AGENT.NAME``), applied last.
+        code: folders with the code of the agents, which is inspected for arguments that are not recorded; None if no
+            code may run.
 
     Raises:
-        ArgumentError: an argument does not exist, or a range is given where it takes one value.
+        ArgumentError: an argument does not exist, or a range is given instead of one value.
     """
     agents: list[str] = []
     others: list[str] = []

@@ -1,4 +1,4 @@
-"""Prepares a replay: the recording, the trial with all edits, the code that drives, and the differences since."""
+"""Preparation of a replay: the recording, the edited trial, the code that drives, and the warnings."""
 
 from __future__ import annotations
 
@@ -48,10 +48,11 @@ class Look:
 
     Args:
         until: number of steps to run.
-        stop_at: the step in which to drop into the ``act`` of the agent that crashed; 0 for none.
-        to_stderr: whether what is printed goes there.
-        panels: the step from which on to draw the agents' panels, and the folder for them.
-        window: open the simulator's own, with so many s of wall time between two steps; it pauses before the crash.
+        stop_at: the step in which the debugger stops in ``act`` of the crashed agent; 0 for none.
+        to_stderr: whether the output of the process goes to standard error.
+        panels: the first step whose panels are drawn, and the folder for the pictures.
+        window: wall time between two steps in the simulator's window, in s; the window pauses before the crash. None
+            for no window.
     """
 
     until: int
@@ -67,15 +68,16 @@ class ReplayOptions:
     """The options of a replay.
 
     Args:
-        code: which code drives: that of the snapshot, today's, or the recorded actions.
-        changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value.
+        code: which code drives: the code of the snapshot, the current code, or the recorded actions.
+        changes: new value by name of an argument: ``NAME`` or ``AGENT.NAME``.
         force: whether to replay from a damaged snapshot.
         times: number of replays.
-        scenario: the name or path of another scenario to drive in; empty for that of the crash.
-        accelerate: whether simulators are sped up where that changes no bit.
-        trusted: whether its code may run; None to find out. Without trust only recorded actions are replayed, and
-            only where that does nothing but simulate.
-        look: what to look at, in a process that has this one's terminal; without it, it runs in one of its own.
+        scenario: name or path of another scenario in which to drive; empty for the scenario of the crash.
+        accelerate: whether simulators are accelerated if the results stay bit-identical.
+        trusted: whether the code of the crash may run; None to determine it. If not trusted, only recorded actions are
+            replayed, and only if the simulator runs no other code.
+        look: what to examine in a process that uses this process's terminal; None to run in the background without the
+            terminal.
     """
 
     code: Code = "snapshot"
@@ -90,19 +92,19 @@ class ReplayOptions:
 
 @dataclass(frozen=True, slots=True)
 class Rerun:
-    """A crash that is prepared for a replay.
+    """A crash that has been prepared for a replay.
 
     Args:
-        bundle: the crash.
-        recorded: the recording.
-        spec: the trial, with all edits.
-        worker: where and how it runs; its scratch folder is not set yet.
-        code: who drives.
+        bundle: bundle of the crash.
+        recorded: the recording of the crash.
+        spec: the trial to run, with all edits.
+        worker: settings of the worker that runs the trial; its scratch folder is not set yet.
+        code: which code drives.
         snapshot: snapshot of the bundle.
-        edits: the differences from the recorded trial, in words.
-        warnings: what may make a difference, in words.
-        other_traffic: those edits that are not about who drives: without the crash, they may be why.
-        elsewhere: whether it is in another scenario, so that steps cannot be compared.
+        edits: the differences from the recorded trial, as text.
+        warnings: warnings about possible causes of different results, as text.
+        other_traffic: the edits that do not concern the agents; if the crash does not occur, they may be the reason.
+        elsewhere: whether the replay uses another scenario, so that its steps cannot be compared.
     """
 
     bundle: Bundle
@@ -118,7 +120,7 @@ class Rerun:
 
     @property
     def defaults(self) -> dict[tuple[str, str], Value | None]:
-        """The default of each argument, by agent (empty for the scenario's own) and name; None if it has none."""
+        """The default of each argument, by agent (empty for the scenario) and name; None if there is no default."""
         scenario = self.worker.scenario
         found = {("", name): known.default for name, known in scenario.scenario_arguments().items()}
         for agent in scenario.agents:
@@ -127,11 +129,11 @@ class Rerun:
 
 
 def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
-    """Check a bundle, and return everything that a new run of its crash needs.
+    """Check a bundle, and return everything that is needed to run its crash again.
 
     Raises:
         BundleError: the bundle is damaged.
-        UsageError: an edit cannot be meant.
+        UsageError: an edit is invalid.
         UntrustedError: the code of the crash would run, but the crash is neither made on this machine nor trusted.
     """
     recorded = bundle.recording()
@@ -221,7 +223,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
 def _in_scenario(
     name: str, settings: HuntSettings, spec: TrialSpec, step_length_s: float
 ) -> tuple[Scenario, TrialSpec]:
-    """Return the trial in another scenario: same agents, arguments, seed and simulation time."""
+    """Return the trial in another scenario, with the same agents, arguments, seed and simulation time."""
     other = load_scenario(name)
     if len(other.agents) != len(settings.agents):
         counts = f"{len(other.agents)} controlled vehicles, and the crash has {len(settings.agents)}"
@@ -257,7 +259,7 @@ def _unsupported_kind(scenario: Scenario, spec: TrialSpec) -> str:
 
 
 def is_current_code(rerun: Rerun) -> bool:
-    """Whether the trials run with this crashhunt, and not with the crashhunt of the snapshot."""
+    """Return whether the trials run with the current crashhunt, and not with the crashhunt of the snapshot."""
     if not rerun.worker.code:
         return True
     files = rerun.snapshot.manifest["files"]

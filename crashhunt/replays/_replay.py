@@ -1,4 +1,4 @@
-"""Replay and confirmation: runs a crash again in a new process, and checks whether the run is bit-identical."""
+"""Replay and confirmation: run a crash again in a new process, and check whether the run is bit-identical."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ class ReplayReport:
     """The result of a replay.
 
     Args:
-        rerun: description of the run.
-        verdict: the verdict; of several replays, that of the first one that deviates.
-        replayed: the trial that was run now.
-        recording: recording of it.
-        divergence: the first difference.
-        around: step, recorded and replayed value of the field that differs, in the steps around.
-        reason: why the two cannot be compared.
-        verdicts: verdict to the number of runs that had it.
+        rerun: description of the replayed run.
+        verdict: the verdict; of several replays, the verdict of the first replay that deviates.
+        replayed: result of the replayed trial.
+        recording: recording of the replayed trial.
+        divergence: the first difference between recording and replay.
+        around: values around the divergence: step, recorded value and replayed value of the field that differs.
+        reason: the reason why the two runs cannot be compared.
+        verdicts: number of runs for each verdict.
     """
 
     rerun: Rerun
@@ -65,16 +65,16 @@ class ReplayReport:
 
     @property
     def bundle(self) -> Bundle:
-        """The crash."""
+        """The bundle of the crash."""
         return self.rerun.bundle
 
     @property
     def steps_replayed(self) -> int:
-        """The number of completed steps."""
+        """The number of completed steps of the replay."""
         return self.recording.steps
 
     def to_json(self) -> JsonObject:
-        """Return the shape that ``replay --json`` prints."""
+        """Return the report in the form that ``replay --json`` prints."""
         return {
             "crash": self.bundle.id,
             "verdict": self.verdict,
@@ -98,14 +98,14 @@ class ReplayReport:
 def judged(
     rerun: Rerun, recorded: Recording, replayed: Recording, result: TrialResult, *, whole: bool = True
 ) -> ReplayReport:
-    """Compare two recordings of a crash.
+    """Compare two recordings of a crash, and return the report.
 
     Args:
-        rerun: description of the run.
-        recorded: the recording, or its beginning.
-        replayed: number of steps that were replayed.
+        rerun: description of the replayed run.
+        recorded: the recording of the crash, or its beginning.
+        replayed: the recording of the replay.
         result: the result of the replay.
-        whole: whether the replay was to end where the crash did.
+        whole: whether the replay was expected to end where the crash did.
     """
     if rerun.elsewhere:
         if result.outcome in rerun.worker.crash_on:
@@ -178,7 +178,7 @@ def _no_fix(rerun: Rerun) -> str:
 
 
 def _end_divergence(was: TrialResult, now: TrialResult, code: Code) -> Divergence | None:
-    """Return where two bit-identical recordings ended differently, such as a hang that did not reproduce."""
+    """Return where two otherwise identical recordings ended differently, such as a hang that did not reproduce."""
     if code == "log" and was.collision is None:  # the record of an agent's fault does not fail
         return None
     if was.outcome is not now.outcome:
@@ -203,7 +203,7 @@ def _end_divergence(was: TrialResult, now: TrialResult, code: Code) -> Divergenc
 
 
 def up_to(recording: Recording, step: int) -> Recording:
-    """Return a recording to the end of a step.
+    """Return the part of a recording up to the end of a step.
 
     Recorded actions can repeat the episode only up to the last complete step.
     """
@@ -214,8 +214,8 @@ def up_to(recording: Recording, step: int) -> Recording:
 def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport:
     """Run a crash again from its bundle alone, and compare every step with the log.
 
-    The scenario comes from the snapshot, even if the original has changed, and so does the agent's code unless the
-    options say otherwise. With recorded actions, no code of the bundle runs.
+    The scenario comes from the snapshot, even if the original has changed. So does the agent's code, unless the options
+    choose other code. With recorded actions, no code of the bundle runs.
 
     Raises:
         BundleError: the bundle is damaged.
@@ -240,21 +240,22 @@ def confirm(
     executors: SharedExecutors | None = None,
     trusted: bool | None = None,
 ) -> Bundle | None:
-    """Return the bundle with the verdict of a first replay, and until when braking would have avoided the crash.
+    """Return the bundle with the verdict of a first replay, and with the last step from which braking avoids the crash.
 
     Args:
-        bundle: the crash.
-        stopped: Returns whether to stop; called repeatedly. A replay that fails afterwards does not count.
-        failed: receives the result of the replay, if it is not the crash.
+        bundle: the crash to confirm.
+        stopped: function that returns whether to stop; called repeatedly. A replay that fails after a stop does not
+            count.
+        failed: function called with the result of the replay if the replay does not crash in the same way.
         executors: the executors that run the trial; None for a new Python process.
-        trusted: whether its code may run; None to find out.
+        trusted: whether the code of the crash may run; None to determine it.
 
     Returns:
-        The bundle with the result, or None if the confirmation was stopped. If no replay can run to its end, for
-        example because it is killed from outside every time, `confirmed` is None and `why_unconfirmed` has the reason.
+        The bundle with the result, or None if the confirmation was stopped. If no replay runs to its end, for example
+        because every replay is killed from outside, `confirmed` is None and `why_unconfirmed` has the reason.
 
     Raises:
-        UntrustedError: its code is neither made here nor trusted.
+        UntrustedError: the code of the crash is neither made here nor trusted.
     """
     try:
         rerun = prepare(bundle, ReplayOptions(force=True, trusted=trusted))
@@ -283,7 +284,7 @@ class _StoppedError(Exception):
 
 
 class _NotSetUpError(CrashhuntError):
-    """The replay took place, and did not get as far as the first step."""
+    """The replay ran, but ended before its first step."""
 
 
 def _run(
@@ -320,7 +321,7 @@ def _run(
 
 
 def _look_into(rerun: Rerun, look: Look) -> ReplayReport:
-    """Run the first steps attached to the terminal, and compare them with those of the log."""
+    """Run the first steps attached to the terminal, and compare them with the steps of the log."""
     from crashhunt.replays._debugger import debug
 
     result, replayed = debug(rerun, look)
