@@ -1,4 +1,4 @@
-"""Plans: the request of a hunt, its resolved settings in ``hunt.toml``, and the options."""
+"""Plans: the user's request for a hunt, the settings in ``hunt.toml`` that result from it, and all options of hunts."""
 
 import lazy_loader
 

@@ -1,10 +1,10 @@
-"""Facts about the code that a hunt names, found without running foreign code in this process.
+"""Facts about the code that a hunt names, found without running user code in this process.
 
-A foreign module may end or stop the process that imports it. One fork of this process imports all of them, returns
-what the command has to know, and ends. Only processes of trials import them again.
+A user's module may end or stop the process that imports it. One fork of this process imports all such modules, returns
+the facts that the command needs, and ends. After that, only the processes of trials import the modules again.
 
-Samplers and executors are parts of the hunt itself, so this process imports them afterwards. A module of theirs that
-ends or stops its process has then been refused.
+Samplers and executors are parts of the hunt itself, so this process imports them afterwards. By then, a sampler or
+executor module that ends or stops its process has been refused.
 """
 
 from __future__ import annotations
@@ -37,13 +37,14 @@ IMPORT_S = 60.0  # besides the time limit of a trial
 
 @dataclass(frozen=True, slots=True)
 class CodeFacts:
-    """What a command knows of the code that a hunt names.
+    """The facts that a command knows about the code that a hunt names.
 
     Args:
-        signatures: arguments of each agent, by locator.
-        oracles: outcomes and their categories of each foreign oracle, by its choice.
-        disturbances: the kind of each foreign model of disturbances, by name.
-        imported: the modules that a process with all of it has imported; None if no module is foreign.
+        signatures: arguments of each agent, by the agent's locator.
+        oracles: outcomes of each user-defined oracle with their categories, by the oracle's choice on the command line.
+        disturbances: the kind of each user-defined disturbance model, by name.
+        imported: the modules that a process with all of this code has imported; None if all modules are crashhunt's
+            own.
     """
 
     signatures: Mapping[str, Signature]
@@ -55,18 +56,18 @@ class CodeFacts:
 def describe_code(
     scenario: Scenario, *, oracles: Sequence[str], disturb: Sequence[str], sampler: str, executor: str, timeout_s: float
 ) -> CodeFacts:
-    """Return the facts about the agents of a scenario, and about the code that options name.
+    """Return the facts about the agents of a scenario, and about other code that options name.
 
     Args:
         scenario: the scenario with its agents.
-        oracles: as ``--oracle`` has them.
-        disturb: as ``--disturb`` has them.
-        sampler: as ``--sampler`` has it.
-        executor: as ``--executor`` has it.
+        oracles: values of ``--oracle``.
+        disturb: value of ``--disturb``.
+        sampler: value of ``--sampler``.
+        executor: value of ``--executor``.
         timeout_s: time limit of a trial in s; imports may take 60 s longer.
 
     Raises:
-        CrashhuntError: foreign code cannot be imported, or has ended or stopped its process.
+        CrashhuntError: user code cannot be imported, or has ended or stopped its process.
     """
     locators = sorted({setup.agent for setup in scenario.agents.values()})
     chosen = [text for text in oracles if is_foreign("oracles", oracle_name(text)) and text != "none"]
@@ -104,7 +105,7 @@ def describe_code(
 
 
 def imported_by(scenario: Scenario, settings: HuntSettings) -> ImportedModules:
-    """Return the modules that trials import. Where one is foreign, a process of its own imports them.
+    """Return the modules that trials import. A separate process imports them if one is not crashhunt's own.
 
     Raises:
         CrashhuntError: a module cannot be imported, or has ended or stopped its process.
@@ -122,7 +123,7 @@ def imported_by(scenario: Scenario, settings: HuntSettings) -> ImportedModules:
 
 
 def _import(locators: Sequence[str], modules: Sequence[str], report: Callable[[str], None]) -> ImportedModules:
-    """Import agents and modules, and report each before."""
+    """Import agents and modules, and report each import before it begins."""
 
     def each(names: Sequence[str]) -> Iterator[str]:
         for name in names:

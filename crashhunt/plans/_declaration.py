@@ -53,19 +53,21 @@ class About:
     """The declaration of an option in addition to its name, type and default.
 
     Args:
-        meaning: meaning of its value, in words.
-        help: text for the command line, if it differs.
-        unset: the effect if the option is not given, in words; empty for the default value.
-        flag: option on the command line; empty if it is not there.
-        metavar: placeholder of its value in the help.
-        group: group of the help of ``crashhunt run``: what is tested, search, faults and probes, what is kept, how it
+        meaning: description of the option's value.
+        help: help text for the command line, if it differs from `meaning`.
+        unset: description of the effect if the option is not given; empty for the default value.
+        flag: option on the command line; empty if the command line has no such option.
+        metavar: placeholder for the value in the help.
+        group: group in the help of ``crashhunt run``: what is tested, search, faults and probes, what is kept, how it
             runs, output.
-        brief: the same in one line, for the short help of ``crashhunt run``; empty for options that it only names.
-        check: returns the fix for an invalid value; empty for a valid one.
-        separator: separator of a list that is one word on the command line; empty if its flag may be repeated.
-        named: of a table, whether every value has a name.
-        anywhere: whether ``suite run`` and ``rerun`` have the flag as well, for all their hunts: it belongs to the
-            machine, and not to the hunt.
+        brief: help text in one line, for the short help of ``crashhunt run``; empty for options that the short help
+            only names.
+        check: function that returns the fix for an invalid value; empty for a valid value.
+        separator: separator of a list that is written as one word on the command line; empty if the option may be
+            repeated.
+        named: for a table, whether every value has a name.
+        anywhere: whether ``suite run`` and ``rerun`` have the option as well, for all their hunts. Such an option
+            belongs to the machine and not to the hunt.
     """
 
     meaning: str
@@ -82,7 +84,7 @@ class About:
 
 
 def option(default: T, meaning: str, **about: Any) -> T:
-    """Declare an option: a field of a dataclass. For ``about``, see `About`."""
+    """Declare an option of hunts as a field of a dataclass. `About` describes the keyword arguments."""
     metadata = {_METADATA_KEY: About(meaning=meaning, **about)}
     if isinstance(default, dict):
         return cast(T, field(default_factory=dict, metadata=metadata))
@@ -90,18 +92,18 @@ def option(default: T, meaning: str, **about: Any) -> T:
 
 
 def at_least(least: int, *, zero: str = "") -> Check:
-    """Return the check of a number; ``zero`` is the meaning of 0, if 0 is allowed."""
+    """Return a check that a number is at least a bound; ``zero`` is the meaning of 0, if 0 is allowed."""
     fix = f"give at least {least}{f' (0: {zero})' if zero else ''}"
     return lambda value: fix if value < least else ""
 
 
 def within(least: float, most: float, fix: str) -> Check:
-    """Return the check of a number with two bounds, both of which it may be."""
+    """Return a check that a number is between two bounds, including both."""
     return lambda value: "" if least <= value <= most else fix  # what is not a number is not within, either
 
 
 def above_zero(fix: str, *, finite: bool = True) -> Check:
-    """Return the check of a number above 0."""
+    """Return a check that a number is above 0."""
     return lambda value: "" if value > 0 and not (finite and math.isinf(value)) else fix
 
 
@@ -112,8 +114,8 @@ class HuntOption:
     Args:
         name: name in Python and in files.
         form: form of its values.
-        default: the value if the option is not given.
-        about: everything else.
+        default: value if the user does not give the option.
+        about: the rest of the option's declaration.
     """
 
     name: str
@@ -144,10 +146,10 @@ class HuntOption:
         return f"{self.about.help or self.about.meaning}{f'; default: {default}' if default else ''}"
 
     def checked(self, value: object) -> object:
-        """Return a checked value of this option; a NumPy number becomes a Python number.
+        """Return a valid value of this option after conversion: a NumPy number becomes a Python number.
 
         Raises:
-            UsageError: it is none.
+            UsageError: the value is invalid.
         """
         if value is None and self.default is None:
             return None
@@ -183,12 +185,12 @@ _TYPES_BY_FORM: Mapping[Form, tuple[tuple[type, ...], str]] = {
 
 
 def declared(kind: type) -> frozenset[str]:
-    """Return the names of the options that a dataclass declares, or has from one that does."""
+    """Return the names of the options that a dataclass declares itself or inherits."""
     return frozenset(item.name for item in fields(kind) if _METADATA_KEY in item.metadata)
 
 
 def declared_options(kind: type) -> tuple[HuntOption, ...]:
-    """Return the options that a dataclass declares, in its order."""
+    """Return the options that a dataclass declares, in the order of its fields."""
     hints = get_type_hints(kind)
     return tuple(
         HuntOption(
@@ -221,13 +223,13 @@ _DURATION = re.compile(r"(?:(\d+(?:\.\d+)?)d)?(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\
 
 
 def seconds_of(text: str) -> float:
-    """Return how many seconds ``90``, ``90s``, ``30m``, ``1h30m`` or ``2d`` are; without end where nothing is said.
+    """Return the number of seconds in ``90``, ``90s``, ``30m``, ``1h30m`` or ``2d``; infinite for an empty text.
 
     >>> seconds_of("1h30m")
     5400.0
 
     Raises:
-        ValueError: the text is not a time.
+        ValueError: the text is not a duration.
     """
     if not text:
         return math.inf
@@ -240,7 +242,7 @@ def seconds_of(text: str) -> float:
 
 
 def check_duration(text: str) -> str:
-    """Return what to give instead of a text that is no time; empty if it is one."""
+    """Return the fix for a text that is not a duration; empty for a valid text."""
     try:
         seconds_of(text)
     except ValueError:
@@ -249,13 +251,13 @@ def check_duration(text: str) -> str:
 
 
 def share_of(text: str) -> float:
-    """Return the share that ``30%`` or ``0.3`` is.
+    """Return the share that a text such as ``30%`` or ``0.3`` means.
 
     >>> share_of("30%")
     0.3
 
     Raises:
-        ValueError: it is no share above 0 and up to 1.
+        ValueError: the text is not a share above 0 and up to 1.
     """
     found = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
     if not 0 < found <= 1:
@@ -264,7 +266,7 @@ def share_of(text: str) -> float:
 
 
 def check_share(text: str) -> str:
-    """Return the fix for a text that is not a share; empty for a share or an empty text."""
+    """Return the fix for a text that is not a share; empty for a valid or an empty text."""
     try:
         share_of(text or "1")
     except ValueError:
@@ -273,7 +275,7 @@ def check_share(text: str) -> str:
 
 
 def check_probe(text: str) -> str:
-    """Return the fix for an invalid interval of probes; empty if the interval is valid."""
+    """Return the fix for an invalid interval between robustness probes; empty if the interval is valid."""
     if check_duration(text):
         return "give a time above 0, such as 4s, or omit the option"
     return "" if not text or sys.platform == "linux" else "omit the option: forks need Linux"
@@ -289,13 +291,13 @@ _RATE = re.compile(r"(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)\s*/
 
 
 def rate_of(text: str) -> tuple[float, RatePer]:
-    """Return the rate and what it is per, of ``1e-3/trial``, ``2/hour`` or ``5/1000km``.
+    """Return the rate and its unit from a text such as ``1e-3/trial``, ``2/hour`` or ``5/1000km``.
 
     >>> rate_of("2/hour")
     (2.0, 'hour')
 
     Raises:
-        ValueError: the text is no such rate, or the rate is out of range.
+        ValueError: the text is not such a rate, or the rate is out of range.
     """
     found = _RATE.fullmatch(text.strip())
     if found is None:
@@ -307,7 +309,7 @@ def rate_of(text: str) -> tuple[float, RatePer]:
 
 
 def check_rate(text: str) -> str:
-    """Return what to give instead of a text that is no rate; empty if it is one, or empty."""
+    """Return the fix for a text that is not a rate; empty for a valid or an empty text."""
     try:
         if text:
             rate_of(text)

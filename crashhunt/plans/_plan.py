@@ -1,4 +1,4 @@
-"""Resolve the request of a user: find the scenario, check the arguments, and make complete settings."""
+"""Resolution of a user's request: find the scenario, check the arguments, and return complete settings."""
 
 from __future__ import annotations
 
@@ -77,21 +77,22 @@ def with_recorded_load_order(scenario: Scenario, recorded: str | None) -> Scenar
     """Return the scenario with the load order of a recorded crash: fixed, or the simulator's own.
 
     Args:
-        scenario: what is run again.
-        recorded: ``load_order`` of the snapshot; None if it has none.
+        scenario: the scenario to run again.
+        recorded: ``load_order`` of the snapshot; None if the snapshot has none.
     """
     order = scenario.backend.load_order
     return scenario if order is None or recorded == FIXED else order.keep(scenario)
 
 
 def load_order_change(scenario: Scenario, recorded: str | None) -> str:
-    """Return how the load order here differs from the recorded one, as a clause; empty if it does not.
+    """Return how the load order here differs from the recorded order, as a clause; empty if both are equal.
 
-    An order that was not fixed is kept by `with_recorded_load_order`, so only a fixed one can be missing here.
+    An order that was not fixed is kept by `with_recorded_load_order`. A difference therefore arises only if the
+    recorded order was fixed, and cannot be fixed here.
 
     Args:
-        scenario: what is run again.
-        recorded: ``load_order`` of the snapshot; None if it has none.
+        scenario: the scenario to run again.
+        recorded: ``load_order`` of the snapshot; None if the snapshot has none.
     """
     order, now = scenario.backend.load_order, load_order_of(scenario)
     if order is None or recorded != FIXED or now == FIXED:
@@ -131,9 +132,9 @@ class Takes:
     """The arguments that an agent accepts.
 
     Args:
-        names: names of those that it declares.
-        open: whether it takes any other as well (``**kwargs``).
-        defaults: defaults of those that have a number, a string or a truth value as default.
+        names: names of the arguments that the agent declares.
+        open: whether the agent accepts any other argument as well (``**kwargs``).
+        defaults: defaults of the arguments whose default is a number, a string or a Boolean.
     """
 
     names: Collection[str] = ()
@@ -145,27 +146,27 @@ class Takes:
 class Owners:
     """The owner of each argument: an agent or the scenario.
 
-    ``AGENT.NAME`` is an argument of that agent, and ``scenario.NAME`` one of the scenario. A bare ``NAME`` belongs to
-    the agent or the scenario that declares it, or else to the agent that accepts any argument. If there are several
-    such owners, a bare ``NAME`` belongs to none.
+    ``AGENT.NAME`` is an argument of that agent, and ``scenario.NAME`` is an argument of the scenario. A bare ``NAME``
+    belongs to the agent or the scenario that declares it, or else to the agent that accepts any argument. If there are
+    several such owners, a bare ``NAME`` belongs to none.
 
     Args:
-        agents: arguments of each agent.
-        scenario: names of the arguments of the scenario.
+        agents: accepted arguments of each agent.
+        scenario: names of the scenario's arguments.
     """
 
     agents: Mapping[str, Takes]
     scenario: Collection[str] = field(default=())
 
     def of(self, word: str, *, option: str) -> tuple[str, str] | None:
-        """Return the agent (empty for the scenario) and the name that are meant; None if no owner has it.
+        """Return the owner of an argument (an agent, or empty for the scenario) and its name; None if no owner has it.
 
         Args:
-            word: as it was written.
-            option: option in which, for the error.
+            word: name of the argument as the user wrote it.
+            option: option that contains the name, for error messages.
 
         Raises:
-            ArgumentError: several have it.
+            ArgumentError: several owners have an argument with this name.
         """
         agent = agent_of(word, self.agents)
         if agent:
@@ -184,16 +185,16 @@ class Owners:
         return (takers[0], word) if takers else None
 
     def of_record(self, word: str, ask: Callable[[str], Takes] | None, *, option: str) -> tuple[str, str] | None:
-        """Return the same where these are of a record, which lacks arguments that have no plain default.
+        """Return owner and name like `of`, for recorded arguments; the record lacks arguments without a plain default.
 
         Args:
-            word: as it was written.
-            ask: returns what an agent takes by its code, which is asked only where the record does not know; None if
-                that code may not run.
-            option: option in which the word was, for the error.
+            word: name of the argument as the user wrote it.
+            ask: function that returns the arguments of an agent from its code; called only if the record does not
+                contain the name. It returns None if the code may not run.
+            option: option that contains the name, for error messages.
 
         Raises:
-            ArgumentError: several have it.
+            ArgumentError: several owners have an argument with this name.
         """
         owner = self.of(word, option=option)
         if owner is not None or ask is None or word.startswith(f"{SCENARIO}."):
@@ -206,7 +207,7 @@ class Owners:
         return Owners(agents, self.scenario).of(word, option=option)
 
     def unknown(self, word: str, *, option: str, whose: str) -> ArgumentError:
-        """Return the error for an unknown name, with the most similar known name."""
+        """Return the error for an unknown argument, with the most similar known name."""
         bare = {name: name for name in self.scenario}
         bare |= {f"{agent}.{name}": name for agent, takes in self.agents.items() for name in takes.names}
         near = (f"did you mean {whole!r}?" for whole, part in bare.items() if did_you_mean(word, [part]))
@@ -223,7 +224,7 @@ class Owners:
 
 
 def agent_of(word: str, agents: Collection[str]) -> str:
-    """Return the agent whose id a word begins with, and a dot; empty if it is a bare name.
+    """Return the agent whose id and a dot begin the given word; empty if the word has no such prefix.
 
     Identifiers may contain dots, and one may be a
     prefix of another. If several match, the longest is used.
@@ -232,15 +233,16 @@ def agent_of(word: str, agents: Collection[str]) -> str:
 
 
 def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None) -> Takes:
-    """Read the arguments of an agent from its code, in a separate process, because the code may come from a snapshot.
+    """Return the arguments of an agent from its code, read in another process, as the code may be a snapshot's.
 
     Args:
-        locator: locator of the agent.
-        code: folders whose modules win over installed ones.
-        folder: folder from where it is imported otherwise; by default the current one.
+        locator: locator of the agent, ``module:attribute`` or a registered name.
+        code: folders whose modules take precedence over installed modules.
+        folder: folder from which other modules are imported; by default the current folder.
 
     Returns:
-        What it takes; anything, where it cannot be asked, because its first run reports the reason.
+        The accepted arguments. If they cannot be determined, every argument is accepted, because the first run reports
+        the reason.
     """
     points = registered("agents")
     target = points[locator].value if locator in points else locator
@@ -259,17 +261,17 @@ def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None)
 
 
 def plan(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario, HuntSettings]:
-    """Resolve a request; see `plan_with_code`."""
+    """Resolve a user's request to a scenario and settings; see `plan_with_code`."""
     return plan_with_code(request, survey=survey)[:2]
 
 
 def plan_with_code(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario, HuntSettings, CodeFacts]:
-    """Resolve a request, and return what was found out about the code that it names.
+    """Resolve a user's request, and return the facts about the code that it names.
 
     Args:
         request: the request of the user.
-        survey: returns the scenario with the vehicles that an agent can replace. It is called last, as it may take
-            long: what cannot be meant is refused sooner.
+        survey: function that returns the scenario with the vehicles that an agent can replace. It is called last
+            because it may take long, and invalid requests are refused before.
 
     Raises:
         CrashhuntError: the request is invalid.
@@ -283,7 +285,7 @@ def plan_with_code(request: Request, *, survey: Surveyor | None = None) -> tuple
 
 
 def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tuple[Scenario, HuntSettings, CodeFacts]:
-    """Resolve a request in a scenario, with facts about its code where they are known."""
+    """Resolve a request in a loaded scenario, with the facts about its code if they are known."""
     scenario = _agents_in(
         scenario.with_agents(_locators(request, scenario)), dict.fromkeys(scenario.agents, request.action)
     )
@@ -347,7 +349,7 @@ def _with_notes(scenario: Scenario, run: RunSettings) -> Scenario:
 
 
 def core_of(scenario: Scenario, run: RunSettings) -> str | None:
-    """Return whether trials use the simulator's compiled core, in words; None if it has none."""
+    """Return as text whether trials use the simulator's compiled core; None if the simulator has no compiled core."""
     core = scenario.backend.core
     if core is None:
         return None
@@ -356,7 +358,7 @@ def core_of(scenario: Scenario, run: RunSettings) -> str | None:
 
 
 def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
-    """Return the scenario as the settings say: who is at the wheel, and whether its simulator is sped up."""
+    """Return the scenario with the agents and the acceleration that the settings choose."""
     missing = scenario.agents.keys() ^ settings.agents.keys()
     if missing:
         raise UsageError(
@@ -375,7 +377,7 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
 
 
 def _agents_in(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
-    """Return the scenario with the requested forms of action; an empty form keeps that of the scenario."""
+    """Return the scenario with the requested forms of actions; an empty form keeps the scenario's form."""
     for agent, action in actions.items():
         if action and not scenario.backend.actions:
             meant, fix = titles(lambda backend: bool(backend.actions)), "omit the option; the environment has its own"
@@ -395,10 +397,10 @@ def disturber(
     """Return the object that draws the disturbances of trials; None if there are none.
 
     Args:
-        scenario: scenario in which they take place.
-        disturb: how often what happens: ``NAME=RATE`` each; or what happens when.
-        agents: the agents around which disturbances take place.
-        find: returns the model of a name; by default it is imported in this process.
+        scenario: scenario in which disturbances take place.
+        disturb: the disturbances: ``NAME=RATE`` for random ones, or the exact disturbances at given steps.
+        agents: identifiers of the agents around which disturbances take place.
+        find: function that returns the disturbance model of a name; by default the model is imported in this process.
 
     Raises:
         CrashhuntError: the disturbance does not exist, or the simulator does not support it.
@@ -419,10 +421,10 @@ def disturber(
 
 
 def disturber_apart(scenario: Scenario, settings: HuntSettings) -> DisturbanceSampler | None:
-    """Return what draws the disturbances of a hunt; a foreign model draws in a process of its own.
+    """Return the object that draws the disturbances of a hunt; a user-defined model draws in a separate process.
 
     Raises:
-        CrashhuntError: as of `disturber`.
+        CrashhuntError: a disturbance does not exist, or the simulator does not support it.
     """
     find = partial(_model_apart, None, settings.run.timeout_s)
     return disturber(scenario, settings.disturb, tuple(settings.agents), find=find)
@@ -436,11 +438,11 @@ def _model_apart(code: CodeFacts | None, timeout_s: float, name: str) -> Disturb
 
 
 def sampler_of(settings: HuntSettings) -> NamedSampler:
-    """Return a new sampler for a hunt.
+    """Return a new sampler for a hunt's settings.
 
     Raises:
-        PluginError: there is no such sampler, it cannot be made, or it is none.
-        CrashhuntError: it refuses the space.
+        PluginError: the sampler does not exist, cannot be created, or is not a sampler.
+        CrashhuntError: the sampler refuses the argument space.
     """
     hunt = HuntFacts(settings.seed, settings.crash_on)
     return NamedSampler(settings.sampler, settings.space, points=settings.points, hunt=hunt)
@@ -448,7 +450,7 @@ def sampler_of(settings: HuntSettings) -> NamedSampler:
 
 @contextmanager
 def _name_scenario_in_errors(request: Request, scenario: Scenario) -> Iterator[None]:
-    """Name the scenario in errors of disturbances that the scenario defines."""
+    """Return a context that adds the scenario's name to errors of disturbances that the scenario defines."""
     try:
         yield
     except CrashhuntError as error:
@@ -459,7 +461,7 @@ def _name_scenario_in_errors(request: Request, scenario: Scenario) -> Iterator[N
 
 
 def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
-    """Return the requested disturbances, or else those of the scenario."""
+    """Return the disturbances that the user requests, or else those of the scenario."""
     words = request.disturb or tuple(f"{name}={rate}" for name, rate in scenario.disturbances.items())
     agents = tuple(scenario.agents)
     fixed = parse_fixed(words, agents)
@@ -486,7 +488,7 @@ _MAX_RARE_CHANCE = 0.2  # per step: above that a first onset is no rare event, a
 
 
 def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str], DisturbanceModel]) -> None:
-    """Refuse what `--rare` has no law for."""
+    """Refuse disturbances for which `--rare` knows no probability law."""
     run = settings.run
     if not settings.rare:
         if run.until_error:
@@ -522,7 +524,7 @@ def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str]
 
 
 def _with_defaults(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
-    """Add a note on events that this simulator never reports; refuse a hunt for such events alone."""
+    """Add a note on events that this simulator never reports; refuse a hunt that looks only for such events."""
     backend = backend_of(scenario.simulator)
     told = backend.reported_events if backend is not None else None
     never = [kind for kind in crash_on if kind in EVENTS and told is not None and kind not in told]
@@ -542,10 +544,10 @@ def parse_crash_on(
 
     Args:
         words: the values of ``--crash-on``.
-        brought: the outcomes of the oracles that were chosen, which may be named as well.
+        brought: the outcomes of the chosen oracles, which ``--crash-on`` may name as well.
 
     Raises:
-        UsageError: the outcome does not exist, or the limit is invalid.
+        UsageError: an outcome does not exist, or a limit is invalid.
     """
     known = tuple(dict.fromkeys((*CRASHES, *EVENTS, *brought)))
     crashes = [str(outcome) for outcome in known]
@@ -624,7 +626,7 @@ def _agents(
 
 
 def _owner(name: str, scenario: Scenario, signatures: Mapping[str, Signature]) -> tuple[str, str]:
-    """Return the agent to which an ``--arg`` belongs."""
+    """Return the agent and the name to which an ``--arg`` refers."""
     takes = {agent: Takes(signature.arguments, signature.open) for agent, signature in signatures.items()}
     owner = Owners(takes).of(name, option="--arg")
     if owner is not None:

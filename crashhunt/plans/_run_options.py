@@ -1,12 +1,14 @@
-"""The one list of hunt options.
+"""The list of all hunt options, the single source for every interface.
 
 The command line, `crashhunt.prepare` and ``run``, ``suite.toml``, ``request.json`` and ``hunt.toml`` are made from it.
-To add an option to all of them, add a field to one of the classes here. The class determines where the option is kept:
+To add an option to all of them, add a field to one of the classes here. The class determines where the option is
+stored:
 
-- `Subject` is resolved into ``hunt.toml`` by `plan`, which has to learn of it;
-- `TrialOptions` decides what a trial is: a key of ``hunt.toml``, and another value makes another hunt;
-- `RunOptions` only decides how trials are run: a key of ``[run]``, which a resumed hunt may have otherwise;
-- `SnapshotOptions` of the ``snapshots`` package is made of `SnapshotChoices`, which are not kept.
+- `Subject`: `plan` resolves the option into ``hunt.toml``, and has to be changed for a new option;
+- `TrialOptions`: the option determines trials and is a key of ``hunt.toml``, and another value makes another hunt;
+- `RunOptions`: the option only determines how trials are run and is a key of ``[run]``, which a resumed hunt may
+  change;
+- `SnapshotChoices`: the option is passed to `SnapshotOptions` of the ``snapshots`` package, and is not stored.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -51,10 +53,10 @@ class _Options:
                 object.__setattr__(self, item.name, tuple(value))
 
     def checked(self) -> Self:
-        """Return the same with every option in order, and as plain as it can be.
+        """Return the same options after validation, with plain Python values.
 
         Raises:
-            UsageError: one is none.
+            UsageError: an option is invalid.
         """
         options = hunt_options(type(self))
         return replace(self, **{known.name: known.checked(getattr(self, known.name)) for known in options})
@@ -114,7 +116,7 @@ class Subject(_Options):
 
 @dataclass(frozen=True, kw_only=True)
 class TrialOptions(_Options):
-    """The options that determine trials; `HuntSettings` has them, too."""
+    """The options that determine trials; `HuntSettings` contains them as well."""
 
     sampler: str = option(
         "random", "name of the sampler",
@@ -189,7 +191,7 @@ class TrialOptions(_Options):
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(_Options):
-    """The options that determine how trials run; `RunSettings` has them, too."""
+    """The options that determine how trials run; `RunSettings` contains them as well."""
 
     duration: str = option(
         "", "time limit of the hunt: ``90s``, ``30m``, ``1h30m``; TRIALS may then be 0",
@@ -304,7 +306,7 @@ class RunOptions(_Options):
         """Return the same options after validation. With `distinct`, the hunt continues after the first crash.
 
         Raises:
-            UsageError: one is none.
+            UsageError: an option is invalid.
         """
         found = super().checked()
         if found.most and not found.until_rate:
@@ -349,13 +351,13 @@ class SnapshotChoices(_Options):
 
 @dataclass(frozen=True, kw_only=True)
 class HuntOptions(SnapshotChoices, RunOptions, TrialOptions, Subject):
-    """All of them, in the order of the help: what `crashhunt.prepare` takes, and a hunt of a ``suite.toml``."""
+    """All options, in the order of the help; they are arguments of `crashhunt.prepare` and keys of a suite's hunt."""
 
     agent: Driver | None = option(None, "agent that drives, if the scenario has one controlled vehicle")
 
 
 def hunt_options(kind: type = HuntOptions) -> tuple[HuntOption, ...]:
-    """Return all options of hunts, or the options that a given dataclass has."""
+    """Return all options of hunts, or the options that the given dataclass contains."""
     names = declared(kind)
     return tuple(known for known in _all_options() if known.name in names)
 

@@ -1,4 +1,4 @@
-"""The request for a hunt, and the settings that it resolves to: ``hunt.toml``."""
+"""The user's request for a hunt, and the settings that result from it (``hunt.toml``)."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ class ArgumentSpec:
     """The values that a hunt tries for one argument.
 
     Args:
-        spec: as in ``--arg NAME=SPEC``.
-        kind: the type of its values.
+        spec: specification of the values, as in ``--arg NAME=SPEC``.
+        kind: the type of the values.
     """
 
     spec: str
@@ -73,13 +73,13 @@ class ArgumentSpec:
 
     @property
     def distribution(self) -> Distribution:
-        """The distribution of the specification."""
+        """The probability distribution that the specification describes."""
         return parse_spec(self.spec, self.kind)
 
 
 @dataclass(frozen=True, kw_only=True)
 class AgentSettings:
-    """``[agents.ID]``: the agent of a vehicle, the values of its arguments, and its form of action if requested."""
+    """The table ``[agents.ID]``: the agent of a vehicle, its argument values, and its form of actions if requested."""
 
     agent: str
     arguments: dict[str, ArgumentSpec] = field(default_factory=dict)
@@ -89,10 +89,12 @@ class AgentSettings:
 @clear_constructor
 @dataclass(frozen=True, kw_only=True)
 class RunSettings(RunOptions):
-    """``[run]``: how the hunt is run. These options do not change trials, so a resumed hunt may have other values.
+    """The table ``[run]``: how the hunt runs.
+
+    These options do not change trials, so a resumed hunt may have other values.
 
     Args:
-        parallel: trials at a time.
+        parallel: number of trials at a time.
     """
 
     parallel: int = 1
@@ -106,21 +108,21 @@ class RunSettings(RunOptions):
 @clear_constructor
 @dataclass(frozen=True, kw_only=True)
 class HuntSettings(TrialOptions):
-    """The content of ``hunt.toml``: all options that determine trials.
+    """The contents of ``hunt.toml``: all options that determine trials.
 
     Args:
-        scenario: the name or path that was given.
+        scenario: name or path of the scenario, as the user gave it.
         scenario_digest: digest of the scenario's files and settings.
         trials: maximum number of trials; 0 if only the time is limited.
         max_steps: maximum number of steps of a trial.
-        seed: seed of the hunt; with a trial's number it determines the trial.
+        seed: seed of the hunt; a trial is determined by this seed and its number.
         crash_on: the outcomes that count as a crash.
         oracles: the oracles that detect crashes, each as in ``--oracle``.
-        agents: agent id to who drives it.
+        agents: agent of each controlled vehicle with its arguments, by agent id.
         scenario_arguments: the values that the hunt tries for the scenario's arguments.
-        events: limits of traffic events that were asked for, such as ``not_moving`` in s.
-        run: how it is run.
-        schema: schema of the file format.
+        events: limits of traffic events that the user requested, such as ``not_moving`` in s.
+        run: options that determine how the hunt runs.
+        schema: version of the file format.
     """
 
     scenario: str
@@ -138,7 +140,7 @@ class HuntSettings(TrialOptions):
 
     @property
     def probe_s(self) -> float:
-        """Time between two probes, in s of simulation time; 0 for no probes."""
+        """Time between two robustness probes, in s of simulation time; 0 for no probes."""
         return seconds_of(self.probe) if self.probe else 0.0
 
     @property
@@ -153,14 +155,14 @@ class HuntSettings(TrialOptions):
 
     @property
     def space(self) -> Space:
-        """Everything that varies, and the constants."""
+        """The space of all arguments: those that vary, and the constants."""
         found = {("", name): spec.distribution for name, spec in self.scenario_arguments.items()}
         for agent, settings in self.agents.items():
             found |= {(agent, name): spec.distribution for name, spec in settings.arguments.items()}
         return found
 
     def differences(self, other: HuntSettings) -> list[str]:
-        """Say in words what makes the trials of two hunts different; how they are run does not."""
+        """Return a description of the differences between the trials of two hunts; how they run is ignored."""
         mine, theirs = _flat(asdict(self)), _flat(asdict(other))
         missing = "(not there)"
         return [
@@ -186,13 +188,13 @@ def _flat(data: object, prefix: str = "") -> dict[str, str]:
 
 
 def write_settings(path: Path, settings: HuntSettings, command: list[str], *, like: Path | None = None) -> None:
-    """Write ``hunt.toml``, with the command line as a comment on top; the file is never incomplete.
+    """Write ``hunt.toml``, with the command line as a comment on top. The file is never incomplete.
 
     Args:
         path: path of the file. Keys that a later version has added to an existing file are kept.
-        settings: the settings to write.
-        command: the command line.
-        like: another file from which that is taken over instead.
+        settings: the settings of the hunt.
+        command: the command line of the hunt.
+        like: path of another file whose additional keys are kept instead.
     """
     import tomli_w
 
@@ -209,7 +211,7 @@ def write_settings(path: Path, settings: HuntSettings, command: list[str], *, li
 
 
 def _in_order(data: Plain, settings: HuntSettings | RunSettings, first: tuple[str, ...]) -> dict[str, object]:
-    """What every version knows, in its order; then what came later, where it is not as it was before it came."""
+    """Return the keys that every version knows, in order, then later keys whose values differ from the default."""
     later = (item for item in fields(settings) if item.name not in first)
     asked = [item.name for item in later if getattr(settings, item.name) not in (_default(item), None)]
     return {name: data[name] for name in (*first, *asked) if name in data}
@@ -223,7 +225,7 @@ def read_settings(path: Path) -> HuntSettings:
     """Read ``hunt.toml``.
 
     Raises:
-        HuntDirectoryError: it is missing or not valid, with the key, its value and the fix.
+        HuntDirectoryError: the file is missing or not valid; the message names the key, its value and the fix.
     """
     from crashhunt.base.validation import validate
 
@@ -277,23 +279,23 @@ def _without_none(data: object) -> Any:
 
 @runtime_checkable
 class ChoosesParallelism(Protocol):
-    """An executor that decides how many trials PARALLEL 0 means, such as one on many machines.
+    """An executor that decides how many trials run at a time if PARALLEL is 0, such as an executor on many machines.
 
-    Elsewhere 0 is one per core of this machine.
+    For other executors, PARALLEL 0 means one trial per core of this machine.
     """
 
     sizes_itself: ClassVar[bool]
 
 
 def executor_of(word: str) -> Callable[..., Any]:
-    """Return the factory of the named executor, with its argument if there is one.
+    """Return the factory of the named executor, with the executor's argument if there is one.
 
     Args:
-        word: a registered name or ``module:attribute``, and perhaps ``:ARG``, in which there may be colons.
+        word: a registered name or ``module:attribute``, optionally followed by ``:ARG``, which may contain colons.
 
     Raises:
-        PluginError: there is no such executor.
-        UsageError: it takes no argument.
+        PluginError: the executor does not exist.
+        UsageError: the executor takes no argument.
     """
     name, argument = _name_and_argument(word)
     factory: Callable[..., Any] = locate("executors", name)
@@ -313,22 +315,22 @@ def executor_of(word: str) -> Callable[..., Any]:
 
 
 def executor_name(word: str) -> str:
-    """Return the registered name or ``module:attribute`` in a choice of an executor; nothing is imported."""
+    """Return the registered name or ``module:attribute`` in the choice of an executor; no module is imported."""
     return _name_and_argument(word)[0]
 
 
 def sizes_itself(word: str) -> bool:
-    """Whether the named executor decides what PARALLEL 0 means."""
+    """Return whether the named executor decides how many trials run at a time if PARALLEL is 0."""
     factory = locate("executors", executor_name(word))
     return isinstance(factory, ChoosesParallelism) and factory.sizes_itself
 
 
 def parallel_here(word: str, parallel: int) -> int:
-    """Return how many trials, such as confirmations, this machine runs at a time in addition to the executor.
+    """Return how many trials this machine runs at a time in addition to the executor, for example for confirmations.
 
     Args:
-        word: as for `executor_of`.
-        parallel: PARALLEL; of many machines, this one has not got as many cores.
+        word: choice of an executor, as for `executor_of`.
+        parallel: the value of PARALLEL; for an executor on many machines, this machine may have fewer cores.
     """
     cores = len(os.sched_getaffinity(0))
     return min(parallel or cores, cores) if sizes_itself(word) else parallel or cores
@@ -352,15 +354,15 @@ _REQUIRED_NUMBERS = {  # the numbers of a hunt that are no options: everybody ha
 @clear_constructor
 @dataclass(frozen=True, kw_only=True)
 class Request(TrialOptions, Subject):
-    """The request of a user for a hunt. `plan` decides everything else. Options are those of the list.
+    """The user's request for a hunt. `plan` determines all further settings.
 
     Args:
-        trials: number of trials.
+        trials: maximum number of trials.
         max_steps: maximum number of steps of a trial.
-        agents: agent id to locator; the id may be empty if the scenario has one controlled vehicle.
-        arguments: ``NAME`` or ``AGENT.NAME`` to specification.
-        scenario_arguments: name to specification.
-        run: how it is run.
+        agents: locator of each agent, by agent id; the id may be empty if the scenario has one controlled vehicle.
+        arguments: specification of each argument, by ``NAME`` or ``AGENT.NAME``.
+        scenario_arguments: specification of each scenario argument, by name.
+        run: options that determine how the hunt runs.
     """
 
     trials: int
@@ -371,10 +373,10 @@ class Request(TrialOptions, Subject):
     run: RunSettings = field(default_factory=RunSettings)
 
     def checked(self) -> Self:
-        """Return the same with plain values.
+        """Return the same request after validation, with plain Python values.
 
         Raises:
-            UsageError: a value cannot be meant.
+            UsageError: a value is invalid.
         """
         for (name, check), value in zip(
             _REQUIRED_NUMBERS.items(), (self.trials, self.max_steps, self.run.parallel), strict=True
@@ -398,7 +400,7 @@ class Request(TrialOptions, Subject):
 
 
 def request_of(asked: HuntOptions, *, trials: int, max_steps: int, parallel: int = 1) -> Request:
-    """Return the request for options as they are given in Python or in a ``suite.toml``.
+    """Return the request for options that were given in Python or in a ``suite.toml``.
 
     Raises:
         UsageError: the agent is not in a module that workers can import.
@@ -415,11 +417,11 @@ def request_of(asked: HuntOptions, *, trials: int, max_steps: int, parallel: int
 
 
 def sized(run: RunSettings) -> RunSettings:
-    """Return what 0 trials at a time means: one per core of this machine, unless the executor knows better.
+    """Return the settings with a number of parallel trials in place of 0: one per core, unless the executor decides.
 
     Raises:
-        PluginError: there is no such executor.
-        UsageError: it takes no argument.
+        PluginError: the executor does not exist.
+        UsageError: the executor takes no argument.
     """
     executor_of(run.executor)  # before anything runs
     if run.parallel or sizes_itself(run.executor):
@@ -445,5 +447,5 @@ def _locator(who: Driver) -> str:
 
 
 def spec_words(given: Mapping[str, Spec] | None) -> dict[str, str]:
-    """Return specifications as they are written on the command line."""
+    """Return specifications of arguments as texts in the syntax of the command line."""
     return {name: str(spec).lower() if isinstance(spec, bool) else str(spec) for name, spec in (given or {}).items()}

@@ -1,4 +1,4 @@
-"""From a name or a path to a scenario: a folder with a ``scenario.toml``, or a configuration of a simulator's own."""
+"""Loading of scenarios by name or path: a folder with a ``scenario.toml``, or a configuration file of a simulator."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ __all__ = [
 
 
 def refuse(where: str, key: str, value: object, message: str, fix: str) -> NoReturn:
-    """Refuse the value of a key of a scenario.
+    """Raise an error that refuses the value of a key of a scenario.
 
     Raises:
-        ScenarioError: always.
+        ScenarioError: in every case; the message names key, value and fix.
     """
     raise ScenarioError(f"{key} = {value!r} {message}", fix=fix, where=where)
 
@@ -67,15 +67,15 @@ def unregistered(simulator: str, where: str) -> ScenarioError:
 
 
 def check(scenario: Scenario, where: str, *, kept: bool) -> None:
-    """Refuse a scenario that cannot be meant.
+    """Refuse an invalid scenario.
 
     Args:
-        scenario: scenario with the folder in which its files are.
-        where: the file that it was read from.
-        kept: it has been run.
+        scenario: the scenario, including the folder of its files.
+        where: path of the file from which the scenario was read.
+        kept: whether the scenario has already run in a hunt.
 
     Raises:
-        ScenarioError: with key, value and fix.
+        ScenarioError: the scenario is invalid; the message names the key, the value and the fix.
     """
     if not scenario.agents:
         refuse(where, "agents", {}, "names no controlled vehicle", "add a table [agents.ego]")
@@ -103,10 +103,10 @@ def check(scenario: Scenario, where: str, *, kept: bool) -> None:
 
 
 def check_arguments(scenario: Scenario, *, kept: bool) -> None:
-    """Refuse ranges that are none, and defaults outside of them.
+    """Refuse invalid ranges of arguments, and defaults outside of their range.
 
     Raises:
-        ScenarioError: with the argument.
+        ScenarioError: an argument is invalid; the message names the argument.
     """
     tables = {"arguments": scenario.arguments}
     tables |= {f"agents.{agent}.arguments": setup.arguments for agent, setup in scenario.agents.items()}
@@ -143,7 +143,7 @@ def _check_files(scenario: Scenario, name: str, backend: Backend, where: str) ->
 
 
 def _check_keys(scenario: Scenario, heeded: frozenset[str], where: str) -> None:
-    """Refuse what only another simulator would heed, instead of passing it over."""
+    """Refuse keys that only another simulator uses, instead of ignoring them."""
     plain = AgentSetup()
     for agent, setup in scenario.agents.items():
         for item in fields(AgentSetup):
@@ -180,7 +180,7 @@ def copy_shipped_scenario(name: str, to: Path) -> None:
 
     Args:
         name: Name of the scenario.
-        to: The folder to make; it may exist if it is empty.
+        to: Path of the new folder; an existing folder must be empty.
 
     Raises:
         ScenarioError: The scenario does not exist.
@@ -215,10 +215,11 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
     Args:
         name: name of a shipped scenario, or the path of a folder, a ``scenario.toml`` or a simulator's configuration.
         ego: for a simulator's configuration, the controlled vehicle in the syntax of `--ego`.
-        kept: whether the scenario is that of a snapshot. A snapshot has run before, so its scenario is not refused now.
+        kept: whether the scenario is that of a snapshot. A snapshot has run before, so its scenario is accepted without
+            a check.
 
     Raises:
-        ScenarioError: it does not exist or is not valid, with file, key, value and the fix.
+        ScenarioError: the scenario does not exist or is not valid; the message names file, key, value and fix.
     """
     path = _path_of(name)
     if path.suffix == ".toml":
@@ -236,22 +237,22 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
 
 
 def endings() -> tuple[str, ...]:
-    """Return the endings of scenario files for messages: ``.toml``, and those of simulators."""
+    """Return the file name endings of scenarios for messages: ``.toml``, and those of simulators' configurations."""
     return (".toml", *(configuration.endings[0] for configuration in configurations()))
 
 
 def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool = False) -> Scenario:
-    """Validate the content of a ``scenario.toml``, without reading the files that it names.
+    """Validate the contents of a ``scenario.toml`` without reading the files that it names.
 
     Args:
-        data: content of the file.
-        where: the file, for the error.
-        folder: where its files are.
-        tolerant: crashhunt itself has written it, perhaps another version: keys that are not known are kept
-            as ``added``.
+        data: contents of the file.
+        where: path of the file, for error messages.
+        folder: folder that contains the files of the scenario.
+        tolerant: whether crashhunt itself wrote the file, possibly a later version; unknown keys are then kept as
+            ``added``.
 
     Raises:
-        ScenarioError: with the key, its value and the fix.
+        ScenarioError: the contents are invalid; the message names the key, its value and the fix.
     """
     added: dict[str, object] = {}
     if tolerant:
@@ -287,7 +288,7 @@ def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool 
 
 
 def _split_known_keys(data: Plain) -> tuple[dict[str, object], dict[str, object]]:
-    """Return the keys that this version knows, and those that a later version has added."""
+    """Return the keys that this version knows, and the keys that a later version added."""
     tables = {name: kind for name in data if (kind := _table_kind(name)) is not None}
     rest = {name: value for name, value in data.items() if name not in tables}
     known: dict[str, object]
@@ -316,7 +317,7 @@ def _keys_of_a_file() -> list[str]:
 
 
 def _path_of(name: str | Path) -> Path:
-    """The file that is meant by a name or a path."""
+    """Return the path of the scenario file that a name or path refers to."""
     path, text = Path(name), str(name)
     if text in shipped_scenarios():  # a folder of the same name is ./NAME
         path = shipped_folder() / text
@@ -375,7 +376,7 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
 
 
 def _resolve_default_path(setup: AgentSetup, folder: Path) -> AgentSetup:
-    """Return the agent with defaults that name a file in the scenario's folder replaced by the path of that file."""
+    """Return the agent setup, in which defaults that name a file of the scenario's folder are replaced by its path."""
     found = {}
     for name, argument in setup.arguments.items():
         default = argument.default

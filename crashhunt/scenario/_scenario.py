@@ -1,12 +1,13 @@
-"""Scenarios, and the descriptors of simulators that they need.
+"""Scenarios, and the descriptors of the simulators in which scenarios run.
 
-A `Scenario` says how to make an episode. It is plain data: no simulator is imported to read, write or digest it. A
-`Backend` is the descriptor of a simulator. Scenarios, plans, snapshots and replays ask it for everything that differs
-between simulators.
+A `Scenario` describes how to set up an episode. It is plain data, so reading, writing or hashing a scenario imports no
+simulator. A `Backend` is the descriptor of a simulator. Scenarios, plans, snapshots and replays use the descriptor for
+everything that differs between simulators.
 
-A simulator may have no descriptor. Then a scenario has no table for it, and crashhunt refuses to drive the recorded
-actions of an untrusted bundle in it. To give your simulator a descriptor, make a `Backend` in a module that does not
-import the simulator, because commands that only read a scenario import it. Register it under the simulator's name::
+The descriptor of a simulator is optional. Without it, a scenario has no table for the simulator, and crashhunt refuses
+to replay the recorded actions of an untrusted bundle in this simulator. To give your simulator a descriptor, make a
+`Backend` in a module that does not import the simulator, because commands that only read a scenario import it. Register
+it under the simulator's name::
 
     [project.entry-points."crashhunt.simulators"]
     mysim = "mypackage.simulator:MySimulator"
@@ -14,7 +15,7 @@ import the simulator, because commands that only read a scenario import it. Regi
     [project.entry-points."crashhunt.backends"]
     mysim = "mypackage.backend:BACKEND"
 
-Then a ``scenario.toml`` may have a table ``[mysim]``. The simulator reads it by ``scenario.table(MySetup)``.
+Then a ``scenario.toml`` may contain a table ``[mysim]``. The simulator reads this table by ``scenario.table(MySetup)``.
 """
 
 from __future__ import annotations
@@ -80,16 +81,17 @@ DEFAULT_AGENT = "crashhunt.agents:KeepLaneWithSpeed"
 
 @dataclass(frozen=True, kw_only=True)
 class ArgumentSetup:
-    """``[arguments.NAME]`` or ``[agents.ID.arguments.NAME]``.
+    """The table ``[arguments.NAME]`` or ``[agents.ID.arguments.NAME]`` of a scenario.
 
     Args:
-        range: the values that a hunt tries, as a specification such as ``5:40``; empty for only the default.
-        default: the value without a request for another one.
+        range: the values that a hunt tries, as a specification such as ``5:40``; if empty, a hunt uses only the
+            default.
+        default: the value used if the user requests no other value.
         unit: unit of the values, such as ``m/s``.
-        help: description in one line.
-        option: option of a scenario argument, its target: an option of SUMO such as ``scale``, or a dotted entry of an
-            environment's configuration or keywords such as ``observation.vehicles_count``. Without an option, it
-            fills ``${NAME}`` in SUMO's route and additional files, or sets the entry of its own name.
+        help: description of the argument in one line.
+        option: the target of a scenario argument: an option of SUMO such as ``scale``, or a dotted entry of an
+            environment's configuration or keywords such as ``observation.vehicles_count``. If it is empty, the argument
+            fills ``${NAME}`` in SUMO's route and additional files, or sets the entry with the argument's name.
     """
 
     range: str = ""
@@ -109,23 +111,25 @@ class ArgumentSetup:
 
 @dataclass(frozen=True, kw_only=True)
 class AgentSetup:
-    """``[agents.ID]``: one controlled vehicle and its agent. All but the first and the last are SUMO's.
+    """``[agents.ID]``: one controlled vehicle and its agent. All keys but the first and the last apply to SUMO only.
 
     Args:
         agent: ``module:attribute``, or the name of a registered agent.
-        existing: take over the vehicle ID of the traffic; otherwise one with that id is added.
-        replaces: the name of a scenario argument that names a vehicle of the traffic: when that has entered, this one
-            drives on in its place.
-        type: the vehicle type of the added one.
-        route: the route of the added one, by its id.
-        edges: or the edges that it drives along (two: the way between them is looked up).
-        depart_s: when it enters, in s of simulation time; the end of the warm-up by default. Of one that ``replaces``
-            another, the latest time at which that may be expected.
-        depart_lane: as SUMO's departLane.
-        depart_pos: as SUMO's departPos.
-        depart_speed: as SUMO's departSpeed.
-        action: ``continuous`` is (target speed, lane change); ``meta`` is highway-env's DiscreteMetaAction.
-        target_speeds: the speeds that FASTER and SLOWER of ``meta`` step through, in m/s.
+        existing: whether the agent controls the vehicle ID of the traffic; otherwise, a vehicle with this id is added.
+        replaces: name of a scenario argument that names a vehicle of the traffic. When this vehicle has entered, the
+            controlled vehicle replaces it.
+        type: type of the added vehicle.
+        route: id of the added vehicle's route.
+        edges: edges of the added vehicle's route, instead of ``route``; for two edges, the shortest route between them
+            is used.
+        depart_s: time at which the vehicle enters, in s of simulation time; by default the end of the warm-up. For a
+            vehicle that ``replaces`` another vehicle, the latest time at which the other vehicle may be expected.
+        depart_lane: lane of departure, as in SUMO's departLane.
+        depart_pos: position of departure, as in SUMO's departPos.
+        depart_speed: speed at departure, as in SUMO's departSpeed.
+        action: form of the actions: ``continuous`` is (target speed, lane change); ``meta`` is highway-env's
+            DiscreteMetaAction.
+        target_speeds: the target speeds that the actions FASTER and SLOWER of ``meta`` select in order, in m/s.
         speed_mode: SUMO's speed mode bits; 6 keeps physical limits and ignores the safe speed.
         arguments: the arguments of the agent that the scenario describes.
     """
@@ -151,10 +155,10 @@ class ObservationSetup:
     """``[observation]``: the observation of an agent, in the layout of highway-env's Kinematics.
 
     Args:
-        vehicles: rows: the controlled vehicle and its nearest actors.
-        features: columns; ``kind`` says what a row is: 1 a motor vehicle, 2 a two-wheeler, 3 a person on foot, 4 what
-            runs on rails, 5 an obstacle.
-        normalize: scale to [-1, 1] by highway-env's ranges.
+        vehicles: number of rows: the controlled vehicle and its nearest actors.
+        features: names of the columns; ``kind`` is the type of the actor: 1 motor vehicle, 2 two-wheeler, 3 pedestrian,
+            4 rail vehicle, 5 obstacle.
+        normalize: whether values are scaled to [-1, 1] by the ranges of highway-env.
     """
 
     vehicles: int = 8
@@ -179,25 +183,26 @@ class Scenario:
     """The setting of a trial: network, traffic, controlled vehicles and their arguments.
 
     Args:
-        title: description in one line.
+        title: description of the scenario in one line.
         simulator: the name of a registered simulator, or ``module:attribute``.
-        step_length_s: the control step, in s; that of some simulators follows from their own configuration.
+        step_length_s: length of a control step, in s; some simulators derive it from their own configuration.
         warmup_s: simulation time before the controlled vehicles enter, in s.
-        insertion_timeout_s: maximum delay of their entry, in s; after it, the episode is invalid.
+        insertion_timeout_s: maximum delay until the controlled vehicles enter, in s; after this delay, the episode is
+            invalid.
         observation: layout of the observations; None for the simulator's own layout, or the default.
         arguments: the arguments that shape the traffic.
-        agents: agent id to controlled vehicle.
-        tables: the tables of plugin simulators by name; in the file, they are on the same level as
-            these keys. Each is of the dataclass that the simulator's `Backend` says.
-        events: limits of traffic events, such as ``not_moving`` in s, where they are not the default.
-        disturbances: faults of other vehicles and of the agent's sensors: name to a rate per second. Only hunts use
-            them.
-        schema: schema of the file format.
-        name: name for users; by default the name of the folder.
-        folder: folder of its files; not part of the file.
-        file: path of the file that was read, relative to the folder; it is not sent to workers.
+        agents: setup of each controlled vehicle, by agent id.
+        tables: the tables of plugin simulators by name; in the file, they are on the same level as these keys. The
+            simulator's `Backend` gives the dataclass of its table.
+        events: limits of traffic events that differ from the default, such as ``not_moving`` in s.
+        disturbances: disturbances, which are faults of other vehicles and of the agent's sensors: rate per second by
+            name. Only hunts use them.
+        schema: version of the file format.
+        name: name shown to users; by default the name of the folder.
+        folder: folder of the scenario's files; not part of the file.
+        file: path of the file that was read, relative to the folder; workers do not receive it.
         notes: decisions of crashhunt, as texts for the user; not part of the file.
-        added: keys that a later version has written into the file; only a worker of that version reads them.
+        added: keys that a later version of crashhunt wrote into the file; only a worker of that version reads them.
     """
 
     title: str = ""
@@ -220,14 +225,14 @@ class Scenario:
 
     @property
     def origin(self) -> str:
-        """The place that errors about the scenario name."""
+        """The place that error messages about the scenario name."""
         return str(self.folder / self.file)
 
     @property
     def backends(self) -> dict[str, Backend]:
-        """The descriptor of the scenario's simulator, by name; without one, the descriptors of its tables.
+        """The descriptor of the scenario's simulator, by name; if it has none, the descriptors of its tables.
 
-        So a class of your own that drives a simulator which is known may be given as ``module:attribute``.
+        Because of these tables, your own class that drives a known simulator may be given as ``module:attribute``.
         """
         names = (self.simulator,) if backend_of(self.simulator) is not None else tuple(self.tables)
         return {name: found for name in names if (found := backend_of(name)) is not None}
@@ -238,10 +243,10 @@ class Scenario:
         return next(iter(self.backends.values()), Backend())
 
     def table(self, kind: type[T]) -> T:
-        """Return the table of a simulator, by its dataclass.
+        """Return the table of a simulator, given the table's dataclass.
 
         Raises:
-            ScenarioError: the scenario has none.
+            ScenarioError: the scenario has no such table.
         """
         found = next((table for table in self.tables.values() if isinstance(table, kind)), None)
         if found is None:
@@ -250,42 +255,42 @@ class Scenario:
         return found
 
     def with_table(self, table: object) -> Scenario:
-        """Return this scenario with another table of the same dataclass."""
+        """Return this scenario with its table of the same dataclass replaced."""
         return replace(
             self, tables={name: table if type(old) is type(table) else old for name, old in self.tables.items()}
         )
 
     def files(self) -> Iterator[str]:
-        """Yield the files that an episode reads, relative to the folder.
+        """Yield the paths of the files that an episode reads, relative to the folder.
 
         Raises:
-            ScenarioError: one of them names a file that is not there.
+            ScenarioError: one of the files names a file that does not exist.
         """
         for backend in self.backends.values():
             yield from backend.files(self)
 
     def texts(self) -> Iterator[str]:
-        """Yield the files that may contain ``${NAME}``.
+        """Yield the paths of the files that may contain ``${NAME}``.
 
         Raises:
-            ScenarioError: one of them names a file that is not there.
+            ScenarioError: one of the files names a file that does not exist.
         """
         for backend in self.backends.values():
             yield from backend.texts(self)
 
     def modules(self) -> Iterator[str]:
-        """Yield the modules that the simulator imports besides the agents': those of environments and crash rules."""
+        """Yield the modules that the simulator imports besides the agents, such as environments and crash rules."""
         locators = [self.simulator]
         for backend in self.backends.values():
             locators += backend.modules(self)
         yield from (locator.partition(":")[0] for locator in locators if ":" in locator)
 
     def scenario_arguments(self) -> dict[str, Argument]:
-        """The arguments that shape the traffic."""
+        """Return the arguments that shape the traffic."""
         return {name: setup.argument(name, f"{self.origin}: arguments") for name, setup in self.arguments.items()}
 
     def agent_arguments(self, agent: str) -> dict[str, Argument]:
-        """Return the scenario's settings of the arguments of an agent."""
+        """Return the settings of an agent's arguments in the scenario."""
         where = f"{self.origin}: agents.{agent}.arguments"
         return {name: setup.argument(name, where) for name, setup in self.agents[agent].arguments.items()}
 
@@ -299,10 +304,10 @@ class Scenario:
 
 
 def with_action(scenario: Scenario, agent: str, action: str) -> Scenario:
-    """Return the scenario with another form of action for one agent.
+    """Return the scenario with another form of actions for one agent.
 
     Raises:
-        ScenarioError: the form of action does not exist.
+        ScenarioError: the form of actions does not exist.
     """
     if action not in ("continuous", "meta"):
         raise ScenarioError(f"{action!r} is not a form of action", fix="give continuous or meta")
@@ -336,11 +341,11 @@ def scenario_digest(scenario: Scenario) -> str:
 
 
 def digest_of_described(files: Mapping[str, HasDigest], *, plain_data: object = None) -> str:
-    """Return a digest of files and of plain data.
+    """Return a digest of files and of plain data together.
 
     Args:
-        files: name of each file to an entry with its digest, ``blake2b``.
-        plain_data: what JSON can hold; None if only the files matter.
+        files: entry of each file by name; an entry contains the file's digest as ``blake2b``.
+        plain_data: JSON-compatible data; None if only the files matter.
     """
     content = {name: entry["blake2b"] for name, entry in files.items()}
     text = json.dumps(content if plain_data is None else [content, plain_data], sort_keys=True)
@@ -348,7 +353,7 @@ def digest_of_described(files: Mapping[str, HasDigest], *, plain_data: object = 
 
 
 def as_in_file(data: Plain) -> dict[str, object]:
-    """Return the fields of a scenario as plain data, in which the simulator's table stands where it does in a file."""
+    """Return the fields of a scenario as plain data, with the tables of simulators on the same level as in a file."""
     found: dict[str, object] = {}
     for key, value in data.items():
         found |= value if key == "tables" and isinstance(value, dict) else {key: value}
@@ -356,7 +361,7 @@ def as_in_file(data: Plain) -> dict[str, object]:
 
 
 def as_plain_data(scenario: Scenario) -> dict[str, object]:
-    """Return a scenario as plain data that TOML can hold, without values that belong to this process only."""
+    """Return a scenario as plain data that TOML can hold, without values that are valid only in this process."""
 
     def plain(value: object) -> object:
         if isinstance(value, dict):
@@ -376,14 +381,14 @@ def as_plain_data(scenario: Scenario) -> dict[str, object]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Configuration:
-    """A file format of the simulator that can be run without a ``scenario.toml``.
+    """A file format of a simulator whose files can be run without a ``scenario.toml``.
 
     Args:
-        endings: endings of its name, such as ``.sumocfg``; messages name the first one.
-        load: returns it as a scenario, from its path and from what ``--ego`` says, which may be empty.
-        arguments: the scenario arguments that every such scenario has, for completion in the shell.
-        takes_ego: whether ``--ego`` chooses its controlled vehicle.
-        waiting: a slow step of loading, in words; empty if there is none.
+        endings: endings of file names, such as ``.sumocfg``; messages name the first ending.
+        load: function that returns the scenario for the path of a file and the value of ``--ego``, which may be empty.
+        arguments: the scenario arguments that every such scenario has, for shell completion.
+        takes_ego: whether ``--ego`` selects the controlled vehicle of such a scenario.
+        waiting: description of a slow step of loading; empty if loading is fast.
     """
 
     endings: tuple[str, ...]
@@ -395,11 +400,12 @@ class Configuration:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accelerator:
-    """An accelerator of a simulator: results are bit-identical, only the speed changes.
+    """An accelerator of a simulator: only the speed changes, and results stay bit-identical.
 
     Args:
-        switched_off: returns a scenario without it, as ``--no-accelerate`` asks for.
-        note: returns a note for a user if it has no effect; empty if it has one, or is switched off.
+        switched_off: function that returns a scenario with the accelerator disabled, as ``--no-accelerate`` requests.
+        note: function that returns a note for the user if the accelerator has no effect; empty if it has an effect or
+            is disabled.
     """
 
     switched_off: Callable[[Scenario], Scenario]
@@ -408,11 +414,12 @@ class Accelerator:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompiledCore:
-    """An optional compiled part, with bit-identical results.
+    """The optional compiled core of a simulator, with bit-identical results.
 
     Args:
-        switched_off: returns a scenario without it, as ``--no-native`` asks for.
-        why_not: returns why it is not used, in words that follow "not used: "; empty if it is.
+        switched_off: function that returns a scenario with the compiled core disabled, as ``--no-native`` requests.
+        why_not: function that returns why the compiled core is not used, as a text after "not used: "; empty if it is
+            used.
     """
 
     switched_off: Callable[[Scenario], Scenario]
@@ -421,14 +428,14 @@ class CompiledCore:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadOrder:
-    """An order in which a simulator processes a scenario at load, which crashhunt fixes where it can.
+    """An order in which a simulator processes objects at load; crashhunt fixes this order if it can.
 
-    Without it, results depend on the memory addresses in a process.
+    If the order is not fixed, results depend on the memory addresses in a process.
 
     Args:
-        what: the objects that are in the order, in words.
-        keep: returns a scenario that keeps the simulator's own order.
-        why_not: returns why the order is not fixed, in words that follow "not fixed: "; empty if it is.
+        what: description of the objects that are processed in this order.
+        keep: function that returns a scenario with the simulator's own order.
+        why_not: function that returns why the order is not fixed, as a text after "not fixed: "; empty if it is fixed.
     """
 
     what: str
@@ -456,46 +463,53 @@ def _own_arguments(scenario: Scenario) -> float:
 class Backend:
     """The properties of a simulator that other packages need; all of them are optional.
 
-    Functions are called with the scenario, whose table is ``scenario.table(KIND)``; paths are relative to its folder.
+    The functions are called with the scenario, whose table is ``scenario.table(KIND)``. Paths are relative to its
+    folder.
 
     Args:
-        title: name for users.
-        table: the dataclass of its table in ``scenario.toml``; its types must be there at run time, and may be numbers,
-            text, lists, tuples and tables of those, and further dataclasses.
+        title: name of the simulator for users.
+        table: the dataclass of the simulator's table in ``scenario.toml``. Its types must be importable at run time.
+            Allowed are numbers, text, lists, tuples, tables of these, and further dataclasses.
         example: the required keys of the table, for the message about a missing table.
-        keys: those keys of ``scenario.toml`` that not every simulator heeds and this one does (``warmup_s``,
-            ``insertion_timeout_s``, ``agents.route``, …): all others are refused. None if that is unknown.
-        shows_itself: whether agents are shown what the simulator shows of itself, where there is no ``[observation]``.
-        check: raises `ScenarioError` for a scenario that cannot be meant, given the file for its ``where``.
-        check_names: the same for what its files do not define, given what ``--ego`` says; not asked about what has run.
-        files: what an episode reads; it is part of the digest, and travels in the snapshot.
-        texts: those of ``files`` that may say ``${NAME}``, for a scenario argument.
-        relocated: returns the content of one of ``texts`` as it is right wherever its folder goes, None if it is.
-        modules: the code of the user's that it imports besides the agents', as ``module:attribute``. Names without
-            a colon are ignored, so the id of an environment is allowed.
-        notes: lines for the user about decisions of crashhunt.
-        versions: the distributions on whose version everything depends that it computes.
-        variables: variables of the environment, on which it depends; written down with the versions.
-        per_processor: whether it may round otherwise on another processor.
-        step_length_s: the control step, in s, where it is not the scenario's own.
-        reported_events: the types of traffic events that it reports; None if that is unknown.
-        disturbances: the types of disturbances of the traffic that it supports; None if that is unknown.
-        actions: the forms of action (``continuous``, ``meta``) that ``--action`` may choose.
-        accelerator: the accelerator of the simulator; None if it has none.
-        core: the compiled part; None if there is none.
-        load_order: the order at load on which its results depend; None if there is none.
-        configurations: file formats that can be run without a ``scenario.toml``.
-        explained: returns the mistake in the scenario after a failed setup, from the message of the failure and from
-            printed output; None if the scenario is not the cause.
-        side_effect: of a stranger's scenario, returns what it would do besides simulating, in words that
-            follow "the crash is a stranger's, and"; empty if it does nothing else. It is given the values of the
-            trial's scenario arguments, and the specifications of those that are texts. Without, strangers are refused.
-        right_of_way: returns the vehicles that have to give way at the junctions of the map; None if unknown.
-        plays_paths: whether it can move others along recorded ways.
-        one_per_process: whether a process can have only one simulation at a time.
-        forkable: whether it is known that a process can be forked after it has made the simulator, which starts no
-            threads. Otherwise a fork finds out before the first trial.
-        survey: how it finds, before a hunt, the vehicles that an agent can replace in one of its ``configurations``.
+        keys: the optional keys of ``scenario.toml`` that this simulator uses (``warmup_s``, ``insertion_timeout_s``,
+            ``agents.route``, …). All other optional keys are refused. None if the keys are unknown.
+        shows_itself: whether agents receive the simulator's own observation if the scenario has no ``[observation]``.
+        check: function that raises `ScenarioError` for an invalid scenario; it also receives the path of the file for
+            the message.
+        check_names: function that refuses names which the scenario's files do not define; it receives the value of
+            ``--ego``, and is not called for scenarios that have already run.
+        files: function that yields the files that an episode reads; they are part of the digest and of the snapshot.
+        texts: function that yields those of ``files`` that may contain ``${NAME}`` for a scenario argument.
+        relocated: function that returns the contents of one of ``texts`` in a form that stays valid if the folder
+            moves; None if the contents are already valid everywhere.
+        modules: function that yields the user's modules that the simulator imports in addition to the agents, as
+            ``module:attribute``. Names without a colon are ignored, so the id of an environment is allowed.
+        notes: function that yields texts for the user about decisions of crashhunt.
+        versions: the Python distributions on whose versions the simulator's results depend.
+        variables: names of environment variables on which results depend; their values are recorded together with the
+            versions.
+        per_processor: whether the simulator may round differently on another processor type.
+        step_length_s: function that returns the control step, in s, if it differs from the scenario's step length.
+        reported_events: the types of traffic events that the simulator reports; None if they are unknown.
+        disturbances: the types of traffic disturbances that the simulator supports; None if they are unknown.
+        actions: the forms of actions (``continuous``, ``meta``) that ``--action`` may select.
+        accelerator: the accelerator of the simulator; None if there is none.
+        core: the compiled core of the simulator; None if there is none.
+        load_order: the order of objects at load on which results depend; None if there is none.
+        configurations: file formats of the simulator that can be run without a ``scenario.toml``.
+        explained: function that returns the error in the scenario after a failed setup, from the failure's message and
+            the printed output; None if the scenario is not the cause.
+        side_effect: function that returns the side effects of an untrusted scenario, as a text after "the crash is a
+            stranger's, and"; empty if there are none. It receives the values of the trial's scenario arguments, and the
+            specifications of text arguments. Without this function, untrusted scenarios are refused.
+        right_of_way: function that returns which vehicles must yield at the junctions of the map; None if this is
+            unknown.
+        plays_paths: whether the simulator can move other actors along recorded paths.
+        one_per_process: whether a process can run only one simulation at a time.
+        forkable: whether a process can safely fork after creating the simulator, because the simulator starts no
+            threads. Otherwise a trial fork determines this before the first trial.
+        survey: how crashhunt finds, before a hunt, the vehicles that an agent can replace in one of the
+            ``configurations``.
     """
 
     title: str = ""
@@ -550,19 +564,19 @@ def _plugin_backends() -> Mapping[str, EntryPoint]:
 
 
 def backend_names() -> tuple[str, ...]:
-    """Return the simulators that have a descriptor, those that come with crashhunt first; nothing is imported."""
+    """Return the names of simulators with a descriptor, crashhunt's own simulators first; no module is imported."""
     return tuple(dict.fromkeys((*_own_backends(), *_plugin_backends())))
 
 
 @cache
 def backend_of(name: str) -> Backend | None:
-    """Return the descriptor of a simulator; None if it has none.
+    """Return the descriptor of a simulator; None if the simulator has no descriptor.
 
     Args:
-        name: name under which the simulator is registered; a ``module:attribute`` has none.
+        name: name under which the simulator is registered; a ``module:attribute`` has no descriptor.
 
     Raises:
-        PluginError: there is one, and it cannot be imported, or is something else.
+        PluginError: the descriptor cannot be imported, or is not a `Backend`.
     """
     if name in _own_backends():
         own: Backend = importlib.import_module(f"crashhunt.scenario.backends.{name}").BACKEND
@@ -589,13 +603,13 @@ def installed_backends() -> Iterator[tuple[str, Backend]]:
 
 
 def configurations() -> Iterator[Configuration]:
-    """Yield the files of simulators' own that are run as they are."""
+    """Yield the file formats of simulators whose files can be run without a ``scenario.toml``."""
     for _, backend in installed_backends():
         yield from backend.configurations
 
 
 def titles(chosen: Callable[[Backend], bool]) -> str:
-    """Return in words what simulators something is for."""
+    """Return as text the simulators for which something is meant."""
     return listed(
         (backend.title or name for name, backend in installed_backends() if chosen(backend)), none="another simulator"
     )
@@ -605,18 +619,18 @@ def titles(chosen: Callable[[Backend], bool]) -> str:
 
 
 class RunToSurvey(TypedDict):
-    """One run of the plain traffic."""
+    """One run of the unmodified traffic."""
 
     seed: int
     values: dict[str, Value]
 
 
 class SurveyJob(TypedDict):
-    """What the process that simulates the plain traffic reads from its JSON file.
+    """The JSON data from which the process that simulates the unmodified traffic reads its job.
 
-    ``scenario`` is what `as_plain_data` returns, ``folder`` holds the scenario's files, ``stage`` is a folder of the
-    process's own, ``answer`` the file for the JSON list of completed runs. The process ends a run after
-    ``processor_time_limit_s`` since its start.
+    ``scenario`` is the result of `as_plain_data`, and ``folder`` contains the scenario's files. ``stage`` is a private
+    folder of the process, and ``answer`` is the file for the JSON list of completed runs. The process stops
+    simulating when it has used ``processor_time_limit_s`` of CPU time.
     """
 
     scenario: Plain
@@ -632,10 +646,11 @@ class TrafficSurvey:
     """How a simulator finds the vehicles that an agent can replace: it simulates the traffic before the hunt.
 
     Args:
-        module: its ``main()`` runs in its own process, with the file of a `SurveyJob` as its only argument.
-        refine: returns the scenario with the candidates that the runs confirm, from what ``module`` answered. Raises
-            `ScenarioError` where no trial can be valid.
-        restore: returns the scenario with the candidates of an earlier hunt, given the scenario that this hunt kept;
+        module: module with a function ``main()``, which runs in its own process; its only argument is the file of a
+            `SurveyJob`.
+        refine: function that returns the scenario with the candidates that the runs confirm, given the output of
+            ``module``. It raises `ScenarioError` if no trial can be valid.
+        restore: function that returns the scenario with the candidates of an earlier hunt, given that hunt's scenario;
             None if the hunt drew no candidates.
     """
 

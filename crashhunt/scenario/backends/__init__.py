@@ -1,6 +1,7 @@
-"""The descriptors of the simulators that come with crashhunt, a module or package each, by the simulator's name.
+"""The descriptors of the simulators that come with crashhunt: a module or package for each, named after it.
 
-Each has a ``BACKEND``, with the dataclass of its table, checks and files. Nothing here imports a simulator.
+Each module has a ``BACKEND`` with the dataclass of its table, its checks and its files. Nothing here imports a
+simulator.
 """
 
 __all__ = ["DEFAULT_SIMULATOR"]

@@ -1,4 +1,4 @@
-"""Any environment of Gymnasium, to a scenario: its table, and what follows from it. Nothing here imports Gymnasium."""
+"""Descriptor of Gymnasium environments: the table of a scenario, and its consequences. It does not import Gymnasium."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ __all__ = ["BACKEND", "CrashRule", "GymSetup"]
 
 @dataclass(frozen=True, kw_only=True)
 class CrashRule:
-    """``[gym.crash]``: when a step of a Gymnasium environment is a crash; any of these.
+    """The table ``[gym.crash]``: the rules by which a step of a Gymnasium environment is a crash; one match suffices.
 
     Args:
-        info: a key of the info that is true.
+        info: a key of ``info`` whose true value means a crash.
         termination: whether the termination of the environment is a crash; truncation is no crash.
-        reward_below: the reward of the step is below this.
-        function: ``module:function``, called with observation, reward, terminated, truncated, info; what it returns is
-            taken as true or false, and a text as what happened.
-        kind: ``module:function``, called in the same way for the step of a crash; it returns the crash type as text.
-            Without it, ``info["crash_kind"]`` is the crash type if it is a text.
+        reward_below: a step whose reward is below this value is a crash.
+        function: ``module:function``, called with observation, reward, terminated, truncated, info. A true result means
+            a crash; a text as the result describes the crash.
+        kind: ``module:function``, called with the same values for the step of a crash; it returns the crash type as
+            text. Without it, ``info["crash_kind"]`` is the crash type if it is a text.
     """
 
     info: str = ""
@@ -41,15 +41,15 @@ class CrashRule:
 
 @dataclass(frozen=True, kw_only=True)
 class GymSetup:
-    """``[gym]``: any environment of Gymnasium.
+    """The table ``[gym]``: any Gymnasium environment.
 
     Args:
-        id: as `gymnasium.make` takes it, or ``module:factory``, which is called with ``kwargs``.
+        id: id for `gymnasium.make`, or ``module:factory``, which is called with ``kwargs``.
         kwargs: keyword arguments of the environment.
-        crash: what counts as a crash.
-        learner: learner of a parallel environment of PettingZoo, the agent that is tested; empty for the first.
-        others: of a parallel environment, ``module:function``, which is called with name, observation, action space and
-            random generator of each other agent and returns its action. Empty for random actions.
+        crash: rules that define a crash.
+        learner: name of the tested agent in a parallel environment of PettingZoo; empty for the first agent.
+        others: for a parallel environment, ``module:function``, which is called with name, observation, action space
+            and random generator of each other agent and returns its action. Empty for random actions.
         danger: the criticality of a step without a scene. ``info.KEY`` is a number of the info from 0 to 1.
             ``-info.KEY`` is a number x that falls with criticality, such as a distance, and gives 1 / (1 + x). A trial
             has the greatest value of its steps. Empty if criticality is unknown.

@@ -1,4 +1,4 @@
-"""highway-env, to a scenario: its table, and what follows from it. Nothing here imports it."""
+"""Descriptor of highway-env: the table of a scenario, and its consequences. It does not import highway-env."""
 
 from __future__ import annotations
 
@@ -26,14 +26,15 @@ _KERNEL = "_crashhunt_highway"  # the compiled module of the accelerator
 
 @dataclass(frozen=True, kw_only=True)
 class HighwaySetup:
-    """``[highway]``: an environment of highway-env.
+    """The table ``[highway]``: an environment of highway-env.
 
     Args:
-        id: as `gymnasium.make` takes it, such as ``highway-fast-v0``; ``module:ID`` imports a module of your own first.
-        config: what differs from the environment's own configuration; tables are merged, but one with another
-            ``type`` replaces.
-        off_road: whether leaving the lanes is a crash; by default everywhere but in car parks, where they are bays.
-        accelerate: whether the accelerator is used; it changes no bit.
+        id: id for `gymnasium.make`, such as ``highway-fast-v0``; ``module:ID`` imports your own module first.
+        config: changes to the environment's default configuration; tables are merged, but a table with another ``type``
+            replaces the default.
+        off_road: whether leaving the lanes is a crash; by default yes, except in car parks, whose lanes are parking
+            bays.
+        accelerate: whether the accelerator is used; results are bit-identical with and without it.
     """
 
     id: str

@@ -1,4 +1,4 @@
-"""The toy, to a scenario: it has no table and reads no file."""
+"""Descriptor of the toy simulator: it has no table and reads no file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SUMO as a scenario names it: its configurations, options and files, and the options for untrusted scenarios."""
+"""SUMO in scenarios: its configurations, options and files, and the options for untrusted scenarios."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""SUMO, to a scenario: its table, its files, and what follows from them."""
+"""Descriptor of SUMO: the table of a scenario, its files, and its consequences."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _files(scenario: Scenario) -> Iterator[str]:
 
 
 def _texts(scenario: Scenario) -> Iterator[str]:
-    """Routes, additional files, and what these have SUMO read."""
+    """Yield route files, additional files, and the files that these make SUMO read."""
     from crashhunt.scenario.backends.sumo._files import nested_files
 
     sumo = scenario.table(SumoSetup)
@@ -81,7 +81,7 @@ def _relocated(path: Path) -> bytes | None:
 
 
 def _notes(scenario: Scenario) -> Iterator[str]:
-    """Tell what SUMO would write and does not."""
+    """Yield a note on output files that SUMO would write, and that a trial does not write."""
     from crashhunt.scenario.backends.sumo._files import written_by
 
     sumo = scenario.table(SumoSetup)

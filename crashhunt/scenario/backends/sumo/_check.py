@@ -19,10 +19,10 @@ __all__ = ["check", "check_options"]
 
 
 def check(scenario: Scenario, where: str) -> None:
-    """Refuse a scenario whose table, arguments, files and controlled vehicles do not go together.
+    """Refuse a scenario whose table, arguments, files and controlled vehicles are not consistent.
 
     Raises:
-        ScenarioError: with key, value and fix.
+        ScenarioError: the scenario is not consistent; the message names key, value and fix.
     """
     sumo = scenario.table(SumoSetup)
     check_options(sumo.options, where)
@@ -51,10 +51,10 @@ def check(scenario: Scenario, where: str) -> None:
 
 
 def check_options(options: Mapping[str, object], where: str) -> None:
-    """Refuse options of SUMO with which a trial would mean something else.
+    """Refuse options of SUMO that would change the meaning of a trial.
 
     Raises:
-        ScenarioError: with the option.
+        ScenarioError: an option would change the meaning of a trial; the message names the option.
     """
     seen: dict[str, str] = {}
     for option, value in options.items():
@@ -73,7 +73,7 @@ def check_options(options: Mapping[str, object], where: str) -> None:
 
 
 def _asked_for(content: bytes) -> list[str]:
-    """Return the arguments that a file asks for as ``${NAME}``."""
+    """Return the arguments that a file uses as ``${NAME}``."""
     if b"${" not in content:
         return []
     return string.Template(content.decode("utf-8", "replace")).get_identifiers()

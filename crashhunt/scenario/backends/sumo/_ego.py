@@ -1,4 +1,4 @@
-"""The controlled vehicle of a bare ``.sumocfg``: one that ``--ego`` names or adds, or another in each trial."""
+"""The controlled vehicle of a plain ``.sumocfg``: ``--ego`` names or adds it, or each trial draws it."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ _OFF_ROAD_CLASSES = {
 
 @dataclass(frozen=True, slots=True)
 class Ego:
-    """The controlled vehicle.
+    """The controlled vehicle of a scenario.
 
     Args:
-        agent: its id.
-        setup: how it gets there.
-        note: what to tell the user.
+        agent: id of the agent.
+        setup: setup of the agent: how the vehicle enters.
+        note: note for the user about the choice.
         arguments: the scenario arguments that the controlled vehicle needs.
     """
 
@@ -77,7 +77,7 @@ class Ego:
 
 @dataclass(frozen=True, slots=True)
 class Departure:
-    """A vehicle that departs, as the route files promise, or that enters, as a simulation has shown."""
+    """A vehicle and its departure time, from the route files, or its entry time, from a simulation."""
 
     vehicle: str
     depart_s: float
@@ -85,10 +85,10 @@ class Departure:
 
 
 def number(text: str, option: str, path: Path) -> float:
-    """Return a number of a configuration or a route file.
+    """Return a number from a configuration or a route file.
 
     Raises:
-        ScenarioError: it is none.
+        ScenarioError: the text is not a number.
     """
     try:
         return float(text)
@@ -97,10 +97,10 @@ def number(text: str, option: str, path: Path) -> float:
 
 
 def seconds(text: str, path: Path) -> float:
-    """Return a time as SUMO writes it, ``90`` or ``0:01:30``, in s.
+    """Return a time in SUMO's notation, ``90`` or ``0:01:30``, in s.
 
     Raises:
-        ScenarioError: it is none.
+        ScenarioError: the text is not a time.
     """
     try:
         parts = [float(part) for part in text.split(":")]
@@ -110,13 +110,14 @@ def seconds(text: str, path: Path) -> float:
 
 
 def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
-    """Return the controlled vehicles.
+    """Return the controlled vehicle that `--ego` selects.
 
     Args:
-        ego: ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty: any, if one departs.
-        files: routes and additional files.
+        ego: ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty for ``any`` if a vehicle
+            departs.
+        files: paths of route files and additional files.
         begin: start of the simulation, in s.
-        path: the configuration, for errors.
+        path: path of the configuration, for error messages.
 
     Raises:
         ScenarioError: the text has another form, or no vehicle matches.
@@ -151,7 +152,7 @@ def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
 
 
 def _draw_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
-    """Draw a vehicle in each trial from those that depart amid traffic; if none departs, add one."""
+    """Draw a vehicle in each trial from those that depart amid traffic; if no vehicle departs, add one."""
     why = "" if ego else NOT_GIVEN
     # Who would have departed before the simulation begins never does.
     known = [one for one in _departures(files) if one.depart_s >= begin and not one.off_road]
@@ -164,14 +165,14 @@ def _draw_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
 def draw_among(
     known: Sequence[Departure], *, why: str = "", verb: str = "enter", few: int = 1, keep_agent: str = ""
 ) -> Ego:
-    """Return a controlled vehicle that replaces another one in each trial, drawn from those that enter amid traffic.
+    """Return a controlled vehicle that replaces another vehicle in each trial, drawn from those entering amid traffic.
 
     Args:
-        known: the vehicles, at least one, by time.
-        why: the beginning of the note.
-        verb: verb of the note: what the vehicles do at their times.
-        few: with fewer candidates than this in the window of times, all of ``known`` are candidates.
-        keep_agent: the id that the controlled vehicle keeps, where that is possible; empty to choose one.
+        known: the vehicles, at least one, ordered by time.
+        why: beginning of the note for the user.
+        verb: verb of the note: what the vehicles do at their times, such as "depart".
+        few: minimum number of candidates in the time window; with fewer, all of ``known`` are candidates.
+        keep_agent: id that the controlled vehicle keeps if possible; empty to choose an id.
     """
     first, last = known[0].depart_s, known[-1].depart_s
     since = first + min(_BUSY_AFTER_S, (last - first) / 3)
@@ -224,7 +225,7 @@ def _on_any_route(files: list[Path], path: Path) -> Ego:
 
 
 def _departures(files: list[Path]) -> list[Departure]:
-    """Return the vehicles whose names are known before the simulation; of a flow, only those that depart soon."""
+    """Return the vehicles whose names are known before the simulation; for a flow, only vehicles that depart soon."""
     found = []
     elements = _elements(files, "vehicle", "trip", "flow", "vType")
     elsewhere = {one.get("id") for one in elements if one.tag == "vType" and one.get("vClass") in _OFF_ROAD_CLASSES}
@@ -259,7 +260,7 @@ def _of_flow(flow: ET.Element, name: str, begin: float, off_road: bool) -> list[
 
 
 def _departure_of(vehicle: str, files: list[Path]) -> float:
-    """Return the departure of a vehicle in the files; SUMO names the vehicles of a flow ``FLOW.0``, ``FLOW.1``."""
+    """Return the departure of a vehicle in the files; SUMO names the vehicles of a flow ``FLOW.0``, ``FLOW.1``, …."""
     flow, _, place = vehicle.rpartition(".")
     for element in _elements(files, "flow"):
         if element.get("id") == flow and place.isdecimal():
@@ -272,7 +273,7 @@ def _departure_of(vehicle: str, files: list[Path]) -> float:
 
 
 def _interval(flow: ET.Element, begin: float) -> float:
-    """The mean time from one vehicle of a flow to the next, in s."""
+    """Return the mean time between two consecutive vehicles of a flow, in s."""
 
     def value(attribute: str) -> float:
         return number(flow.get(attribute, "").removeprefix("exp(").removesuffix(")"), attribute, Path())
@@ -333,7 +334,7 @@ LONG_WAIT_S = 300.0
 
 
 class Gridlock(TypedDict):
-    """A traffic jam that does not move: ``standing`` of ``vehicles`` since ``since_s``, to the end of the run."""
+    """A traffic jam that lasts to the end of the run: ``standing`` of ``vehicles`` have not moved since ``since_s``."""
 
     since_s: float
     standing: int
@@ -341,7 +342,7 @@ class Gridlock(TypedDict):
 
 
 class SurveyedRun(TypedDict):
-    """One run of the plain traffic; an entry is vehicle, time in s, vehicle class, whether it is parked."""
+    """One run of the unmodified traffic; an entry is (vehicle, time in s, vehicle class, whether it is parked)."""
 
     begin_s: float
     end_s: float
@@ -356,11 +357,11 @@ def refine(scenario: Scenario, answer: Json) -> Scenario:
     """Return the scenario with the vehicles that entered in every run as candidates, and with notes on the traffic.
 
     Args:
-        scenario: scenario of a ``.sumocfg``, with the candidates that its route files promise.
-        answer: the runs, at least one, as `SurveyedRun`.
+        scenario: scenario of a ``.sumocfg``, with the candidates from its route files.
+        answer: the runs as `SurveyedRun`; at least one.
 
     Raises:
-        ScenarioError: every vehicle that enters is one that an agent cannot drive.
+        ScenarioError: an agent can drive none of the vehicles that enter.
         NoValidTrialError: no vehicle enters.
     """
     runs = cast("list[SurveyedRun]", answer)
@@ -396,7 +397,7 @@ def refine(scenario: Scenario, answer: Json) -> Scenario:
 
 
 def restore(scenario: Scenario, kept: Scenario) -> Scenario | None:
-    """Return the scenario with the candidates of the hunt that kept ``kept``; None if that hunt drew none."""
+    """Return the scenario with the candidates of the hunt whose scenario is ``kept``; None if that hunt drew none."""
     agent, *others = kept.agents
     before = kept.agents[agent]
     if others or before.replaces != EGO_VEHICLE or EGO_VEHICLE not in kept.arguments:
@@ -419,10 +420,10 @@ def _entry_failure(scenario: Scenario) -> str:
 
 
 def _entering_in_all_runs(runs: Sequence[SurveyedRun]) -> list[Departure]:
-    """Return the drivable vehicles that entered in every run, by the latest time at which they did.
+    """Return the drivable vehicles that entered in every run, sorted by the latest of their entry times.
 
-    A run that was cut short says nothing about what enters later. Where no vehicle entered in every run, those of the
-    run with the most entries are returned: a demand scaled to 0 at one end of a range is no reason to refuse.
+    A run that was cut short is ignored for later vehicles. If no vehicle entered in every run, the vehicles of the run
+    with the most entries are returned. A demand scaled to 0 at one end of a range is therefore not refused.
     """
     found: list[dict[str, float]] = []
     for run in runs:
@@ -437,7 +438,7 @@ def _entering_in_all_runs(runs: Sequence[SurveyedRun]) -> list[Departure]:
 
 
 def _entering_before_gridlock(stuck_s: float | None, known: list[Departure]) -> list[Departure]:
-    """Return the vehicles that enter before a gridlock, and where there are enough, before it builds up."""
+    """Return the vehicles that enter before a gridlock; if there are enough, only those before it builds up."""
     if stuck_s is None:
         return known
     early = [one for one in known if one.depart_s < stuck_s - GRIDLOCK_BUILDS_UP_S]

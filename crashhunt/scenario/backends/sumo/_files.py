@@ -1,4 +1,4 @@
-"""The command line that SUMO is started with, and the files staged for it in a folder of the worker's own."""
+"""The command line that starts SUMO, and the files staged for SUMO in a private folder of the worker."""
 
 from __future__ import annotations
 
@@ -80,9 +80,9 @@ class FileReference:
     Args:
         tag: tag of the element.
         attribute: name of the attribute.
-        value: the name in the file.
-        kind: whether SUMO reads or writes it.
-        offset: offset of the element in the file, in bytes.
+        value: the file name, as written in the XML file.
+        kind: whether SUMO reads or writes the file.
+        offset: offset of the element in the XML file, in bytes.
     """
 
     tag: str
@@ -92,15 +92,15 @@ class FileReference:
     offset: int
 
     def __str__(self) -> str:
-        """Return the reference as written in the file."""
+        """Return the reference as it is written in the XML file."""
         return f'<{self.tag} {self.attribute}="{self.value}">'
 
 
 def read_xml(path: Path) -> bytes:
-    """Return the content of a file as SUMO reads it: unpacked where it is compressed, whatever it is called.
+    """Return the contents of a file as SUMO reads it: decompressed if it is compressed, regardless of its name.
 
     Raises:
-        ScenarioError: it cannot be read.
+        ScenarioError: the file cannot be read.
     """
     try:
         content = path.read_bytes()
@@ -122,7 +122,7 @@ def references(content: bytes, where: str) -> list[FileReference]:
     """Return the references to other files in an XML file.
 
     Raises:
-        ScenarioError: it is no valid XML.
+        ScenarioError: the file is not valid XML.
     """
     if not any(word in content and pattern.search(content) for word, pattern in _WORTH_PARSING.items()):
         return []
@@ -164,17 +164,17 @@ def references(content: bytes, where: str) -> list[FileReference]:
 
 
 def _is_written(key: str) -> bool:
-    """Whether the parameter of a vehicle, a type or a traffic light is a file that SUMO writes."""
+    """Return whether a parameter of a vehicle, a vehicle type or a traffic light names a file that SUMO writes."""
     return key == "file" or (key.endswith(".file") and key != "device.fcd-replay.file")
 
 
 def rewritten(content: bytes, found: list[FileReference], name: Callable[[FileReference], str]) -> bytes:
-    """Return an XML file in which attributes name other files; all else stays as it is.
+    """Return an XML file with other file names in its attributes; the rest stays unchanged.
 
     Args:
-        content: content of the file.
-        found: what `references` has found in it.
-        name: returns the new name for each reference; an equal name changes nothing.
+        content: contents of the XML file.
+        found: the references that `references` has found in the file.
+        name: function that returns the new name for a reference; an equal name changes nothing.
     """
     from xml.sax.saxutils import quoteattr  # which imports urllib and ssl
 
@@ -189,7 +189,7 @@ def rewritten(content: bytes, found: list[FileReference], name: Callable[[FileRe
 
 
 def _value_span(content: bytes, reference: FileReference) -> tuple[int, int] | None:
-    """Where the value of an attribute is, with its quotes; None for one that the document type gives by default."""
+    """Return the position of an attribute's value with its quotes; None if the value is the document type's."""
     wanted = reference.attribute.encode()
     match = _TAG.match(content, reference.offset)
     while match is not None and (match := _ATTRIBUTE.match(content, match.end())) is not None:
@@ -199,10 +199,10 @@ def _value_span(content: bytes, reference: FileReference) -> tuple[int, int] | N
 
 
 def movable(path: Path) -> bytes | None:
-    """Return the content of a file as it is right wherever its folder goes; None if it is so already.
+    """Return the contents of a file in a form that stays valid if its folder moves; None if no change is needed.
 
     Raises:
-        ScenarioError: it cannot be read.
+        ScenarioError: the file cannot be read.
     """
     content = read_xml(path)
 
@@ -215,15 +215,15 @@ def movable(path: Path) -> bytes | None:
 
 
 def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) -> tuple[str, ...]:
-    """Return all files that SUMO reads because of some files, directly or indirectly, relative to the folder.
+    """Return all files that SUMO reads because of the given files, directly or indirectly, relative to the folder.
 
     Args:
         folder: folder of the scenario.
-        names: files in it.
-        inside: refuse what lies outside the folder, before it is looked at.
+        names: names of files in the folder.
+        inside: whether to refuse files outside of the folder without reading them.
 
     Raises:
-        ScenarioError: one does not exist.
+        ScenarioError: a file does not exist.
     """
     found: dict[str, None] = {}
     waiting = list(names)
@@ -240,7 +240,7 @@ def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) 
 
 
 def written_by(folder: Path, names: tuple[str, ...]) -> list[str]:
-    """Return the output that SUMO would write because of some files, in words; empty for none."""
+    """Return a description of the output that SUMO would write because of some files; empty if it would write none."""
     found = [
         f"{name}: {reference}"
         for name in dict.fromkeys((*names, *nested_files(folder, names)))
@@ -289,15 +289,15 @@ _NULL_DEVICE = "/dev/null"
 
 
 class StagedFiles:
-    """The scenario's files, as one worker reads them.
+    """The scenario's files, in the form in which one worker reads them.
 
-    Every file is linked into a folder of the worker's own. One that says what SUMO is to write is copied there, and
-    writes nothing: the files of a thousand trials are of no use, and two workers would write the same one. A route
-    or additional file that says ``${NAME}`` is filled in per trial.
+    Every file is linked into a private folder of the worker. A file that requests output from SUMO is copied without
+    these requests, because two workers would write the same file. In a route or additional file, ``${NAME}`` is
+    replaced in every trial.
 
     Args:
-        scenario: whose files.
-        folder: folder to stage them in; must exist.
+        scenario: scenario to which the files belong.
+        folder: folder into which the files are staged; it must exist.
     """
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
@@ -316,15 +316,15 @@ class StagedFiles:
                 staged.symlink_to(source.resolve())
 
     def __del__(self) -> None:
-        """Close the folders that had to be opened to be named."""
+        """Close the folders that had to be opened for paths with special characters."""
         for opened in self._opened.values():
             os.close(opened)
 
     def arguments(self, seed: int, values: Mapping[str, Value]) -> list[str]:
-        """Render the files for one trial and return SUMO's command line without the program.
+        """Write the files for one trial, and return SUMO's command line without the program.
 
         Raises:
-            InvalidEpisodeError: a file asks for an argument that the scenario does not have.
+            InvalidEpisodeError: a file uses an argument that the scenario does not have.
         """
         for path, template in self._templates.items():
             try:
@@ -359,7 +359,7 @@ class StagedFiles:
         return [f"--{name}={value}" for name, value in options.items()]
 
     def _stage(self, source: Path, staged: Path) -> bool:
-        """Copy a file that cannot be read where it is; False for one that can."""
+        """Copy a file that SUMO cannot read unchanged; return False if no copy is needed."""
         content = read_xml(source)
         is_net = staged == self._folder / self._sumo.net
         if b"${" in content and not is_net and not self._sumo.literal:
@@ -373,7 +373,7 @@ class StagedFiles:
         return True
 
     def _staged_content(self, content: bytes, path: Path) -> bytes:
-        """The content of a file that reads only what is staged, and writes nothing."""
+        """Return the contents of a file, changed so that it reads only staged files and writes none."""
 
         def name(reference: FileReference) -> str:
             if reference.kind == "written":
@@ -388,7 +388,7 @@ class StagedFiles:
         return ",".join(self._path(self._folder / name.strip()) for name in names)
 
     def _path(self, path: Path) -> str:
-        """The name of a staged file in an option, where SUMO takes a comma for the end and fills in ``${NAME}``."""
+        """Return the path of a staged file without characters that SUMO interprets in options, such as ``,``."""
         if not {",", "$"}.intersection(str(path)):
             return str(path)
         parent = str(path.parent)
@@ -398,11 +398,11 @@ class StagedFiles:
 
 
 def filled_in(content: bytes, values: Mapping[str, Value]) -> bytes:
-    """Return a route or additional file as a trial reads it.
+    """Return a route or additional file with the values of a trial in place of ``${NAME}``.
 
     Raises:
-        KeyError: it asks for an argument that is not there.
-        ValueError: the file is no text, or contains an invalid dollar sign.
+        KeyError: the file uses an argument that has no value.
+        ValueError: the file is not text, or contains an invalid dollar sign.
     """
     return _substitute(string.Template(content.decode()), values).encode() if b"${" in content else content
 

@@ -1,4 +1,4 @@
-"""Loads a map, OpenStreetMap or OpenDRIVE, as the scenario that is made from it."""
+"""Loading of a map, OpenStreetMap or OpenDRIVE, as a scenario that is made from the map."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["load_map"]
 
 
 def load_map(path: Path, ego: str) -> Scenario:
-    """Return the scenario of a map; it is made once, and kept in the user's cache.
+    """Return the scenario of a map. It is made once, and then kept in the user's cache.
 
     Raises:
-        ScenarioError: the map cannot be used, or a vehicle is named.
+        ScenarioError: the map cannot be used, or ``ego`` names a vehicle.
     """
     if ego:
         fix = "omit the option, or make the scenario yourself: crashhunt init DIR"

@@ -1,8 +1,8 @@
-"""What SUMO's files define: the vehicles, types, routes and edges that a scenario may name.
+"""Names that SUMO's files define: the vehicles, types, routes and edges to which a scenario may refer.
 
 SUMO itself reports a missing name only when a trial begins, and never reports a missing vehicle of the traffic. Names
-are therefore checked before a hunt, as far as the files show them. They are searched and not parsed, as a network may
-have hundreds of megabytes.
+are therefore checked before a hunt, as far as the files contain them. The files are searched and not parsed, because a
+network may have hundreds of megabytes.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _VEHICLES = b"vehicle|trip|flow"
 
 
 def check_names(scenario: Scenario, ego: str = "") -> None:
-    """Refuse a controlled vehicle whose type, route, edges or, of the traffic, id are in none of the files.
+    """Refuse a controlled vehicle whose type, route, edges or traffic vehicle is not defined in any file.
 
     Args:
-        scenario: whose files exist.
-        ego: as it was given on the command line, for the message.
+        scenario: scenario whose files exist.
+        ego: value of ``--ego`` on the command line, for the message.
 
     Raises:
-        ScenarioError: a name is unknown; the message has the most similar one.
+        ScenarioError: a name is unknown; the message contains the most similar known name.
     """
     demand = [read_xml(scenario.folder / name) for name in scenario.texts()]
     open_ended = any(_GENERATED_ID.search(text) for text in demand)
@@ -69,7 +69,11 @@ def line_of(name: str, files: Iterable[Path]) -> str:
 
 
 def _check_replaced(scenario: Scenario, setup: AgentSetup, demand: list[bytes]) -> None:
-    """Look up the default alone: a range may name hundreds, and a missing vehicle costs one trial, which reports it."""
+    """Check that the default of the argument for the replaced vehicle exists.
+
+    Other values of the argument are not checked: there may be hundreds of them, and a missing vehicle costs only one
+    trial, which reports it.
+    """
     name = scenario.arguments[setup.replaces].default
     if isinstance(name, str):
         _check_vehicle(name, demand, f"arguments.{setup.replaces}.default", scenario.origin)
@@ -143,12 +147,12 @@ _DEFINED_ID = re.compile(r"(?:flow|vType|vehicle type|vehicle|trip|route|edge|la
 
 
 def explained(message: str, output: str, scenario: Scenario) -> ScenarioError | None:
-    """Return what is wrong with a scenario in which no episode could be set up; None if SUMO is not to blame.
+    """Return the error of a scenario in which no episode could be set up; None if SUMO is not the cause.
 
     Args:
         message: message of the exception in the worker.
-        output: what SUMO printed last.
-        scenario: the loaded scenario, not the copy of the worker.
+        output: the last output of SUMO.
+        scenario: the loaded scenario, not the worker's copy.
     """
     said, errors = message.removeprefix(_SET_UP_ERROR), _errors(output)
     died = message.startswith("the process died") and errors
@@ -161,7 +165,7 @@ def explained(message: str, output: str, scenario: Scenario) -> ScenarioError | 
 
 
 def _errors(output: str) -> list[str]:
-    """The error messages in what SUMO printed, each in one line; what belongs to one is indented below it."""
+    """Return the error messages in SUMO's output, each as one line; indented lines belong to the message above them."""
     found: list[str] = []
     open_ = False
     for line in output.splitlines():
@@ -204,7 +208,7 @@ def _about_a_vehicle(said: str, scenario: Scenario) -> ScenarioError | None:
 
 
 def _about_a_file(said: str, scenario: Scenario) -> ScenarioError:
-    """The file and the line that SUMO names, or in which what it names is defined."""
+    """Return an error with the file and line that SUMO names, or in which the named element is defined."""
     line = _LINE_ERROR.search(said)
     if line is not None:
         text = said[: line.start()].strip()

@@ -1,4 +1,4 @@
-"""SUMO's options: those of every trial, their names, and which of them read, write or open a port."""
+"""SUMO's options: those set in every trial, their names, and which of them read files, write files or open a port."""
 
 from __future__ import annotations
 
@@ -212,14 +212,14 @@ _CANONICAL = dict(pair.split("=") for pair in _SYNONYMS.split())
 
 
 def canonical(name: str) -> str:
-    """Return what SUMO lists an option as, for its short name, a synonym, or the name it once had."""
+    """Return the name under which SUMO lists an option, given its short name, a synonym or a former name."""
     if name.endswith(".knownveh"):
         return name.removesuffix("knownveh") + "explicit"
     return _CANONICAL.get(name, name)
 
 
 def writes(name: str) -> bool:
-    """Whether the value of an option is a file that SUMO writes."""
+    """Return whether the value of an option is a file that SUMO writes."""
     return name in _OUTPUT_OPTIONS or name.endswith(("-output", ".output"))
 
 
@@ -235,7 +235,7 @@ def is_shown(name: str) -> bool:
 
 
 def is_true(value: object) -> bool:
-    """Whether SUMO reads the value of an option that is true or false as true."""
+    """Return whether SUMO reads the value of a Boolean option as true."""
     return str(value).strip().lower() in ("1", "yes", "true", "on", "x", "t")
 
 
@@ -244,18 +244,19 @@ def is_true(value: object) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class SumoSetup:
-    """``[sumo]``: files, relative to the scenario's folder, and further options of SUMO.
+    """The table ``[sumo]``: files, relative to the scenario's folder, and further options of SUMO.
 
     Args:
-        net: the network.
+        net: the network file.
         routes: route files.
         additional: additional files.
         options: further options of SUMO without their dashes, such as ``lateral-resolution``. The default of
-            ``time-to-teleport`` is -1, so SUMO removes no vehicle from a jam. SUMO writes none of their output files.
-        native: whether the compiled core may be used; it changes no bit.
-        fix_link_order: whether SUMO processes the links of the network in the order of their construction.
-            Otherwise it uses the order of their memory addresses, which differs between processes.
-        literal: whether ``${NAME}`` in a route or additional file is left as it is, instead of being filled in.
+            ``time-to-teleport`` is -1, so SUMO removes no vehicle from a jam. Output files that options request are not
+            written.
+        native: whether the compiled core may be used; results are bit-identical with and without it.
+        fix_link_order: whether SUMO processes the links of the network in the order of their construction. Otherwise
+            SUMO uses the order of the memory addresses of the links, which differs between processes.
+        literal: whether ``${NAME}`` in a route or additional file stays unchanged instead of being replaced.
     """
 
     net: str

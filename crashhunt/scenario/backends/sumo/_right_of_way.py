@@ -1,4 +1,4 @@
-"""Right of way in a network: reads the request matrix of each junction."""
+"""Right of way in a network, from the request matrix of each junction."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _UNREGULATED_TYPES = ("unregulated", "internal", "dead_end", "rail_signal", "rai
 
 
 def right_of_way(scenario: Scenario) -> RightOfWay | None:
-    """Return the ways across the junctions of a scenario; None if its network cannot be read."""
+    """Return the right of way at the junctions of a scenario; None if its network cannot be read."""
     path = scenario.folder / scenario.table(SumoSetup).net
     try:
         return _read(path, path.stat().st_mtime_ns)

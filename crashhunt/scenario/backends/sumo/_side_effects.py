@@ -1,4 +1,4 @@
-"""Side effects that SUMO would have for an untrusted scenario; unknown elements count as harmful."""
+"""The side effects that SUMO would have for an untrusted scenario; unknown XML elements count as harmful."""
 
 from __future__ import annotations
 
@@ -101,11 +101,11 @@ LABELS = frozenset({"origId", "origFrom", "origTo", "ref", "destination", "name"
 
 
 class _SideEffectError(Exception):
-    """The message describes it."""
+    """Signals a side effect; the message of the exception describes it."""
 
 
 def side_effect(scenario: Scenario, values: Mapping[str, Value], _specifications: Iterable[str]) -> str:
-    """Return the side effect that SUMO would have with the options and files of a scenario; empty for none."""
+    """Return the side effect that SUMO would have with the options and files of a scenario; empty if there is none."""
     sumo = scenario.table(SumoSetup)
     options = [*sumo.options, *(setup.option for setup in scenario.arguments.values() if setup.option)]
     for option in options:
@@ -130,9 +130,9 @@ def _check_text(file: str, content: bytes, *, reads: bool) -> None:
     """Refuse an XML file with elements other than those known to simulate.
 
     Args:
-        file: its name.
-        content: as SUMO gets it.
-        reads: whether the files that it names have been looked at.
+        file: name of the file.
+        content: contents as SUMO reads them.
+        reads: whether the files that the file names have been checked.
     """
     parser = expat.ParserCreate()
 

@@ -1,4 +1,4 @@
-"""Loads a plain ``.sumocfg``, written for SUMO alone, as a scenario."""
+"""Loading of a plain ``.sumocfg``, which was written only for SUMO, as a scenario."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ _REASONS = {
 
 
 def read_config(path: Path) -> tuple[dict[str, str], list[str]]:
-    """Return the options of a configuration by the names that SUMO lists them under, and what to tell about them.
+    """Return the options of a configuration by SUMO's names for them, and notes for the user about them.
 
     SUMO ignores the sections, and replaces ``${NAME}`` by the environment variable and ``~`` by the home directory.
-    That is done here once, so that a replay on another machine does not depend on them.
+    This function does the same once, so that a replay on another machine does not depend on these values.
 
     Raises:
-        ScenarioError: it is not a configuration.
+        ScenarioError: the file is not a configuration of SUMO.
     """
     try:
         root = ET.parse(path).getroot()
@@ -92,12 +92,12 @@ def _resolved(value: str, used: dict[str, str]) -> str:
 
 
 def split_names(value: str) -> list[str]:
-    """Split a list of files; a blank is part of a name."""
+    """Split a list of file names; a space is part of a name."""
     return [name.strip() for name in value.split(",") if name.strip()]
 
 
 def changes(options: Mapping[str, str]) -> list[str]:
-    """Return the options of a configuration that a trial changes, with the reasons, in words."""
+    """Return the options of a configuration that a trial changes, each with the reason as text."""
     found = []
     for name, value in options.items():
         if name == "seed":
@@ -124,7 +124,7 @@ def _is_equal(value: str, other: str) -> bool:
 
 
 def is_left_out(name: str) -> bool:
-    """Whether an option has no meaning in a trial."""
+    """Return whether an option has no meaning in a trial, so that it is omitted."""
     return is_output(name) or is_shown(name) or name.startswith("load-state")
 
 
@@ -138,16 +138,17 @@ _PATIENCE_S = 300.0
 def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
     """Turn a SUMO configuration into a scenario.
 
-    Its network, routes, additional files and options are kept. Its output files are not written. Options that a trial
-    sets itself (the seed, the number of threads) are ignored. The notes list both. The demand becomes the scenario
-    argument ``scale``.
+    The network, routes, additional files and options of the configuration are kept. Its output files are not written.
+    Options that a trial sets itself (the seed, the number of threads) are ignored. The notes list both. The demand
+    becomes the scenario argument ``scale``.
 
     Args:
-        path: the configuration.
-        ego: ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty: any, where one departs.
+        path: path of the configuration.
+        ego: ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty for ``any`` if a vehicle
+            departs.
 
     Raises:
-        ScenarioError: the configuration is not one, or names no vehicle and no route.
+        ScenarioError: the file is not a configuration of SUMO, or defines no vehicle and no route.
     """
     options, notes = read_config(path)
     if "net-file" not in options:
@@ -197,7 +198,7 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
 
 
 def _files(options: dict[str, str], path: Path, unset: str) -> tuple[Path, dict[str, tuple[str, ...]]]:
-    """Return the folder that holds all files of the configuration, and their names in it by option."""
+    """Return the folder that contains all files of the configuration, and their names in this folder by option."""
     base = path.resolve().parent
     named: dict[str, list[str]] = {key: [] for key in _FILE_OPTIONS}
     for key in [key for key in options if key in _FILE_OPTIONS or key in INPUTS]:
@@ -223,7 +224,7 @@ def _files(options: dict[str, str], path: Path, unset: str) -> tuple[Path, dict[
 
 
 def _times(options: dict[str, str], path: Path) -> tuple[float, float]:
-    """Return when the simulation begins, and its step length, in s."""
+    """Return the start time of the simulation and the step length, in s."""
     begin = seconds(options.get("begin", "0"), path)
     end = seconds(options.get("end", "-1"), path)
     if 0 <= end < begin:
