@@ -39,7 +39,7 @@ class SpeedAndLaneChange:
         self.space: Space[object] = spaces.Tuple((speed, spaces.Discrete(3, start=-1)))
 
     def encode(self, action: Any) -> NDArray[np.float64]:
-        """Return float64, shape (2,)."""
+        """Return the action as a float64 array of shape (2,)."""
         try:
             speed, lane_change = action
             # Most agents return this form in every step, so check it first.
@@ -64,8 +64,8 @@ class SpeedAndLaneChange:
 class SpaceAction:
     """An action inside a Box, Discrete, MultiDiscrete or MultiBinary space.
 
-    Numbers count by their value: True is 1, and a float64 value is accepted by a float32 space. Refused are values that
-    the type of the space cannot hold: a float for an integer, 300 for eight bits, complex and masked numbers.
+    Numbers count by their value: True is 1, and a float64 value is accepted by a float32 space. Values that the type of
+    the space cannot hold are refused: a float for an integer, 300 for eight bits, complex and masked numbers.
     """
 
     names: tuple[str, ...] = ()
@@ -95,7 +95,7 @@ class SpaceAction:
 
 
 class MetaAction(SpaceAction):
-    """highway-env's DiscreteMetaAction: 0 LANE_LEFT, 1 IDLE, 2 LANE_RIGHT, 3 FASTER, 4 SLOWER; or fewer of them.
+    """highway-env's DiscreteMetaAction: 0 LANE_LEFT, 1 IDLE, 2 LANE_RIGHT, 3 FASTER, 4 SLOWER; or some of these.
 
     Args:
         meanings: The name of each number, from 0. Agents find the names in the attribute ``meanings`` of the space.
@@ -110,7 +110,7 @@ class MetaAction(SpaceAction):
         self.space.meanings = meanings  # type: ignore[attr-defined]
 
     def encode(self, action: object) -> NDArray[np.generic]:
-        """Return int64, shape (1,)."""
+        """Return the action as an int64 array of shape (1,)."""
         if isinstance(action, np.ndarray) and action.size == 1:
             action = action.reshape(())
         return super().encode(action).reshape(1)
@@ -137,7 +137,7 @@ def cast(action: object, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
 
 
 def is_masked(action: object) -> bool:
-    """Whether the value is an array with a masked element."""
+    """Return whether the value is an array with a masked element."""
     ma = sys.modules.get("numpy.ma")  # NumPy imports this module on first use, so without it no masked array exists
     return ma is not None and isinstance(action, ma.MaskedArray) and bool(ma.is_masked(action))
 

@@ -1,8 +1,8 @@
-"""Descriptions of the state after a crash, for environments that do not name the types of their crashes.
+"""Descriptions of the state after a crash, for environments that do not report the types of their crashes.
 
-A cell is the set of true flags and short texts of the last info. The last observation is no part of it, unlike the
-cells of Go-Explore (Ecoffet et al. 2021): with its coarse levels, guided hunts found fewer planted faults on seven of
-nine problems, because one fault ends in several cells (`scripts/search --faults`).
+A cell is the set of true flags and short texts of the last ``info``. Unlike the cells of Go-Explore (Ecoffet et al.
+2021), a cell does not contain the last observation. With coarse levels of the observation, guided hunts found fewer
+planted faults on seven of nine problems, because one fault ended in several cells (`scripts/search --faults`).
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _MAX_TEXT_CHARACTERS, _MAX_WORDS = 20, 8  # of the info
 
 
 def crash_cell(info: Mapping[str, object]) -> str:
-    """Return a description of the last step, equal for similar ones.
+    """Return a description of the last step, equal for similar steps.
 
     Args:
-        info: info of the last step. Flags that are true and short texts count; numbers do not.
+        info: ``info`` of the last step. True flags and short texts are used; numbers are not.
     """
     words = []
     for key, value in info.items():

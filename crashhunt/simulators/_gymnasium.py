@@ -49,16 +49,17 @@ _ACTION_BOUNDARY = Boundary(Party.ENVIRONMENT, "action conversion")
 class ObservationForm:
     """Converts the observations of an environment into arrays.
 
-    An observation is recorded as it is if its space is an array. Observations of a Dict or Tuple space of arrays are
-    flattened, if that loses nothing. Any other observation is recorded as the text of its value (`encode_value`).
+    An observation is recorded unchanged if its space is an array. Observations of a Dict or Tuple space of arrays are
+    flattened, if flattening loses no information. Any other observation is recorded as the text of its value
+    (`encode_value`).
 
     Args:
-        space: The environment's observation space.
+        space: The observation space of the environment.
 
     Attributes:
         original: The environment's observation space.
         space: The space of the arrays.
-        structured: Whether agents receive something else than the array: call `restore`.
+        structured: Whether agents receive another object than the array; call `restore` to get this object.
     """
 
     def __init__(self, space: Space[Any]) -> None:
@@ -77,7 +78,7 @@ class ObservationForm:
         """Return a new array with the type and shape of `space`.
 
         Raises:
-            ForeignError: The environment's observation does not have the form that its space says.
+            ForeignError: The environment's observation does not have the form of the environment's observation space.
         """
         if self._values is not None:
             return self._values.encode(observation)
@@ -94,11 +95,11 @@ class ObservationForm:
         return spaces.unflatten(self.original, array) if self.flattened else array
 
     def contains(self, observation: object, array: NDArray[np.generic]) -> bool:
-        """Return whether an observation lies inside the environment's space.
+        """Return whether an observation lies inside the environment's observation space.
 
         Args:
             observation: The observation.
-            array: Its array.
+            array: The observation as an array.
         """
         if self.structured:
             with _SPACE_BOUNDARY, _quiet():
@@ -126,7 +127,7 @@ class OpaqueSpace(Space[Any]):
 
     @property
     def is_np_flattenable(self) -> bool:
-        """False: the arrays have no fixed size."""
+        """Return False, because the arrays have no fixed size."""
         return False
 
     def sample(self, *args: Any, **kwargs: Any) -> NDArray[np.uint8]:
@@ -134,7 +135,7 @@ class OpaqueSpace(Space[Any]):
         return encode_value(self.original.sample(*args, **kwargs))
 
     def contains(self, x: Any) -> bool:
-        """Return whether an array holds the text of a value."""
+        """Return whether an array contains the text of a value of the space."""
         if not (isinstance(x, np.ndarray) and x.dtype == np.uint8 and x.ndim == 1):
             return False
         try:
@@ -148,7 +149,7 @@ class OpaqueSpace(Space[Any]):
 
 
 class _Values:
-    """Converts values of any class into arrays and back.
+    """Converts values of any class to arrays and back.
 
     A value that a recording cannot hold is restored as the object itself, in the process that has encoded it.
     """
@@ -168,14 +169,14 @@ class _Values:
         return array
 
     def restore(self, array: NDArray[np.generic]) -> object:
-        """Return the value that an array holds: a copy, or the object itself if it cannot be restored."""
+        """Return the value that an array represents: a copy, or the object itself if the value cannot be restored."""
         text = array.tobytes()
         return self._originals[text] if text in self._originals else decode_value(array)[0]
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Ignore warnings: Gymnasium warns whenever it turns lists and numbers into arrays."""
+    """Return a context without warnings, because Gymnasium warns whenever it converts lists and numbers to arrays."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -186,12 +187,12 @@ def _is_array(space: Space[Any]) -> bool:
 
 
 def _can_be_recorded(dtype: np.dtype[Any]) -> bool:
-    """Whether logs hold arrays of a type without losing a bit."""
+    """Return whether logs can store arrays of a type without losing a bit."""
     return (dtype.kind == "f" and dtype.itemsize in (4, 8)) or dtype.kind in "ib" or dtype.str[1:] in ("u1", "u2", "u4")
 
 
 def _leaves(space: Space[Any]) -> Iterator[Space[Any]]:
-    """Yield the spaces inside Dict and Tuple spaces; an empty one, which Gymnasium cannot flatten, as it is."""
+    """Yield the spaces inside Dict and Tuple spaces, and empty such spaces, which Gymnasium cannot flatten."""
     if isinstance(space, spaces.Dict | spaces.Tuple) and len(space.spaces):
         for part in space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces:
             yield from _leaves(part)
@@ -200,7 +201,7 @@ def _leaves(space: Space[Any]) -> Iterator[Space[Any]]:
 
 
 def _flattens_exactly(space: Space[Any]) -> bool:
-    """Whether flattening a value of a space and unflattening it loses nothing."""
+    """Return whether flattening and unflattening a value of a space loses no information."""
     leaves = list(_leaves(space))
     if isinstance(space, _ARRAY_SPACES) or not leaves or not all(isinstance(leaf, _ARRAY_SPACES) for leaf in leaves):
         return False
@@ -220,7 +221,7 @@ def _fits(leaf: Space[Any], dtype: np.dtype[Any]) -> bool:
 
 
 def _equal(one: Any, other: Any) -> bool:
-    """Whether two structures have equal numbers."""
+    """Return whether two structures contain equal numbers."""
     if isinstance(one, Mapping):
         return isinstance(other, Mapping) and all(key in other and _equal(one[key], other[key]) for key in one)
     if isinstance(one, tuple):
@@ -290,7 +291,7 @@ class OpaqueAction:
         raise ActionError(f"the action {describe_action(action)} is not in {self.space}", fix="return one that is")
 
     def restore(self, array: NDArray[np.generic]) -> object:
-        """Return the action that an array holds."""
+        """Return the action that an array represents."""
         return self._values.restore(array)
 
     def _contains(self, action: object) -> bool:
@@ -311,7 +312,7 @@ def action_form(space: Space[Any]) -> ActionForm:
 
 
 def native(form: ActionForm, action: NDArray[np.generic]) -> object:
-    """Return an encoded action in the form that the environment expects: a number, an array or a structure."""
+    """Return an encoded action in the form that the environment expects: a number, an array or a nested structure."""
     if isinstance(form, OpaqueAction):
         return form.restore(action)
     if isinstance(form, FlatAction):
@@ -323,7 +324,7 @@ def native(form: ActionForm, action: NDArray[np.generic]) -> object:
 
 
 def as_tables(scenario: Scenario, arguments: Mapping[str, Value]) -> list[dict[str, object]]:
-    """Return a table for each argument, with the entry that it sets; ``a.b`` sets the entry ``b`` of table ``a``."""
+    """Return the values of arguments as nested tables; the argument ``a.b`` sets the entry ``b`` of table ``a``."""
     tables = []
     for name, value in arguments.items():
         option = scenario.arguments[name].option or name if name in scenario.arguments else name
@@ -338,7 +339,7 @@ def as_tables(scenario: Scenario, arguments: Mapping[str, Value]) -> list[dict[s
 def merge(config: dict[str, object], table: Plain) -> None:
     """Write the entries of a table into a configuration.
 
-    Tables inside it are merged. A table whose ``type`` differs replaces the existing table.
+    Nested tables are merged. A table whose ``type`` differs replaces the existing table.
     """
     for key, value in table.items():
         old = config.get(key)
@@ -349,7 +350,7 @@ def merge(config: dict[str, object], table: Plain) -> None:
 
 
 def reseed_in_place(generator: np.random.Generator | np.random.RandomState, seed: int) -> None:
-    """Set a generator to the state of a new generator with this seed, for all objects that share the generator."""
+    """Set a generator to the state of a new generator with the given seed, for all objects that share the generator."""
     if isinstance(generator, np.random.RandomState):
         generator.seed(seed)
         return

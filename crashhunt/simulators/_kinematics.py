@@ -45,8 +45,8 @@ class Kinematics:
     """Builds observations: float32, shape (vehicles, features).
 
     Row 0 is the controlled vehicle. Its x is the distance driven (m). Its y is the distance to the right of the
-    leftmost lane's centre (m). Its vx and vy are the speeds along and across the lane (m/s). Its heading is that in the
-    map.
+    leftmost lane's centre (m). Its vx and vy are the speeds along and across the lane (m/s). Its heading is relative to
+    the map.
 
     The other rows are the nearest actors, the nearest first, relative to the controlled vehicle: x ahead (m), y to the
     right (m), velocity (m/s) and heading. Headings grow clockwise, because y points to the right. Rows without an actor
@@ -84,7 +84,7 @@ class Kinematics:
 
     @property
     def usual(self) -> bool:
-        """Whether the observation has exactly the columns that the compiled core writes, not normalised."""
+        """Whether the observation is not normalised and has exactly the columns that the compiled core writes."""
         return self._usual
 
     @property
@@ -100,7 +100,7 @@ class Kinematics:
         return spaces.Box(low, high, self.shape, np.float32)
 
     def blank(self) -> NDArray[np.float32]:
-        """Return the observation of an agent that has left the simulation: zeros."""
+        """Return the observation of an agent that has left the simulation, which contains only zeros."""
         return np.zeros(self.shape, np.float32)
 
     def observe(
@@ -180,7 +180,7 @@ class Unseen:
     """Hides one vehicle from one agent, from the next observation on.
 
     Args:
-        kinematics: Makes the observations.
+        kinematics: The object that makes the observations.
         agent: The agent that does not see the vehicle.
         vehicle: The identifier of the vehicle.
     """
@@ -193,7 +193,7 @@ class Unseen:
         self._hidden.add(self._pair)
 
     def keep(self) -> None:
-        """Keep the vehicle hidden, which needs no action."""
+        """Keep the vehicle hidden; this needs no action."""
 
     def end(self) -> None:
         """Show the vehicle again."""

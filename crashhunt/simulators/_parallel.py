@@ -16,14 +16,14 @@ __all__ = ["OneLearner", "is_parallel", "takes_turns"]
 
 
 class TakesTurns(Protocol):
-    """An environment of PettingZoo whose agents act one after the other."""
+    """The interface of a PettingZoo environment whose agents act one after the other."""
 
     def agent_iter(self) -> Iterator[Any]:
         """Yield the agents in their order."""
 
 
 class Parallel(Protocol):
-    """An environment of PettingZoo whose agents act at the same time: its ``ParallelEnv``."""
+    """The interface of a PettingZoo environment whose agents act at the same time: its ``ParallelEnv``."""
 
     possible_agents: Sequence[Any]
     """All agents that may take part."""
@@ -40,29 +40,29 @@ class Parallel(Protocol):
         """Begin an episode."""
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Any]:
-        """Let all agents act."""
+        """Let all agents act, and return the results of the step."""
 
 
 def is_parallel(made: Any) -> TypeGuard[Parallel]:
-    """Whether an object has the interface of PettingZoo's ``ParallelEnv``, whose agents do not take turns."""
+    """Return whether an object has the interface of PettingZoo's ``ParallelEnv``, whose agents do not take turns."""
     return supports(made, Parallel) and callable(made.observation_space) and not takes_turns(made)
 
 
 def takes_turns(made: Any) -> bool:
-    """Whether an object is an environment of PettingZoo whose agents act one after the other."""
+    """Return whether an object is a PettingZoo environment whose agents act one after the other."""
     return supports(made, TakesTurns)
 
 
 class OneLearner(gymnasium.Env[Any, Any]):
     """Shows the environment as the learner sees it. The other agents act by a policy that the seed determines.
 
-    An episode terminates when the learner's does, or when the learner is not among the agents any more.
+    An episode terminates when the learner terminates, or when the learner is no longer among the agents.
 
     Args:
         parallel: The environment, with the interface of PettingZoo's ``ParallelEnv``.
-        learner: The agent that crashhunt tests, which is one of ``possible_agents``; empty for the first.
-        policy: Called with name, observation, action space and random generator of another agent, returns its action.
-            None for random actions, inside the mask of possible actions if the environment gives one.
+        learner: The agent that crashhunt tests, one of ``possible_agents``; empty for the first agent.
+        policy: Function that returns the action of another agent, given its name, observation, action space and random
+            generator. None for random actions, within the mask of possible actions if the environment provides a mask.
     """
 
     def __init__(self, parallel: Any, learner: str = "", policy: Callable[..., object] | None = None) -> None:
@@ -84,7 +84,7 @@ class OneLearner(gymnasium.Env[Any, Any]):
         return self._seen[self._learner], dict(self._infos.get(self._learner, {}))
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Let all agents act."""
+        """Let all agents act, and return the learner's results of the step."""
         learner = self._learner
         actions = {
             name: action if name == learner else self._other_actions(name)

@@ -59,10 +59,11 @@ class Options(TypedDict, total=False):
     """Options of an episode.
 
     Args:
-        arguments: The scenario arguments by name.
+        arguments: The values of the scenario arguments, by name.
         only: Identifiers, as in scenes, of the actors that take part in addition to the agents. Without this option all
             actors take part. Only simulators with `SupportsExclusion` get this option.
-        script: Recorded paths along which all other actors are moved. Only simulators with `SupportsScripts` get it.
+        script: Recorded paths along which all other actors are moved. Only simulators with `SupportsScripts` get this
+            option.
     """
 
     arguments: Mapping[str, Value]
@@ -118,7 +119,7 @@ class OfAnyLength(Protocol):
 
 
 class Simulator(Protocol):
-    """Runs one episode after another.
+    """Runs the episodes of a scenario, one after another.
 
     Contract: after two calls of `reset` with equal arguments, all methods return bit-identical results for equal
     actions. This holds in the same process and in another process, whatever ran before. The simulator never changes an
@@ -128,7 +129,7 @@ class Simulator(Protocol):
     `NamesObservations`, `ReportsEvents`, `HasMap`, `HasWindow`, `SupportsFullBraking`, `ReportsSurroundings`,
     `SupportsDisturbances`, `SupportsHolds`, `SupportsExclusion`, `SupportsScripts`, `SupportsReseeding`, `CountsSetUp`,
     `RunsForeignCode`, `RestoresState` and `PreparesProcess`. A simulator supports a protocol if it has the methods and
-    attributes of the protocol. It need not register them.
+    attributes of the protocol. Registration is not needed.
     """
 
     @property
@@ -184,7 +185,7 @@ class ReportsNotices(Protocol):
 
     @property
     def notices(self) -> Iterable[str]:
-        """Lines of text. A hunt reads them after each episode and prints each line once."""
+        """The notices as lines of text. A hunt reads them after each episode and prints each line once."""
 
 
 class FlattensObservations(Protocol):
@@ -199,17 +200,17 @@ class FlattensObservations(Protocol):
 
 
 class RestoresObservations(Protocol):
-    """A simulator that makes structured observations again of their arrays, in place of `gymnasium.spaces.unflatten`.
+    """A simulator that restores structured observations from arrays itself, instead of `gymnasium.spaces.unflatten`.
 
-    Needed for observations of the agents in `FlattensObservations.shown_spaces` whose arrays are not flattened values,
-    such as texts and graphs.
+    This protocol is needed if the arrays of agents in `FlattensObservations.shown_spaces` are not flattened values, as
+    for texts and graphs.
     """
 
     def restore_observation(self, agent: str, array: NDArray[Any], /) -> object:
         """Return the observation that an agent receives.
 
         Args:
-            agent: The agent, which is in `shown_spaces`.
+            agent: The agent that receives the observation; it is in `shown_spaces`.
             array: An array that `Simulator.reset` or `Simulator.step` has returned in this episode.
         """
 
@@ -361,7 +362,7 @@ class SupportsExclusion(Protocol):
 
     @property
     def entered(self) -> Sequence[str]:
-        """Identifiers of all actors that have entered since `Simulator.reset`, excluded ones too.
+        """Identifiers of all actors that have entered since `Simulator.reset`, including excluded actors.
 
         The sequence is empty if `Simulator.reset` got no option ``only``.
         """
@@ -372,7 +373,7 @@ class SupportsScripts(Protocol):
 
     @property
     def scripted(self) -> bool:
-        """Whether the other actors of this episode follow recorded paths."""
+        """Whether the other actors of the current episode follow recorded paths."""
 
 
 class SupportsReseeding(Protocol):
@@ -395,7 +396,7 @@ class SupportsReseeding(Protocol):
 
 
 class CountsSetUp(Protocol):
-    """A simulator that counts the steps that it simulates before the first step, such as the warm-up of traffic."""
+    """A simulator that counts the steps before the first step of an episode, such as the warm-up of traffic."""
 
     setup_steps: int
     """Number of steps that the last `Simulator.reset` simulated, even if it failed.
@@ -405,7 +406,7 @@ class CountsSetUp(Protocol):
 
 
 class RunsForeignCode(Protocol):
-    """A simulator of crashhunt's own that runs code of others, which may fail without a fault of crashhunt."""
+    """A simulator of crashhunt that runs foreign code, which may fail without a fault of crashhunt."""
 
     party: Party
     """Whose code it runs: that of a simulator, or of a user's environment."""
@@ -420,11 +421,11 @@ class RestoresState(Protocol):
     """A simulator whose episodes change state outside the simulator object, such as class attributes of a library."""
 
     def tidy(self) -> None:
-        """Restore that state as it was before the first episode; called before the first episode and after each."""
+        """Restore the state outside of the simulator as it was at first; called around every episode."""
 
 
 class PreparesProcess(Protocol):
-    """A simulator that can prepare a process once, such as load tables that every first episode would load.
+    """A simulator that can prepare a process once, for example by loading tables that every first episode would load.
 
     The simulator's `reset` does not sample from the action spaces.
     """
@@ -438,24 +439,24 @@ class NamesMetaActions(Protocol):
 
     @property
     def meanings(self) -> Sequence[str]:
-        """The name of each number, from 0, such as ``SLOWER``."""
+        """The name of each action number, counted from 0, such as ``SLOWER``."""
 
 
 class FastStepper(Protocol):
     """Runs uneventful steps of an episode with one agent in the compiled core, each in one call.
 
-    The simulator object then lags behind the core until `catch_up` is called.
+    The simulator object keeps an older state than the core until `catch_up` is called.
     """
 
     core: UsualSteps
     """The compiled object that runs a step and returns its outcome."""
 
     def is_unpatched(self, simulator: Simulator, /) -> bool:
-        """Whether a step of the core equals a step of this simulator: false if the simulator or a method is wrapped."""
+        """Return whether a step of the core equals a step of the simulator; false if a method of it is wrapped."""
 
     @property
     def roster(self) -> Roster:
-        """The actors in sight, which may already be those after the step that `core` runs."""
+        """The actors in sight. They may already be the actors after the step that `core` runs."""
 
     def enter(self, ids: tuple[str, ...], /) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:
         """Set the vehicles in sight; return their data for `core`, or None if `core` cannot continue with them."""
@@ -464,7 +465,7 @@ class FastStepper(Protocol):
         """Let `core` continue from the simulator's state; return the scene, or None if that is not possible yet."""
 
     def catch_up(self) -> StepResult:
-        """Bring the simulator to the state of `core`; return the result that its last step would have returned."""
+        """Set the simulator to the state of `core`; return the result that its last step would have returned."""
 
     def apply(self, agent: str, action: NDArray[np.generic], /) -> bool:
         """Apply an encoded action; return whether the step can stay uneventful."""
@@ -478,7 +479,7 @@ class SupportsFastSteps(Protocol):
 
     @property
     def at_once(self) -> FastStepper | None:
-        """The fast path of this episode; None if the episode has no fast path."""
+        """The object that runs fast steps in this episode; None if the episode has no fast path."""
 
 
 FACULTIES: tuple[type, ...] = (

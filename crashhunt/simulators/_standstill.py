@@ -1,4 +1,4 @@
-"""A counter of the steps for which vehicles stand still; each simulator decides which vehicles it counts."""
+"""A counter of the steps in which vehicles stand still; each simulator decides which vehicles it counts."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class Standstill:
         self._stood: dict[str, int] = {}
 
     def begin(self) -> None:
-        """Forget the last episode."""
+        """Reset the counters for a new episode."""
         self._stood.clear()
 
     @property
     def counted(self) -> tuple[dict[str, int], int]:
-        """The number of steps for which each vehicle has stood still, and the limit in steps; for the compiled core."""
+        """The number of steps that each vehicle has stood still, and the limit in steps; used by the compiled core."""
         return self._stood, self._steps
 
     def move(self, vehicle: str) -> None:
@@ -42,7 +42,10 @@ class Standstill:
         self._stood.pop(vehicle, None)
 
     def look(self, vehicle: str, speed: float) -> float:
-        """Count a step of a vehicle; return the limit in s in the step in which its standstill reaches it, else 0."""
+        """Count a step of a vehicle.
+
+        Return the limit in s in the step in which its standstill reaches the limit, else 0.
+        """
         if abs(speed) >= self.SPEED:
             if self._stood:
                 self.move(vehicle)

@@ -52,7 +52,7 @@ class GymSimulator:
 
     Args:
         scenario: The scenario to run.
-        stage: Not used.
+        stage: Ignored; other simulators need this argument.
 
     Raises:
         ScenarioError: The environment or the crash rule does not exist.
@@ -106,7 +106,7 @@ class GymSimulator:
         reseed_in_place(self._env.unwrapped.np_random, seed)
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
-        """Step the environment."""
+        """Run one step of the environment."""
         action = native(self.actions[self._agent], actions[self._agent])
         with _STEP:
             observation, reward, ended, cut, info = self._env.step(action)
@@ -128,11 +128,11 @@ class GymSimulator:
         return {agent: shown}, {agent: reward}, {agent: over}, {agent: False}, {agent: info}
 
     def restore_observation(self, agent: str, array: NDArray[np.generic]) -> object:
-        """Return what the agent receives for a recorded observation."""
+        """Return the observation that the agent receives for a recorded observation."""
         return self._form.restore(array)
 
     def scene(self) -> Scene:
-        """Return the scene: the time and a crash, without actors."""
+        """Return the scene: the time and a possible crash, without actors."""
         return self._scene
 
     def close(self) -> None:
@@ -148,7 +148,7 @@ class GymSimulator:
             self._notice(f"the environment {self._setup.id!r} cannot be closed: {in_words(error.error)}")
 
     def _recorded_observation(self, observation: object) -> NDArray[np.generic]:
-        """Return an observation as it is recorded; report an observation outside the space once per hunt.
+        """Return an observation in its recorded form; report an observation outside of the space once per hunt.
 
         The episode continues, because many environments leave their space by a rounding error.
         """

@@ -1,7 +1,7 @@
 """The toy simulator: controlled vehicles in a row on one straight lane, behind a leader that brakes at random.
 
-It is the test double of simulators and the shortest example of the protocol. It is pure Python, takes microseconds per
-step, and can fail on purpose in every way in which a simulator can fail.
+The toy replaces simulators in tests, and is the shortest example of the protocol. It is pure Python, needs microseconds
+per step, and can fail on purpose in every way in which a simulator can fail.
 """
 
 from __future__ import annotations
@@ -42,16 +42,17 @@ class ToySimulator:
 
     All scenario arguments are optional:
 
-    - ``leader_speed``: in m/s, 10 by default.
-    - ``gap_m``: the gap from bumper to bumper at the start, 30 by default.
-    - ``road_m``: the length of the road, 1000 by default.
-    - ``step_wall_s``: the shortest wall time of a step.
+    - ``leader_speed``: speed of the leader in m/s, 10 by default.
+    - ``gap_m``: the gap from bumper to bumper at the start, in m, 30 by default.
+    - ``road_m``: the length of the road, in m, 1000 by default.
+    - ``step_wall_s``: the minimum wall time of a step, in s.
     - ``fail_reset``: true makes `reset` fail on purpose.
-    - ``fail_at_step``, ``exit_at_step``, ``segfault_at_step``, ``hang_at_step``: the step that fails on purpose.
+    - ``fail_at_step``, ``exit_at_step``, ``segfault_at_step``, ``hang_at_step``: number of the step that fails on
+      purpose.
 
     Args:
-        scenario: Its agents and its step length are used.
-        stage: Not used.
+        scenario: Scenario whose agents and step length are used.
+        stage: Ignored; other simulators need this argument.
     """
 
     def __init__(self, scenario: Scenario, stage: Path) -> None:
@@ -128,7 +129,7 @@ class ToySimulator:
         return self._scene
 
     def lanes(self) -> list[Lane]:
-        """Return the one lane."""
+        """Return the only lane of the road."""
         return [Lane("road_0", 3.5, ((0.0, 0.0), (float(self._argument("road_m", 1000.0)), 0.0)))]
 
     def full_braking(self, agent: str) -> FullBraking:
@@ -145,13 +146,13 @@ class ToySimulator:
         return _LEADER_ID if disturbance.who == "ahead" and ahead == [_LEADER_ID] else ""
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance:
-        """Make a vehicle brake, at most as hard as vehicles can, or hide it."""
+        """Make a vehicle brake, at most as hard as its maximum deceleration, or hide the vehicle."""
         if disturbance.what == "unseen":
             return Unseen(self._kinematics, disturbance.agent, vehicle)
         return _Braking(self, vehicle, min(disturbance.how_strong, _BRAKING))
 
     def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
-        """Keep the leader at its speed; the road has one lane, so lanes need no hold."""
+        """Keep the speed of the leader. The road has one lane, so a lane needs no hold."""
         return _Steady(self, vehicle) if vehicle == _LEADER_ID and what == "keep_speed" else None
 
     def keep_speed(self, vehicle: str) -> None:

@@ -32,7 +32,7 @@ def configured(default: Config, scenario: Scenario, arguments: Mapping[str, Valu
 
     Args:
         default: The environment's default configuration.
-        scenario: Gives the entries that differ from the default, and the number of controlled vehicles.
+        scenario: Scenario that contains the changed entries and the number of controlled vehicles.
         arguments: The scenario arguments of the trial.
 
     Raises:

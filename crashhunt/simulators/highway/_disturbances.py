@@ -48,7 +48,7 @@ def place_of(agent: Any, other: Any) -> str:
 
 
 def crosses(network: RoadNetwork, agent: Any, other: Any) -> bool:
-    """Whether the paths of two vehicles cross, and neither vehicle is on a road of the other vehicle's path."""
+    """Return whether the paths of two vehicles cross, and neither vehicle is on a road of the other vehicle's path."""
     own_roads, own = _way(network, agent)
     roads, way = _way(network, other)
     if other.lane_index[:2] in own_roads or agent.lane_index[:2] in roads:
@@ -120,7 +120,7 @@ class HighwayDisturbances:
 
     @property
     def is_active(self) -> bool:
-        """Whether a vehicle is disturbed at the moment."""
+        """Whether any vehicle is currently disturbed."""
         return bool(self._active)
 
     def before_moving(self, dt: float) -> None:
@@ -174,7 +174,7 @@ class HighwayDisturbances:
         return min(near, key=lambda found: found[0])[1] if near else None
 
     def disturb(self, vehicle: Any, disturbance: Disturbance, agent: Any) -> ActiveDisturbance | None:
-        """Disturb a vehicle until the disturbance ends; return None if the vehicle cannot be disturbed so."""
+        """Disturb a vehicle until the disturbance ends; return None if the vehicle cannot be disturbed in this way."""
         strong = disturbance.how_strong
         hardest = min(strong, float(vehicle.ACC_MAX))
         active: _Active
@@ -239,7 +239,7 @@ class _Active:
         """Change the vehicle's decision for a sub-step of ``dt`` s."""
 
     def after(self) -> None:
-        """Undo effects of the sub-step that is over."""
+        """Undo the effects of the sub-step that has ended."""
 
     def keep(self) -> None:
         """Do nothing, because `override` runs in every sub-step."""
@@ -249,7 +249,7 @@ class _Active:
         self._release(self)
 
     def _brake(self, deceleration: float, dt: float, down_to: float = 0.0) -> None:
-        """Brake at least with this deceleration, until the speed is ``down_to``."""
+        """Brake with at least the given deceleration until the speed is ``down_to``."""
         action, speed = self.vehicle.action, float(self.vehicle.speed)
         wanted = max(-deceleration, min(0.0, (down_to - speed) / dt))
         if speed <= down_to:
@@ -291,7 +291,7 @@ class _Speeds(_Active):
 
 
 class _CutsIn(_Active):
-    """Makes the vehicle change lanes as soon as no vehicle overlaps it there, and brake in the new lane if asked."""
+    """Makes the vehicle change lanes as soon as no vehicle overlaps it there, and optionally brake in the new lane."""
 
     def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], deceleration: float, lane: Any) -> None:
         super().__init__(vehicle, let_go, deceleration)
@@ -363,7 +363,7 @@ class _MergesLate(_Active):
 
 
 class _Ignores(_Active):
-    """Makes the vehicle ignore right of way: it drives on whenever the right-of-way rules stop it."""
+    """Makes the vehicle ignore right of way: it continues whenever the right-of-way rules would stop it."""
 
     def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], how_strong: float) -> None:
         super().__init__(vehicle, let_go, how_strong)

@@ -1,6 +1,6 @@
 """Imports highway-env without matplotlib and pandas, which take most of its import time.
 
-Both are imported on first use. An episode needs nothing of matplotlib, and needs pandas only for observations that the
+Both are imported on first use. An episode does not use matplotlib, and uses pandas only for observations that the
 accelerator does not compute.
 """
 

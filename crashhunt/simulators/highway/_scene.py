@@ -55,13 +55,13 @@ def contact_of(
     actor_of: Callable[[RoadObject], Actor],
     lane: str,
 ) -> Contact:
-    """Return the contact of a controlled vehicle that has just crashed: with the nearest crashed object.
+    """Return the contact of a controlled vehicle that has just crashed, with the nearest crashed object.
 
     Args:
         agent: The agent's identifier.
         vehicle: The agent's vehicle.
         things: All vehicles and obstacles.
-        actor_of: Returns the actor of an object.
+        actor_of: Function that returns the actor of an object.
         lane: The lane of the vehicle.
     """
     # highway-env does not mark a hit obstacle as crashed, so every obstacle is a candidate.
@@ -104,8 +104,8 @@ class VehicleFilter:
         road: The road of the environment.
         takes_part: Identifiers of the objects that stay, as in scenes.
         agents: Identifiers of the agents, which stay as well.
-        things: Returns all vehicles and obstacles.
-        actor_of: Returns the actor of an object.
+        things: Function that returns all vehicles and obstacles.
+        actor_of: Function that returns the actor of an object.
 
     Attributes:
         entered: Identifiers of all objects that have entered, in order, without the agents.

@@ -32,7 +32,7 @@ class Puppet(Vehicle):  # type: ignore[misc]
 
     Args:
         road: The road of the environment.
-        path: The recorded path; past its end the vehicle drives straight on.
+        path: The recorded path; after its end, the vehicle drives straight on.
         sub_steps: Number of sub-steps in each step.
         step_length_s: Step length, in s.
     """
@@ -57,7 +57,7 @@ class Puppet(Vehicle):  # type: ignore[misc]
         """Do nothing, because the path is fixed."""
 
     def step(self, dt: float) -> None:
-        """Move by a sub-step along the path, whatever is in the way."""
+        """Move by a sub-step along the path, regardless of obstacles."""
         self._done += 1
         self._move()
 
@@ -113,7 +113,7 @@ class Puppets:
         return [(thing, path.actor) for path, thing in self.things]
 
     def enter(self, steps: int) -> None:
-        """Put exactly the actors on the road that were recorded at this step; keep objects that cannot be hit."""
+        """Put exactly the actors on the road that were recorded at the step; keep objects that cannot be hit."""
         road = self._road
         there = [thing for path, thing in self.things if self._is_present(path, steps)]
         known = {id(thing) for thing in road.vehicles}
@@ -129,7 +129,7 @@ class Puppets:
 
 
 def place_of(state: ActorState, length: float) -> tuple[NDArray[np.float64], float, float]:
-    """Return the centre, heading and speed in highway-env's coordinates of a state in scene coordinates."""
+    """Convert a state in scene coordinates to the centre, heading and speed in highway-env's coordinates."""
     x = state.x - length / 2 * math.cos(state.heading)
     y = state.y - length / 2 * math.sin(state.heading)
     return np.array([x, -y]), -state.heading, state.speed

@@ -70,7 +70,7 @@ class HighwaySimulator:
 
     Args:
         scenario: The scenario to run.
-        stage: Not used.
+        stage: Ignored; other simulators need this argument.
 
     Raises:
         ScenarioError: The environment or an entry of its configuration does not exist, or it has too few vehicles.
@@ -221,7 +221,7 @@ class HighwaySimulator:
         return self._disturbances.disturb(thing, disturbance, self._controlled[disturbance.agent])
 
     def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
-        """Apply a hold to a vehicle until the hold ends."""
+        """Apply a hold to a vehicle until the hold ends; return None if that is impossible."""
         present = {id(thing) for thing in self._env.road.vehicles}
         found = (thing for thing, actor in self._known.values() if actor.id == vehicle and id(thing) in present)
         return self._disturbances.hold(next(found, None), what)
@@ -304,7 +304,7 @@ class HighwaySimulator:
         self._known |= {id(thing): (thing, actor) for thing, actor in self._puppets.actors}
 
     def _is_at_an_end(self, vehicle: RoadObject) -> bool:
-        """Whether a vehicle has driven off the end of a lane without a following lane."""
+        """Return whether a vehicle has driven off the end of a lane that has no following lane."""
         along, lateral = vehicle.lane.local_coordinates(vehicle.position)
         inside = abs(lateral) <= vehicle.lane.width_at(along) / 2
         return inside and along > vehicle.lane.length and vehicle.lane_index[1] not in self._env.road.network.graph

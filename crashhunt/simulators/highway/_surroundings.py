@@ -1,6 +1,6 @@
 """What a careful driver of a highway-env vehicle would consider: vehicles ahead and on the neighbouring lanes.
 
-Actors that cross are not considered: highway-env's roads have no right of way that could be read.
+Crossing actors are not considered, because highway-env's roads have no right of way that could be read.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def surroundings_of(
         network: network of roads.
         vehicle: vehicle of the agent.
         others: all other vehicles and obstacles.
-        name_of: returns the identifier of an actor.
+        name_of: function that returns the identifier of an actor.
     """
     things = list(others)
     ahead: dict[str, Neighbor] = {}

@@ -1,4 +1,4 @@
-"""SUMO, by libsumo, which is imported when a simulator is made."""
+"""SUMO as a simulator, through libsumo, which is imported when a simulator is created."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Fault injection on SUMO: a vehicle is commanded while its disturbance lasts, and then drives by itself again.
+"""Fault injection on SUMO: a vehicle receives commands while its disturbance lasts, and then drives by itself again.
 
 SUMO's own checks stay on where possible. A vehicle that brakes hard still keeps a safe speed behind the vehicle ahead,
 and never brakes harder than the ``decel`` of its type. A cut-in uses any gap, but never overlaps another vehicle.
@@ -56,7 +56,7 @@ _WALKING_AREA = re.compile(r"_w\d+_\d+$")  # netconvert's names of walking areas
 
 
 def roadside(scene: Scene, agent: str, who: str, reach_m: float, junctions: JunctionLanes) -> str:
-    """Return the nearest person that walks on one side of the road ahead of an agent and can step out.
+    """Return the nearest person who walks on one side of the road ahead of an agent and can step onto the road.
 
     Args:
         scene: The current scene.
@@ -88,7 +88,8 @@ def can_step_out(actor: str, agent: str, reach_m: float, junctions: JunctionLane
     """Return whether SUMO keeps a person on its own lane while the person steps out.
 
     SUMO scores each lane nearby by distance, angle and route (``Helper::moveToXYMap``). This function compares the same
-    score for the person's lane and for junction lanes, at points along the person's path. It returns false in doubt.
+    score for the person's lane and for junction lanes, at points along the person's path. If the result is uncertain,
+    it returns false.
 
     Args:
         actor: Identifier of a walking person.
@@ -212,7 +213,7 @@ class _Way(NamedTuple):
 
     @classmethod
     def of(cls, person: str, agent: str) -> _Way:
-        """Return the path from a person's current position into the path of an agent."""
+        """Return the straight path from a person's current position into the path of an agent."""
         start: tuple[float, float] = sumo.person_getPosition(person)
         heading = math.radians(90.0 - sumo.vehicle_getAngle(agent))
         own_x, own_y = sumo.vehicle_getPosition(agent)
@@ -227,7 +228,7 @@ class _Way(NamedTuple):
         return 90.0 - math.degrees(math.atan2(self.direction[1], self.direction[0]))
 
     def at(self, out_m: float) -> tuple[float, float]:
-        """Return the point at a distance from the start."""
+        """Return the point of the path at a distance from its start."""
         return self.start[0] + out_m * self.direction[0], self.start[1] + out_m * self.direction[1]
 
 
@@ -319,7 +320,7 @@ class SumoDisturbances:
     Args:
         controlled: Identifiers of the agents, which are never a target.
         step_length_s: Step length of the simulation, in s.
-        driving: Knows whether traffic drives on the left.
+        driving: `Driving` object, which knows whether traffic drives on the left.
 
     Attributes:
         speeds: Speeds in m/s of moved persons, by SUMO id, because SUMO reports 0 for them.
@@ -347,7 +348,7 @@ class SumoDisturbances:
         return "" if found in self._controlled else found
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance | None:
-        """Disturb an actor; return None if the actor cannot be disturbed so."""
+        """Disturb an actor; return None if the actor cannot be disturbed in this way."""
         strong = disturbance.how_strong
         try:
             if disturbance.what == "step_out":
@@ -440,7 +441,7 @@ class _Speeds:
 
 
 class _CutsIn:
-    """Makes the vehicle change lanes as soon as no vehicle overlaps it there, and brake in the new lane if asked."""
+    """Makes the vehicle change lanes as soon as no vehicle overlaps it there, and optionally brake in the new lane."""
 
     def __init__(self, vehicle: str, lane: str, deceleration: float, dt: float, how_long: float) -> None:
         self.how_strong = deceleration

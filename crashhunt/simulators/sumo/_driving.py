@@ -42,7 +42,7 @@ class Driving:
         self._is_left_hand: bool | None = None
 
     def begin(self, agents: Iterable[str]) -> None:
-        """Forget the last episode, but keep what was read from the network."""
+        """Reset the state of the last episode, but keep data that was read from the network."""
         self._targets = dict.fromkeys(agents, -1)
 
     def apply(self, agent: str, action: NDArray[np.generic]) -> bool:
@@ -79,9 +79,9 @@ class Driving:
         return exists
 
     def neighboring_lane(self, agent: str, change: int) -> tuple[bool, int] | None:
-        """Return whether a neighbouring lane exists that the vehicle may use, and by how much SUMO's index differs.
+        """Return whether the vehicle may use a neighbouring lane, and the difference of SUMO's lane indices.
 
-        None inside a junction, where no lane has neighbours.
+        The result is None inside a junction, where lanes have no neighbours.
 
         Args:
             agent: identifier of the vehicle.
@@ -133,7 +133,7 @@ class Driving:
 
 
 def _is_right_of(lane: str, other: str) -> bool:
-    """Whether a lane lies to the right of another lane of the same edge."""
+    """Return whether a lane lies to the right of another lane of the same edge."""
     (x, y, *_), (to_x, to_y, *_) = sumo.lane_getShape(other)[:2]
     at_x, at_y = sumo.lane_getShape(lane)[0][:2]
     return bool((to_x - x) * (at_y - y) < (to_y - y) * (at_x - x))

@@ -45,7 +45,7 @@ def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]
 
 @contextmanager
 def steps_counted(simulator: CountsSetUp, step_length_s: float) -> Iterator[None]:
-    """Count the steps that are simulated in the block, even if the block fails."""
+    """Return a context that counts the simulated steps inside it, even if it fails."""
     began = libsumo.simulation.getTime()
     try:
         yield
@@ -57,16 +57,16 @@ def steps_counted(simulator: CountsSetUp, step_length_s: float) -> Iterator[None
 def enter(
     scenario: Scenario, setups: Mapping[str, AgentSetup], replaced: Mapping[str, str], taking_part: VehicleFilter | None
 ) -> None:
-    """Warm up, add the agents' vehicles that the traffic does not have, and wait until all are on the road.
+    """Warm up the traffic, add missing vehicles of agents, and wait until all agents' vehicles are on the road.
 
     Args:
-        scenario: Gives the length of the warm-up and the longest wait.
+        scenario: Scenario that contains the length of the warm-up and the maximum wait.
         setups: The setups of the agents that drive.
         replaced: The vehicles of the traffic that are replaced, each with its agent.
-        taking_part: Removes excluded actors; None if all actors take part.
+        taking_part: Filter that removes excluded actors; None if all actors take part.
 
     Raises:
-        InvalidEpisodeError: A controlled vehicle did not enter in time, or had left again.
+        InvalidEpisodeError: A controlled vehicle did not enter in time, or had already left the simulation.
     """
     begin = libsumo.simulation.getTime()
     if scenario.warmup_s > 0:
@@ -158,7 +158,7 @@ class VehicleFilter:
 
     Args:
         takes_part: Identifiers of the actors that stay, as in scenes.
-        leaving: Receives the SUMO ids of removed persons, which scenes must hide.
+        leaving: Collection to which the SUMO ids of removed persons are added, because scenes must hide them.
 
     Attributes:
         entered: Identifiers of all actors that have entered, in order.

@@ -46,7 +46,7 @@ class PresentVehicles(NamedTuple):
 
     Args:
         scene: The scene after the last step.
-        observations: The observations that the agents get next.
+        observations: The observations that the agents receive next.
         steps: Number of completed steps.
     """
 
@@ -56,24 +56,25 @@ class PresentVehicles(NamedTuple):
 
 
 class UsualSteps:
-    """Implements `FastStepper`: runs uneventful steps of one episode in the compiled core.
+    """Implements `FastStepper`: runs uneventful steps of an episode in the compiled core.
 
     While the core runs steps, the simulator, its sight and its events keep an older state. The method `catch_up` brings
-    them to the state of the core. The method `resume` brings the core to their state.
+    them to the state of the core. The method `resume` brings the core to the state of these objects.
 
     Args:
         core: The compiled core.
         agent: The only agent of the episode.
-        sight: Reads scenes from SUMO.
-        events: Detects traffic events.
-        kinematics: Makes observations.
-        simulate: Simulates a step.
+        sight: Object that reads scenes from SUMO.
+        events: Object that detects traffic events.
+        kinematics: Object that makes observations.
+        simulate: Function that simulates a step.
         part: Wraps a function that does a part of a step, so that it raises the same errors as a whole step.
-        present: Returns the state of the simulator.
-        arrive: Called with the new state of the simulator.
-        apply: Applies an action; returns whether the step can stay uneventful.
-        finish: Completes a step that SUMO has simulated and that is not uneventful.
-        from_left: Returns the distance in m from the centre line of an edge's leftmost lane to that of another lane.
+        present: Function that returns the state of the simulator.
+        arrive: Function called with the new state of the simulator.
+        apply: Function that applies an action and returns whether the step can stay uneventful.
+        finish: Function that completes a step which SUMO has simulated and which is not uneventful.
+        from_left: Function that returns the distance in m from the centre line of an edge's leftmost lane to the centre
+            line of another lane.
         start_m: The distance that the agent had driven at the start, in m.
         step_length_s: Step length, in s.
         lateral: Whether vehicles may leave the centre line of a lane.
@@ -116,17 +117,17 @@ class UsualSteps:
         self._rosters: dict[Vehicles, Roster] = {}  # of the scenes that `catch_up` may need
 
     def is_unpatched(self, simulator: Simulator) -> bool:
-        """Whether the simulator still has the attributes that the core bypasses: false for a wrapper or a patch."""
+        """Return whether the simulator still has the attributes that the core bypasses; false for a wrapper."""
         return all(getattr(simulator, name) == own for name, own in self._instead_of.items())
 
     def begin(self) -> None:
-        """Give the core the counters of the episode that is about to begin."""
+        """Pass the event counters of the new episode to the core."""
         self.core.heed(*self._events.counted)
         self._controlled = self._events.controlled
 
     @property
     def roster(self) -> Roster:
-        """The actors in sight, which may already be those after the step that the core runs."""
+        """The actors in sight. They may already be the actors after the step that the core runs."""
         return self._sight.roster
 
     def _enter(self, ids: tuple[str, ...]) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:
@@ -141,7 +142,7 @@ class UsualSteps:
         return *seen, row, self._controlled
 
     def resume(self) -> Scene | None:
-        """Let the core continue from the simulator's state; return the scene, or None if that is not possible yet."""
+        """Bring the simulator to the state of the core; return the result that its last step would have returned."""
         self.catch_up()
         (scene, observations, steps), seen = self._present(), self._sight.plain
         lane, columns, agent = scene.agent_lanes.get(self._agent, ""), scene.columns, self._agent
@@ -175,7 +176,7 @@ class UsualSteps:
         return self._last
 
     def reads_right(self) -> bool:
-        """Whether the core's values are bit-identical to those of libsumo's getters."""
+        """Return whether the core's values are bit-identical to the values of libsumo's getters."""
         if self._sight.plain is None:
             return True
         vehicles, ids = self._sight.plain

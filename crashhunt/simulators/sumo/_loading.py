@@ -28,7 +28,7 @@ _XERCES_INITIALIZE_SYMBOL = (
 
 
 def keep_xml_ready() -> bool:
-    """Keep SUMO's XML library (Xerces) initialized after the simulation that runs; return whether that was possible.
+    """Keep SUMO's XML library (Xerces) initialized after the running simulation; return whether that was possible.
 
     SUMO terminates the library after each simulation and initializes it again for the next one. That takes a third of
     the time for loading a small network, because the library builds its Unicode tables. The library counts its
@@ -55,11 +55,11 @@ ready_xml = cache(keep_xml_ready)
 
 
 class Loading:
-    """Loads simulations.
+    """Loads simulations into the process's SUMO instance.
 
     Args:
-        fix_link_order: Whether SUMO processes the links of a network in the order of their construction. By itself,
-            SUMO processes them in the order of their addresses, which differs between processes.
+        fix_link_order: Whether SUMO processes the links of a network in the order of their construction. By default,
+            SUMO processes them in the order of their memory addresses, which differs between processes.
     """
 
     def __init__(self, *, fix_link_order: bool) -> None:

@@ -48,7 +48,7 @@ class Sight:
     With SUMO's pedestrian model ``nonInteracting``, persons walk through vehicles, so scenes omit them.
 
     Args:
-        controlled: Identifiers of the vehicles around which to look.
+        controlled: Identifiers of the vehicles around which actors are read.
         step_length_s: Step length, in s.
         lateral: Whether vehicles may leave the centre line of a lane.
         speeds: Speeds in m/s of moved persons, by SUMO id, because SUMO reports 0 for them.
@@ -79,7 +79,7 @@ class Sight:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the previous episode, but keep what was read from the network."""
+        """Delete the state of the previous episode, but keep data that was read from the network."""
         self._known.clear()  # in the next episode, the same id may be another vehicle
         self._articulated: set[str] = set()
         self._bends.reset()
@@ -147,7 +147,7 @@ class Sight:
 
     @property
     def around(self) -> tuple[Vehicles, int, float]:
-        """The controlled vehicles, the steps between two looks around, and the squared range (m²); for the core."""
+        """The controlled vehicles, the steps between two selections, and the squared range (m²); for the core."""
         assert self._eyes is not None
         return self._eyes, self._every, _SIGHT_SQUARED
 
@@ -168,7 +168,7 @@ class Sight:
         self._see(ids, ())
 
     def reads_right(self) -> bool:
-        """Whether the core's values are bit-identical to those of libsumo's getters."""
+        """Return whether the core's values are bit-identical to the values of libsumo's getters."""
         if self.core is None or self._vehicles is None:
             return True
         seen = self.core.in_sight(self._eyes, _SIGHT_SQUARED) if self._eyes is not None else self._in_sight()
@@ -184,7 +184,7 @@ class Sight:
         return right and repr(read) == repr(found)  # repr() has all digits of each number
 
     def distrust(self) -> None:
-        """Stop using the core, and forget the episode."""
+        """Stop using the core, and delete the state of the episode."""
         self.core = None
         self.reset()
 
@@ -217,7 +217,7 @@ class Sight:
         return found
 
     def _persons_changed(self) -> bool:
-        """Whether a person entered, left, or got into a vehicle."""
+        """Return whether a person entered, left, or got into a vehicle."""
         if not (sumo.person_getIDCount() or self._all_persons):
             return False
         if sumo.person_getIDList() != self._all_persons:
@@ -237,7 +237,7 @@ class Sight:
             self._see(ids, persons)
 
     def lose(self, vehicle: str) -> None:
-        """Remove a vehicle that has been taken off the road, which SUMO reports only after the next step."""
+        """Remove a vehicle that has been taken off the road; SUMO reports this only after the next step."""
         if vehicle in self._ids:
             self._see(tuple(name for name in self._ids if name != vehicle), self._persons)
 
@@ -294,7 +294,7 @@ class Sight:
         return tuple(found)
 
     def _is_high(self) -> bool:
-        """Whether heights in the network differ by more than `_FLAT_M`."""
+        """Return whether heights in the network differ by more than `_FLAT_M`."""
         low = high = None
         for lane in sumo.lane_getIDList():
             length = sumo.lane_getLength(lane)
@@ -311,7 +311,7 @@ def _lists(columns: Columns) -> Lists:
 
 
 def _is_coming_or_going() -> bool:
-    """Whether a vehicle entered or left in the last step."""
+    """Return whether a vehicle entered or left the simulation in the last step."""
     return bool(
         sumo.simulation_getDepartedNumber()
         or sumo.simulation_getArrivedNumber()
@@ -323,7 +323,7 @@ def _is_coming_or_going() -> bool:
 def _near(
     names: Sequence[str], points: Sequence[tuple[float, float]], eyes: Sequence[tuple[float, float]]
 ) -> tuple[str, ...]:
-    """Return the names of the points within `SIGHT_M` of a controlled vehicle, in their order."""
+    """Return the names of the points within `SIGHT_M` of a controlled vehicle, in their original order."""
     seen: set[str] = set()
     for ex, ey in eyes:
         seen.update(

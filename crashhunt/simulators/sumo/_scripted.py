@@ -32,7 +32,7 @@ class ScriptedSight:
     """Reads the controlled vehicles from SUMO, and adds the recorded actors.
 
     Args:
-        sight: Reads scenes from SUMO.
+        sight: Object that reads scenes from SUMO.
         script: The recorded paths by step of the episode. Actors in sight at the end of the recording drive straight
             on afterwards.
     """

@@ -1,4 +1,4 @@
-"""SUMO as a simulator, through libsumo. Import this module in worker processes only: libsumo has no second instance."""
+"""SUMO as a simulator, through libsumo. Import this module only in worker processes: libsumo has one instance."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ class SumoSimulator:
         reseed_generators(sumo.__file__, seed)
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
-        """Apply the actions and simulate one step; the reward is the distance driven in it, in m."""
+        """Apply the actions and simulate one step; the reward is the distance driven in the step, in m."""
         if self.at_once is not None and self.at_once.core.step > self._steps:
             self.at_once.catch_up()
         self._off_road = []
@@ -254,7 +254,7 @@ class SumoSimulator:
         return FullBraking((0.0, 0), f"as hard as its speed mode {setup.speed_mode} allows")
 
     def surroundings(self, agent: str) -> Surroundings:
-        """Return what a careful driver of a vehicle would consider now."""
+        """Return what a careful driver of the vehicle would consider after the last step."""
         self.scene()  # brings SUMO to the current step
         return surroundings_of(agent, self._driving.neighboring_lane)
 
@@ -281,7 +281,7 @@ class SumoSimulator:
         return [] if self._taking_part is None else self._taking_part.entered
 
     def close(self) -> None:
-        """End the simulation, unless another simulator of this process has begun one since."""
+        """End the simulation, unless another simulator of this process has since begun a simulation."""
         if _current is not None and _current() is self and libsumo.isLoaded():
             libsumo.close()
 
@@ -291,7 +291,7 @@ class SumoSimulator:
         return float(right - left)
 
     def _begin(self, only: Sequence[str] | None, script: Paths | None, arguments: Mapping[str, Value]) -> None:
-        """Forget the last episode, and set the actors that take part in the next episode."""
+        """Reset the state of the last episode, and set the actors that take part in the next episode."""
         self._sight.reset()
         self._sight.leaving.clear()
         self._look_with, setups = self._sight, self._scenario.agents
@@ -346,7 +346,7 @@ class SumoSimulator:
         )
 
     def _arrive(self, present: PresentVehicles) -> None:
-        """Adopt the state of the core."""
+        """Set the simulator to the state of the core."""
         self._scene, self._shown, self._steps = present
 
     def _apply_alone(self, agent: str, action: NDArray[np.generic]) -> bool:
@@ -355,7 +355,7 @@ class SumoSimulator:
         return not self._off_road
 
     def _is_core_wrong(self, observations: Observations, usual: UsualSteps | None) -> bool:
-        """Whether the compiled core returns different values than the Python code that it replaces."""
+        """Return whether the compiled core returns other values than the Python code that it replaces."""
         core, self._scene.core = self._scene.core, None
         plain = self._observe_all()
         self._scene.core = core
@@ -366,7 +366,7 @@ class SumoSimulator:
         return {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}
 
     def _read_scene(self) -> None:
-        """Read the scene."""
+        """Read the scene after the last step."""
         self._scene = self._look_with.look(self._steps, self._off_road)
 
     def _observe(self, agent: str, row: int) -> NDArray[np.float32]:

@@ -26,7 +26,7 @@ def surroundings_of(agent: str, neighboring_lane: Callable[[str, int], tuple[boo
 
     Args:
         agent: identifier of the vehicle, which is on the road.
-        neighboring_lane: as of `Driving`.
+        neighboring_lane: the method of `Driving` with this name.
     """
     speed = max(0.0, float(sumo.vehicle_getSpeed(agent)))
     look_m = max(_MIN_LOOK_M, _LOOK_S * speed)
@@ -77,7 +77,7 @@ def _red_lights(agent: str, look_m: float) -> list[Neighbor]:
 
 
 def _crossing(agent: str, look_m: float) -> list[Crossing]:
-    """Return the actors that SUMO counts among the foes of the next links, except those that need not yield either."""
+    """Return the actors that SUMO counts as foes of the next links, unless neither actor has to yield."""
     length = float(sumo.vehicle_getLength(agent))
     found = []
     for foe in sumo.vehicle_getJunctionFoes(agent, look_m):

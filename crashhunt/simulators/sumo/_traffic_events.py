@@ -33,7 +33,7 @@ _MAX_LEADER_GAP_M = 100.0
 
 
 class HardBraking:
-    """Detects vehicles that brake hard because of a controlled vehicle.
+    """Detects vehicles that brake hard because of a controlled vehicle in their path.
 
     SUMO computes a step from the state at its beginning, so the controlled vehicle must have been ahead then. Either
     the braking vehicle was its follower, or it braked hard because of the same controlled vehicle in the step before.
@@ -48,7 +48,7 @@ class HardBraking:
         self._limit = limit
 
     def begin(self, agents: Sequence[str], controlled: Mapping[str, object]) -> None:
-        """Forget the last episode.
+        """Reset the state of the last episode.
 
         Args:
             agents: Identifiers of the agents that act.
@@ -63,12 +63,12 @@ class HardBraking:
 
     @property
     def followers(self) -> dict[str, str]:
-        """The follower of each controlled vehicle after the last step; empty if it has none."""
+        """The vehicle behind each controlled vehicle after the last step; empty if there is none."""
         return self._followers
 
     @property
     def counted(self) -> tuple[dict[str, float], float]:
-        """The limits in m/s²: by vehicle, and for all vehicles (0 if there is none); for the core."""
+        """The limits in m/s²: by vehicle, and for all vehicles (0 if there is none); used by the compiled core."""
         return self._limits, self._limit or 0.0
 
     @property
@@ -83,7 +83,7 @@ class HardBraking:
     def look(
         self, last: Scene, scene: Scene, agents: Sequence[str], lanes: Mapping[str, str]
     ) -> list[tuple[str, str, str]]:
-        """Return each agent for which a vehicle began to brake hard between two scenes, the vehicle, and the text."""
+        """Return each agent for which a vehicle began to brake hard between two scenes, that vehicle, and a text."""
         hard = self._braking_hard(last, scene)
         found = self._because_of_agents(hard, scene, lanes) if hard or self._wary else []
         index = scene.roster.index
@@ -112,7 +112,7 @@ class HardBraking:
         return found
 
     def _ahead_of(self, vehicle: str, lanes: Mapping[str, str]) -> tuple[str, str]:
-        """Return the agent's vehicle that a vehicle must react to, and its place; empty if it is another vehicle."""
+        """Return the agent's vehicle to which a vehicle must react, and its place; empty for any other vehicle."""
         leader = sumo.vehicle_getLeader(vehicle, _MAX_LEADER_GAP_M)
         if leader is not None and leader[0]:
             return (leader[0], "ahead of it") if leader[0] in self._followers else ("", "")
@@ -180,7 +180,7 @@ class SumoEvents:
         self._standstill = Standstill(step_length_s, limits)
 
     def begin(self, scene: Scene, agents: Sequence[str], controlled: Mapping[str, object]) -> None:
-        """Forget the last episode.
+        """Reset the state of the last episode.
 
         Args:
             scene: The scene before the first step.
@@ -203,12 +203,12 @@ class SumoEvents:
 
     @property
     def followers(self) -> dict[str, str]:
-        """The follower of each agent; empty if it has none."""
+        """The vehicle behind each agent; empty if there is none."""
         return self._braking.followers
 
     @property
     def counted(self) -> tuple[dict[str, float], float, dict[str, int], int]:
-        """The counters of `HardBraking` and `Standstill`, for the core."""
+        """The counters of `HardBraking` and `Standstill`, used by the compiled core."""
         return *self._braking.counted, *self._standstill.counted
 
     def is_quiet(self, agent: str) -> bool:
@@ -356,8 +356,8 @@ class SumoEvents:
 def _ways_between(lane: str, edge: str) -> list[tuple[str, ...]]:
     """Return the signal states of the links on each shortest way by which a vehicle can get from a lane to an edge.
 
-    In a long step a vehicle passes several links, and each of them may have a signal. Links inside a junction count as
-    none, because the signal stands where a vehicle enters.
+    In a long step a vehicle passes several links, and each of them may have a signal. Links inside a junction are not
+    returned, because the signal stands where a vehicle enters the junction.
     """
     ways: list[tuple[str, tuple[str, ...]]] = [(lane, ())]
     for _ in range(_MAX_LINKS_PER_STEP):  # shortest way first, because a vehicle cannot drive a detour in one step

@@ -1,4 +1,4 @@
-"""Simulates the plain traffic of a scenario, without a controlled vehicle, and reports which vehicles enter and when.
+"""Simulates the unmodified traffic of a scenario, without a controlled vehicle, and reports which vehicles enter when.
 
 libsumo holds one simulation per process, so this module runs in its own process, with this command:
 ``python -m crashhunt.simulators.sumo._traffic_survey JOB``. It reads the job from the JSON file JOB and writes the
@@ -44,7 +44,7 @@ STOPPED_BIT = 1  # bit of SUMO's stop state
 
 
 def main() -> None:
-    """Simulate the runs of the job; the answer holds the completed runs."""
+    """Simulate the runs of the job, and write the completed runs to the answer file."""
     job: SurveyJob = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     # Processor time: on a busy machine, a limit of wall time would change the candidates, and with them the hunt.
     deadline_s = time.process_time() + job["processor_time_limit_s"]
@@ -125,7 +125,7 @@ def _run(files: StagedFiles, seed: int, values: dict[str, Value], deadline_s: fl
 
 
 def _standing(present: tuple[str, ...]) -> tuple[int, int]:
-    """Return the number of vehicles that stand still, and of all vehicles, both without vehicles at a planned stop."""
+    """Return the number of vehicles that stand still, and of all vehicles; vehicles at a planned stop do not count."""
     free = [vehicle for vehicle in present if not sumo.vehicle_getStopState(vehicle) & STOPPED_BIT]
     return sum(sumo.vehicle_getSpeed(vehicle) < STANDING_MPS for vehicle in free), len(free)
 
