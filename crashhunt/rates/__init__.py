@@ -1,4 +1,4 @@
-"""How often an agent crashes: intervals that are valid at any time, and the trials that they count."""
+"""Crash rates: how often an agent crashes, intervals that are valid at any time, and the trials that count."""
 
 import lazy_loader
 

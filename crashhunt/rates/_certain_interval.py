@@ -1,35 +1,38 @@
-"""Intervals for a rate that are valid whenever you look at them, and a test whether two rates differ.
+"""Intervals for a rate that are valid at any time, and a test whether two rates differ.
 
-Each unit has Y events (0 to b) and an exposure D (above 0, at most Dmax). The rate is E[Y] / E[D]. Computes for each
-possible rate r the capital of bets against r, and returns the rates whose capital is below 1 / alpha:
+Each unit has Y events (0 to b) and an exposure D (above 0, at most Dmax). The rate is E[Y] / E[D]. For each possible
+rate r, the module computes the capital of bets against r. The interval consists of the rates whose capital is below 1 /
+alpha:
 
     E(r) = sum_j w_j prod_i (1 + k_j(r) (Y_i - r D_i)),    k_j(r) = clip(q_j / r - 1, -0.999 / b, 0.999 / (r Dmax)).
 
 Component j bets as if the rate were q_j. More than half of the weight is on q = 0, because most agents crash rarely.
-Without an event the upper end is at about 3.5 / n. Clopper and Pearson's is at 3.7 / n, and valid at one fixed n only.
-The other weight is on 162 rates, each 10 % above the one before: a coarser grid leaves an interval of many events
-wider than the data allow. Most of it is between 1e-4 and 0.1, where a hunt of 100,000 trials can have 30 events.
+Without an event, the upper end of the interval is at about 3.5 / n. The upper end of Clopper and Pearson's interval is
+at 3.7 / n, and is valid only at one fixed n. The other weight is on a grid of 162 rates, each 10 % above the rate
+before. A coarser grid makes an interval of many events wider than necessary. Most of this weight is between 1e-4 and
+0.1, because a hunt of 100,000 trials can have 30 events at such rates.
 
 Invariant: at the true rate each factor is positive and has mean 1 given the past. So E is a non-negative martingale
-that begins at 1. By Ville's inequality it ever reaches 1 / alpha with probability alpha at most. You may look at the
-interval after every trial, and stop because of what it shows. This needs independent units of one distribution, in an
-order that does not depend on their results. It needs b, Dmax, w and q that are fixed before the first unit.
+that begins at 1. By Ville's inequality, the probability that E ever reaches 1 / alpha is at most alpha. You may
+therefore look at the interval after every trial, and stop because of the result. The units must be independent, of one
+distribution, and in an order that does not depend on their results. The numbers b, Dmax, w and q must be fixed before
+the first unit.
 
 Why components below 1 do not count: each component is at most 1 at the observed rate, because log(1 + x) <= x. On
-either side of that rate, a component that exceeds 1 keeps growing. So the sum over the components above 1 grows to both
-sides, and bisection finds where it crosses 1 / alpha. The sum is smaller than E, so the interval stays valid.
+either side of that rate, a component that exceeds 1 keeps growing. The sum over the components above 1 therefore grows
+to both sides, and bisection finds the rate at which the sum crosses 1 / alpha. The sum is smaller than E, so the
+interval stays valid.
 
 Sources:
-J. Ville, Étude critique de la notion de collectif (1939).
-H. Robbins, Statistical methods related to the law of the iterated logarithm (1970), for mixtures.
-I. Waudby-Smith and A. Ramdas, Estimating means of bounded random variables by betting, JRSS B 86(1), 2024, for the
-bets.
-P. Grünwald, R. de Heide and W. Koolen, Safe testing, JRSS B 86(5), 2024, for e-values.
+Sources: J. Ville, Étude critique de la notion de collectif (1939). H. Robbins, Statistical methods related to the law
+of the iterated logarithm (1970), for mixtures. I. Waudby-Smith and A. Ramdas, Estimating means of bounded random
+variables by betting, JRSS B 86(1), 2024, for the bets. P. Grünwald, R. de Heide and W. Koolen, Safe testing, JRSS B
+86(5), 2024, for e-values.
 
-Cost: a unit adds to a counter. A capital takes as many logarithms as there are components times different units. With
-trials as exposure there are two different units. Many different exposures are spread over a fixed grid: a unit between
-two grid points counts partly as the one and partly as the other, with the same sum. The logarithm of each factor is
-concave in the exposure, so this makes no capital greater, and the interval stays valid.
+Cost: a unit increments a counter. A capital needs one logarithm for each component and each different unit. With trials
+as exposure there are two different units. Many different exposures are spread over a fixed grid: a unit between two
+grid points counts partly at each of the two points, with the same sum. The logarithm of each factor is concave in the
+exposure, so the grid increases no capital, and the interval stays valid.
 """
 
 from __future__ import annotations
@@ -63,11 +66,11 @@ _GRID_PARTS = 256  # parts of the greatest exposure
 
 
 class Interval(NamedTuple):
-    """The rates that the units are compatible with.
+    """The rates that are compatible with the counted units.
 
     Args:
-        low: the least.
-        high: the greatest; infinite if there is no exposure.
+        low: the least rate.
+        high: the greatest rate; infinite if there is no exposure.
     """
 
     low: float
@@ -75,12 +78,12 @@ class Interval(NamedTuple):
 
 
 class Bets:
-    """What is bet against a rate, before the first unit.
+    """The bets against each possible rate, fixed before the first unit.
 
     Args:
-        most_events: that one unit can have.
-        most_exposure: that one unit can have, in any measure; rates are per one of it.
-        fixed_exposure: whether every unit has the greatest exposure and one event at most, as trials do.
+        most_events: maximum number of events of a unit.
+        most_exposure: maximum exposure of a unit, in the unit of measurement to which rates refer.
+        fixed_exposure: whether every unit has the maximum exposure and at most one event, as trials do.
     """
 
     def __init__(
@@ -101,14 +104,14 @@ class Bets:
         self._log_weights: NDArray[np.float64] = np.log(shares)
 
     def stakes(self, rate: float) -> NDArray[np.float64]:
-        """Return the share of the capital that each component bets on more events than at a rate."""
+        """Return the share of its capital that each component bets on more events than the given rate."""
         least = -_SHARE_AT_STAKE / self.most_events
         most = _SHARE_AT_STAKE / (rate * self.most_exposure)
         found: NDArray[np.float64] = np.clip(self._alternatives / rate - 1.0, least, most)
         return found
 
     def log_evidence(self, log_capitals: NDArray[np.float64]) -> float:
-        """Return the logarithm of the sum of the components that have won; minus infinity if no component has."""
+        """Return the logarithm of the sum of the components above 1; minus infinity if there are none."""
         won = log_capitals > 0
         if not won.any():
             return -math.inf
@@ -117,17 +120,17 @@ class Bets:
         return top + math.log(float(np.exp(logs - top).sum()))
 
     def log_mixture(self, log_capitals: NDArray[np.float64]) -> float:
-        """Return the logarithm of the sum of all components: the martingale itself."""
+        """Return the logarithm of the sum of all components, which is the martingale."""
         logs = self._log_weights + log_capitals
         top = float(logs.max())
         return top + math.log(float(np.exp(logs - top).sum()))
 
 
 class RateTest:
-    """Counts units, and returns what they say of the rate at any time.
+    """Counts units, and returns at any time the rates that are compatible with them.
 
     Args:
-        bets: fixed before the first unit.
+        bets: the bets, fixed before the first unit.
     """
 
     def __init__(self, bets: Bets | None = None) -> None:
@@ -138,15 +141,15 @@ class RateTest:
         self._as_arrays: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None = None
 
     def add(self, events: float, exposure: float = 1.0, times: int = 1) -> None:
-        """Add units.
+        """Add a number of equal units.
 
         Args:
             events: number of events in each unit, from 0 to the greatest number.
-            exposure: exposure of each unit, from 0 to the greatest.
-            times: how many such units.
+            exposure: exposure of each unit, from 0 to the maximum exposure.
+            times: number of units to add.
 
         Raises:
-            ValueError: a unit is beyond the bounds that the bets rely on.
+            ValueError: a unit exceeds the bounds on which the bets rely.
         """
         bets = self.bets
         if not (0 <= events <= bets.most_events and 0 <= exposure <= bets.most_exposure * (1 + _PRECISION)):
@@ -167,11 +170,11 @@ class RateTest:
                     self._count(some, over, count)
 
     def _has_few_events(self) -> bool:
-        """Whether units differ by their exposures, and not by their events."""
+        """Return whether units differ in their exposures, but not in their events."""
         return len({events for events, _ in self._units}) <= _MAX_EVENTS
 
     def _count(self, events: float, exposure: float, times: float) -> None:
-        """Count units, or spread them over the two grid points around their exposure."""
+        """Count units, or distribute them over the two grid points around their exposure."""
         if not self._spreads:
             self._units[events, exposure] += times
             return
@@ -183,13 +186,13 @@ class RateTest:
                 self._units[events, point * part] += share * times
 
     def extend(self, units: Iterable[tuple[float, float]]) -> None:
-        """Add units, each as events and exposure."""
+        """Add units, each given as (events, exposure)."""
         for events, exposure in units:
             self.add(events, exposure)
 
     @property
     def observed(self) -> float | None:
-        """Events by exposure; None if there is no exposure."""
+        """Events divided by exposure; None if there is no exposure."""
         return self.events / self.exposure if self.exposure > 0 else None
 
     def log_capitals(self, rate: float) -> NDArray[np.float64]:
@@ -208,7 +211,7 @@ class RateTest:
     def interval(self, alpha: float = 0.05) -> Interval:
         """Return the rates with less evidence against them than 1 / alpha.
 
-        The probability that it ever excludes the true rate, after any number of units, is `alpha` at most.
+        The probability that the interval ever excludes the true rate, after any number of units, is at most `alpha`.
         """
         greatest = 1 / self.bets.most_exposure if self.bets.fixed_exposure else math.inf
         if self.exposure <= 0:
@@ -220,7 +223,7 @@ class RateTest:
         return Interval(low, high)
 
     def _crossing(self, inside: float, factor: float, threshold: float, bound: float = math.inf) -> float:
-        """Return where the evidence reaches a threshold, on the way from a rate by a factor; at most the bound."""
+        """Return the rate at which the evidence reaches a threshold, searched from a rate by a factor up to a bound."""
         outside = inside * factor
         while self.log_evidence(min(outside, bound)) < threshold:
             if outside >= bound:
@@ -236,20 +239,21 @@ class RateTest:
         return outside
 
     def verdict(self, bar: float, alpha: float = 0.05) -> str:
-        """Return ``below`` or ``above`` where the interval lies on one side of a bar, else ``undecided``."""
+        """Return ``below`` or ``above`` if the interval lies on one side of a threshold, else ``undecided``."""
         if self.exposure <= 0 or self.log_evidence(bar) < -math.log(alpha):
             return "undecided"
         return "below" if self.events < bar * self.exposure else "above"
 
 
 def discordance_evidence(only_first: int, only_second: int) -> float:
-    """Return the logarithm of the evidence that two paired runs do not have events equally often.
+    """Return the logarithm of the evidence that events are not equally frequent in two paired runs.
 
     Only discordant pairs count, as in McNemar's test (1947): without a difference each is a fair coin. The evidence is
-    the capital of a mixture of bets on that coin. Half of it has the weights of R. E. Krichevsky and V. K. Trofimov
-    (1981), which find any bias in the end. The other half bets on one side three times as often as on the other, which
-    is what most changes of interest look like: it decides those sooner. Either half is a martingale that begins at 1,
-    and so is the mixture. It may be looked at after every pair; 1 / evidence is a p-value at any time.
+    the capital of a mixture of bets on that coin. Half of the mixture has the weights of R. E. Krichevsky and V. K.
+    Trofimov (1981), which detect any bias eventually. The other half bets that one side occurs three times as often as
+    the other. Most changes of interest have such a bias, and this half detects them sooner. Each half is a martingale
+    that begins at 1, and so is the mixture. You may look at the evidence after every pair, and 1 / evidence is a
+    p-value at any time.
 
     >>> round(discordance_evidence(0, 0), 9)
     0.0
@@ -263,5 +267,5 @@ def discordance_evidence(only_first: int, only_second: int) -> float:
 
 
 def _log_mean(first: float, second: float) -> float:
-    """Return the logarithm of the mean of two numbers that are given by theirs."""
+    """Return the logarithm of the mean of two numbers, given the logarithms of the numbers."""
     return max(first, second) + math.log1p(math.exp(-abs(first - second))) - math.log(2.0)

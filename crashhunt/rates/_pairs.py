@@ -1,25 +1,25 @@
-"""Whether one of two agents crashes more often, in the same traffic: a test and an interval that are valid at any time.
+"""Test and interval, valid at any time, for the question whether one of two agents crashes more often in equal traffic.
 
 A pair is one trial of each agent with the same number, seed and traffic. Pairs count in the order of their numbers, up
-to the first number that has not ended for both. A crash ends a trial early, so the pairs that happen to have ended are
-not a fair sample. The first k pairs are. With `--seeds` a pair is a traffic with all its trials.
+to the first number whose trials have not both ended. A crash ends a trial early, so the finished pairs are not a fair
+sample, but the first k pairs are. With `--seeds`, a pair consists of all trials of a traffic seed.
 
 The difference of a pair is Z = (crashes of the second - crashes of the first) / trials, from -1 to 1. The interval of
 E[Z] has two ends, each with half of the error probability. For the upper end, each component bets that E[Z] is less
-than d, with the share s of the most that it may stake:
+than d, with a share s of its maximum stake:
 
     E(d) = sum_j w_j / 2 prod_i (1 - s_j (Z_i - d) / (1 - d)).
 
-Invariant: at the true difference each factor is positive and has mean 1 given the past. So the sum is a non-negative
-martingale that begins at 1 / 2. By Ville's inequality it ever reaches 1 / alpha with probability alpha / 2 at most.
-Each factor grows with d for every Z. So the differences that are not rejected are an interval, and bisection finds
-its end. The lower end is the upper end of -Z.
+Invariant: at the true difference each factor is positive and has mean 1 given the past. The sum is therefore a
+non-negative martingale that begins at 1 / 2. By Ville's inequality, the probability that the sum ever reaches 1 / alpha
+is at most alpha / 2. Each factor grows with d for every Z. The differences that are not rejected are therefore an
+interval, and bisection finds its end. The lower end is the upper end of -Z.
 
-Sources: as in `_certain_interval`, from where the evidence of discordant pairs comes. For Z the bets are those of I.
+Sources: those of `_certain_interval`, which computes the evidence of discordant pairs. The bets on Z are those of I.
 Waudby-Smith and A. Ramdas (2024), with a mixture over fixed shares.
 
-Cost: a pair adds to a counter. An end takes 50 evaluations, each of as many logarithms as there are components times
-different values of Z.
+Cost: a pair increments a counter. An end takes 50 evaluations, each with one logarithm for every component and every
+different value of Z.
 """
 
 from __future__ import annotations
@@ -64,13 +64,14 @@ Pair = tuple[tuple["TrialFacts", "TrialFacts"], ...]
 
 
 class PairSequence:
-    """Puts trials of two agents, which end in any order, into pairs in the order of their numbers.
+    """Combines trials of two agents, which end in any order, to pairs in the order of their numbers.
 
-    A trial that is invalid for one of them leaves both sides. Trials that are not drawn at random do not count.
+    A trial that is invalid for one agent is excluded for both. Trials that are not drawn at random do not count.
 
     Args:
-        rules: how the trials of the first and of the second agent count.
-        is_same: whether two trials of the same number have the same seed and traffic; by default all have.
+        rules: counting rules for the trials of the first agent and of the second agent.
+        is_same: function that returns whether two trials of the same number have the same seed and traffic; by default,
+            all have.
     """
 
     def __init__(
@@ -87,11 +88,11 @@ class PairSequence:
         self.valid = self.invalid = self.not_random = self.not_same = 0  # pairs of trials
 
     def add(self, side: int, trial: TrialFacts) -> Iterator[Pair]:
-        """Add a trial, and yield the pairs that are complete now, also those without a trial that counts.
+        """Add a trial, and yield the newly complete pairs, including pairs without a trial that counts.
 
         Args:
-            side: 0 for a trial of the first agent, 1 for one of the second.
-            trial: trial of any number; one that was added before is ignored.
+            side: 0 for a trial of the first agent, 1 for a trial of the second agent.
+            trial: trial of any number; a trial that was added before is ignored.
         """
         if not trial.has_ended or self._has(trial.number) or not self._is_wanted(trial.number):
             return
@@ -109,7 +110,7 @@ class PairSequence:
         return not self._traffics or number < self._traffics * self._rounds
 
     def _numbers(self, place: int) -> list[int]:
-        """Return the numbers of the trials of a pair; none where there is no such traffic."""
+        """Return the numbers of the trials of a pair; empty if the hunt has no such traffic seed."""
         if not self._traffics:
             return [place]
         if place >= self._traffics:
@@ -136,12 +137,12 @@ class PairSequence:
 
     @property
     def position(self) -> int:
-        """How many pairs have ended in a row: the number of the first trial, or traffic, that has not for both."""
+        """The number of the first trial, or traffic seed, that has not ended for both agents."""
         return self._next
 
     @property
     def excluded(self) -> int:
-        """How many trials have ended, but belong to no complete pair yet."""
+        """The number of trials that have ended, but do not belong to a complete pair yet."""
         return sum(map(len, self._waiting))
 
     @property
@@ -151,12 +152,12 @@ class PairSequence:
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether certainly too many pairs have an invalid trial."""
+        """Whether too many pairs certainly have an invalid trial."""
         return has_too_many_invalid(self.invalid, self.valid)
 
     @property
     def why_not(self) -> str:
-        """Why the pairs say nothing; empty if they do."""
+        """The reason why the pairs allow no verdict; empty if they allow one."""
         if self.invalid_share <= MAX_INVALID_SHARE:
             return ""
         many = f"{self.invalid} of {self.invalid + self.valid} pairs have an invalid trial"
@@ -164,16 +165,16 @@ class PairSequence:
 
 
 class PairTest:
-    """Counts pairs, and returns what they say of the difference at any time.
+    """Counts pairs, and returns at any time the difference that is compatible with them.
 
     Attributes:
-        pairs: how many count.
-        only_first: number of the pairs in which the first agent crashes and the second does not. Where a pair is a
-            traffic: in how many the first crashes more often.
-        only_second: likewise.
-        both: in how many both crash, equally often.
-        crashes: crashes of the first and of the second.
-        trials: trials of each, in these pairs.
+        pairs: number of pairs that count.
+        only_first: number of pairs in which the first agent crashes and the second does not. If a pair has several
+            trials, number of pairs in which the first agent crashes more often.
+        only_second: number of such pairs with the two agents exchanged.
+        both: number of pairs in which both agents crash, equally often.
+        crashes: number of crashes of the first agent and of the second agent.
+        trials: number of trials of each agent in these pairs.
     """
 
     def __init__(self, rounds: int = 1) -> None:
@@ -183,7 +184,7 @@ class PairTest:
         self._differences: Counter[float] = Counter()
 
     def add(self, pair: Pair) -> None:
-        """Add a pair; one without a trial that counts is ignored."""
+        """Add a pair; a pair without a trial that counts is ignored."""
         if not pair:
             return
         first, second = (sum(both[side].crashed for both in pair) for side in (0, 1))
@@ -196,12 +197,12 @@ class PairTest:
         self._differences[(second - first) / self._rounds] += 1
 
     def add_counts(self, only_first: int, only_second: int, alike: int) -> None:
-        """Add pairs of single trials by their number.
+        """Add the counts of pairs that have one trial per agent.
 
         Args:
-            only_first: pairs in which only the first crashes.
-            only_second: pairs in which only the second does.
-            alike: pairs in which neither does.
+            only_first: number of pairs in which only the first agent crashes.
+            only_second: number of pairs in which only the second agent crashes.
+            alike: number of pairs in which no agent crashes, or both do.
         """
         self.pairs += only_first + only_second + alike
         self.trials += only_first + only_second + alike
@@ -212,20 +213,21 @@ class PairTest:
 
     @property
     def log_evidence(self) -> float:
-        """The logarithm of the evidence that the two do not crash equally often."""
+        """The logarithm of the evidence that the two agents do not crash equally often."""
         return discordance_evidence(self.only_first, self.only_second)
 
     def difference(self, alpha: float = 0.05) -> Interval | None:
-        """Return the interval of the difference in crashes per trial, second minus first; None without a pair.
+        """Return the interval of the difference in crashes per trial, second minus first agent; None without a pair.
 
-        The probability that it ever excludes the true difference, after any number of pairs, is `alpha` at most.
+        The probability that the interval ever excludes the true difference, after any number of pairs, is at most
+        `alpha`.
         """
         if not self.pairs:
             return None
         return Interval(-self._upper_end(-1, alpha), self._upper_end(1, alpha))
 
     def excludes(self, difference: float, alpha: float = 0.05) -> bool:
-        """Return whether the interval excludes a difference."""
+        """Return whether the interval excludes the given difference."""
         threshold = -math.log(alpha)
         return max(self._log_evidence_below(sign * difference, sign) for sign in (1, -1)) >= threshold
 
@@ -235,7 +237,7 @@ class PairTest:
         return self.pairs > 0 and all(self._log_evidence_below(margin, sign) >= threshold for sign in (1, -1))
 
     def _log_evidence_below(self, difference: float, sign: int) -> float:
-        """Return the logarithm of the evidence that sign * E[Z] is less than a difference."""
+        """Return the logarithm of the evidence that sign * E[Z] is less than the given difference."""
         values = sign * np.array(list(self._differences), float)
         times = np.array(list(self._differences.values()), float)
         stakes = _SHARES / (1 - difference)
@@ -258,16 +260,16 @@ class PairTest:
 
 
 class PairWatch:
-    """Watches two agents until one certainly crashes more often, or both about equally often.
+    """Watches two agents until one agent certainly crashes more often, or both certainly crash about equally often.
 
-    The pairs are looked at in order, one after the other. Once a pair decides, later pairs do not count. So any number
-    of workers gives the same verdict. The probability of each wrong verdict is `alpha` at most: better or worse where
-    both crash equally often, and no difference where there is one above the margin.
+    The pairs are evaluated in order, one after another. After a decision, later pairs do not count, so the verdict does
+    not depend on the number of workers. The probability of each wrong verdict is at most `alpha`: *better* or *worse*
+    if both agents crash equally often, and *no difference* if the difference is above the margin.
 
     Args:
-        margin: the greatest difference in crashes per trial that counts as none; 0 for no such verdict.
-        alpha: the probability of a wrong verdict, at most.
-        rounds: trials per pair.
+        margin: the greatest difference in crashes per trial that counts as no difference; 0 to disable this verdict.
+        alpha: maximum probability of a wrong verdict.
+        rounds: number of trials in each pair.
     """
 
     def __init__(self, margin: float, alpha: float = 0.05, rounds: int = 1) -> None:
@@ -276,11 +278,11 @@ class PairWatch:
         self.verdict: PairVerdict = "undecided"
 
     def add(self, pairs: Sequence[Pair] | Iterator[Pair], *, may_end: bool = True) -> None:
-        """Add pairs in their order, until one decides.
+        """Add pairs in their order until a pair decides.
 
         Args:
-            pairs: pairs in order.
-            may_end: whether better and no difference are verdicts yet; worse always is one.
+            pairs: the pairs, in the order of their numbers.
+            may_end: whether the verdicts *better* and *no difference* are allowed yet; *worse* is always allowed.
         """
         for pair in pairs:
             if self.verdict != "undecided":
@@ -289,7 +291,7 @@ class PairWatch:
             self.decide(may_end=may_end)
 
     def decide(self, *, may_end: bool = True) -> PairVerdict:
-        """Return the verdict on the pairs that were added; the first verdict stays."""
+        """Return the verdict on the pairs that were added; the first verdict is final."""
         test = self.test
         if self.verdict == "undecided" and test.log_evidence >= -math.log(self.alpha):
             is_worse = test.only_second > test.only_first

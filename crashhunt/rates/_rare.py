@@ -1,40 +1,45 @@
-"""The rare-event estimator: crash probability per trial from roots and their copies with forced first onsets.
+"""Estimator of rare crashes: the crash probability from root trials and forks with a forced first disturbance.
 
-Each root has a value: the weighted crashes of its copies, plus the probability of no onset where the root itself
-crashes. The values are independent, given the allocation, and unbiased (see `crashhunt.disturbances.FirstOnsets`). The
-estimate is their mean. Crashes that a disturbance had an effect on, and crashes without, are summed apart.
+A root is a trial from which copies are forked. In every copy, the first disturbance is forced to begin (its *onset*) at
+a drawn step. The value of a root is the sum of the weighted crashes of its copies. If the root itself crashes, the
+probability that no disturbance begins is added. The values are independent, given the allocation of copies, and
+unbiased (see `crashhunt.disturbances.FirstOnsets`). The estimate is the mean of the values. Crashes affected by a
+disturbance and other crashes are summed separately.
 
-Plain trials: after each root come four trials as ``run`` without ``--rare`` has them. They take about as many steps as
-the root and its copies. Which trial is a root follows from its number. Plain trials have two purposes. Of undisturbed
-crashes the copies know no more than the root, so the undisturbed part of a root is the mean over it and its plain
-trials. And they bound what no copy has met.
+Plain trials: each root is followed by four trials that are drawn as ``run`` without ``--rare`` draws them. Together
+they take about as many steps as the root and its copies. The number of a trial determines whether it is a root. Plain
+trials have two purposes. First, copies give no additional information on undisturbed crashes, so the undisturbed part
+of a root's value is the mean over the root and its plain trials. Second, plain trials bound the probability of crashes
+that no copy has met.
 
-Learning: the forcing of a block of 32 roots depends on the blocks before the previous one only. So it is the same
-whatever the number of workers, and no worker waits for the end of a block. The proposal is 10 % the law itself and
-90 % the law times the square root of the smoothed crash share of each cell. That minimizes the variance for
-independent copies of equal cost; the 10 % bound all weights.
+Learning: the forcing of a block of 32 roots depends only on the blocks before the previous block. The forcing is
+therefore independent of the number of workers, and no worker waits for the end of a block. The proposal distribution
+consists of two parts: 10 % is the law of the disturbances, and 90 % is this law times the square root of each cell's
+smoothed crash share. This proposal minimizes the variance for independent copies of equal cost; the 10 % bound all
+weights.
 
-The estimated interval joins two parts. Undisturbed crashes of roots and plain trials are counted, so their share has
+The estimated interval combines two parts. Undisturbed crashes of roots and plain trials are counted, so their share has
 Clopper and Pearson's interval, which is valid for any number of crashes. The part with weights has Student's t interval
-with Hall's correction for skewness. Few roots have large values, so without the correction the interval is too often
-too low. It is reported only where the data can carry it. The effective sample size and the number of roots with a crash
-are at least 20, and no root has more than 20 % of the sum. The distances of both intervals from their estimates add up
-as squares. No interval from weighted copies can exclude a failure mode that no copy has met. Nor does the estimated
-interval include undisturbed crashes before the first one is met.
+with Hall's correction for skewness. Few roots have large values, so without the correction the interval would too often
+be too low. It is reported only under two conditions. The effective sample size and the number of roots with a crash are
+at least 20, and no root contributes more than 20 % of the sum. The distances of both intervals from their estimates are
+added as squares. No interval from weighted copies can exclude a failure mode that no copy has met. The estimated
+interval does not include undisturbed crashes before the first one occurs.
 
-The certain interval is for that: it is the one of `crashhunt.rates._certain_interval`, so it is valid at any number of
-roots. A plain trial is a unit with 0 or 1 crashes and exposure 1. A root is a unit with the value V, which is at most
-B. Its forcing fixes B before the root begins. So V / B counts as events and 1 / B as exposure. Their ratio of means is
-the rate. A root without a crash counts as 1 / B of a trial. The lower end has a second source: the copies alone. Their
-bound is that of their weights, so it is far below 1 for rare onsets. The crash probability by copies is a part of the
-whole, so a lower bound of it is one of the whole. Both intervals together have the confidence, by Bonferroni's
-inequality. The first has three quarters of the risk, the second a quarter.
+The certain interval covers such failure modes as well. It is the interval of `crashhunt.rates._certain_interval`, so it
+is valid at any number of roots. A plain trial is a unit with 0 or 1 crashes and exposure 1. A root is a unit with the
+value V, which is at most B. The forcing fixes B before the root begins. V / B therefore counts as events and 1 / B as
+exposure, and the ratio of their means is the rate. A root without a crash counts as 1 / B of a trial. The lower end has
+a second source, the copies alone. The value of the copies is bounded by their weights, so the bound is far below 1 if
+disturbances are rare. The crash probability in the copies is a part of the whole crash probability, so its lower bound
+is also a lower bound of the whole. By Bonferroni's inequality, both intervals together have the given confidence. The
+first interval has three quarters of the error probability, the second a quarter.
 
-Source: Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 to 9; Kish, Survey sampling, 1965, for the
+Sources: Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 to 9; Kish, Survey sampling, 1965, for the
 effective sample size; P. Hall, On the removal of skewness by transformation, JRSS B 54(1), 1992; C. J. Clopper and
 E. S. Pearson, Biometrika 26(4), 1934; G. Y. Zou and A. Donner, Construction of confidence limits about effect measures,
 Statistics in Medicine 27(10), 2008, for the sum of two parts.
-Cost: constant for a root; the certain interval takes milliseconds for each hundred roots with different values.
+Cost: constant for each root. The certain interval takes milliseconds for each hundred roots with different values.
 """
 
 from __future__ import annotations
@@ -86,24 +91,24 @@ MAX_EXCLUDED: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Root:
-    """The estimates from one root, which is a plain trial from which copies were forked.
+    """The estimates from one root: a plain trial from which copies were forked.
 
     Args:
-        undisturbed: its estimate of the probability of a crash that no disturbance had an effect on.
-        disturbed: the same for the other crashes.
-        counted: the part of ``undisturbed`` that is a share of trials, without copies.
-        own: the part of their sum that is not of copies, from 0 to 1.
-        by: by cell, the part of ``disturbed`` that is of copies.
-        steps: simulated for it, those of copies included.
-        own_steps: its own steps.
-        bound: the largest possible part of copies, known before the root begins.
+        undisturbed: estimate of the probability of a crash on which no disturbance had an effect.
+        disturbed: estimate of the probability of all other crashes.
+        counted: the part of ``undisturbed`` that is a share of trials and contains no copies.
+        own: the part of the sum of both estimates that comes from the root itself, from 0 to 1.
+        by: the part of ``disturbed`` that comes from copies, by cell.
+        steps: number of simulated steps of the root and its copies.
+        own_steps: number of simulated steps of the root itself.
+        bound: upper bound of the part that comes from copies, known before the root begins.
         crashed: whether the root itself crashed undisturbed.
-        copies: the part of copies, from 0 to `bound`.
-        plain: valid plain trials after it.
-        invalid: invalid ones, which do not count.
-        plain_crashes: how many of them crashed.
-        plain_undisturbed: how many of these crashed undisturbed.
-        plain_steps: simulated for them.
+        copies: the part of the estimates that comes from copies, from 0 to `bound`.
+        plain: number of valid plain trials after the root.
+        invalid: number of invalid plain trials after the root, which do not count.
+        plain_crashes: number of these plain trials that crashed.
+        plain_undisturbed: number of these plain trials that crashed undisturbed.
+        plain_steps: number of simulated steps of these plain trials.
     """
 
     undisturbed: float
@@ -124,20 +129,20 @@ class Root:
 
     @property
     def value(self) -> float:
-        """The estimate of the crash probability."""
+        """The root's estimate of the crash probability."""
         return self.undisturbed + self.disturbed
 
 
 @dataclass(frozen=True, slots=True)
 class Estimated:
-    """An estimated interval, and what it rests on.
+    """An estimated interval, and the figures that show its reliability.
 
     Args:
         low: lower end of the interval.
         high: upper end of the interval.
-        effective: effective sample size of the part with weights, in roots.
-        largest_share: share of the root with the greatest value in the sum of that part, 0 to 1.
-        roots_with_crash: how many roots have a value above 0 in that part.
+        effective: effective sample size of the part with weights, as a number of roots.
+        largest_share: share of the root with the greatest value in the sum of this part, 0 to 1.
+        roots_with_crash: number of roots with a value above 0 in this part.
     """
 
     low: float
@@ -149,28 +154,29 @@ class Estimated:
 
 @dataclass(frozen=True, slots=True)
 class RareEstimate:
-    """The crash probability per trial, estimated from roots.
+    """The crash probability per trial, estimated from roots and their copies.
 
     Args:
-        roots: how many.
-        estimate: crash probability per trial; None if there is no root.
-        undisturbed: the part of crashes that no disturbance had an effect on.
-        disturbed: the other part.
-        estimated: interval for ``estimate``; None if the roots cannot carry one.
-        estimated_disturbed: the same for ``disturbed``.
-        why_not: why there is no interval for ``estimate``; empty if there is.
-        why_not_disturbed: the same for ``disturbed``.
-        more_roots: how many more roots are probably needed for ``estimated``; None if that cannot be predicted.
-        certain: bounds that hold whatever the roots have not met; None if they were not asked for.
-        excluded: how many roots have no complete result.
-        parts: parts by cell, the part of ``disturbed`` whose first onset is of that cell.
-        undisturbed_crashes: how many roots and plain trials crashed undisturbed.
-        plain: how many plain trials count.
-        plain_crashes: how many of them crashed.
-        steps: how many were simulated.
-        plain_steps: how many of them for plain trials.
-        plain_equivalent_steps: how many steps plain trials would take to the same standard error; None without one.
-        relative_error: half the width of ``estimated`` over the estimate; infinite if there is none.
+        roots: number of roots.
+        estimate: estimated crash probability per trial; None if there is no root.
+        undisturbed: the part of the estimate from crashes on which no disturbance had an effect.
+        disturbed: the part of the estimate from all other crashes.
+        estimated: interval of ``estimate``; None if the roots do not allow an interval.
+        estimated_disturbed: interval of ``disturbed``; None if the roots do not allow an interval.
+        why_not: reason why ``estimate`` has no interval; empty if it has an interval.
+        why_not_disturbed: reason why ``disturbed`` has no interval; empty if it has an interval.
+        more_roots: number of further roots that ``estimated`` probably needs; None if that cannot be predicted.
+        certain: interval that is valid even for crashes that no copy has met; None if it was not requested.
+        excluded: number of roots without a complete result.
+        parts: the part of ``disturbed`` for each cell, to which the first disturbance belongs.
+        undisturbed_crashes: number of roots and plain trials that crashed undisturbed.
+        plain: number of plain trials that count.
+        plain_crashes: number of plain trials that crashed.
+        steps: number of simulated steps.
+        plain_steps: number of simulated steps of plain trials.
+        plain_equivalent_steps: number of steps that plain trials would need for the same standard error; None if there
+            is no standard error.
+        relative_error: half the width of ``estimated``, divided by the estimate; infinite if there is no interval.
     """
 
     roots: int
@@ -195,13 +201,13 @@ class RareEstimate:
 
     @property
     def relative_error(self) -> float:
-        """Half the width of the estimated interval over the estimate; infinite without an interval."""
+        """Half the width of the estimated interval, divided by the estimate; infinite without an interval."""
         if self.estimated is None or not self.estimate:
             return math.inf
         return (self.estimated.high - self.estimated.low) / 2 / self.estimate
 
     def to_json(self) -> JsonObject:
-        """Return plain data without NaN."""
+        """Return the estimate as JSON-compatible data without NaN."""
         shared = {key: value for key, value in self.running().items() if key not in _RUNNING_KEYS}
         return {
             **shared,
@@ -223,7 +229,7 @@ class RareEstimate:
         }
 
     def running(self) -> RunningRate:
-        """Return what ``status`` reports of it."""
+        """Return the rate in the form that ``status`` reports."""
         one = self.estimated
         return {
             "method": "rare",
@@ -255,16 +261,16 @@ def _plain(one: Estimated | None) -> JsonObject | None:
 
 
 def is_root(number: int) -> bool:
-    """Whether a trial in rare mode is a root; the others are plain trials."""
+    """Return whether a trial in rare mode is a root; all other trials are plain trials."""
     return number % TRIALS_PER_ROOT == 0
 
 
 def with_plain(root: Root, trials: Iterable[TrialResult], crash_on: Sequence[Outcome]) -> Root:
-    """Return a root with the plain trials after it.
+    """Return a root, combined with the plain trials that follow it.
 
     Args:
-        root: as it is alone.
-        trials: the plain trials; invalid ones do not count.
+        root: the root without its plain trials.
+        trials: the plain trials after the root; invalid trials do not count.
         crash_on: the outcomes that count as a crash.
     """
     trials = list(trials)
@@ -284,12 +290,12 @@ def with_plain(root: Root, trials: Iterable[TrialResult], crash_on: Sequence[Out
 
 
 def root_of(result: TrialResult, crash_on: Sequence[Outcome], hazard: float) -> Root | None:
-    """Return the value of a root; None if it has no complete result.
+    """Return the estimates from a root; None if the root has no complete result.
 
     Args:
-        result: result of the root.
+        result: result of the root's trial.
         crash_on: the outcomes that count as a crash.
-        hazard: sum of the chances per step of all models around all agents.
+        hazard: sum of the start probabilities of disturbances per step, over all models and agents.
     """
     forced = result.forced
     if forced is None or forced.unanswered or result.outcome is Outcome.INVALID or result.spec.forcing is None:
@@ -321,11 +327,12 @@ def root_of(result: TrialResult, crash_on: Sequence[Outcome], hazard: float) -> 
 
 
 def _bound(forcing: Forcing, hazard: float) -> float:
-    """Return the largest sum of the weights of copies.
+    """Return an upper bound of the sum of the weights of a root's copies.
 
     Args:
-        forcing: forcing of the root.
-        hazard: sum of all chances of a trial, which bounds the probability of an onset from above.
+        forcing: forcing of the root's disturbances.
+        hazard: sum of all start probabilities in a trial, an upper bound of the probability that any disturbance
+            begins.
     """
     ratios = (1.0, *forcing.ratios.values())
     most_proposed = min(1.0, hazard) * max(ratios)
@@ -335,11 +342,11 @@ def _bound(forcing: Forcing, hazard: float) -> float:
 
 
 def learn_forcing(earlier: Iterable[Forced], start: Forcing) -> Forcing:
-    """Return the forcing that earlier roots suggest.
+    """Return the forcing of disturbances that minimizes the variance according to earlier roots.
 
     Args:
-        earlier: what came of the copies of earlier roots.
-        start: the forcing of the first roots, where earlier ones say nothing.
+        earlier: results of the copies of earlier roots.
+        start: the forcing of the first roots, used as long as earlier roots have no crashes.
     """
     learned = _Learned()
     roots = 0
@@ -366,13 +373,13 @@ def learn_forcing(earlier: Iterable[Forced], start: Forcing) -> Forcing:
 
 
 class _Learned:
-    """What the copies of earlier roots suggest, by the cell of their first onset.
+    """The statistics of the copies of earlier roots, by the cell of their first disturbance.
 
     Attributes:
-        masses: probability of the first onset, summed over roots.
-        copies: number of copies of roots.
-        squares: sum of the squares of their values. A value estimates the crash probability given the first onset, from
-            one copy and the copies of it.
+        masses: probability of the first disturbance, summed over roots.
+        copies: number of copies of these roots.
+        squares: sum of the squared values of copies. A value estimates the crash probability, given the first
+            disturbance, from one copy and the copies forked from it.
     """
 
     def __init__(self) -> None:
@@ -388,7 +395,7 @@ class _Learned:
         self._mass = 0.0
 
     def add(self, one: Forced) -> None:
-        """Count the copies of a root."""
+        """Add the copies of a root to the statistics."""
         self.masses.update(one.masses)
         for first, *seconds in one.by_first_onset():
             cell, alone = first.cell, first.within if first.crash else 0.0
@@ -404,14 +411,14 @@ class _Learned:
 
     @property
     def second_mass(self) -> float:
-        """Mean probability of a second onset after a first one; 0 if no second onset was forced."""
+        """Return the mean probability that a second disturbance begins after the first; 0 if none was forced."""
         return self._mass / self._forced.total() if self._forced else 0.0
 
     def cells_with_seconds(self) -> tuple[str, ...]:
-        """Return the cells on whose copies second onsets are to be forced.
+        """Return the cells whose copies get further copies with a forced second disturbance.
 
-        The other cells together have few crashes after a second onset, even if one more than was met is counted for
-        each cell. While no copy has crashed, these are all cells that are known.
+        The other cells together have few crashes after a second disturbance, even if one additional crash is counted
+        for each cell. As long as no copy has crashed, all known cells are returned.
         """
         total = math.fsum(self.masses[cell] * self._values[cell] / count for cell, count in self.copies.items())
         after = {
@@ -431,7 +438,7 @@ class RareCounter:
     """Counts roots with their plain trials, and returns the estimate at any time.
 
     Args:
-        least_bound: lower limit of all `Root.bound`, fixed before the first root; None for no certain interval.
+        least_bound: lower limit of every `Root.bound`, fixed before the first root; None for no certain interval.
         confidence: confidence of all intervals, in (0, 1).
     """
 
@@ -449,13 +456,13 @@ class RareCounter:
             self._tests = RateTest(), RateTest(Bets(1.0, 1.0 / least_bound, fixed_exposure=False))
 
     def add(self, root: Root | None, plain: Iterable[bool] = (), invalid: int = 0) -> None:
-        """Add a root.
+        """Add the estimates from a root.
 
         Args:
-            root: root with its plain trials; None if it has no complete result.
-            plain: of a root without a complete result, which of its valid plain trials crashed: they count for
+            root: root with its plain trials; None if the root has no complete result.
+            plain: for a root without a complete result, whether each valid plain trial after it crashed; they count for
                 the certain interval.
-            invalid: of a root without a complete result, how many of its plain trials are invalid.
+            invalid: for a root without a complete result, number of invalid plain trials after it.
         """
         if root is None:
             self.excluded += 1
@@ -486,11 +493,11 @@ class RareCounter:
         self._add_plain([True] * root.plain_crashes + [False] * (root.plain - root.plain_crashes))
 
     def add_plain(self, crashed: Iterable[bool], invalid: int = 0) -> None:
-        """Add plain trials that belong to no root that counts: they count for the certain interval.
+        """Add plain trials that follow no valid root; they count for the certain interval.
 
         Args:
-            crashed: of the valid ones, which crashed.
-            invalid: number of the others.
+            crashed: whether each valid plain trial crashed.
+            invalid: number of invalid plain trials.
         """
         self._counts["invalid"] += invalid
         self._add_plain(list(crashed))
@@ -502,7 +509,7 @@ class RareCounter:
                 self._tests[0].add(float(one))
 
     def certain(self) -> tuple[float, float] | None:
-        """Return bounds that are valid at any time; None if they were not requested, or if no trial counts."""
+        """Return an interval that is valid at any time; None if it was not requested, or if no trial counts."""
         if self._tests is None or not self._tests[0].count:
             return None
         alpha = 1.0 - self.confidence
@@ -580,8 +587,8 @@ def rare_estimate(
 
     Args:
         roots: roots with a complete result, in the order of their numbers.
-        least_bound: lower limit of all `Root.bound`, fixed before the first root; None for no certain interval.
-        excluded: how many roots have none.
+        least_bound: lower limit of every `Root.bound`, fixed before the first root; None for no certain interval.
+        excluded: number of roots without a complete result.
         confidence: confidence of all intervals, in (0, 1).
     """
     counter = RareCounter(least_bound, confidence)
@@ -593,14 +600,14 @@ def rare_estimate(
 
 
 class _Sums:
-    """Sums over the values of roots."""
+    """Sums over the values of roots, for mean, standard error and skewness."""
 
     def __init__(self) -> None:
         self.total = self.squares = self.cubes = self.greatest = 0.0
         self.positive = 0
 
     def add(self, value: float) -> None:
-        """Add the value of a root."""
+        """Add the value of a root to the sums."""
         self.total += value
         self.squares += value * value
         self.cubes += value**3
@@ -608,11 +615,11 @@ class _Sums:
         self.positive += value > 0
 
     def standard_error(self, count: int) -> float:
-        """Return the standard error of the mean of so many roots."""
+        """Return the standard error of the mean value of a number of roots."""
         return math.sqrt(max(0.0, self.squares - self.total**2 / count) / (count - 1) / count)
 
     def skewness(self, count: int) -> float:
-        """Return the skewness of the values of so many roots; 0 if all are equal."""
+        """Return the skewness of the values of a number of roots; 0 if all values are equal."""
         mean = self.total / count
         variance = self.squares / count - mean**2
         if variance <= 1e-12 * mean**2:  # rounding
@@ -621,7 +628,7 @@ class _Sums:
         return third / (variance * math.sqrt(variance))
 
     def interval(self, count: int, confidence: float) -> tuple[Estimated | None, str, int | None]:
-        """Return the estimated interval, or None with the reason and how many more roots are probably needed."""
+        """Return the estimated interval, or None with the reason and the number of roots that are probably missing."""
         if not count:
             return None, "no root has ended", None
         if self.total <= 0.0:
@@ -668,7 +675,7 @@ def _clopper_pearson(events: float, trials: int, confidence: float) -> tuple[flo
 
 
 def _unskewed(quantile: float, skewness: float, count: int) -> float:
-    """Return the value of Student's statistic at which Hall's transformation of it is a quantile."""
+    """Return the value of Student's statistic whose Hall transformation is the given quantile."""
     if abs(skewness) < 1e-6:
         return quantile
     scale = skewness / math.sqrt(count)

@@ -1,4 +1,4 @@
-"""A rate as commands report it: an estimate where there is one, a certain interval, and why something is missing."""
+"""A rate as commands report it: an estimate if available, a certain interval, and reasons for missing numbers."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _MIN_CONFIDENCE, _MAX_CONFIDENCE = 50.0, 99.9999  # percent; above that, six dig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RatePart:
-    """The rate of some of the crashes, or in some of the trials.
+    """The rate of a part of the crashes, or in a part of the trials.
 
     Args:
-        by: what divides the parts: ``kind``, ``fault``, ``disturbance`` or an argument.
+        by: the property that divides the parts: ``kind``, ``fault``, ``disturbance`` or an argument.
         name: name of the part.
-        trials: valid trials in it.
-        crashes: crashes of them.
-        estimate: crashes by exposure; None if the number of trials was not fixed ahead.
-        certain: interval, at the confidence of all parts together; None if there is none.
+        trials: number of valid trials in the part.
+        crashes: number of crashes in the part.
+        estimate: crashes divided by exposure; None if the number of trials was not fixed in advance.
+        certain: interval that is valid at any time, at the confidence of all parts together; None if there is none.
     """
 
     by: str
@@ -41,7 +41,7 @@ class RatePart:
     certain: Interval | None
 
     def to_json(self) -> JsonObject:
-        """Return plain data."""
+        """Return the part as JSON-compatible data."""
         return {
             "by": self.by, "name": self.name, "trials": self.trials, "crashes": self.crashes,
             "estimate": self.estimate, "certain": _plain(self.certain),
@@ -50,27 +50,27 @@ class RatePart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CrashRate:
-    """How often the agents of a hunt crash.
+    """The crash rate of the agents of a hunt.
 
     Args:
         dir: directory of the hunt.
-        per: what the rate is per.
+        per: the unit of exposure to which the rate refers, such as a trial or a kilometre.
         confidence: confidence of the certain interval, in percent.
-        method: ``plain``, counted trials; or ``rare``, copies with forced onsets.
-        units: independent units that count: trials, or traffics.
-        crashes: crashes in them.
-        trials: valid trials in them.
-        driven_s: time that the agents drove in them, in s.
-        driven_m: distance, in m.
-        estimate: crashes by exposure; None if the number of trials was not fixed ahead.
-        certain: interval that is valid whenever you look; None if there is none.
-        why_not: why there is no interval, or no estimate; empty if there are both.
-        excluded: reason to number of trials that do not count.
-        parts: parts of the rate, by disturbance and by what was asked for.
-        steps: that the trials took.
-        bar: rate that it was compared with; None for none.
-        verdict: ``below``, ``above`` or ``undecided``; empty without a bar.
-        why_undecided: why more trials do not help to compare it; empty if they do, or it is decided.
+        method: ``plain`` for counted trials, or ``rare`` for forks with forced disturbances.
+        units: number of independent units that count: trials or traffic seeds.
+        crashes: number of crashes in these units.
+        trials: number of valid trials in these units.
+        driven_s: time that the agents drove in these trials, in s.
+        driven_m: distance that the agents drove in these trials, in m.
+        estimate: crashes divided by exposure; None if the number of trials was not fixed in advance.
+        certain: interval that is valid whenever the user looks at it; None if there is none.
+        why_not: reason why the interval or the estimate is missing; empty if both are given.
+        excluded: number of trials that do not count, by reason.
+        parts: parts of the rate, by disturbance and by the property that the user chose.
+        steps: number of simulated steps of the trials.
+        bar: threshold with which the rate is compared; None for no threshold.
+        verdict: ``below``, ``above`` or ``undecided``; empty if there is no threshold.
+        why_undecided: reason why more trials cannot decide the comparison; empty if they can, or if it is decided.
     """
 
     dir: str
@@ -93,7 +93,7 @@ class CrashRate:
     why_undecided: str = ""
 
     def to_json(self) -> JsonObject:
-        """Return an entry of what ``rate --json`` prints; what is no finite number is null."""
+        """Return an entry of the output of ``rate --json``; values that are not finite numbers are null."""
         found: JsonObject = {
             "dir": self.dir,
             "per": self.per,
@@ -121,10 +121,10 @@ class CrashRate:
 
 
 def check_confidence(percent: float) -> None:
-    """Refuse a confidence, in percent, that no interval or verdict can have.
+    """Refuse a confidence, in percent, that is out of range for intervals and verdicts.
 
     Raises:
-        UsageError: it is out of range.
+        UsageError: the confidence is out of range.
     """
     if not _MIN_CONFIDENCE <= percent <= _MAX_CONFIDENCE:
         fix = f"give percent from {_MIN_CONFIDENCE:g} to {_MAX_CONFIDENCE:g}, such as 95"
@@ -143,18 +143,19 @@ def make_rate(
     parts: tuple[RatePart, ...] = (),
     bar: float | None = None,
 ) -> CrashRate:
-    """Return the rate of counted units.
+    """Return the crash rate from counted units.
 
     Args:
         directory: directory of the hunt.
-        per: what the rate is per.
+        per: the unit of exposure to which the rate refers.
         counter: counter of all units.
-        sequence: that the units came from.
+        sequence: sequence that yielded the units.
         confidence: confidence of the interval, in percent.
-        why_no_interval: reason against any interval, such as a sampler that learns; empty for none.
-        why_no_estimate: reason against an estimate; empty for none.
+        why_no_interval: reason why no interval is possible, such as a learning sampler; empty if an interval is
+            possible.
+        why_no_estimate: reason why no estimate is possible; empty if an estimate is possible.
         parts: parts of the rate.
-        bar: rate to compare with.
+        bar: threshold with which the rate is compared.
     """
     why_not = why_no_interval or counter.why_not
     if not why_not and not counter.units:

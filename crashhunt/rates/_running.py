@@ -1,7 +1,7 @@
-"""The rate of a running hunt: its certain interval after every trial, and the decision on a bar.
+"""The rate of a running hunt: its certain interval after every trial, and the decision about a threshold.
 
-Cost: constant for each trial. A new interval takes milliseconds, so it is made for people who watch only, in a small
-share of the time.
+Cost: constant for each trial. A new interval takes milliseconds, so it is computed only for display, and only in a
+small share of the time.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ T = TypeVar("T")
 
 
 class Paced(Generic[T]):
-    """Makes a value again once it is out of date, in a small share of the time.
+    """Caches a value that is expensive to compute, and computes it again only in a small share of the time.
 
     Args:
-        make: makes it.
+        make: function that computes the value.
     """
 
     def __init__(self, make: Callable[[], T]) -> None:
@@ -45,11 +45,11 @@ class Paced(Generic[T]):
         self._due = 0.0
 
     def __call__(self, version: int, *, now: bool = False) -> T:
-        """Return the value.
+        """Return the value, which may be out of date.
 
         Args:
-            version: version of what it is made from.
-            now: whether one that is out of date will not do.
+            version: version of the data from which the value is computed.
+            now: whether an outdated value is not sufficient.
         """
         began = time.monotonic()
         if self._made is not None and (self._made[0] == version or (began < self._due and not now)):
@@ -65,10 +65,10 @@ class RateWatch:
     """Counts the trials of a running hunt, and returns the certain interval at any time.
 
     Args:
-        rule: how trials count.
-        per: what the rate is per.
+        rule: rule by which trials count.
+        per: the unit of exposure to which the rate refers.
         crash_on: the outcomes that count as a crash.
-        alpha: the probability that the interval ever excludes the rate, at most.
+        alpha: maximum probability that the interval ever excludes the rate.
     """
 
     def __init__(self, rule: CountingRule, per: Per, crash_on: Sequence[str], alpha: float = 0.05) -> None:
@@ -78,12 +78,12 @@ class RateWatch:
         self._paced: Paced[RunningRate] = Paced(self._running)
 
     def add(self, result: TrialResult | Mapping[str, Any]) -> None:
-        """Add a trial that has ended, in any order, as a result or as a ledger has it."""
+        """Add a finished trial, in any order, as a result or as data from a ledger."""
         make = facts_of_plain if isinstance(result, dict) else facts_of
         self.add_facts(make(result, self._crash_on))  # type: ignore[arg-type]
 
     def add_facts(self, trial: TrialFacts) -> None:
-        """Add a trial that has ended."""
+        """Add the facts of a finished trial."""
         for unit in self.sequence.add(trial):
             self._count(unit)
 
@@ -92,14 +92,15 @@ class RateWatch:
         return self.counter.add(unit)
 
     def interval(self) -> Interval | None:
-        """Return the certain interval; None if there is no unit, or an exposure is not known."""
+        """Return the certain interval; None if there is no unit, or if an exposure is unknown."""
         return self.counter.interval(self.alpha)
 
     def running(self, *, now: bool = False) -> RunningRate:
-        """Return the rate so far.
+        """Return the current rate of the hunt.
 
         Args:
-            now: whether that of some moments ago will not do, where a new one takes too much of the time.
+            now: whether the rate must be up to date; otherwise a rate some moments old is returned if a new one takes
+                too long.
         """
         sequence = self.sequence
         version = sequence.valid + sequence.invalid + sequence.not_random + sequence.trained_on
@@ -133,20 +134,21 @@ class RateWatch:
 
 
 class BarWatch(RateWatch):
-    """Watches a hunt until its rate is certainly below or above a bar, or until more trials are of no use.
+    """Watches a hunt until its rate is certainly below or above a threshold, or until more trials are of no use.
 
-    The evidence against the bar is updated with each unit, at constant cost. Once it decides, later units do not count.
-    So any number of workers gives the same decision, the same interval and the same estimate.
+    The evidence against the threshold is updated after each unit, at constant cost. After a decision, later units do
+    not count. Decision, interval and estimate therefore do not depend on the number of workers.
 
-    The watch ends undecided where the rate certainly is within 20 % of the bar: a rate that equals the bar would never
-    be decided. It ends so too where too many trials are invalid, or where trials have no exposure.
+    The watch ends undecided if the rate is certainly within 20 % of the threshold, because a rate equal to the
+    threshold would never be decided. It also ends undecided if too many trials are invalid, or if trials have no
+    exposure.
 
     Args:
-        rule: how trials count.
-        bar: the rate.
-        per: what it is per.
+        rule: rule by which trials count.
+        bar: threshold with which the rate is compared.
+        per: the unit of exposure to which the threshold refers.
         crash_on: the outcomes that count as a crash.
-        alpha: the probability of a wrong decision, at most.
+        alpha: maximum probability of a wrong decision.
     """
 
     def __init__(self, rule: CountingRule, bar: float, per: Per, crash_on: Sequence[str], alpha: float = 0.05) -> None:
@@ -161,7 +163,7 @@ class BarWatch(RateWatch):
         self.decided_at: int | None = None
 
     def add_facts(self, trial: TrialFacts) -> None:
-        """Add a trial that has ended."""
+        """Add the facts of a finished trial."""
         if self.decided_at is not None:
             return
         for unit in self.sequence.add(trial):
@@ -195,7 +197,7 @@ class BarWatch(RateWatch):
         return found
 
     def _factors(self, found: tuple[float, float], test: RateTest) -> list[Any]:
-        """Return the logarithms by which a unit multiplies the capitals, for the bar and its two ends."""
+        """Return the logarithms by which a unit multiplies the capitals, for the threshold and its two bounds."""
         import numpy as np
 
         factors = self._log_factors.get(found)
@@ -217,7 +219,7 @@ class BarWatch(RateWatch):
         return self._rejects(1, test) and (is_below or self._rejects(2, test))
 
     def noted(self) -> UntilRate:
-        """Return what the ledger says of it."""
+        """Return the facts that the ledger records about the comparison."""
         return {"bar": f"{self.bar!r}/{self.per}", "decided_at": self.decided_at, "verdict": self.verdict}
 
     def _running(self) -> RunningRate:

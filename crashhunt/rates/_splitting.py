@@ -1,14 +1,15 @@
-"""Splitting: levels that pilots suggest, the test of these levels, and the value of a tree.
+"""Splitting: levels suggested by pilot trials, a test of these levels, and the value of a tree of copies.
 
-The first `PILOT_ROOTS` roots have no copies. The greatest measure of each shows how rarely a level is reached, and the
-levels are quantiles of these. The next `PILOT_ROOTS` roots are trees with these levels. The hunt ends there unless each
-level at least doubles the crash probability: otherwise copies from a level say no more than plain trials. Neither
-counts for the estimate, so the levels are fixed before the first tree that counts, and there is no bias.
+The first `PILOT_ROOTS` roots have no copies. The greatest measure of each such pilot shows how rarely a level is
+reached. The levels are quantiles of these greatest measures. The next `PILOT_ROOTS` roots are trees with these levels.
+The hunt ends after these trees unless each level at least doubles the crash probability. Otherwise, copies from a level
+give no more information than plain trials. Pilots and test trees do not count for the estimate. The levels are
+therefore fixed before the first tree that counts, and the estimate has no bias.
 
-The value of a tree is the weight of its paths that crash. It is at most 1, so a tree is a unit of the certain interval
-like a plain trial, with a fractional number of crashes.
+The value of a tree is the weight of its paths that crash, which is at most 1. A tree is therefore a unit of the certain
+interval like a plain trial, with a fractional number of crashes.
 
-Source: as `crashhunt.episode._splitting`. Cost: constant for a path.
+Source: that of `crashhunt.episode._splitting`. Cost: constant for a path.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ MIN_FACTOR: Final = 2.0
 
 
 def choose_levels(peaks: Sequence[float]) -> tuple[float, ...]:
-    """Return levels of which each is reached by a third of the pilots that reach the one before.
+    """Return the levels; each is reached by a third of the pilot trials that reach the level before it.
 
     Args:
-        peaks: the greatest measure of each pilot, in 1/s; levels are above 0.
+        peaks: the greatest measure of each pilot trial, in 1/s; levels are above 0.
     """
     ordered = sorted((min(peak, _MAX_LEVEL_PER_S) for peak in peaks), reverse=True)
     places = [len(ordered) // COPIES_PER_LEVEL**number for number in range(1, _MAX_LEVELS + 1)]
@@ -48,10 +49,10 @@ def choose_levels(peaks: Sequence[float]) -> tuple[float, ...]:
 
 
 def tree_of(result: TrialResult, crash_on: Sequence[Outcome]) -> Root | None:
-    """Return the value of a tree; None if it has no complete result.
+    """Return the value of a tree of copies; None if the tree has no complete result.
 
     Args:
-        result: result of the root.
+        result: result of the tree's root trial.
         crash_on: the outcomes that count as a crash.
     """
     forced = result.forced
@@ -73,10 +74,10 @@ def tree_of(result: TrialResult, crash_on: Sequence[Outcome]) -> Root | None:
 
 
 def crash_shares(trees: Iterable[tuple[Forced, bool]], levels: int) -> list[float]:
-    """Return the crash probability of all paths, and of those that reach each level; NaN if none does.
+    """Return the crash probability of all paths, and of the paths that reach each level; NaN if no path does.
 
     Args:
-        trees: results of trees, each with whether the root itself crashed.
+        trees: results of trees, each with whether the root trial itself crashed.
         levels: number of levels.
     """
     paths = [
@@ -95,7 +96,7 @@ def crash_shares(trees: Iterable[tuple[Forced, bool]], levels: int) -> list[floa
 
 
 def why_unfit(shares: Sequence[float]) -> str:
-    """Return why levels are of no use, from the crash probabilities of `crash_shares`; empty if they are of use."""
+    """Return the reason why levels are of no use, given the result of `crash_shares`; empty if they are of use."""
     if len(shares) < 2:
         return f"in {PILOT_ROOTS} pilot roots, no agent came closer to a vehicle ahead"
     if not shares[0]:

@@ -1,15 +1,17 @@
-"""What counts as a unit of a hunt, in which order, and how much exposure it has.
+"""The units of a hunt that count for a rate, their order, and their exposure.
 
-A unit is a trial, or with ``--seeds`` a traffic with all its trials, because trials of one traffic are not independent.
+A unit is a trial, or with ``--seeds`` all trials of a traffic seed, because trials in the same traffic are not
+independent.
 
 Invariant: units count in the order of their numbers, up to the first trial that has not ended. Trials that crash early
-end early, so the trials that happen to have ended are not a fair sample. The first k trials are. So the interval stays
-valid where a hunt stopped at its first crash, was killed, ran out of time, or used many workers.
+end early, so the finished trials are not a fair sample, but the first k trials are. The interval therefore stays valid
+if a hunt stopped at its first crash, was killed, ran out of time, or used many workers.
 
-Invalid trials leave both sides of the rate. More than 5 % of them make the rate one of other traffic than described, so
-no rate is reported. A trial whose process was killed from outside has not ended: a resumed hunt runs it again.
+Invalid trials count neither as crashes nor as exposure. If more than 5 % of the trials are invalid, the rate would
+refer to other traffic than described, so no rate is reported. A trial whose process was killed from outside has not
+ended: a resumed hunt runs it again.
 
-Cost: constant for each trial; trials wait in memory only until those of lower numbers have ended.
+Cost: constant for each trial. A trial stays in memory only until all trials of lower numbers have ended.
 """
 
 from __future__ import annotations
@@ -54,20 +56,21 @@ _SPARE_STEPS = 1  # of the bound: exposures are rounded
 
 
 class TrialFacts(NamedTuple):
-    """What a rate needs to know of a trial.
+    """The facts about a trial that a rate needs.
 
     Args:
-        number: its place in the hunt.
-        has_ended: False if its process was killed from outside, so that a resumed hunt runs it again.
-        valid: whether it could be set up.
-        crashed: whether it ended with an outcome that the hunt counts as a crash.
-        steps: how many it took.
-        driven_s: time that the agents drove, in s; None if it is not known.
-        driven_m: distance, in m; None if it is not known.
-        step_length_s: step length of the simulator; None if it is not known.
-        origin: the strategy that proposed it; empty for none.
-        tags: what it belongs to, such as the bin of an argument; for parts of a rate.
-        seed: seed of its traffic.
+        number: number of the trial in the hunt.
+        has_ended: whether the trial has ended; False if its process was killed from outside, so that a resumed hunt
+            runs the trial again.
+        valid: whether the trial could be set up.
+        crashed: whether the trial ended with an outcome that the hunt counts as a crash.
+        steps: number of steps of the trial.
+        driven_s: time that the agents drove, in s; None if it is unknown.
+        driven_m: distance that the agents drove, in m; None if it is unknown.
+        step_length_s: step length of the simulator, in s; None if it is unknown.
+        origin: the strategy that proposed the trial; empty if there was none.
+        tags: the groups to which the trial belongs, such as the bin of an argument; used for parts of a rate.
+        seed: seed of the trial's traffic.
     """
 
     number: int
@@ -88,7 +91,7 @@ Unit: TypeAlias = tuple[TrialFacts, ...]
 
 
 def facts_of(result: TrialResult, crash_on: Sequence[str]) -> TrialFacts:
-    """Return what a rate needs to know of a result."""
+    """Return the facts about a trial that a rate needs, from its result."""
     return TrialFacts(
         number=result.spec.number,
         has_ended=not result.was_killed_from_outside,
@@ -104,7 +107,7 @@ def facts_of(result: TrialResult, crash_on: Sequence[str]) -> TrialFacts:
 
 
 def facts_of_plain(data: Mapping[str, Any], crash_on: Sequence[str], tags: tuple[str, ...] = ()) -> TrialFacts:
-    """Return the same of a trial as a ledger has it."""
+    """Return the facts about a trial that a rate needs, from its data in a ledger."""
     spec, failure = data["spec"], data.get("failure") or {}
     return TrialFacts(
         number=spec["number"],
@@ -123,15 +126,16 @@ def facts_of_plain(data: Mapping[str, Any], crash_on: Sequence[str], tags: tuple
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CountingRule:
-    """How trials count, fixed before the first of them.
+    """The rule by which trials count, fixed before the first trial.
 
     Args:
-        max_steps: the bound on each trial, in steps.
-        agents: how many controlled vehicles there are.
-        plain_origin: the origin of the trials that were drawn independently; empty if all were.
-        traffics: how many traffics the hunt has; 0 if each trial has its own.
-        planned: how many trials; 0 for no limit.
-        is_held_out: returns whether no agent was trained on the traffic of a seed; None if no agent was trained on any.
+        max_steps: maximum number of steps of a trial.
+        agents: number of controlled vehicles.
+        plain_origin: the origin of the trials that were drawn independently; empty if all trials were.
+        traffics: number of traffic seeds of the hunt; 0 if each trial has its own seed.
+        planned: planned number of trials; 0 for no limit.
+        is_held_out: function that returns whether no agent was trained on the traffic of a seed; None if no agent was
+            trained.
     """
 
     max_steps: int
@@ -143,11 +147,11 @@ class CountingRule:
 
     @property
     def trials_per_unit(self) -> int:
-        """How many trials a unit has: one, or as many as every traffic has."""
+        """The number of trials in a unit: one, or the number of trials of a traffic seed."""
         return self.planned // self.traffics if self.traffics else 1
 
     def bets(self, per: Per, step_length_s: float | None) -> Bets:
-        """Return the bets on units, with the greatest exposure that one can have."""
+        """Return the bets on units, with the maximum exposure of a unit."""
         most = self.trials_per_unit
         if per == "trial":
             return Bets(most, most)
@@ -157,10 +161,10 @@ class CountingRule:
 
 
 class UnitSequence:
-    """Puts trials that end in any order into units in the order of their numbers.
+    """Combines trials that end in any order to units in the order of their numbers.
 
     Args:
-        rule: how they count.
+        rule: rule by which trials count.
     """
 
     def __init__(self, rule: CountingRule) -> None:
@@ -172,7 +176,7 @@ class UnitSequence:
         self.hopeless_at: int | None = None  # the first trial with which too many are invalid, see has_too_many_invalid
 
     def add(self, trial: TrialFacts) -> Iterator[Unit]:
-        """Add a trial, and yield the units that are complete now."""
+        """Add a trial, and yield the units that are now complete."""
         if not trial.has_ended:
             return
         if self._rule.traffics:
@@ -185,11 +189,11 @@ class UnitSequence:
                 yield unit
 
     def add_counted(self, *, valid: int, invalid: int) -> None:
-        """Add the first trials of a hunt as counts, where each trial is a unit and has its own traffic.
+        """Add the first trials of a hunt as counts, if each trial is a unit with its own traffic.
 
         Args:
-            valid: how many ended and count.
-            invalid: how many ended and do not.
+            valid: number of trials that ended and count.
+            invalid: number of trials that ended and do not count.
         """
         self._next += valid + invalid
         self.valid += valid
@@ -206,7 +210,7 @@ class UnitSequence:
                 yield unit
 
     def _counted(self, trials: list[TrialFacts]) -> Unit:
-        """Return the trials that count."""
+        """Return those of the trials that count."""
         origin = self._rule.plain_origin
         plain = [trial for trial in trials if not origin or trial.origin == origin]
         self.not_random += len(trials) - len(plain)
@@ -223,17 +227,17 @@ class UnitSequence:
 
     @property
     def position(self) -> int:
-        """How many trials, or traffics, have ended in a row."""
+        """The number of trials, or traffic seeds, that ended before the first that has not."""
         return self._next
 
     @property
     def excluded(self) -> int:
-        """How many trials have ended, but a trial of a lower number has not."""
+        """The number of trials that have ended although a trial of a lower number has not."""
         return len(self._waiting) + sum(map(len, self._traffics.values()))
 
     @property
     def why_empty(self) -> str:
-        """Why no trial counts, for a sequence without a valid trial."""
+        """Return the reason why no trial counts, for a sequence without a valid trial."""
         if self.trained_on and not self.invalid:
             return (
                 f"an agent was trained on the traffic of all {self.trained_on} trials; run another --seed, or train "
@@ -243,15 +247,15 @@ class UnitSequence:
 
     @property
     def invalid_share(self) -> float:
-        """The share of invalid trials among those in the sequence."""
+        """The share of invalid trials among the trials of the sequence."""
         return self.invalid / (self.invalid + self.valid) if self.invalid else 0.0
 
 
 def has_too_many_invalid(invalid: int, valid: int) -> bool:
-    """Return whether the share of invalid trials is above `MAX_INVALID_SHARE`, and more trials will hardly change it.
+    """Return whether the share of invalid trials exceeds `MAX_INVALID_SHARE`, and more trials will hardly change this.
 
-    The share in all trials is certainly above 4 %. The probability that it ever seems so at a smaller share is 5 % at
-    most. So a hunt ends after some thousand trials at any share from 5 % on.
+    If so, the share among all trials is above 4 %, with an error probability of at most 5 %. A hunt with a share of 5 %
+    or more therefore ends after some thousand trials.
     """
     if invalid <= MAX_INVALID_SHARE * (invalid + valid):
         return False
@@ -262,13 +266,13 @@ def has_too_many_invalid(invalid: int, valid: int) -> bool:
 
 
 class RateCounter:
-    """Counts units for one measure of exposure, of all trials or of a part of them.
+    """Counts units for one measure of exposure, either of all trials or of a part of the trials.
 
     Args:
-        rule: how trials count.
-        per: what the rate is per.
-        within: whether a trial belongs to the part; all do where it is None.
-        matches: whether a crash belongs to the part; all do where it is None.
+        rule: rule by which trials count.
+        per: the unit of exposure to which the rate refers.
+        within: function that returns whether a trial belongs to the part; None for all trials.
+        matches: function that returns whether a crash belongs to the part; None for all crashes.
     """
 
     def __init__(
@@ -288,7 +292,7 @@ class RateCounter:
         self.why_not = ""
 
     def add(self, unit: Unit) -> tuple[float, float] | None:
-        """Add a unit; return its crashes and exposure, or None if it does not belong to the part."""
+        """Add a unit; return its crashes and its exposure, or None if it does not belong to the part."""
         trials = [trial for trial in unit if self._within(trial)] if self._within is not None else unit
         if not trials:
             return None
@@ -312,12 +316,12 @@ class RateCounter:
         return len(crashed), exposure
 
     def add_counted(self, *, trials: int, crashes: int, steps: int) -> None:
-        """Add trials as counts, for the rate per trial where each trial is a unit.
+        """Add trials as counts, for the rate per trial if each trial is a unit.
 
         Args:
-            trials: valid ones.
-            crashes: crashes of them.
-            steps: that they took.
+            trials: number of valid trials.
+            crashes: number of these trials that crashed.
+            steps: number of simulated steps of these trials.
         """
         self.units += trials
         self.trials += trials
@@ -339,10 +343,10 @@ class RateCounter:
         return driven / (_S_PER_HOUR if self._per == "hour" else _M_PER_1000KM)
 
     def interval(self, alpha: float) -> Interval | None:
-        """Return the certain interval; None if there is no unit, or an exposure is not known."""
+        """Return the certain interval; None if there is no unit, or if an exposure is unknown."""
         return None if self.test is None or self.why_not else self.test.interval(alpha)
 
     @property
     def observed(self) -> float | None:
-        """Crashes by exposure; None if that is not known."""
+        """Crashes divided by exposure; None if the exposure is unknown."""
         return None if self.test is None or self.why_not else self.test.observed
