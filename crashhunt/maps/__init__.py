@@ -1,7 +1,7 @@
-"""From a map to a scenario: a network for SUMO, traffic that flows on it, and the folder that a hunt takes.
+"""Conversion of a map to a scenario: a network for SUMO, traffic on this network, and the folder for a hunt.
 
 netconvert, netgenerate and randomTrips of the distribution eclipse-sumo do the work (extra ``maps``), each in its own
-process. What they say no to is an error of one line.
+process. If a program refuses its input, crashhunt reports an error of one line.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Scenarios of maps that are named in a hunt: each is made once, and kept in the user's cache by the map's content."""
+"""Cache of scenarios of maps that hunts name: a scenario is made once, and stored by the map's contents."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _MAX_KEPT = 20
 
 
 def cached_scenario(path: Path) -> Path:
-    """Return the folder of the scenario of a map, which is made where the cache does not have it.
+    """Return the folder of the scenario of a map; the scenario is made if the cache does not contain it.
 
     Raises:
-        ScenarioError: the map cannot be used, with the fix.
-        HuntDirectoryError: the cache cannot be used.
+        ScenarioError: the map cannot be used; the message gives the fix.
+        HuntDirectoryError: the cache folder cannot be used.
     """
     kind = kind_of_file(path)
     assert kind is not None
@@ -54,10 +54,10 @@ def cached_scenario(path: Path) -> Path:
 
 
 def _cache_folder() -> Path:
-    """Return the folder, which belongs to this user alone.
+    """Return the cache folder, to which only this user has access.
 
     Raises:
-        HuntDirectoryError: it belongs to another user, other users may write into it, or it cannot be made.
+        HuntDirectoryError: the folder belongs to another user, other users may write into it, or it cannot be created.
     """
     home = os.environ.get("XDG_CACHE_HOME", "")
     fix = "set XDG_CACHE_HOME to a folder of your own, or make the scenario yourself: crashhunt init DIR"
@@ -74,7 +74,7 @@ def _cache_folder() -> Path:
 
 
 def _is_whole(folder: Path) -> bool:
-    """Return whether a kept scenario is as it was made."""
+    """Return whether a cached scenario is complete and unchanged."""
     try:
         proof = json.loads((folder / _COMPLETION_MARK).read_text(encoding="utf-8"))
         return bool(proof) and not any(changed_file(folder / name, entry) for name, entry in proof.items())
@@ -83,7 +83,7 @@ def _is_whole(folder: Path) -> bool:
 
 
 def _keep(building: Path, folder: Path) -> None:
-    """Give the new scenario its name; where another process was faster, its own stays."""
+    """Move the new scenario to its final path; if another process was faster, that process's scenario is kept."""
     for _ in range(2):
         try:
             building.rename(folder)

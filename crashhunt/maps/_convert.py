@@ -1,4 +1,4 @@
-"""From a map to a network of SUMO, by netconvert or netgenerate."""
+"""Conversion of a map to a network of SUMO, by netconvert or netgenerate."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ class ConvertOptions:
     """The options of the conversion of a map to a network.
 
     Args:
-        bbox: the part of the map, in degrees; None for all of it.
-        people: sidewalks and crossings.
-        bicycles: lanes and paths for bicycles.
-        left_hand: traffic keeps to the left.
+        bbox: bounding box of the part of the map to convert, in degrees; None for the whole map.
+        people: whether the network has sidewalks and crossings.
+        bicycles: whether the network has lanes and paths for bicycles.
+        left_hand: whether traffic drives on the left.
     """
 
     bbox: BBox | None = None
@@ -62,11 +62,11 @@ class ConvertOptions:
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """A network.
+    """A converted network.
 
     Args:
-        network: the content of the network.
-        notes: what the user should know of how it was made.
+        network: contents of the network.
+        notes: notes for the user about the conversion.
     """
 
     network: RoadNetwork
@@ -77,10 +77,10 @@ def convert(source: MapSource, options: ConvertOptions, tools: Tools, folder: Pa
     """Write the network of a map as ``map.net.xml``.
 
     Args:
-        source: a file that `check_source` has accepted, or the shape of a map.
-        options: what to make of it.
-        tools: the programs.
-        folder: into which the network is written; other files in it are left behind.
+        source: a map file that `check_source` has accepted, or the shape of a generated map.
+        options: options of the conversion.
+        tools: the programs of eclipse-sumo.
+        folder: folder into which the network is written; other files in it are not removed.
 
     Raises:
         ScenarioError: a program refuses the map, or the map has no road for cars.
@@ -113,7 +113,7 @@ def convert(source: MapSource, options: ConvertOptions, tools: Tools, folder: Pa
 
 
 def _safe_name(source: MapSource) -> str:
-    """The name of the map in the folder: SUMO splits names at commas and blanks, and a user's may have any."""
+    """Return a file name for the map in the folder, because SUMO splits the user's file names at commas and spaces."""
     assert source.path is not None
     lower = source.path.name.lower()
     stem = {"osm": "given.osm", "opendrive": "given.xodr", "net": "given.net.xml"}[source.kind]
@@ -133,7 +133,7 @@ def _copy_map(source: MapSource, folder: Path) -> None:
 
 
 def _unpack_pbf(path: Path, target: Path) -> None:
-    """Write an OpenStreetMap PBF as XML: netconvert does not read it.
+    """Convert an OpenStreetMap PBF file to XML, because netconvert does not read PBF.
 
     Raises:
         ScenarioError: osmium is not installed, or the file is damaged.
@@ -158,10 +158,10 @@ def _keeps_left(path: Path) -> bool:
 
 
 def _check_lengths(path: Path) -> None:
-    """Refuse roads of a length that OpenDRIVE forbids. netconvert makes some road of them, and reports nothing.
+    """Refuse roads whose length OpenDRIVE forbids. netconvert would convert them to other roads without a message.
 
     Raises:
-        ScenarioError: a road or a geometry has a negative length, or one that is no number.
+        ScenarioError: the length of a road or a geometry is negative or not a number.
     """
     data = gzip.decompress(path.read_bytes()) if _is_packed(path) else path.read_bytes()
     for element, text in _LENGTH.findall(data):
@@ -178,7 +178,7 @@ def _check_lengths(path: Path) -> None:
 
 
 def _is_lanelet(path: Path) -> bool:
-    """Return whether a map without roads is one of Lanelet2, which borrows the file format of OpenStreetMap."""
+    """Return whether a map without roads is a Lanelet2 map, which uses the file format of OpenStreetMap."""
     return not _is_packed(path) and _LANELET.search(path.read_bytes()) is not None
 
 
@@ -196,7 +196,7 @@ def _unpack(folder: Path) -> None:
 
 
 def _run_converter(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> Iterator[str]:
-    """Run the program, and yield notes on what it omitted."""
+    """Run the conversion program, and yield notes on parts of the map that it omitted."""
     program = "netconvert" if source.path is not None else "netgenerate"
     words = [*_command_arguments(source, options, tools), "--output-file", NET, "--xml-validation", "never"]
     done = tools.run(program, words, folder)
@@ -227,7 +227,7 @@ def _place_in_error(source: MapSource) -> str:
 def _command_arguments(
     source: MapSource, options: ConvertOptions, tools: Tools, *, everything: bool = False
 ) -> list[str]:
-    """Return the arguments for a map, apart from the file to write."""
+    """Return the program's arguments for a map, except the file to write."""
     words = _input(source, options, tools)
     classes = [CAR, *([BICYCLE] if options.bicycles else []), *([PERSON] if options.people else [])]
     if source.path is not None and not everything:
@@ -276,14 +276,14 @@ def _input(source: MapSource, options: ConvertOptions, tools: Tools) -> list[str
 
 
 def _strip_comment(path: Path) -> None:
-    """Remove the comment with date and paths of this machine, so that the same map gives the same file."""
+    """Remove the comment that contains the date and paths of this machine, so that equal maps give equal files."""
     text = path.read_text(encoding="utf-8")
     begin, comment, end = text.partition("<net ")
     path.write_text(_COMMENT.sub("", begin) + comment + end, encoding="utf-8")
 
 
 def _no_road(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> ScenarioError:
-    """Return the error about a map without a road for cars, with what the map has instead."""
+    """Return the error for a map without a road for cars; its message describes the contents of the map."""
     words = [
         *_command_arguments(source, options, tools, everything=True),
         *_IGNORE_ERROR_OPTIONS,

@@ -1,4 +1,4 @@
-"""Traffic for a network: routes that exist, and flows on them."""
+"""Traffic for a network: drivable routes, and vehicle flows on them."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ _MAX_PER_LANE_PER_HOUR = 800.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Route:
-    """A way through the network that vehicles take.
+    """A route through the network that vehicles take.
 
     Args:
-        id: such as ``r7``.
-        edges: ids of its edges.
+        id: id of the route, such as ``r7``.
+        edges: ids of the route's edges.
         weight: number of drawn trips on this route.
-        length_m: length in m.
-        free_s: its time on free roads, in s.
+        length_m: length of the route, in m.
+        free_s: travel time on the route without other traffic, in s.
     """
 
     id: str
@@ -62,13 +62,13 @@ class Route:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demand:
-    """The traffic of a place.
+    """The traffic in a network.
 
     Args:
         routes: routes of vehicles.
-        vehicles_per_hour: vehicles per hour of all routes together, at demand 1.
+        vehicles_per_hour: vehicles per hour on all routes together, at demand 1.
         walks: the edges of each person flow.
-        ego_routes: ids of the routes from which that of the controlled vehicle is drawn.
+        ego_routes: ids of the routes from which the route of the controlled vehicle is drawn.
     """
 
     routes: tuple[Route, ...]
@@ -86,18 +86,18 @@ class Demand:
 def find_demand(network: RoadNetwork, tools: Tools, folder: Path, *, net: str, people: bool) -> Demand:
     """Return traffic for a network.
 
-    Trips are drawn by SUMO's randomTrips.py, mostly from the ends of the network through it, and routed by duarouter,
-    so every route can be driven.
+    SUMO's randomTrips.py draws the trips, most of them between ends of the network. duarouter computes their routes, so
+    every route is drivable.
 
     Args:
-        network: what the file holds.
-        tools: the programs.
-        folder: folder in which they work.
-        net: name of the network in the folder.
-        people: whether persons walk.
+        network: contents of the network file.
+        tools: the programs of eclipse-sumo.
+        folder: folder in which the programs run.
+        net: name of the network file in the folder.
+        people: whether pedestrians take part.
 
     Raises:
-        ScenarioError: no route for cars exists.
+        ScenarioError: no route for cars exists in the network.
     """
     routes = _routes(network, tools, folder, net)
     walks = _walks(tools, folder, net) if people else ()
@@ -116,7 +116,7 @@ def find_demand(network: RoadNetwork, tools: Tools, folder: Path, *, net: str, p
 
 
 def _entry_capacity(network: RoadNetwork, routes: Sequence[Route], weight: int) -> float:
-    """Return how many vehicles an hour all routes together may have, so that none has too many for its first road."""
+    """Return the maximum number of vehicles per hour on all routes, so that no first road of a route is overloaded."""
     first: dict[str, int] = {}
     for route in routes:
         first[route.edges[0]] = first.get(route.edges[0], 0) + route.weight
@@ -165,7 +165,7 @@ def _walks(tools: Tools, folder: Path, net: str) -> tuple[tuple[str, ...], ...]:
 
 
 def _counted(path: Path, tag: str) -> dict[tuple[str, ...], int]:
-    """Return how often each way is in a file, in the order of the file; nothing if the file is missing."""
+    """Return how often each route occurs in a file, in the order of the file; empty if the file is missing."""
     if not path.is_file():
         return {}
     counts: dict[tuple[str, ...], int] = {}
@@ -177,7 +177,7 @@ def _counted(path: Path, tag: str) -> dict[tuple[str, ...], int]:
 
 
 def _ego_routes(routes: Sequence[Route]) -> tuple[str, ...]:
-    """Return routes that begin at different places, those with the most traffic first."""
+    """Return routes that begin at different places, the routes with the most traffic first."""
     # Where all are short, the longest are the best there is.
     by_length = sorted(routes, key=lambda route: -route.length_m)
     long = sum(route.length_m >= _EGO_WAY_M for route in routes)
@@ -190,7 +190,7 @@ def _ego_routes(routes: Sequence[Route]) -> tuple[str, ...]:
 
 
 def route_file(demand: Demand, network: RoadNetwork, *, bicycles: bool) -> str:
-    """Return the content of the route file, with ``${NAME}`` for each argument of the scenario."""
+    """Return the contents of the route file, with ``${NAME}`` for each argument of the scenario."""
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         "<!-- What stands in braces after a dollar sign is filled in per trial, from [arguments] of scenario.toml. -->",

@@ -1,4 +1,4 @@
-"""Writes the files of a scenario that people read: ``scenario.toml``, ``agent.py``, ``README.md``, the workflow."""
+"""Writes the readable files of a scenario: ``scenario.toml``, ``agent.py``, ``README.md`` and the CI workflow."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _DEFAULT_AGENT = "crashhunt.agents:CarFollowing"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapArgument:
-    """An argument of the scenario, as ``scenario.toml`` has it."""
+    """An argument of the scenario, in the form of ``scenario.toml``."""
 
     name: str
     default: float | int | str
@@ -43,11 +43,11 @@ class MapArgument:
 
 
 def arguments_of(demand: Demand, scales: tuple[float, float], *, bicycles: bool) -> list[MapArgument]:
-    """Return the arguments of a scenario.
+    """Return the arguments of a scenario that is made from a map.
 
     Args:
-        demand: its traffic.
-        scales: the smallest and the largest factor on the traffic.
+        demand: traffic of the scenario.
+        scales: the smallest and the largest traffic factor.
         bicycles: whether cyclists take part.
     """
     low, high = scales
@@ -115,14 +115,14 @@ help = "on a free road"
 def scenario_toml(
     title: str, arguments: list[MapArgument], *, warmup_s: float, speed_limit_mps: float, agent: str = ""
 ) -> str:
-    """Return ``scenario.toml``.
+    """Return the contents of ``scenario.toml``.
 
     Args:
-        title: description in one line.
+        title: description of the scenario in one line.
         arguments: arguments of the scenario.
-        warmup_s: warmup in s.
-        speed_limit_mps: usual on the routes, in m/s; agents want to drive about as fast.
-        agent: who drives; crashhunt's car-following agent by default.
+        warmup_s: duration of the warm-up, in s.
+        speed_limit_mps: usual speed limit on the routes, in m/s; agents want to drive at about this speed.
+        agent: agent that drives; by default crashhunt's car-following agent.
     """
     lines = [
         f"title = {_text(title)}",
@@ -165,7 +165,7 @@ def _text(text: str) -> str:
 
 
 def agent_module(speed_limit_mps: float) -> str:
-    """Return ``agent.py``: a driver to begin with."""
+    """Return the contents of ``agent.py``: a simple agent as a starting point."""
     return _AGENT_MODULE.replace("SPEED", f"{speed_limit_mps:.1f}").replace("HIGH", f"{1.3 * speed_limit_mps:.1f}")
 
 
@@ -224,11 +224,11 @@ class Driver:
 
 
 def next_commands(folder: str, steps: int) -> list[str]:
-    """Return the next commands.
+    """Return the commands that the user can run next.
 
     Args:
-        folder: folder of the scenario, as the user named it; empty for the current one.
-        steps: a bound on a trial.
+        folder: folder of the scenario, as the user named it; empty for the current folder.
+        steps: maximum number of steps of a trial.
     """
     enter = [f"cd {shlex.quote(folder)}"] if folder else []
     return [
@@ -280,16 +280,16 @@ this notice with the map.
 def readme(
     title: str, place: list[str], *, demand: Demand, steps: int, run_s: int, from_osm: bool, workflow_file: str
 ) -> str:
-    """Return ``README.md``.
+    """Return the contents of the scenario's ``README.md``.
 
     Args:
         title: title of the place.
         place: description of the place, in lines.
-        demand: its traffic.
-        steps: a bound on a trial.
-        run_s: how long the plain traffic ran, in s.
-        from_osm: whether the map is OpenStreetMap's.
-        workflow_file: name of the workflow; empty for none.
+        demand: traffic of the scenario.
+        steps: maximum number of steps of a trial.
+        run_s: simulated duration of the traffic without an agent, in s.
+        from_osm: whether the map comes from OpenStreetMap.
+        workflow_file: name of the workflow file; empty if there is none.
     """
     walks = f", {len(demand.walks)} flows of persons" if demand.walks else ""
     row = (
@@ -334,11 +334,11 @@ SET_UP      - uses: crashhunt/crashhunt/.github/actions/corpus@vVERSION
 
 
 def workflow(folder: str, steps: int) -> str:
-    """Return a workflow of GitHub's that uses both actions.
+    """Return a GitHub workflow that uses both actions of crashhunt.
 
     Args:
-        folder: folder of the scenario, relative to the top of the repository; ``.`` where it is the top.
-        steps: a bound on a trial.
+        folder: folder of the scenario, relative to the root of the repository; ``.`` if it is the root.
+        steps: maximum number of steps of a trial.
     """
     crashes = "crashes" if folder == "." else f"{folder}/crashes"
     words = f"--scenario {shlex.quote(folder)} --agent {AGENT} --seed 1"
@@ -353,7 +353,7 @@ def workflow(folder: str, steps: int) -> str:
 
 
 def _scalar(text: str) -> str:
-    """Return a text as YAML writes it in double quotes: as JSON does, but for letters that are not ASCII."""
+    """Return a text in double quotes for YAML: as in JSON, but with letters outside of ASCII unchanged."""
     ascii_only = json.dumps(text, ensure_ascii=False)
     return "".join(one if one.isascii() and one != "\x7f" else f"\\U{ord(one):08x}" for one in ascii_only)
 

@@ -1,4 +1,4 @@
-"""Makes the folder of a scenario from a map, whole or not at all."""
+"""Creation of a scenario folder from a map; if it fails, no folder remains."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ class MapOptions:
     """The options of a scenario that is made from a map.
 
     Args:
-        bbox: the part of the map, in degrees; None for all of it.
-        demand: the smallest and the largest factor on the traffic.
-        people: persons walk, on sidewalks and crossings.
-        bicycles: cyclists ride.
-        left_hand: traffic keeps to the left.
-        agent: who drives; crashhunt's car-following agent by default.
-        workflow: the CI for which a workflow is written; empty for none.
+        bbox: bounding box of the part of the map to convert, in degrees; None for the whole map.
+        demand: the smallest and the largest traffic factor.
+        people: whether pedestrians walk, on sidewalks and crossings.
+        bicycles: whether cyclists ride.
+        left_hand: whether traffic drives on the left.
+        agent: agent that drives; by default crashhunt's car-following agent.
+        workflow: name of the CI system for which a workflow is written; empty for none.
         picture: whether ``map.png`` is drawn.
     """
 
@@ -80,9 +80,9 @@ class PlainTrial:
     """The result of one trial in the new scenario.
 
     Args:
-        outcome: how it ended.
+        outcome: outcome of the trial.
         steps: number of steps.
-        wall_s: how long it took, in s, with the start of its processes.
+        wall_s: wall time of the trial in s, including the start of its processes.
     """
 
     outcome: str
@@ -92,17 +92,17 @@ class PlainTrial:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeScenario:
-    """A scenario that has been made and checked.
+    """A scenario that was made from a map and then checked.
 
     Args:
         folder: folder of the scenario.
-        source: the map.
-        network: what the map holds.
-        demand: its traffic.
-        plain: what the traffic did at its usual demand.
-        busy: what it did at the largest.
-        steps: a bound on trials, from the longest route.
-        notes: what the user should know.
+        source: the map from which the scenario was made.
+        network: contents of the network.
+        demand: traffic of the scenario.
+        plain: result of the traffic at its usual demand.
+        busy: result of the traffic at its largest demand.
+        steps: maximum number of steps of a trial, derived from the longest route.
+        notes: notes for the user.
         trial: the result of one trial; None if none ran.
     """
 
@@ -118,7 +118,7 @@ class MadeScenario:
     commands: list[str] = field(default_factory=list)
 
     def to_json(self) -> dict[str, object]:
-        """Return the shape of ``crashhunt init --json``."""
+        """Return the scenario in the form that ``crashhunt init --json`` prints."""
         drivable = self.network.drivable()
         return {
             "dir": str(self.folder),
@@ -160,16 +160,16 @@ def make_scenario(
     """Make the folder of a scenario from a map, and check the scenario.
 
     Args:
-        source: the map.
-        options: what to make of it.
-        directory: where the folder is to be; it must not exist, or be empty.
-        try_out: runs one trial, given the folder and a bound on its steps.
-        tell: receives in a few words what happens now.
+        source: the map file or the shape of a generated map.
+        options: options of the scenario.
+        directory: path of the new folder; an existing folder must be empty.
+        try_out: function that runs one trial, given the folder and the maximum number of steps.
+        tell: function that receives a short description of the current stage.
 
     Raises:
-        ScenarioError: the map cannot be used, with the fix.
-        HuntDirectoryError: the directory has files, or cannot be written.
-        UsageError: options that do not go with the map.
+        ScenarioError: the map cannot be used; the message gives the fix.
+        HuntDirectoryError: the directory contains files, or cannot be written.
+        UsageError: an option does not fit the map.
     """
     _check_directory(directory)
     _check_options(source, options)
@@ -228,7 +228,7 @@ def _check_options(source: MapSource, options: MapOptions) -> None:
 def _build(
     source: MapSource, options: MapOptions, tools: Tools, building: Path, target: Path, say: Callable[[str], None]
 ) -> MadeScenario:
-    """Write network, routes and picture into the folder."""
+    """Write the network, the routes and the picture into the folder."""
     with temporary_folder("map") as work:
         say("making the network")
         made = convert(
@@ -299,7 +299,7 @@ def _draw(found: MadeScenario, folder: Path) -> None:
 
 
 def _write_texts(found: MadeScenario, options: MapOptions, building: Path, target: Path) -> None:
-    """Write what describes the place, when the trial has run."""
+    """Write the files that describe the scenario, after its trial has run."""
     (building / AGENT_FILE).write_text(agent_module(_speed_limit_mps(found.demand)), encoding="utf-8")
     (building / README).write_text(
         readme(
@@ -317,14 +317,14 @@ def _write_texts(found: MadeScenario, options: MapOptions, building: Path, targe
 
 
 def _warmup_s(demand: Demand) -> float:
-    """Return how long traffic fills the roads: as long as a usual trip takes."""
+    """Return the duration of the warm-up, in s, in which traffic fills the roads: the duration of a usual trip."""
     weight = sum(route.weight for route in demand.routes)
     low, high = _WARMUP_S
     return round(min(max(1.2 * sum(route.free_s * route.weight for route in demand.routes) / weight, low), high))
 
 
 def _steps(demand: Demand) -> int:
-    """Return a bound on trials: twice the time of the longest route of the agent on free roads."""
+    """Return the maximum number of steps of trials: twice the time of the agent's longest route on free roads."""
     longest = max(route.free_s for route in demand.routes if route.id in demand.ego_routes)
     low, high = _STEPS
     return min(max(round(2 * longest / _STEP_S / _STEPS_ROUNDED) * _STEPS_ROUNDED, low), high)
@@ -359,7 +359,7 @@ def _lights(network: RoadNetwork) -> int:
 
 
 def describe_place(found: MadeScenario) -> list[str]:
-    """Return what the place is, in about ten lines."""
+    """Return a description of the place in about ten lines."""
     network, demand, plain, busy = found.network, found.demand, found.plain, found.busy
     drivable = network.drivable()
     roads_km = sum(edge.length_m for edge in drivable) / 1000

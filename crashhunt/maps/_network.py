@@ -1,4 +1,4 @@
-"""The content of a SUMO network: roads, lanes, permitted vehicle classes, junctions."""
+"""The contents of a SUMO network: roads, lanes, permitted vehicle classes and junctions."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ CAR, TRUCK, BICYCLE, PERSON = "passenger", "truck", "bicycle", "pedestrian"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkLane:
-    """One lane.
+    """One lane of a road.
 
     Args:
-        length_m: length in m.
+        length_m: length of the lane, in m.
         speed_mps: the speed limit, in m/s.
         allowed: the vehicle classes that may use it; None for all.
         disallowed: the vehicle classes that may not use the lane.
-        shape: its centre line, in m.
+        shape: centre line of the lane, in m.
     """
 
     length_m: float
@@ -39,7 +39,7 @@ class NetworkLane:
     shape: tuple[Point, ...]
 
     def admits(self, vehicle_class: str) -> bool:
-        """Return whether vehicles of a class may use it."""
+        """Return whether vehicles of a class may use the lane."""
         if self.allowed is not None:
             return vehicle_class in self.allowed or "all" in self.allowed
         return vehicle_class not in self.disallowed and "all" not in self.disallowed
@@ -47,10 +47,10 @@ class NetworkLane:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A road in one direction, from a junction to the next.
+    """A road in one direction, from one junction to the next.
 
     Args:
-        id: SUMO's.
+        id: SUMO's id of the road.
         name: name of the street; empty if the map has none.
         lanes: lanes from right to left in right-hand traffic.
     """
@@ -60,28 +60,28 @@ class Edge:
     lanes: tuple[NetworkLane, ...]
 
     def admits(self, vehicle_class: str) -> bool:
-        """Return whether vehicles of a class may use one of its lanes."""
+        """Return whether vehicles of a class may use a lane of the road."""
         return any(lane.admits(vehicle_class) for lane in self.lanes)
 
     def open_lanes(self, vehicle_class: str) -> tuple[NetworkLane, ...]:
-        """Return the lanes that vehicles of a class may use."""
+        """Return the lanes of the road that vehicles of a class may use."""
         return tuple(lane for lane in self.lanes if lane.admits(vehicle_class))
 
     @property
     def length_m(self) -> float:
-        """In m."""
+        """The length of the road, in m."""
         return self.lanes[0].length_m
 
 
 @dataclass(slots=True)
 class RoadNetwork:
-    """A network, without what is inside junctions.
+    """A road network, without the lanes inside junctions.
 
     Args:
         edges: edges by id, in the order of the file.
-        junctions: type of junction to its number; ends of roads are not counted.
+        junctions: number of junctions of each type; ends of roads are not counted.
         crossings: number of pedestrian crossings.
-        left_hand: whether traffic keeps to the left.
+        left_hand: whether traffic drives on the left.
         areas: the outlines of junctions, in m.
     """
 
@@ -92,7 +92,7 @@ class RoadNetwork:
     areas: list[tuple[Point, ...]] = field(default_factory=list)
 
     def drivable(self) -> list[Edge]:
-        """Return the edges that cars may use."""
+        """Return the roads that cars may use."""
         return [edge for edge in self.edges.values() if edge.admits(CAR)]
 
 
@@ -100,10 +100,10 @@ _DEAD_END_TYPES = {"dead_end", "unregulated", "district"}
 
 
 def read_network(path: Path) -> RoadNetwork:
-    """Return what a network file holds.
+    """Return the contents of a network file.
 
     Raises:
-        ScenarioError: it is not a network of SUMO.
+        ScenarioError: the file is not a network of SUMO.
     """
     found = RoadNetwork()
     try:

@@ -1,4 +1,4 @@
-"""Draws the map of a place with its busiest roads."""
+"""Drawing of the map of a place with its busiest roads."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ def draw_map(
     hours: float,
     busiest: list[tuple[str, float]],
 ) -> None:
-    """Write a PNG: roads in the colour of their traffic, the names of the busiest, a scale.
+    """Write a PNG with roads in the colour of their traffic, the names of the busiest roads, and a scale.
 
     Args:
         network: the network to draw.
-        vehicles: vehicles on each edge, in the time that was simulated.
-        path: path of the PNG.
-        title: above the map.
-        hours: that were simulated.
-        busiest: edges to name, with their vehicles per hour; the first has the most.
+        vehicles: number of vehicles on each road in the simulated time.
+        path: path of the PNG file.
+        title: text above the map.
+        hours: simulated time, in hours.
+        busiest: roads whose names are drawn, with their vehicles per hour; the busiest road is first.
     """
     from PIL import Image, ImageDraw
 
@@ -130,9 +130,9 @@ def _draw_labels(
 
 
 def drawable(text: str) -> str:
-    """Return a text in letters that the font has; empty if it has too few of them.
+    """Return a text that contains only letters of the font; empty if too few letters remain.
 
-    Pillow's own font has Latin letters, and draws boxes for all others, such as the sharp s of German.
+    Pillow's own font has Latin letters, and draws boxes for all other letters, such as the sharp s of German.
     """
     from crashhunt.panels import font
 
@@ -160,7 +160,7 @@ def _midpoint(edge: Edge) -> tuple[float, float]:
 def _draw_scale(
     draw: ImageDraw.ImageDraw, scale: float, size: tuple[int, int], ink: tuple[int, int, int], letters: object
 ) -> None:
-    """Draw a line of a round length."""
+    """Draw a scale: a line whose length is a round number."""
     length = next((m for m in (5000, 2000, 1000, 500, 200, 100, 50, 20, 10) if m * scale <= _BAR_PIXELS), 10)
     x, y = _MARGIN, size[1] - 24
     draw.line([(x, y), (x + length * scale, y)], fill=ink, width=3)

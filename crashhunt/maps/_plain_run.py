@@ -1,4 +1,4 @@
-"""Runs the plain traffic of a new scenario, without an agent, and measures whether it flows."""
+"""Simulation of the traffic of a new scenario without an agent, to measure whether the traffic flows."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ class PlainRun:
     """The result of a simulation of the traffic without an agent for `RUN_S` seconds.
 
     Args:
-        demand: the factor on the traffic.
-        wanted: vehicles that were to enter.
+        demand: traffic factor.
+        wanted: number of vehicles that should have entered.
         entered: number of vehicles that entered.
         arrived: number of vehicles that reached their destination.
         running: number of vehicles on the road at the end.
-        halting: number of these vehicles that stood.
-        teleports: vehicles that SUMO moved on after they had stood for 300 s.
+        halting: number of these vehicles that stood still.
+        teleports: number of vehicles that SUMO teleported after they had stood still for 300 s.
         collisions: number of collisions between vehicles of the traffic.
-        mean_speed_mps: mean speed of those that arrived, in m/s.
-        persons: that walked.
-        edge_vehicles: vehicles that entered each edge.
-        probe_delays_s: route to the time that a vehicle waited to enter on it, in s; routes that none entered on
-            are missing.
+        mean_speed_mps: mean speed of the vehicles that arrived, in m/s.
+        persons: number of pedestrians.
+        edge_vehicles: number of vehicles that entered each road.
+        probe_delays_s: time that a probe vehicle waited to enter on each route, in s; routes without such a vehicle are
+            missing.
     """
 
     demand: float
@@ -73,7 +73,7 @@ class PlainRun:
 
     @property
     def jam(self) -> str:
-        """The reason why the traffic does not flow, in words; empty if it flows."""
+        """The reason why the traffic does not flow, as text; empty if the traffic flows."""
         if not self.entered:
             return "no vehicle enters"
         if self.wanted - self.entered > max(5, _MAX_WAITING_SHARE * self.wanted):
@@ -91,19 +91,19 @@ def run_plain_traffic(
     demand: Demand, network: RoadNetwork, tools: Tools, folder: Path, values: Mapping[str, object], *, net: str,
     scale: float, probes_at_s: float, bicycles: bool, step_s: float = _STEP_S,
 ) -> PlainRun:  # fmt: skip
-    """Simulate the traffic with a probe vehicle on each route that the agent may get.
+    """Simulate the traffic, with a probe vehicle on each route that the agent may get.
 
     Args:
-        demand: the traffic.
+        demand: the traffic of the scenario.
         network: network in which the traffic drives.
-        tools: the programs.
-        folder: folder with the network, in which files are written.
+        tools: the programs of eclipse-sumo.
+        folder: folder that contains the network, and into which files are written.
         values: values of the scenario's arguments.
-        net: name of the network.
-        scale: the factor on the traffic.
-        probes_at_s: when the probes are to enter, in s.
+        net: name of the network file.
+        scale: traffic factor.
+        probes_at_s: times at which the probe vehicles are to enter, in s.
         bicycles: whether cyclists take part.
-        step_s: the step of the simulation, in s.
+        step_s: step length of the simulation, in s.
 
     Raises:
         ScenarioError: SUMO refuses the network or the traffic.
@@ -178,21 +178,21 @@ def calibrate(
     demand: Demand, network: RoadNetwork, tools: Tools, folder: Path, values: Mapping[str, object], *, net: str,
     scales: tuple[float, float], probes_at_s: float, bicycles: bool,
 ) -> tuple[Demand, PlainRun, PlainRun]:  # fmt: skip
-    """Return the demand with which the traffic flows at both scales, and the two runs that show it.
+    """Return the demand at which the traffic flows with both factors, and the two runs that show this.
 
     Args:
-        demand: the traffic to begin with.
+        demand: the traffic before calibration.
         network: network in which the traffic drives.
-        tools: the programs.
-        folder: folder with the network.
+        tools: the programs of eclipse-sumo.
+        folder: folder that contains the network.
         values: values of the scenario's arguments.
-        net: name of the network.
-        scales: the usual factor on the traffic, and the largest.
-        probes_at_s: when probes enter, in s.
+        net: name of the network file.
+        scales: the usual and the largest traffic factor.
+        probes_at_s: times at which the probe vehicles are to enter, in s.
         bicycles: whether cyclists take part.
 
     Raises:
-        ScenarioError: it jams with a tenth of the traffic too, or no vehicle of an agent can enter.
+        ScenarioError: even a tenth of the traffic jams, or no vehicle of an agent can enter.
     """
     usual, most = scales
 

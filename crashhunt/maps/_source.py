@@ -47,7 +47,7 @@ class MapSource:
     Args:
         kind: kind of the map.
         path: path of the file; None if the map is generated.
-        shape: shape of a generated map: columns and rows of a grid, arms and rings of a spider's web.
+        shape: shape of a generated map: columns and rows of a grid, or arms and rings of a spider web.
     """
 
     kind: Kind
@@ -66,7 +66,7 @@ class MapSource:
 
     @property
     def name(self) -> str:
-        """The name of the place: that of the file without its ending."""
+        """The name of the place: the name of the file without its ending."""
         if self.path is None:
             return f"{self.kind}-{self.shape[0]}x{self.shape[1]}"
         for ending in sorted(ENDINGS[self.kind], key=len, reverse=True):
@@ -76,7 +76,7 @@ class MapSource:
 
 
 def kind_of_file(path: Path) -> Kind | None:
-    """Return what kind of map a file has by its ending; None if it is another file."""
+    """Return the kind of map that a file's name ending means; None for other files."""
     for kind, endings in ENDINGS.items():
         if path.name.lower().endswith(endings):
             return kind  # type: ignore[return-value]
@@ -84,10 +84,10 @@ def kind_of_file(path: Path) -> Kind | None:
 
 
 def parse_shape(text: str, option: str) -> tuple[int, int]:
-    """Return the two numbers of ``4x4``.
+    """Return the two numbers of a shape such as ``4x4``.
 
     Raises:
-        UsageError: it has another form, or a number is too small or too large.
+        UsageError: the text has another form, or a number is too small or too large.
     """
     parts = text.lower().split("x")
     fix = f"give two numbers from {_SMALLEST_SHAPE} to {_LARGEST_SHAPE}, such as {option} 4x4"
@@ -102,10 +102,10 @@ def parse_shape(text: str, option: str) -> tuple[int, int]:
 
 
 def parse_bbox(text: str) -> BBox:
-    """Return the four numbers of ``W,S,E,N``, in degrees.
+    """Return the four numbers of a bounding box ``W,S,E,N``, in degrees.
 
     Raises:
-        UsageError: they are not four numbers, not in this order, or out of range.
+        UsageError: the text has not four numbers, or they are in the wrong order or out of range.
     """
     fix = "give west,south,east,north in degrees, such as --bbox=11.54,48.18,11.56,48.19"
     try:
@@ -124,10 +124,10 @@ def parse_bbox(text: str) -> BBox:
 
 
 def check_source(source: MapSource) -> None:
-    """Refuse a file that cannot be a map of its kind, before any program reads it.
+    """Refuse a file that cannot be a map of its kind, before a program reads the file.
 
     Raises:
-        ScenarioError: it does not exist, is empty or too large, has another ending, or has other content.
+        ScenarioError: the file does not exist, is empty or too large, or its ending or contents are wrong.
     """
     path = source.path
     if path is None:
@@ -174,7 +174,7 @@ def _too_large(source: MapSource, message: str) -> ScenarioError:
 
 
 def _check_unpacked(source: MapSource, path: Path) -> None:
-    """Refuse a packed map that is too large or damaged, before it fills memory or the disk."""
+    """Refuse a compressed map that is too large or damaged, before it fills the memory or the disk."""
     size = 0
     try:
         with gzip.open(path) as file:

@@ -1,4 +1,4 @@
-"""The programs of the distribution eclipse-sumo: where they are, and how one of them runs."""
+"""The programs of the distribution eclipse-sumo: their paths, and how to run them."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class ToolResult:
     """The exit code and the output of a program.
 
     Args:
-        code: its exit code; 0 means success.
-        output: everything that it printed.
+        code: exit code of the program; 0 means success.
+        output: everything that the program printed.
     """
 
     code: int
@@ -59,12 +59,13 @@ class Tools:
         """Run a program to its end.
 
         Args:
-            program: such as ``netconvert``, or a script below ``tools`` such as ``randomTrips.py``.
-            words: its arguments.
-            folder: folder in which it runs; names in its arguments are relative to it.
+            program: name of the program, such as ``netconvert``, or of a script below ``tools``, such as
+                ``randomTrips.py``.
+            words: arguments of the program.
+            folder: folder in which the program runs; names in its arguments are relative to this folder.
 
         Raises:
-            ScenarioError: it cannot be started, takes too long, is killed, or has filled the disk.
+            ScenarioError: the program cannot be started, takes too long, is killed, or has filled the disk.
         """
         command = [str(self.home / "bin" / program), *words]
         if program.endswith(".py"):
@@ -104,7 +105,7 @@ class Tools:
 
 
 def _begin(parent: int, mask: set[signal.Signals | int]) -> None:
-    """Prepare a program in its process: signals end it as they do by default, and the end of its parent does."""
+    """Prepare the process of a program: signals have their default effect, and the end of the parent ends it."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
             signal.signal(number, signal.SIG_DFL)
@@ -114,10 +115,10 @@ def _begin(parent: int, mask: set[signal.Signals | int]) -> None:
 
 @cache
 def find_tools() -> Tools:
-    """Return the installed programs.
+    """Return the installed programs of eclipse-sumo.
 
     Raises:
-        ScenarioError: eclipse-sumo is not installed, or does not go with libsumo.
+        ScenarioError: eclipse-sumo is not installed, or its version does not fit that of libsumo.
     """
     install = "pip install 'crashhunt[maps]'"
     # The package is called sumo, and so is many a folder of users: only the one of the distribution has programs.
@@ -138,12 +139,12 @@ def find_tools() -> Tools:
 
 
 def _release(version: str) -> tuple[int, ...]:
-    """Return major and minor number: releases that differ in the third one have the same file formats."""
+    """Return the major and the minor version number; releases that differ only in the third have equal file formats."""
     return tuple(int(part) for part in version.split(".")[:2] if part.isdecimal())
 
 
 def first_error(output: str) -> str:
-    """Return the first error in what a program has printed, without its prefix; empty if there is none."""
+    """Return the first error in the output of a program, without its prefix; empty if there is none."""
     for line in output.splitlines():
         if line.startswith("Error:"):
             return line.removeprefix("Error:").strip()

@@ -1,4 +1,4 @@
-"""Minimization: fewer actors, simpler arguments and fewer disturbances, with the same crash type."""
+"""Minimization: fewer actors, simpler arguments and fewer disturbances, while the crash type stays the same."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Runs candidates on persistent workers, several at a time, and remembers the result of each."""
+"""Runs minimization candidates on persistent workers, several at a time, and stores the result of each candidate."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ __all__ = ["OutOfTimeError", "Ran", "Runs", "is_same"]
 
 
 class OutOfTimeError(StoppedError):
-    """The time limit of the user is reached."""
+    """The user's time limit has been reached."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ran:
-    """The result of a candidate.
+    """The result of a minimization candidate.
 
     Args:
-        same: whether it crashes in the same manner.
-        steps: number of steps.
-        digest: digest of the recording.
+        same: whether the candidate crashes in the same manner as the original.
+        steps: number of steps of the candidate's run.
+        digest: digest of the run's recording.
     """
 
     same: bool
@@ -48,24 +48,25 @@ class Ran:
 
 
 class Runs:
-    """Runs candidates for a crash.
+    """Runs the minimization candidates for a crash.
 
     Args:
-        rerun: the crash.
-        signature: what must stay.
-        scratch: a folder for the workers.
+        rerun: the crash to minimize.
+        signature: signature of the crash, which candidates must keep.
+        scratch: folder for the files of the workers.
         memory: A file with the results of candidates, for a search that resumes after an interruption.
-        parallel: trials at a time.
+        parallel: number of trials at a time.
         budget: maximum number of runs.
-        time_s: time limit for all of them, in s of wall-clock time; None without a limit.
-        stopped: Returns whether to stop; called repeatedly.
-        watch: called with the number of runs so far, and the maximum.
+        time_s: wall-time limit for all runs, in s; None for no limit.
+        stopped: function that returns whether to stop; called repeatedly.
+        watch: function called with the number of finished runs and the maximum number.
 
     Attributes:
-        count: number of runs, with those known from an interrupted call.
-        steps: number of steps of these, altogether.
-        most_steps: what takes longer to crash does not count as the same.
-        found_steps: how many steps the last candidate that crashed in the same manner has begun.
+        count: number of runs, including runs whose results an interrupted call has stored.
+        steps: total number of simulated steps in these runs.
+        most_steps: maximum number of steps until the crash; a candidate that crashes later does not count as the same
+            crash.
+        found_steps: number of steps, including the last one, of the last candidate that crashed in the same manner.
     """
 
     def __init__(
@@ -97,17 +98,17 @@ class Runs:
         self._reruns = Reruns(rerun, scratch, parallel=parallel, stopped=is_over, keep_all=False, warm_copies=0)
 
     def first(self, candidates: Sequence[TrialSpec], *, again: bool = False) -> int | None:
-        """Return the place of the first candidate that crashes in the same manner; None if none does.
+        """Return the index of the first candidate that crashes in the same manner; None if no candidate does.
 
-        Which it is does not depend on how many run at a time.
+        The result does not depend on the number of trials that run at a time.
 
         Args:
-            candidates: vehicles to try.
+            candidates: specifications of the trials to try.
             again: whether to run candidates again that are known not to crash.
 
         Raises:
             StoppedError: The search stopped before the answer was known.
-            CrashhuntError: no trial can be run at all.
+            CrashhuntError: no trial can be run.
         """
         found: dict[int, Ran] = {}
         places: list[int] = []  # of the candidates that have to be run
@@ -147,7 +148,7 @@ class Runs:
         """Return the actors that entered in a trial; empty if the simulator cannot report them.
 
         Raises:
-            StoppedError: The search stopped.
+            StoppedError: The search was stopped.
         """
         self.count += 1
         try:
@@ -161,14 +162,14 @@ class Runs:
         return tuple(dict.fromkeys(ended.entered)) if same else ()
 
     def close(self) -> None:
-        """End every process."""
+        """End all worker processes."""
         self._reruns.close()
 
     def _bounded(self, spec: TrialSpec) -> TrialSpec:
         return replace(spec, max_steps=min(spec.max_steps, self.most_steps))
 
     def _judged(self, ended: EndedRun) -> Ran:
-        """Return whether a candidate crashed with the same type; the slow signature is computed last."""
+        """Return whether a candidate crashed with the same type; the slow signature is compared last."""
         was, result = self._rerun.bundle.result, ended.result
         same = result.outcome is was.outcome
         if was.collision is not None and result.collision is not None:
@@ -206,7 +207,7 @@ class Runs:
 
 
 def is_same(found: Signature | None, wanted: Signature, spec: TrialSpec) -> bool:
-    """Return whether a trial crashed with the same type; the paths of scripted actors include their disturbances."""
+    """Return whether a trial crashed with the same type; disturbances of scripted actors are part of their paths."""
     if found is not None and spec.script is not None:
         found = replace(found, disturbed=wanted.disturbed)
     return found == wanted

@@ -1,4 +1,4 @@
-"""The scripted form of a crash: other actors follow recorded paths, so removing an actor changes no other actor."""
+"""The scripted form of a crash: other actors follow recorded paths, so removing one actor changes no other actor."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _LONGER_S = 1.0  # by which the crash may come later than it did: the others are
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """The actors of a crash that remain.
+    """The actors of a crash that remain in a candidate.
 
     Args:
-        agents: the actors that drive themselves.
-        others: the actors that are moved; may include agents.
-        begin: the step of the recording with which it begins.
+        agents: identifiers of the agents that drive themselves.
+        others: identifiers of the actors that follow recorded paths; they may include agents.
+        begin: the step of the recording at which the candidate begins.
     """
 
     agents: tuple[str, ...]
@@ -43,10 +43,10 @@ class Part:
 
 
 class Scripting:
-    """Makes trials of parts of a recorded crash.
+    """Creates trials with parts of a recorded crash.
 
     Args:
-        rerun: the crash.
+        rerun: the crash to minimize.
     """
 
     def __init__(self, rerun: Rerun) -> None:
@@ -65,7 +65,7 @@ class Scripting:
         return self._paths.steps
 
     def spec(self, part: Part) -> TrialSpec:
-        """Return the trial of a part, with the arguments that were recorded."""
+        """Return the trial for the remaining actors, with the recorded arguments."""
         paths = self._paths.driven_by(part.agents).only(part.others)
         paths = paths.cut(part.begin, paths.steps, self._step_s).placing()
         disturbed = (one for one in self._spec.disturbances if one.what in SENSOR_KINDS and one.step > part.begin)
@@ -80,7 +80,7 @@ class Scripting:
         )
 
     def begins(self, agents: Sequence[str]) -> list[int]:
-        """Return the possible later starts, the latest first; none is later than the last avoidable step."""
+        """Return the possible later starts, the latest first; no start is later than the last avoidable step."""
         known = [{step for step, _ in path.lanes} for path in self._paths.agents if path.actor.id in agents]
         steps = sorted(set.intersection(*known)) if known else []
         found = []

@@ -1,10 +1,10 @@
-"""Delta debugging of a set, simpler values of an argument: the order of candidates.
+"""Search for a minimal test case: delta debugging of a set, and simpler values of an argument.
 
-The search is independent of trials: it works on any items.
+The search is independent of trials: it works on items of any kind.
 
-Delta debugging (Zeller and Hildebrandt, *Simplifying and Isolating Failure-Inducing Input*, 2002) for what there are
-several of; for a value, the plainest first, as Hypothesis does it. The search is deterministic: the next candidate
-depends on earlier results, and not on the number of workers.
+Delta debugging (Zeller and Hildebrandt, *Simplifying and Isolating Failure-Inducing Input*, 2002) reduces sets. For a
+value, simpler values are tried first, as in Hypothesis. The search is deterministic: the next candidate depends on
+earlier results, and not on the number of workers.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ _ROUNDING_DIGITS = (1, 2, 3, 4)
 
 
 def fewest(items: Sequence[T], tried: Tried[tuple[T, ...]], likely: Sequence[Sequence[T]] = ()) -> tuple[T, ...]:
-    """Return a minimal part of some items that still passes the test: without any single one of them, it fails.
+    """Return a minimal part of some items that still passes a test: without any single remaining item, the test fails.
 
     Args:
-        items: all of them, with which it is known to do it.
-        tried: tries some of them.
-        likely: what is tried first.
+        items: all items, with which the test is known to pass.
+        tried: function that runs the test with some of the items.
+        likely: parts of the items that are tested first.
     """
     found = tuple(items)
     if not found:
@@ -63,7 +63,7 @@ def _chunks(items: tuple[T, ...], count: int) -> list[tuple[T, ...]]:
 
 
 def plainest(value: Value, default: Value | None) -> list[Value]:
-    """Return simpler values to try in place of a value, the simplest first: its default, then rounder numbers.
+    """Return simpler values to try instead of a value, the simplest first: its default, then rounder numbers.
 
     Args:
         value: The value of an argument.
@@ -74,7 +74,7 @@ def plainest(value: Value, default: Value | None) -> list[Value]:
 
 
 def as_type_of(value: Value, default: Value) -> Value | None:
-    """Return a default as the type of a value; None if that would be another value. ``speed=5`` may mean 5.0."""
+    """Return a default in the type of a value; None if its value would change. ``speed=5`` may mean 5.0."""
     if isinstance(value, float) and isinstance(default, int) and not isinstance(default, bool):
         return float(default)
     return default if type(default) is type(value) else None

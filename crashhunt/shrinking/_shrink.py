@@ -1,4 +1,4 @@
-"""Minimization of a crash, from the crash to the bundle of the result."""
+"""Minimization of a crash, from the original crash to the bundle of the minimized crash."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ class Shrunk:
     """The result of a minimization.
 
     Args:
-        bundle: the crash.
+        bundle: bundle of the original crash.
         verdict: whether the crash was minimized, cannot be minimized, or did not reproduce.
-        ended: why it was ended.
+        ended: how the minimization ended.
         small: the minimized crash; None if nothing was removed.
-        why: reason for the end, in words.
-        actors: how many were seen before and after, the agents with them.
+        why: the reason for the end, as text.
+        actors: number of actors in the scenes before and after the minimization, including agents.
         trials: number of runs.
-        steps: number of steps of these, altogether.
+        steps: total number of simulated steps in these runs.
         removed: the removed actors and disturbances.
-        changed: arguments with a new value: name to old and new value.
+        changed: arguments with a new value: old and new value by name.
         steps_cut: number of steps that were removed from the beginning.
-        notes: what may make a difference, in words.
+        notes: notes on possible causes of different results, as text.
     """
 
     bundle: Bundle
@@ -68,12 +68,12 @@ class Shrunk:
 
     @property
     def scripted(self) -> tuple[str, ...] | None:
-        """The actors that are moved along recorded paths; None if the others drive."""
+        """The actors that follow recorded paths; None if the other actors drive themselves."""
         script = self.small.result.spec.script if self.small is not None else None
         return None if script is None else script.names
 
     def to_json(self) -> JsonObject:
-        """Return the shape that ``shrink --json`` prints."""
+        """Return the result in the form that ``shrink --json`` prints."""
         after = self.small or self.bundle
         return {
             "crash": self.bundle.id,
@@ -98,7 +98,7 @@ class Shrunk:
 
 
 def shrunk_name(crash: str) -> str:
-    """Return what the smaller one of a crash is called."""
+    """Return the name of the minimized bundle of a crash."""
     return f"{crash}{layout.SMALL}"
 
 
@@ -116,24 +116,24 @@ def shrink(
     """Minimize a crash while its crash type stays the same, and write the minimized crash as a bundle next to it.
 
     The search removes other actors and disturbances, and simplifies arguments: towards their defaults, or rounder. If
-    the crash needs more than a few other actors, these follow their recorded paths. Then any path can be removed, and
-    the beginning can be cut off. The result depends on the crash and the budget only, unless time runs out. An
-    interrupted search leaves the best result, and the same call resumes from there.
+    the crash needs more than a few other actors, these follow their recorded paths. In that form, any path and the
+    beginning can be removed. The result depends only on the crash and the budget, unless the time runs out. An
+    interrupted search keeps the best result, and the same call resumes the search.
 
     Args:
-        bundle: the crash.
+        bundle: the crash to minimize.
         budget: maximum number of trials.
-        time_s: time limit, in s of wall-clock time; two runs that confirm the result are additional.
-        form: ``traffic``: the other actors drive. ``scripted``: they follow recorded paths. ``either``: the form
-            depends on the number of remaining actors.
-        parallel: runs at a time; 0 for one per core.
-        watch: called with the number of runs so far, and the maximum.
-        stopped: Returns whether to stop; called repeatedly.
-        trusted: whether its code may run; None to find out.
+        time_s: wall-time limit, in s; the two runs that confirm the result take additional time.
+        form: ``traffic``: the other actors drive themselves. ``scripted``: they follow recorded paths. ``either``: the
+            form depends on the number of remaining actors.
+        parallel: number of runs at a time; 0 for one per core.
+        watch: function called with the number of finished runs and the maximum number.
+        stopped: function that returns whether to stop; called repeatedly.
+        trusted: whether the code of the crash may run; None to determine it.
 
     Raises:
         BundleError: the crash is damaged.
-        UntrustedError: its code is neither made here nor trusted.
+        UntrustedError: the code of the crash is neither made here nor trusted.
         CrashhuntError: no trial can be run, or the bundle cannot be written.
     """
     if bundle.id.endswith(layout.SMALL):
@@ -221,9 +221,9 @@ def _constructor_defaults(rerun: Rerun) -> dict[tuple[str, str], Value]:
 
 
 def _write_smallest(rerun: Rerun, search: Minimizer, signature: Signature) -> Bundle | None:
-    """Run the smallest in a fresh process, and write its bundle; another process confirms it, as of every crash.
+    """Run the smallest candidate in a new process, and write its bundle, which another process then confirms.
 
-    If a result does not reproduce, the next larger one is tried; None if none reproduces.
+    If a candidate does not reproduce, the next larger one is run. The result is None if no candidate reproduces.
     """
     bundle = rerun.bundle
     tries = _MAX_CONFIRMATIONS if bundle.confirmed is False else 1
@@ -240,7 +240,7 @@ def _write_smallest(rerun: Rerun, search: Minimizer, signature: Signature) -> Bu
 
 
 def _confirm_smallest(small: Bundle) -> Bundle:
-    """Confirm the minimized crash. Its bundle is written before, because this may take a minute."""
+    """Confirm the minimized crash. Its bundle is already written, because the confirmation may take a minute."""
     try:
         small.write()
         small = confirm(small, trusted=True) or small  # it runs what the whole crash was trusted to run

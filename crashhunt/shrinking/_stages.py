@@ -1,4 +1,4 @@
-"""The candidates of a minimization in their order, and the smallest one that still crashes."""
+"""The candidates of a minimization in their order, and the smallest candidate that still crashes."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ _FEW_ACTORS = 3  # actors; a crash with at most this number keeps the form in wh
 
 
 class Minimizer:
-    """Makes a crash smaller.
+    """Minimizes a crash in several stages.
 
     Args:
-        rerun: the crash.
-        runs: what runs candidates.
+        rerun: the crash to minimize.
+        runs: object that runs the candidates.
         form: Whether the other actors drive; with ``either``, they drive if few of them remain.
-        constructor_defaults: The defaults in the agents' own code, by agent and name. They win over those of the
-            scenario, because the user finds them where the agent is fixed.
+        constructor_defaults: The defaults in the agents' own code, by agent and name. They take precedence over the
+            defaults of the scenario, because the user sees them where the agent is fixed.
 
     Attributes:
-        best: the smallest that did it.
+        best: the smallest candidate that crashed in the same manner.
         smaller: the minimized candidates that still crash, in the order in which they were found.
-        reproduced: whether the crash itself came again.
-        notes: what could not be tried, in words.
+        reproduced: whether the original crash itself reproduced.
+        notes: notes on stages that were not possible, as text.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Minimizer:
         return "done", ""
 
     def _smaller_traffic(self) -> None:
-        """Plain arguments first: few trials make a crash that can be read, and leaving out others may take hundreds."""
+        """Simplify arguments first, which takes few trials, then remove actors, which may take hundreds of trials."""
         self._everybody = self._runs.entered(replace(self.best, only=(ALL_AGENTS,)))  # of the crash as it was
         self._left_out = bool(self._everybody)
         if not self._left_out and _actors(self._rerun.recorded) > len(self._rerun.recorded.agents):
@@ -138,7 +138,7 @@ class Minimizer:
 
     @contextmanager
     def _no_longer(self) -> Iterator[None]:
-        """Refuse candidates that take longer than the best: steps count more than arguments and disturbances."""
+        """Refuse candidates that crash later than the best one: steps count more than arguments and disturbances."""
         before, self._runs.most_steps = self._runs.most_steps, min(self._runs.most_steps, self._steps)
         try:
             yield
@@ -176,7 +176,7 @@ class Minimizer:
             fewest(self._everybody, tried)
 
     def _first_groups(self) -> list[tuple[str, ...]]:
-        """Return groups of actors to try first: none, the collision partner, the nearest actors, single actors."""
+        """Return groups of actors to keep at first: none, the collision partner, the nearest actors, single actors."""
         recording, known = self._rerun.recorded, set(self._everybody)
         near = [name for name in _nearest(recording, self._rerun.bundle.driver) if name in known]
         other = [name for name in self._others_of_the_crash() if name in known]
@@ -217,7 +217,10 @@ class Minimizer:
             self._until_nothing_helps(self._fewer_moved)
 
     def _begin_later(self, scripting: Scripting) -> None:
-        """Script the few actors that are left, from as late as possible: without the rest, the crash took longer."""
+        """Move the few remaining actors along recorded paths, and begin as late as possible.
+
+        Without the removed actors, the crash may take longer; a later beginning avoids that.
+        """
         others = tuple(name for name in scripting.whole.others if name in (self.best.only or ()))
         agents = scripting.whole.agents
         whole = Part(agents, others)
@@ -253,7 +256,7 @@ class Minimizer:
         fewest(script.names, tried)
 
     def _fewest_moved(self, scripting: Scripting) -> Part | None:
-        """Remove all unnecessary other actors; return None if the crash does not reproduce in this form."""
+        """Remove all unnecessary actors in scripted form; return None if the crash does not reproduce in this form."""
         whole, about = scripting.whole, self._rerun.bundle.driver
         near = [name for name in _nearest(self._rerun.recorded, about) if name not in whole.agents]
         other = tuple(self._others_of_the_crash())
@@ -284,11 +287,11 @@ class Minimizer:
         return replace(found, others=fewest(found.others, tried))
 
     def _fewer_from_later_on(self, scripting: Scripting, part: Part) -> None:
-        """Remove more actors with a later beginning, because actors that mattered only before are then unnecessary.
+        """Remove more actors with a later beginning; actors that mattered only before it are then unnecessary.
 
-        The method first tries each other actor alone, and in a pair with the collision partner. Then it starts from all
-        actors again and removes the unnecessary ones: an agent that reacts to all visible actors may need different
-        actors than with the original beginning.
+        The method first tries each other actor alone, and in a pair with the collision partner. Then the method starts
+        again from all actors and removes the unnecessary ones. An agent that reacts to all visible actors may need
+        other actors than with the original beginning.
         """
         begins = list(dict.fromkeys((part.begin, *scripting.begins(part.agents), 0)))
         whole = scripting.whole
@@ -312,7 +315,7 @@ class Minimizer:
                 break
 
     def _without_any(self, scripting: Scripting, part: Part) -> Part | None:
-        """Remove the unnecessary actors of a part; return None if the crash does not reproduce with the part."""
+        """Remove the unnecessary actors of a part; return None if the crash does not reproduce with the whole part."""
         if self._runs.first([scripting.spec(part)]) is None:
             return None
 
@@ -354,7 +357,7 @@ class Minimizer:
     # What came of it
 
     def actors(self, after: Recording | None) -> tuple[int, int]:
-        """The number of actors before and after."""
+        """Return the number of actors before and after the minimization."""
         before = _actors(self._rerun.recorded)
         return before, before if after is None else _actors(after)
 
@@ -390,7 +393,7 @@ class Minimizer:
         return shifted in self.best.disturbances
 
     def changed(self) -> dict[str, tuple[Value | None, Value | None]]:
-        """Arguments that have another value."""
+        """The arguments whose value was changed."""
         was, now = self._rerun.spec, self.best
         pairs = {
             f"{agent}.{name}" if agent else name: (_value(was, (agent, name)), _value(now, (agent, name)))
@@ -404,7 +407,7 @@ def _actors(recording: Recording) -> int:
 
 
 def _nearest(recording: Recording, agent: str) -> list[str]:
-    """The others in the last scene, the nearest first."""
+    """Return the other actors in the last scene, the nearest actor first."""
     scenes = recording.scenes()
     if not scenes or agent not in scenes[-1].roster.index:
         return []
