@@ -1,4 +1,4 @@
-"""The dashboard: a live page over many hunts, in the browser."""
+"""The dashboard: a live web page that shows many hunts."""
 
 import lazy_loader
 

@@ -51,11 +51,11 @@ _SCRIPTS = ("common.js", "list.js", "hunt.js", "crash.js", "compare.js", "style.
 
 
 class Application(NamedTuple):
-    """What answers requests.
+    """The dashboard's application, which answers requests.
 
     Args:
         asgi: the ASGI application.
-        close: ends all processes that it has started.
+        close: function that ends all processes that the application has started.
     """
 
     asgi: ASGIApp
@@ -63,12 +63,12 @@ class Application(NamedTuple):
 
 
 def make_application(catalog: Catalog, *, host: str, token: str = "", allow_control: bool = False) -> Application:
-    """Return the application, guarded.
+    """Return the application, protected against requests that do not come from the user.
 
     Args:
-        catalog: catalog of the hunts that it shows.
-        host: that it listens on.
-        token: that requests need; empty for none.
+        catalog: catalog of the hunts that the application shows.
+        host: host on which the server listens.
+        token: token that requests need; empty if they need none.
         allow_control: whether requests may stop hunts and start commands.
     """
     shown = _Shown(catalog)
@@ -238,7 +238,7 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
 
 
 class _Shown:
-    """The views of all hunts, kept between requests.
+    """The views of all hunts, which are kept between requests.
 
     Args:
         catalog: catalog of the hunts.
@@ -254,7 +254,7 @@ class _Shown:
         self.compared = HuntComparer()
 
     def view(self, identifier: str) -> HuntView | None:
-        """Return a hunt by its identifier; None if it is unknown or gone."""
+        """Return the view of a hunt by the hunt's identifier; None if the hunt is unknown or was deleted."""
         found = self._catalog.find(identifier)
         return None if found is None else self._view(found)
 
@@ -266,7 +266,7 @@ class _Shown:
             return view
 
     def crashes(self, identifier: str) -> CrashList | None:
-        """Return the crashes of a hunt; None if it is unknown or gone."""
+        """Return the crashes of a hunt; None if the hunt is unknown or was deleted."""
         found = self._catalog.find(identifier)
         if found is None:
             return None
@@ -278,10 +278,10 @@ class _Shown:
             return known
 
     def rows(self, since: str) -> JsonObject:
-        """Return the rows that have changed since a revision, and the identifiers of all hunts.
+        """Return the rows of hunts that have changed since a revision, and the identifiers of all hunts.
 
         Args:
-            since: revision that an earlier call returned; any other text returns all rows.
+            since: revision that an earlier call returned; for any other text, all rows are returned.
         """
         found = self._catalog.hunts()
         rows = {name: self._view(hunt).row() for name, hunt in found.items()}
@@ -305,7 +305,7 @@ class _Shown:
 
 
 def _answer(request: Request, data: JsonObject) -> Response:
-    """Return data as JSON, or 304 where the reader has it already."""
+    """Return data as a JSON response, or status 304 if the browser already has these data."""
     text = json.dumps(_finite({"version": API_VERSION, **data}), ensure_ascii=False, separators=(",", ":"))
     body = text.encode("utf-8", "replace")
     tag = f'"{hashlib.blake2b(body, digest_size=12).hexdigest()}"'
@@ -316,7 +316,7 @@ def _answer(request: Request, data: JsonObject) -> Response:
 
 
 def _finite(value: object) -> object:
-    """Return plain data without numbers that JSON has no word for."""
+    """Return plain data without the numbers that JSON cannot express: NaN and infinity."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -327,7 +327,7 @@ def _finite(value: object) -> object:
 
 
 def _digest(row: JsonObject) -> bytes:
-    """Return the digest of what makes a row another one: without what changes with the clock only."""
+    """Return the digest of a row, without the values that change only with the clock."""
     row = {name: value for name, value in row.items() if name != "newest_kind_s"}
     return hashlib.blake2b(json.dumps(row, default=str).encode("utf-8", "replace"), digest_size=12).digest()
 
@@ -349,7 +349,7 @@ def _from_error(error: Exception) -> Response:
 
 @cache
 def _assets() -> dict[str, bytes]:
-    """Return the scripts and the style by name; the player is the one of the report."""
+    """Return the scripts and the style sheet by name; the player is the same as in the report."""
     player = player_parts()
     folder = resources.files("crashhunt.dashboard").joinpath("static")
     found = {name: folder.joinpath(name).read_bytes() for name in _SCRIPTS}
@@ -358,10 +358,10 @@ def _assets() -> dict[str, bytes]:
 
 @cache
 def _plotly() -> bytes:
-    """Return the script of plotly that its package ships, its one large function in parentheses.
+    """Return the script of plotly from its Python package, with its single large function in parentheses.
 
-    A browser compiles a function in parentheses while the script loads. It compiles any other one at its first call,
-    where it holds up the page: 0.2 s of the first view.
+    A browser compiles a function in parentheses while the script loads. It compiles any other function at its first
+    call, which would delay the first view of the page by 0.2 s.
     """
     script = resources.files("plotly").joinpath("package_data", "plotly.min.js").read_bytes()
     head, opening, rest = script.partition(b" : this, () => {\n")
@@ -372,20 +372,20 @@ def _plotly() -> bytes:
 
 @cache
 def _stamp(name: str) -> str:
-    """Return what changes when a file does."""
+    """Return a value that changes when the file changes."""
     data = _plotly() if name == "plotly.js" else _assets()[name]
     return hashlib.blake2b(data, digest_size=6).hexdigest()
 
 
 def _lasting(request: Request, name: str) -> dict[str, str]:
-    """Return for how long a browser may keep a file: for ever, where its address says which version it is."""
+    """Return how long a browser may cache a file: for ever if its address contains the version."""
     fits = request.query_params.get("v") == _stamp(name)
     return {"cache-control": "public, max-age=31536000, immutable" if fits else "no-cache"}
 
 
 @cache
 def _page(name: str) -> bytes:
-    """Return a page, with the player in its place and a version in the address of each script."""
+    """Return an HTML page, with the player inserted and with a version in the address of each script."""
     text = resources.files("crashhunt.dashboard").joinpath("static", f"{name}.html").read_text(encoding="utf-8")
     text = text.replace("<!--PLAYER-->", player_parts().controls)
     for asset in (*_assets(), "plotly.js"):

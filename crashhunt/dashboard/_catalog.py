@@ -1,7 +1,7 @@
-"""Finds the hunts below the folders that the user named, and gives each an identifier for links.
+"""Finds the hunts below the folders that the user named, and assigns each hunt an identifier for links.
 
-No path of a request reaches the file system: a request names an identifier, and the catalog knows its folder. A hunt is
-listed only if its files lie inside one of the named folders after all symbolic links are resolved.
+No path in a request reaches the file system, because a request contains an identifier, and the catalog maps it to a
+folder. A hunt is listed only if its files lie inside one of the named folders after all symbolic links are resolved.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ _MAX_BYTES = {layout.HUNT: 4 << 20, layout.CRASH: 16 << 20}
 
 @dataclass(frozen=True, slots=True)
 class FoundHunt:
-    """A hunt that was found.
+    """A hunt that the catalog has found.
 
     Args:
-        id: of it in links: 16 hexadecimal digits that depend on its path only.
-        path: path of its folder, resolved.
-        root: the named folder that it lies in.
-        name: its path below that folder, or the folder's own name.
-        suite: the folder that it shares with other hunts, below the named one; empty for none.
-        exported: whether it was unpacked from a file that ``crashhunt export`` wrote.
+        id: identifier in links: 16 hexadecimal digits that depend only on the path of the hunt.
+        path: path of the hunt's folder, with symbolic links resolved.
+        root: the folder named by the user that contains the hunt.
+        name: path of the hunt relative to `root`, or the name of its folder.
+        suite: folder that contains this and other hunts, relative to `root`; empty if there is none.
+        exported: whether the hunt was unpacked from a file that ``crashhunt export`` wrote.
     """
 
     id: str
@@ -60,11 +60,11 @@ class FoundHunt:
 
 
 class Catalog:
-    """The hunts below some folders; they are looked for again while requests come.
+    """The hunts below some folders; the search is repeated while requests arrive.
 
     Args:
-        roots: the folders, which exist.
-        exported: unpacked exports, by the name of the file.
+        roots: the existing folders to search.
+        exported: folders of unpacked exports, by the name of the exported file.
     """
 
     def __init__(self, roots: Sequence[Path], exported: dict[str, Path] | None = None) -> None:
@@ -76,7 +76,7 @@ class Catalog:
         self.is_cut = False
 
     def hunts(self) -> dict[str, FoundHunt]:
-        """Return the hunts by identifier, in the order of the named folders."""
+        """Return the hunts by identifier, in the order of the folders named by the user."""
         with self._lock:
             began = time.monotonic()
             if began >= self._due:
@@ -86,7 +86,7 @@ class Catalog:
             return self._found
 
     def find(self, identifier: str) -> FoundHunt | None:
-        """Return a hunt by its identifier; None if it is unknown, or its folder is gone."""
+        """Return a hunt by its identifier; None if the identifier is unknown, or if the hunt's folder was deleted."""
         found = self._found.get(identifier) or self.hunts().get(identifier)
         return found if found is not None and found.path.is_dir() else None
 
@@ -107,7 +107,7 @@ class Catalog:
                     yield FoundHunt(id=_identifier(path), path=path, root=root, name=name, suite=suite)
 
     def _below(self, root: Path) -> Iterator[Path]:
-        """Yield the folders of hunts, parents before children; a hunt has no hunts inside."""
+        """Yield the folders of hunts below a folder, parents before children; hunts themselves are not searched."""
         folders, looked = [(root, 0)], 0
         while folders:
             folder, depth = folders.pop(0)
@@ -135,20 +135,20 @@ class Catalog:
 
 
 def is_inside(path: Path, roots: Sequence[Path]) -> bool:
-    """Whether a resolved path is one of some folders, or lies in one."""
+    """Return whether a resolved path equals one of some folders, or lies inside one of them."""
     return any(path == root or root in path.parents for root in roots)
 
 
 def unreadable(folder: Path, root: Path, names: Iterable[str] = _OWN_FILES) -> str:
-    """Return why a file of a folder must not be opened; empty if all may be.
+    """Return the reason why a file of a folder must not be opened; empty if all files may be opened.
 
-    The folder of a stranger may have links that lead out of it, pipes at which a reader waits for ever, and files that
-    fill the memory.
+    A folder of another user may contain links that lead out of it, pipes at which a reader waits for ever, and files
+    that fill the memory.
 
     Args:
-        folder: whose files are checked.
-        root: that they must lie in.
-        names: names of the files and folders; those of a hunt by default.
+        folder: folder whose files are checked.
+        root: folder inside which the files must lie.
+        names: names of the files and folders to check; by default the names of a hunt's files.
     """
     for name in names:
         path = folder / name
@@ -168,11 +168,11 @@ def unreadable(folder: Path, root: Path, names: Iterable[str] = _OWN_FILES) -> s
 
 
 def unreadable_below(folder: Path, root: Path) -> str:
-    """Return why a file in a folder, or in one below, must not be opened; empty if all may be.
+    """Return the reason why a file in a folder or its subfolders must not be opened; empty if all may be opened.
 
     Args:
-        folder: which may be missing.
-        root: that the files must lie in.
+        folder: folder whose files are checked; it may be missing.
+        root: folder inside which the files must lie.
     """
     folders = [str(folder)]  # texts: a snapshot has 50 folders, and making a path takes longer than listing its folder
     while folders:

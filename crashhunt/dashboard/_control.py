@@ -1,7 +1,7 @@
-"""What the page may start or stop with ``--allow-control``: an interrupt of a hunt, and commands for a crash.
+"""Actions of the page with ``--allow-control``: it may interrupt a hunt, and start commands for a crash.
 
-Commands run one after the other, each in its own process, as if the user had started it. A command without a
-terminal cannot ask whether to trust code, so it refuses the code of a stranger.
+Commands run one after the other, each in its own process, as if the user had started it. A command without a terminal
+cannot ask whether to trust code, so it refuses untrusted code.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ _TERMINAL_ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 def stop_hunt(view: HuntView) -> None:
-    """Interrupt a running hunt as Ctrl-C does: it keeps what has ended, and can be resumed.
+    """Interrupt a running hunt as Ctrl-C does: finished trials are kept, and the hunt can be resumed.
 
     Raises:
-        UsageError: it does not run, or not on this machine.
+        UsageError: the hunt is not running, or runs on another machine.
     """
     state = view.refresh()
     owner = view.facts.get("owner")
@@ -77,7 +77,7 @@ class _Job:
 
 
 class Jobs:
-    """Runs commands, one at a time, in the order in which they were asked for."""
+    """Runs commands, one at a time, in the order in which they were requested."""
 
     def __init__(self) -> None:
         self._numbers = itertools.count(1)
@@ -88,16 +88,16 @@ class Jobs:
         self._thread: threading.Thread | None = None
 
     def add(self, hunt: str, path: Path, crash: str, name: str) -> JsonObject:
-        """Add a job.
+        """Add a job to the queue.
 
         Args:
             hunt: identifier of the hunt.
-            path: path of its folder.
-            crash: identifier of the crash, which is there.
-            name: name of the command, one of `COMMANDS`.
+            path: path of the hunt's folder.
+            crash: identifier of a crash that exists in the hunt.
+            name: name of the command; one of `COMMANDS`.
 
         Raises:
-            UsageError: there is no such command, or too many jobs wait.
+            UsageError: the command does not exist, or too many jobs are waiting.
         """
         if name not in COMMANDS:
             raise UsageError(f"there is no job {name!r}", fix=one_of(name, COMMANDS))
@@ -114,12 +114,12 @@ class Jobs:
             return job.to_json()
 
     def list(self, hunt: str, crash: str) -> list[JsonObject]:
-        """Return the jobs for a crash, the latest first."""
+        """Return the jobs for a crash, the latest job first."""
         with self._changed:
             return [job.to_json() for job in reversed(self._jobs) if (job.hunt, job.crash) == (hunt, crash)]
 
     def close(self) -> None:
-        """Interrupt the job that runs, and start no more."""
+        """Interrupt the running job, and start no further jobs."""
         with self._changed:
             self._closed = True
             process = self._process
@@ -149,7 +149,7 @@ class Jobs:
             self._follow(job, process)
 
     def _follow(self, job: _Job, process: subprocess.Popen[bytes]) -> None:
-        """Take in what a process prints, until it ends."""
+        """Collect the output of a process until the process ends."""
         assert process.stdout is not None
         text = ""
         with process.stdout:

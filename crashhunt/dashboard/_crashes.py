@@ -1,4 +1,4 @@
-"""The saved crashes and near misses of a hunt: what each is, and where it happened. Runs no code of a bundle."""
+"""The saved crashes and near misses of a hunt, with their types and places. No code of a bundle runs."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ _MAX_GENERATIONS = 50  # of a lineage
 
 
 class _Entry(NamedTuple):
-    """A bundle, as of the time when its ``crash.json`` was written."""
+    """A bundle, with the time at which its ``crash.json`` was written."""
 
     written: tuple[int, int]
     row: JsonObject
 
 
 class CrashList:
-    """The bundles of a hunt, each read once.
+    """The bundles of a hunt; each bundle is read once.
 
     Args:
-        found: the hunt.
+        found: the hunt that contains the bundles.
     """
 
     def __init__(self, found: FoundHunt) -> None:
@@ -65,7 +65,7 @@ class CrashList:
 
     @staticmethod
     def _minimized(folder: Path | None) -> Path | None:
-        """Return the folder of the minimized crash of a crash; None if there is none."""
+        """Return the folder with the minimized form of a crash; None if there is none."""
         if folder is None:
             return None
         found = folder.with_name(f"{folder.name}{layout.SMALL}")
@@ -79,9 +79,9 @@ class CrashList:
         return found
 
     def rows(self) -> JsonObject:
-        """Return ``crashes``, one entry each, and ``pending``, how many are still being analysed.
+        """Return ``crashes``, with one entry for each crash, and ``pending``, the number of crashes not yet analysed.
 
-        Reading the log of a crash takes 50 ms and more, so its own thread does it.
+        Reading the log of a crash takes 50 ms or more, so a separate thread reads the logs.
         """
         with self._lock:
             folders = self._folders()
@@ -111,10 +111,10 @@ class CrashList:
         return row
 
     def _read(self, folder: Path) -> Bundle:
-        """Read a bundle.
+        """Read a bundle of the hunt.
 
         Raises:
-            BundleError: it is damaged, or a file of it or of the hunt must not be opened.
+            BundleError: the bundle is damaged, or a file of the bundle or the hunt must not be opened.
         """
         root = self._found.path
         why = (
@@ -128,10 +128,10 @@ class CrashList:
         return read_bundle(folder)
 
     def bundle(self, crash: str) -> Bundle | None:
-        """Return a crash by its identifier; None if it is missing.
+        """Return a crash by its identifier; None if the crash does not exist.
 
         Raises:
-            BundleError: it is damaged, or a file of it must not be opened.
+            BundleError: the crash is damaged, or one of its files must not be opened.
         """
         folder = self.folder(crash)
         return None if folder is None else self._read(folder)
@@ -152,10 +152,10 @@ class CrashList:
                 self._analysed[name] = written, said
 
     def detail(self, crash: str) -> JsonObject | None:
-        """Return a crash for its page: the player's data, words, table, and commands; None if there is none.
+        """Return the data of a crash for its page (player, texts, table and commands); None if it does not exist.
 
         Raises:
-            BundleError: it is damaged.
+            BundleError: the crash is damaged.
         """
         folder = self.folder(crash)
         if folder is None:
@@ -181,7 +181,7 @@ class CrashList:
         }
 
     def _lineage(self, number: int) -> list[list[object]]:
-        """Return the trials that a trial was made from: number, origin and danger."""
+        """Return the ancestors of a trial, each with number, origin and criticality."""
         path = self._found.path / layout.LEDGER
         if not has_begun(path):
             return []
@@ -202,7 +202,7 @@ class CrashList:
         return found
 
     def log(self, crash: str) -> Path | None:
-        """Return the file of a crash's log, inside of the hunt; None if there is none."""
+        """Return the path of a crash's log inside the hunt; None if there is no log."""
         folder = self.folder(crash)
         if folder is None:
             return None
@@ -210,7 +210,7 @@ class CrashList:
         return path if is_inside(path, [self._found.path]) and path.is_file() else None
 
     def map(self) -> JsonObject:
-        """Return the roads around the crashes, and where each crash and near miss happened.
+        """Return the roads around the crashes, and the places of crashes and near misses.
 
         Returns:
             ``lanes``: for each lane, x and y of its two borders in m, right and then left. ``points``: for each crash
@@ -273,7 +273,7 @@ def _summary(bundle: Bundle) -> JsonObject:
 
 
 def _analysis(bundle: Bundle) -> JsonObject:
-    """Return keys of the row of a crash or near miss that need its log: type and fault, or the most critical place."""
+    """Return the keys of a crash's or near miss's row that need its log: type and fault, or the critical place."""
     if not bundle.is_near_miss:
         recording = bundle.recording() if bundle.result.collision is not None else None
         return {"type": str(signature_of(bundle, recording)), "fault": fault_of(bundle, recording).verdict}
@@ -287,7 +287,7 @@ def _analysis(bundle: Bundle) -> JsonObject:
 
 
 def _commands(hunt: Path, crash: str, bundle: Bundle) -> list[list[str]]:
-    """Return name and text of the commands for a crash, ready to be pasted into a shell."""
+    """Return the commands for a crash by name, as text to paste into a shell."""
     near = bundle.is_near_miss
     may_shrink = not near and not crash.endswith(layout.SMALL)
     words = {

@@ -1,4 +1,4 @@
-"""What pages show besides trials: settings, command, logs, workers and events of a hunt; a comparison of hunts."""
+"""Further contents of the pages: settings, command, logs, workers and events of a hunt, and comparisons of hunts."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _PHASES = {
 
 
 def detail_of(view: HuntView) -> JsonObject:
-    """Return a hunt as ``/api/hunts/ID`` does: its row, and what its page shows."""
+    """Return the data of a hunt for ``/api/hunts/ID``: its row, and the further contents of its page."""
     row = view.row()
     settings, counts = view.settings, view.counts
     is_readable = not view.unreadable()
@@ -69,7 +69,7 @@ def detail_of(view: HuntView) -> JsonObject:
 
 
 def _log(view: HuntView) -> tuple[str, str]:
-    """Return what wrote the end of a log, and the end: the hunt of a suite, else the crash of the last trial."""
+    """Return the name and the end of a log: of the suite's hunt, or else of the crash of the last trial."""
     if text := read_tail(view.path / layout.RUN_LOG, view.path):
         return "", text
     for folder in crash_folders(view.path)[-1:]:
@@ -78,7 +78,7 @@ def _log(view: HuntView) -> tuple[str, str]:
 
 
 def _settings(settings: HuntSettings) -> JsonObject:
-    """Return settings for people, in the words of the command line."""
+    """Return settings as text, in the terms of the command line."""
     found: JsonObject = {
         "scenario": settings.scenario,
         **{f"agent {name}": agent.agent for name, agent in settings.agents.items()},
@@ -100,7 +100,7 @@ def _settings(settings: HuntSettings) -> JsonObject:
 
 
 def _columns(settings: HuntSettings) -> list[str]:
-    """Return the arguments that may vary, by the names that points have for them."""
+    """Return the arguments that may vary, by their names in the data of the plots."""
     several = len(settings.agents) > 1
     names = [
         f"{agent}.{name}" if several else name for agent, chosen in settings.agents.items() for name in chosen.arguments
@@ -109,7 +109,7 @@ def _columns(settings: HuntSettings) -> list[str]:
 
 
 def _command(path: Path) -> str:
-    """Return the command line in the first line of ``hunt.toml``; empty if there is none."""
+    """Return the command line from the first line of ``hunt.toml``; empty if there is none."""
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             first = file.readline(20_000)
@@ -119,7 +119,7 @@ def _command(path: Path) -> str:
 
 
 def _workers(view: HuntView) -> list[JsonObject]:
-    """Return where each running trial is, from the header of its black box."""
+    """Return the present step of each running trial, from the header of its black box."""
     owner = view.facts.get("owner")
     is_here = owner is not None and owner["host"] == socket.gethostname()
     now, found = time.monotonic(), {}  # the clock of black boxes, which counts from the start of a machine
@@ -137,7 +137,7 @@ def _workers(view: HuntView) -> list[JsonObject]:
 
 
 def importance_of_points(points: Sequence[Point]) -> list[JsonObject]:
-    """Return how much of the differences in criticality each argument explains, as the static report does."""
+    """Return the share of the variation in criticality that each argument explains, as in the report."""
     trials: list[tuple[Mapping[str, Value], float]] = []
     for point in points:
         danger = 1.0 if point["category"] != "no crash" else point["danger"]
@@ -155,7 +155,7 @@ _MAX_TRIALS = 200_000  # of all hunts together
 
 
 class HuntComparer:
-    """Compares hunts, and keeps the last comparison."""
+    """Compares hunts, and caches the last comparison."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -164,10 +164,10 @@ class HuntComparer:
         self._due = 0.0
 
     def compare(self, views: Sequence[HuntView]) -> JsonObject:
-        """Return ``hunts``, each a row with its curve and ``figures``, and ``pairs``, the first against each other.
+        """Return ``hunts``, each a row with its curve and ``figures``, and ``pairs``, each hunt against the first hunt.
 
         Args:
-            views: views of the hunts.
+            views: views of the hunts to compare.
         """
         with self._lock:
             rows = []

@@ -1,4 +1,4 @@
-"""One hunt as the dashboard shows it. When its files change, only new data are read."""
+"""The state of a hunt for the dashboard. When the files of the hunt change, only new data are read."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class HuntView:
     """The known state of a hunt, kept between requests.
 
     Args:
-        found: the hunt.
+        found: the hunt whose state is read.
     """
 
     def __init__(self, found: FoundHunt) -> None:
@@ -79,10 +79,10 @@ class HuntView:
         return self.found.path
 
     def refresh(self, *, points: bool = False) -> HuntState:
-        """Read what is new; return the state of the hunt.
+        """Read new data of the hunt, and return its state.
 
         Args:
-            points: whether the sample for plots is wanted as well.
+            points: whether to read the sample for plots as well.
         """
         with self._lock:
             try:
@@ -131,7 +131,10 @@ class HuntView:
         )
 
     def unreadable(self) -> str:
-        """Return why a file of the hunt must not be opened; empty if all may be. Snapshots are examined once."""
+        """Return the reason why a file of the hunt must not be opened; empty if all may be.
+
+        Snapshots are examined once.
+        """
         snapshots = self.path / layout.SNAPSHOTS
         if why := unreadable(self.path, self.found.root):
             return why
@@ -179,7 +182,10 @@ class HuntView:
             ledger.close()
 
     def _read_copies(self, ledger: Ledger) -> None:
-        """Sum up probes and branches, which reads all trials: not more often than their share of time allows."""
+        """Sum up the results of robustness probes and branches.
+
+        The method reads all trials, so it runs only within its share of the time.
+        """
         if not self.facts.get("copies"):
             self._copies = {}
             return
@@ -194,7 +200,7 @@ class HuntView:
     # What the pages show.
 
     def row(self) -> JsonObject:
-        """Return the hunt as an entry of ``/api/hunts``: what ``status --json`` says, and a few keys more."""
+        """Return the hunt as an entry of ``/api/hunts``: the data of ``status --json``, and a few further keys."""
         with self._lock:
             state = self.refresh()
             settings, counts = self.settings, self.counts
@@ -222,11 +228,11 @@ class HuntView:
             return row
 
     def kinds(self) -> list[KindData] | None:
-        """Return the crash types that the hunt has noted; None if the first crash ends it."""
+        """Return the crash types that the hunt has recorded; None if the hunt ends at its first crash."""
         return self.facts.get("kinds") if self.counts is not None else None
 
     def kind_firsts(self) -> list[int]:
-        """Return the numbers of the trials with which a crash type came first, in order."""
+        """Return in order the numbers of the trials in which a crash type occurred for the first time."""
         dropped = self.facts.get("dropped") or {}
         found = []
         for kind in self.kinds() or []:
@@ -238,7 +244,7 @@ class HuntView:
         return sorted(found)
 
     def active_at(self) -> float:
-        """Return when something happened last, in s since the epoch; 0 if that is unknown."""
+        """Return the time of the hunt's last activity, in s since the epoch; 0 if it is unknown."""
         times = [self._last or 0.0, self.facts.get("heartbeat", 0.0), self.facts.get("began", 0.0)]
         if self.counts is None:
             with suppress(OSError):
@@ -246,7 +252,7 @@ class HuntView:
         return max(times)
 
     def rate(self, state: HuntState) -> JsonObject | None:
-        """Return the rate per trial as ``rate --json`` does; None if there is no trial, or it is not known yet."""
+        """Return the crash rate per trial as ``rate --json`` does; None without a trial, or if it is not yet known."""
         settings, counts = self.settings, self.counts
         if settings is None or counts is None or not counts.trials:
             return None
@@ -263,7 +269,7 @@ class HuntView:
         return self._rate_of_all(state, settings, counts, held_out)
 
     def _held_out(self, settings: HuntSettings) -> HeldOutTraffics:
-        """Return the rule for the traffics that count; snapshots are read once."""
+        """Return the rule that selects the traffic seeds that count; snapshots are read once."""
         key = _sign(self.path / layout.SNAPSHOTS)
         if self._held_out_rule is None or self._held_out_key != key:
             self._held_out_rule, self._held_out_key = held_out_traffics(settings, [self.path]), key
@@ -272,7 +278,7 @@ class HuntView:
     def _rate_of_all(
         self, state: HuntState, settings: HuntSettings, counts: TrialCounts, held_out: HeldOutTraffics
     ) -> JsonObject | None:
-        """Measure a rate that needs all trials, within its share of time."""
+        """Compute a crash rate that needs all trials, within its share of the time."""
         if counts.trials > _MAX_TRIALS_READ:
             why = f"it reads all trials, of which there are more than {_MAX_TRIALS_READ:,}"
             return {"why_not": f"{why}; run: {shlex.join(['crashhunt', 'rate', str(self.path)])}"}
@@ -293,14 +299,14 @@ class HuntView:
 
 
 def _rate_data(rate: CrashRate) -> JsonObject:
-    """Return what the page needs of a rate, under the keys of ``rate --json``."""
+    """Return the parts of a crash rate that the page needs, under the keys of ``rate --json``."""
     data = rate.to_json()
     names = ("per", "confidence", "method", "units", "crashes", "estimate", "certain", "why_not", "left_out")
     return {name: data[name] for name in names}
 
 
 def _sign(path: Path) -> tuple[int, int, int]:
-    """Return what changes when a file does."""
+    """Return a value that changes when the file changes."""
     try:
         found = path.stat()
     except OSError:
@@ -309,12 +315,12 @@ def _sign(path: Path) -> tuple[int, int, int]:
 
 
 def read_tail(path: Path, root: Path, most: int = _LOG_TAIL_BYTES) -> str:
-    """Return the end of a text file, from the beginning of a line; empty if it is missing or outside of a folder.
+    """Return the last lines of a text file; empty if the file is missing or outside of a folder.
 
     Args:
         path: path of the file.
-        root: that it must lie in, after links are resolved.
-        most: bytes.
+        root: folder inside which the file must lie after links are resolved.
+        most: maximum number of bytes to read.
     """
     resolved = path.resolve()
     if root not in resolved.parents:

@@ -1,14 +1,15 @@
-"""Refuses requests that are not the user's, before anything is read for them.
+"""Refuses requests that do not come from the user, before any data are read for them.
 
-The page shows files of this machine, so other sites in the same browser, and other users of the network, are kept out:
+The page shows files of this machine, so other web sites in the same browser, and other users of the network, must not
+get access:
 
-- The name in the Host header must be ours. A site that lets its own name point to this machine (DNS rebinding) sends
-  its own name.
-- Without a loopback address, a token is needed. It is compared in constant time, and kept in a cookie that scripts
-  cannot read and other sites cannot send.
+- The name in the Host header must be a name of this server. A site that makes its own name point to this machine (DNS
+  rebinding) sends its own name.
+- If the server does not listen on a loopback address, a token is needed. The token is compared in constant time, and
+  kept in a cookie that scripts cannot read and other sites cannot send.
 - Requests of other sites are refused by the headers Sec-Fetch-Site and Origin, which scripts cannot set.
-- Sizes are bounded, and so is the number of requests at a time.
-- Each answer forbids scripts, styles, connections and frames that are not ours.
+- The size of requests and the number of requests at a time are bounded.
+- Each response forbids scripts, styles, connections and frames of other sites.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ _HEADERS = {
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host to listen on can be reached from this machine only."""
+    """Return whether a host to listen on can be reached only from this machine."""
     if host == "localhost":
         return True
     try:
@@ -69,10 +70,10 @@ def is_loopback(host: str) -> bool:
 
 
 def names_of(host: str) -> frozenset[str]:
-    """Return the names that a request may call this machine by, besides any IP address.
+    """Return the names by which a request may address this machine, in addition to IP addresses.
 
     Args:
-        host: host to listen on.
+        host: host on which the server listens.
     """
     names = {"localhost", host.lower()}
     if not is_loopback(host):
@@ -81,13 +82,13 @@ def names_of(host: str) -> frozenset[str]:
 
 
 class Guard:
-    """Passes on the requests of the user, and refuses all others.
+    """Forwards the requests of the user, and refuses all other requests.
 
     Args:
-        app: that answers requests.
-        host: that the server listens on.
-        token: that every request needs; empty for none.
-        control: whether requests may ask for more than to read.
+        app: application that answers the forwarded requests.
+        host: host on which the server listens.
+        token: token that every request needs; empty if requests need none.
+        control: whether requests may do more than read.
     """
 
     def __init__(self, app: ASGIApp, *, host: str, token: str = "", control: bool = False) -> None:
@@ -99,7 +100,7 @@ class Guard:
         self._requests = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
+        """Answer or refuse one request."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -160,7 +161,7 @@ class Guard:
         return self._addresses or address.is_loopback
 
     def _is_foreign(self, scope: Scope, headers: _Headers, host: str) -> bool:
-        """Whether another site sent a request that is more than a link to a page."""
+        """Return whether another site sent a request, unless the request only follows a link to a page."""
         is_page = scope["method"] in ("GET", "HEAD") and not scope["path"].startswith("/api")
         site = headers.only("sec-fetch-site")
         if site in ("cross-site", "same-site") and not (is_page and headers.only("sec-fetch-mode") == "navigate"):
@@ -172,7 +173,7 @@ class Guard:
         return scope["method"] == "POST" and headers.only("x-crashhunt") != "1"
 
     def _without_token(self, scope: Scope, headers: _Headers) -> Response | None:
-        """Return the answer to a request without the token; None if the request has it."""
+        """Return the response to a request without the token; None if the request contains the token."""
         query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True, max_num_fields=100)
         given = [value for name, value in query if name == "token"]
         if given and self._fits(given[-1]) and scope["method"] in ("GET", "HEAD"):
@@ -204,7 +205,7 @@ class _Headers:
             self._found.setdefault(name.decode("latin-1").lower(), []).append(value.decode("latin-1"))
 
     def only(self, name: str) -> str | None:
-        """Return the value of a header; None if it is missing or there twice."""
+        """Return the value of a header; None if the header is missing or occurs twice."""
         values = self._found.get(name, ())
         return values[0] if len(values) == 1 else None
 
@@ -222,7 +223,7 @@ def _is_small(length: str) -> bool:
 
 
 def _bounded(receive: Receive) -> Receive:
-    """Return a function that stops reading a body above the limit, also if its length is unknown."""
+    """Return a function that stops reading a request's body above the limit, even if its length is unknown."""
     taken = 0
 
     async def bounded() -> Message:
@@ -237,7 +238,7 @@ def _bounded(receive: Receive) -> Receive:
 
 
 def _refused(status: int, message: str, fix: str) -> Response:
-    """Return an error in the shape of every command's ``--json``."""
+    """Return an error response in the JSON form that every command's ``--json`` has."""
     return JSONResponse(
         {"error": {"message": message, "fix": fix, "where": ""}}, status, headers={"cache-control": "no-store"}
     )

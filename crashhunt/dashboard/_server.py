@@ -30,12 +30,12 @@ _MAX_TRIED_PORTS = 100
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where the dashboard is.
+    """The address at which a browser reaches the dashboard.
 
     Args:
-        host: that the server listens on.
-        port: likewise.
-        token: that requests need; empty for none.
+        host: host on which the server listens.
+        port: port on which the server listens.
+        token: token that requests need; empty if they need none.
     """
 
     host: str
@@ -44,7 +44,7 @@ class Address:
 
     @property
     def url(self) -> str:
-        """The link to open."""
+        """The link that opens the dashboard."""
         host = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(self.host, self.host)
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/" + (f"?token={quote(self.token, safe='')}" if self.token else "")
@@ -60,19 +60,19 @@ def serve(
     allow_control: bool = False,
     announce: Callable[[Address], None],
 ) -> None:
-    """Serve the dashboard until an interrupt.
+    """Serve the dashboard until the user interrupts.
 
     Args:
         paths: hunts, suites, folders with hunts below them, or files that ``crashhunt export`` wrote.
         host: host to listen on.
         port: port to listen on; 0 for any free port.
-        token: that requests need; a random one where it is empty and the host is no loopback address.
-        browser: whether to open a browser where there is one.
+        token: token that requests need; if it is empty and the host is not a loopback address, a random token is used.
+        browser: whether to open a browser, if one is available.
         allow_control: whether the page may stop hunts and start commands.
-        announce: called with the address once it can be opened.
+        announce: function called with the address as soon as the dashboard can be opened.
 
     Raises:
-        UsageError: a path does not exist, the port is taken, the token is short, or the extra is missing.
+        UsageError: a path does not exist, the port is in use, the token is too short, or the extra is not installed.
     """
     if missing := _missing():
         raise UsageError(f"the dashboard needs {', '.join(missing)}", fix="run: pip install 'crashhunt[dashboard]'")
@@ -98,7 +98,7 @@ def serve(
 
 
 def has_dashboard() -> bool:
-    """Whether the packages of the dashboard are installed; imports none of them."""
+    """Return whether the packages of the dashboard are installed, without importing them."""
     return not _missing()
 
 
@@ -119,12 +119,12 @@ def _open(url: str) -> None:
 
 
 def _has_screen() -> bool:
-    """Whether a browser with a window could be opened; one in the terminal would take the terminal."""
+    """Return whether a browser with a window can be opened; a browser in the terminal would occupy the terminal."""
     return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _roots(paths: Sequence[Path], opened: ExitStack) -> tuple[list[Path], dict[str, Path]]:
-    """Return the folders to look into, and the folders of unpacked exports by the name of the file."""
+    """Return the folders to search, and the folders of unpacked exports by the name of the exported file."""
     folders: list[Path] = []
     exported: dict[str, Path] = {}
     for path in paths:
@@ -143,10 +143,10 @@ def _roots(paths: Sequence[Path], opened: ExitStack) -> tuple[list[Path], dict[s
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """Return a socket that listens.
+    """Return a socket that listens on a host and a port.
 
     Raises:
-        UsageError: the port is taken, not allowed or out of range, or the host is not one of this machine.
+        UsageError: the port is in use, not allowed or out of range, or the host is not a host of this machine.
     """
     if not 0 <= port < 65536:
         raise UsageError(f"--port is {port} (allowed: 0 to 65535)", fix="give a port in that range")
@@ -179,7 +179,7 @@ def _bound(family: int, target: tuple[object, ...]) -> socket.socket:
 
 
 def _next_free(family: int, target: tuple[object, ...]) -> int:
-    """Return the next port above that is free; 0 if none is near."""
+    """Return the next higher port that is free; 0 if none of the next ports is free."""
     host, port, *rest = target
     assert isinstance(port, int)
     for number in range(port + 1, min(port + _MAX_TRIED_PORTS, 65536)):

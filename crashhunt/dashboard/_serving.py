@@ -1,4 +1,4 @@
-"""The ASGI server, with what the dashboard needs besides: it says when it listens."""
+"""The ASGI server, extended by what the dashboard needs: a limit on request times, and a signal that it listens."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _SHUTDOWN_S = 1  # that a request may take after Ctrl-C
 
 
 class _Protocol(H11Protocol):
-    """HTTP with a limit of the time for a request's headers, which uvicorn lacks.
+    """HTTP protocol with a time limit for the headers of a request, which uvicorn lacks.
 
-    Clients that begin requests and never end them would otherwise use up all connections.
+    Without the limit, clients that begin requests and never complete them could use up all connections.
     """
 
     _deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for the first request."""
+        """Start the time limit of the first request."""
         super().connection_made(transport)
         self._watch()
 
@@ -42,7 +42,7 @@ class _Protocol(H11Protocol):
         self._watch()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the connection."""
+        """Cancel the time limit of the closed connection."""
         super().connection_lost(exc)
         if self._deadline is not None:
             self._deadline.cancel()
@@ -74,11 +74,11 @@ class _Server(uvicorn.Server):
 
 
 def make_server(application: ASGIApp, begun: Callable[[], None]) -> uvicorn.Server:
-    """Return the server.
+    """Return the server of the dashboard.
 
     Args:
-        application: that answers.
-        begun: called once, when requests are answered.
+        application: application that answers the requests.
+        begun: function called once, as soon as requests are answered.
     """
     config = uvicorn.Config(
         application, log_level="critical", access_log=False, server_header=False, date_header=False,
@@ -90,14 +90,14 @@ def make_server(application: ASGIApp, begun: Callable[[], None]) -> uvicorn.Serv
 
 
 def run_server(application: ASGIApp, listening: socket.socket, begun: Callable[[], None]) -> None:
-    """Answer requests until Ctrl-C.
+    """Run the server until Ctrl-C.
 
     Args:
-        application: that answers.
-        listening: the socket.
-        begun: called once, when requests are answered.
+        application: application that answers the requests.
+        listening: the listening socket.
+        begun: function called once, as soon as requests are answered.
 
     Raises:
-        KeyboardInterrupt: after Ctrl-C, once everything is closed.
+        KeyboardInterrupt: the user pressed Ctrl-C; all connections have been closed.
     """
     make_server(application, begun).run(sockets=[listening])

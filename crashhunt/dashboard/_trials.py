@@ -1,11 +1,12 @@
-"""Counts the trials of a hunt by part of the hunt, and keeps a sample of them for plots.
+"""Counts the trials of a hunt in each part of the hunt, and keeps a sample of the trials for plots.
 
-A hunt may have a million trials and write a thousand each second. So nothing here grows with the number of trials, and
-a refresh reads what is new: trials beyond the greatest number that is known, and gaps below it. Trials end in any
-order, so their numbers are no order of arrival.
+A hunt may have a million trials and write a thousand each second. The memory therefore does not grow with the number of
+trials. A refresh reads only new trials: those with numbers above the greatest known number, and those in gaps below
+this number. Trials end in any order, so their numbers do not show the order in which they ended.
 
 Invariants: `outcomes`, the parts and the counts up to the first gap are exact. The sample contains every crash, up to
-`MAX_CRASHES`, and of the other trials an even share: halved whenever there are more than `MAX_POINTS`.
+`MAX_CRASHES`, and an evenly spaced share of the other trials. This share is halved whenever the sample has more than
+`MAX_POINTS` trials.
 """
 
 from __future__ import annotations
@@ -46,14 +47,14 @@ Point: TypeAlias = "dict[str, object]"
 
 
 class Prefix(NamedTuple):
-    """The first trials of a hunt, up to the first that has not ended.
+    """The first trials of a hunt, up to the first trial that has not ended.
 
     Args:
         valid: number of trials that count.
         invalid: number of trials that do not count.
-        crashes: crashes of the valid ones.
-        steps: steps of the valid ones.
-        excluded: number of trials that have ended after them.
+        crashes: number of valid trials that crashed.
+        steps: number of simulated steps of the valid trials.
+        excluded: number of trials that have ended although an earlier trial has not.
     """
 
     valid: int
@@ -64,7 +65,7 @@ class Prefix(NamedTuple):
 
 
 class _Part:
-    """The results of the trials of one part."""
+    """The results of the trials in one part of the hunt."""
 
     __slots__ = ("outcomes", "steps")
 
@@ -74,7 +75,7 @@ class _Part:
 
 
 class TrialCounts:
-    """Counts the trials of a hunt.
+    """Counts the trials of a hunt, with a sample for plots.
 
     Args:
         crash_on: the outcomes that the hunt counts as a crash.
@@ -93,10 +94,10 @@ class TrialCounts:
         self._killed: set[int] = set()
 
     def refresh(self, ledger: Ledger) -> list[tuple[int, str]]:
-        """Count what is new.
+        """Read new trials and count them.
 
         Returns:
-            Number and outcome of each new trial. The first call returns nothing, because they would be all.
+            Number and outcome of each new trial; empty at the first call, because all trials are new.
         """
         if self.last < 0:
             self._begin(ledger)
@@ -147,10 +148,10 @@ class TrialCounts:
         self._advance()
 
     def _usual(self, ledger: Ledger, known: Mapping[str, tuple[int, int, int]]) -> str:
-        """Return the most frequent outcome, if its trials by part follow from those of the others; else nothing.
+        """Return the most frequent outcome if its trials in each part follow from those of other outcomes; else empty.
 
-        That is so where each of its trials took equally many steps, as with ``survived``, and no number is missing but
-        among the last ones. It spares sorting a million numbers by part.
+        This is possible if all trials with this outcome took the same number of steps, as with ``survived``, and
+        numbers are missing only near the end. It avoids sorting a million numbers by part.
         """
         # Steps of invalid trials are counted apart from those of others.
         usual = max(known.keys() - {Outcome.INVALID}, key=lambda outcome: known[outcome][0], default="")
@@ -161,12 +162,12 @@ class TrialCounts:
         return usual if least == most and missing == len(self._tail_gaps(ledger)) else ""
 
     def _tail_gaps(self, ledger: Ledger) -> set[int]:
-        """Return the missing ones of the last numbers."""
+        """Return those of the last trial numbers that are missing in the ledger."""
         first = max(0, self.last - _TAIL)
         return set(range(first, self.last)) - {number for number, _, _ in ledger.ended_between(first, self.last)}
 
     def _fill(self, outcome: str, steps: int, gaps: set[int]) -> None:
-        """Count as one outcome all trials that are neither counted nor missing."""
+        """Count all trials that are neither counted nor missing under one outcome."""
         missing = Counter(number // self._width for number in gaps)
         for part in range(self.last // self._width + 1):
             there = min(self._width, self.last + 1 - part * self._width) - missing[part]
@@ -181,7 +182,7 @@ class TrialCounts:
         self.outcomes[outcome] += trials
 
     def _gaps(self, last: int) -> list[tuple[int, int]]:
-        """Return the ranges of numbers that may be new, up to the last one of the ledger."""
+        """Return the ranges of numbers that may belong to new trials, up to the last number in the ledger."""
         found, first = [], self._prefix
         for number in sorted(self._waiting):
             if number > first:
@@ -192,7 +193,7 @@ class TrialCounts:
         return [*found, (max(first, self._prefix), last)] if last >= first else found
 
     def _advance(self) -> None:
-        """Take the trials behind the first gap to the counts before it."""
+        """Move trials after the first gap to the counts of the trials before it, if the gap is closed."""
         while self._prefix in self._waiting and self._prefix not in self._killed:
             outcome, steps = self._waiting.pop(self._prefix)
             self._prefix_outcomes[outcome] += 1
@@ -208,7 +209,7 @@ class TrialCounts:
 
     @property
     def prefix(self) -> Prefix:
-        """What a rate counts."""
+        """The counts of trials on which a rate is based."""
         invalid = self._prefix_outcomes[Outcome.INVALID]
         return Prefix(
             valid=self._prefix_outcomes.total() - invalid,
@@ -220,19 +221,19 @@ class TrialCounts:
 
     @property
     def trials(self) -> int:
-        """How many have ended."""
+        """The number of finished trials."""
         return self.outcomes.total()
 
     @property
     def crashes(self) -> int:
-        """How many ended with an outcome that counts as a crash."""
+        """The number of trials with an outcome that counts as a crash."""
         return sum(count for outcome, count in self.outcomes.items() if outcome in self.crash_on)
 
     def curve(self, most: int = PARTS) -> list[list[int]]:
-        """Return trials, steps and crashes so far, after each part of the hunt; the first is nothing at all.
+        """Return cumulative trials, steps and crashes after each part of the hunt; all are 0 in the first entry.
 
         Args:
-            most: points, at least 2.
+            most: maximum number of points; at least 2.
         """
         found, trials, steps, crashes = [[0, 0, 0]], 0, 0, 0
         for number in sorted(self._parts):
@@ -246,7 +247,7 @@ class TrialCounts:
         return [found[round(place * (len(found) - 1) / (most - 1))] for place in range(most)]
 
     def parts(self) -> list[dict[str, object]]:
-        """Return the parts: the first and the last number, and the number of trials with each outcome."""
+        """Return the parts of the hunt: first and last trial number, and the number of trials with each outcome."""
         return [
             {
                 "first": number * self._width,
@@ -259,7 +260,7 @@ class TrialCounts:
 
 
 class Sample:
-    """Trials for plots: all crashes, and an even share of the others.
+    """Trials for plots: all crashes, and an evenly spaced share of the other trials.
 
     Args:
         crash_on: the outcomes that the hunt counts as a crash.
@@ -275,11 +276,11 @@ class Sample:
         self._crashes = 0
 
     def begin(self, ledger: Ledger, last: int, crashes: int) -> None:
-        """Read the existing sample of a hunt.
+        """Read the sample from the existing trials of a hunt.
 
         Args:
             ledger: ledger of the hunt.
-            last: the greatest number of a trial.
+            last: the greatest trial number.
             crashes: number of crashes.
         """
         while (last + 1) * self.share > MAX_POINTS:
@@ -293,7 +294,7 @@ class Sample:
         self._take(ledger, sorted(numbers))
 
     def add(self, ledger: Ledger, trials: Iterable[tuple[int, str]]) -> None:
-        """Read those of new trials that belong to the sample.
+        """Read those of the new trials that belong to the sample.
 
         Args:
             ledger: ledger of the hunt.
@@ -341,10 +342,10 @@ class Sample:
         self.generation += 1
 
     def since(self, cursor: str) -> tuple[list[Point], str, bool]:
-        """Return the points that came after a cursor, the next cursor, and whether they replace all before.
+        """Return the points added after a cursor, the next cursor, and whether they replace all earlier points.
 
         Args:
-            cursor: that an earlier call returned; any other text gives all points.
+            cursor: cursor that an earlier call returned; for any other text, all points are returned.
         """
         now = f"{self.generation}.{len(self.points)}"
         generation, _, count = cursor.partition(".")
@@ -360,7 +361,7 @@ def _number(point: Point) -> int:
 
 
 def _is_drawn(number: int, share: float) -> bool:
-    """Whether a trial is among a share of all, evenly over the hunt; a smaller share is part of a greater one."""
+    """Return whether a trial belongs to a given share of all trials, evenly spaced; a smaller share is a subset."""
     return number * _GOLDEN_RATIO % 1.0 < share
 
 

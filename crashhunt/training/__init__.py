@@ -1,4 +1,4 @@
-"""Training on crashes: the environment ``crashhunt/Crashes-v0``, the split of traffics, and ``trained_on.json``."""
+"""Training on crashes: the environment ``crashhunt/Crashes-v0``, the split of seeds, and ``trained_on.json``."""
 
 import lazy_loader
 

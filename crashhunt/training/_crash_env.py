@@ -34,16 +34,16 @@ _MAX_INVALID = 20
 
 
 class CrashEnv(gymnasium.Env[Any, Any]):
-    """``gymnasium.make("crashhunt:crashhunt/Crashes-v0")``.
+    """The environment that ``gymnasium.make("crashhunt:crashhunt/Crashes-v0")`` returns.
 
     Each reset begins with a saved crash or with a plain episode. A crash episode repeats the recorded actions up to
     ``before_s`` before the crash, then the caller acts. A plain episode has another seed, and arguments from the ranges
     of a hunt. Spaces, rewards and crash rules are those of the scenario. An episode terminates when the vehicle crashes
-    or arrives. Crashes that the agent does not survive yet are drawn more often (`CrashReplay`).
+    or arrives. Crashes that the agent does not yet survive are drawn more often (`CrashReplay`).
 
-    Only traffics of the training part are used: `crashhunt split` shows the parts. `info` has ``crash`` (its name;
-    empty in a plain episode), ``seed``, ``step`` and ``sim_time_s``, and in the last step ``outcome`` and
-    ``has_crashed``.
+    Only traffic seeds of the training part are used; `crashhunt split` shows the parts. `info` contains ``crash`` (name
+    of the crash; empty in a plain episode), ``seed``, ``step`` and ``sim_time_s``. In the last step, it also contains
+    ``outcome`` and ``has_crashed``.
 
     ``reset(options={"crash": NAME})`` chooses a crash of `crashes`. An empty name chooses a plain episode.
 
@@ -52,21 +52,22 @@ class CrashEnv(gymnasium.Env[Any, Any]):
         before_s: Simulation time before the crash at which the caller takes over, in s.
         after_s: Simulation time after the step of the crash at which the episode is truncated, in s.
         share: Probability that a reset begins with a crash, from 0 to 1.
-        test: Share of the traffics in the test part, which is never used, from 0 to below 1.
-        trained_on: File ``trained_on.json``, or the folder of the policy in which it is written; empty for no file.
+        test: Share of the traffic seeds in the test part, which is never used, from 0 to below 1.
+        trained_on: File ``trained_on.json``, or the policy's folder, into which the file is written; empty for no file.
         agent: The controlled vehicle; by default the first agent of the scenario. The other agents drive as in the
-            hunt, with today's code.
-        max_steps: The longest plain episode in steps; None for that of the hunt.
-        crash_reward: Added to the reward of the step of a crash, such as -10.
-        process: Whether the simulation runs in its own process; by default with SUMO, of which a process can have
-            only one.
-        render_mode: Only None.
+            hunt, with the current code.
+        max_steps: Maximum number of steps of a plain episode; None for the maximum of the hunt.
+        crash_reward: Reward that is added in the step of a crash, such as -10.
+        process: Whether the simulation runs in its own process; by default only with SUMO, because a process can have
+            only one simulation of SUMO.
+        render_mode: Only None is allowed.
 
     Attributes:
         crashes: Names of the crashes of the training part.
 
     Raises:
-        UsageError: An option is out of range, no crash is in the training part, or scenarios or spaces differ.
+        UsageError: An option is out of range, no crash is in the training part, or the crashes' scenarios or spaces
+            differ.
         UntrustedError: A crash is neither made here nor trusted.
         CrashhuntError: A crash is damaged, or its scenario cannot be loaded.
     """
@@ -126,7 +127,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
 
     @property
     def trained_on(self) -> TrainedOn:
-        """The traffics that an agent has been trained on with this environment."""
+        """The traffic seeds on which an agent has been trained with this environment."""
         return TrainedOn(
             test=self._split.test,
             seeds=frozenset(crash.seed for crash in self._training),
@@ -137,18 +138,18 @@ class CrashEnv(gymnasium.Env[Any, Any]):
 
     @property
     def scores(self) -> dict[str, float]:
-        """Name of each crash to how often its latest episodes crashed: an exponential average that begins at 1."""
+        """How often the latest episodes from each crash crashed, by name: an exponential average that begins at 1."""
         return dict(zip(self.crashes, self._replay.scores.tolist(), strict=True))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode.
 
         Args:
-            seed: Of the draws of this and all further episodes; it also forgets the outcomes so far.
-            options: ``crash`` chooses a crash by its name, or a plain episode by an empty name.
+            seed: Seed for the draws of this and all further episodes; it also deletes the outcomes of earlier episodes.
+            options: ``crash`` is the name of the crash to begin with; an empty name selects a plain episode.
 
         Raises:
-            UsageError: There is no such crash in the training part, or no such option.
+            UsageError: The crash is not in the training part, or an option does not exist.
             SimulatorError: No episode can be set up.
         """
         super().reset(seed=seed)
@@ -177,7 +178,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
             self._replay.remove(index)
 
     def _chosen(self, options: dict[str, Any]) -> int | None:
-        """Return the index of the crash that options choose: -1 for a plain episode, None for no choice."""
+        """Return the index of the crash that the options select: -1 for a plain episode, None for no selection."""
         if not isinstance(options, dict):
             raise UsageError(f"options is {options!r}", fix="give {'crash': NAME}")
         unknown = sorted(options.keys() - {"crash"})
@@ -213,7 +214,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
         raise AssertionError
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Advance one step.
+        """Advance the episode by one step.
 
         Raises:
             ActionError: The action is not in the action space.
@@ -233,7 +234,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
 
 
 class _RemoteCrashEpisodes(RemoteEpisodes):
-    """`CrashEpisodes` in a child process."""
+    """Runs `CrashEpisodes` in a child process."""
 
     served = "crashhunt.training._episodes:CrashEpisodes"
 
@@ -243,25 +244,25 @@ class _RemoteCrashEpisodes(RemoteEpisodes):
         return found
 
     def reset_to_plain(self, hunt: int, seed: int) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode with a traffic of a hunt."""
+        """Begin an episode in a new traffic of a hunt."""
         found: tuple[Any, dict[str, Any]] = self._ask("reset_to_plain", hunt, seed)
         return found
 
     def step(self, action: object) -> tuple[Any, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
-        """Advance one step."""
+        """Advance the episode by one step."""
         found: tuple[Any, float, bool, bool, dict[str, Any]] = self._ask("step", action)
         return found
 
 
 def _check_types(**numbers: object) -> None:
-    """Refuse options that are no numbers, such as those of a configuration file."""
+    """Refuse options that are not numbers, such as text from a configuration file."""
     for name, value in numbers.items():
         if not isinstance(value, Real):
             raise UsageError(f"{name} is {value!r}", fix="give a number")
 
 
 def _places(crashes: object) -> list[str | Path]:
-    """Return the directories with crashes."""
+    """Return the directories that contain crashes."""
     fix = "give the directories of hunts or of a corpus"
     if isinstance(crashes, str | Path):
         return [crashes]
@@ -274,7 +275,7 @@ def _places(crashes: object) -> list[str | Path]:
 
 
 def _record_file(trained_on: object) -> Path | None:
-    """Return the file ``trained_on.json``; None for no file."""
+    """Return the path of ``trained_on.json``; None for no file."""
     if not isinstance(trained_on, str | Path) or "\0" in str(trained_on):
         raise UsageError(f"trained_on is {trained_on!r}", fix="give the folder of the policy")
     if not str(trained_on):
@@ -300,9 +301,9 @@ def make_training_env(crashes: Sequence[str | Path] | str | Path, **options: Any
 
     Args:
         crashes: Directories of hunts, corpora or crashes of one scenario.
-        options: Those of `crashhunt.training.CrashEnv`.
+        options: Options of `crashhunt.training.CrashEnv`.
 
     Raises:
-        CrashhuntError: As of `crashhunt.training.CrashEnv`.
+        CrashhuntError: As for `crashhunt.training.CrashEnv`.
     """
     return gymnasium.make("crashhunt:crashhunt/Crashes-v0", crashes=crashes, **options)

@@ -1,8 +1,8 @@
-"""Episodes that begin shortly before a saved crash, or with a traffic of the same hunt.
+"""Episodes that begin shortly before a saved crash, or with new traffic of the same hunt.
 
-The recorded actions are repeated up to the step at which the agent takes over. That needs neither the code of the
-recorded agent nor its state. Each observation and scene of these steps is compared with the recording bit for bit: only
-then does the agent face the situation that led to the crash.
+The recorded actions are repeated up to the step at which the agent takes over. This needs neither the code of the
+recorded agent nor its state. Each observation and scene of these steps is compared with the recording bit for bit, to
+ensure that the agent faces the situation that led to the crash.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ class CrashEpisodes:
         agent: The controlled vehicle that the caller drives; if empty, the first agent of the scenario.
         before_s: Simulation time before the crash at which the caller takes over, in s.
         after_s: Simulation time after the step of the crash at which the episode is truncated, in s.
-        max_steps: The longest plain episode in steps; 0 for that of the hunt.
+        max_steps: Maximum number of steps of a plain episode; 0 for the maximum of the hunt.
 
     Attributes:
         observation_space: The observation space of the vehicle.
         action_space: The action space of the vehicle.
         step_length_s: Simulation time of a step, in s.
         agent: The controlled vehicle.
-        is_closed: Whether there can be no further episodes: never, since no other process is involved.
+        is_closed: Whether there can be no further episodes; always false, because no other process is involved.
 
     Raises:
         CrashhuntError: A crash cannot be run again, or the crashes have different scenarios or spaces.
@@ -94,11 +94,11 @@ class CrashEpisodes:
         """Begin an episode shortly before a crash.
 
         Args:
-            index: Place of the crash in the list.
+            index: Index of the crash in the list of crashes.
 
         Returns:
-            The observation, the info, and in words where the repeated steps differ from the recording; empty if they
-            are bit-identical. If they differ, the episode must not be used.
+            The observation, the info, and a description of where the repeated steps differ from the recording. The
+            description is empty if they are bit-identical; otherwise the episode must not be used.
         """
         bundle = self._bundles[index]
         stage = self._enter(bundle.hunt)
@@ -116,11 +116,11 @@ class CrashEpisodes:
         return *self._observation_and_info(episode), ""
 
     def reset_to_plain(self, hunt: int, seed: int) -> tuple[object, dict[str, object]]:
-        """Begin an episode with a traffic of a hunt.
+        """Begin an episode with new traffic of a hunt.
 
         Args:
-            hunt: Place of a crash in the list; the traffic has the settings of its hunt.
-            seed: Of the traffic and of the arguments of the scenario.
+            hunt: Index of a crash; the traffic has the settings of the crash's hunt.
+            seed: Seed of the traffic and of the scenario arguments.
 
         Raises:
             SimulatorError: The episode cannot be set up.
@@ -136,7 +136,7 @@ class CrashEpisodes:
         return self._observation_and_info(episode)
 
     def step(self, action: object) -> tuple[object, float, bool, bool, dict[str, object]]:
-        """Advance one step; return observation, reward, whether it has terminated or is truncated, and the info."""
+        """Advance one step; return observation, reward, whether the episode terminated or is truncated, and info."""
         episode, stage = self._episode, self._running
         if episode is None or stage is None or episode.result is not None:
             raise SimulatorError("no episode is running", fix="call reset")
@@ -156,14 +156,14 @@ class CrashEpisodes:
         return observation, reward, terminated, not terminated, info
 
     def close(self) -> None:
-        """End the simulation and remove its files."""
+        """End the simulation and delete its files."""
         self._end_episode()
         for stage in self._stages.values():
             stage.simulator.close()
         self._folder.remove()
 
     def _enter(self, hunt: Path) -> _Stage:
-        """Return the stage of a hunt; end the simulation of another one, because SUMO has one for the process."""
+        """Return the stage of a hunt; first end another hunt's simulation, because a process has only one of SUMO."""
         self._end_episode()
         stage = self._stages[hunt]
         if self._running is not None and self._running is not stage:
@@ -199,12 +199,12 @@ class CrashEpisodes:
 
 
 class _Stage:
-    """A hunt whose traffics can be run: its simulator, spaces and settings.
+    """A hunt whose traffic can be simulated: its simulator, spaces and settings.
 
     Args:
-        bundle: Any crash of the hunt.
-        agent: The controlled vehicle of the caller; empty for the first.
-        folder: For files of the simulator.
+        bundle: Bundle of any crash of the hunt.
+        agent: The controlled vehicle of the caller; empty for the first agent.
+        folder: Folder for the files of the simulator.
     """
 
     def __init__(self, bundle: Bundle, agent: str, folder: Path) -> None:
@@ -228,11 +228,11 @@ class _Stage:
         self.action_space: Space[object] = self.simulator.actions[self.agent].space
 
     def make_agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Value]) -> Agent:
-        """Return the driver of a vehicle: for the caller's own vehicle one that is never asked."""
+        """Return the agent of a vehicle; for the caller's own vehicle, an agent whose actions are never used."""
         return _Caller() if agent == self.agent else self.parts.agent(agent, simulator, arguments)
 
     def plain_spec(self, seed: int, max_steps: int) -> TrialSpec:
-        """Return a trial of the hunt with another seed; its arguments are drawn independently, as by ``random``."""
+        """Return a trial of the hunt with another seed; its arguments are drawn independently of other trials."""
         rng = np.random.default_rng(np.random.SeedSequence(seed))
         arguments: dict[str, dict[str, Value]] = {agent: {} for agent in self.settings.agents}
         scenario_arguments: dict[str, Value] = {}
@@ -250,21 +250,21 @@ class _Stage:
 
 
 class _Caller:
-    """The agent slot of the caller in an episode. `Episode.step` receives the actions of the caller."""
+    """The place of the caller's agent in an episode. `Episode.step` receives the actions from the caller instead."""
 
     def reset(self, seed: int) -> None:
-        """Nothing to reset."""
+        """Do nothing, because this agent has no state."""
 
     def act(self, observation: object) -> object:
-        """Never called."""
+        """Raise an error, because this method is never called."""
         raise AssertionError
 
 
 def _require_same(first: _Stage, other: _Stage) -> None:
-    """Refuse crashes that one policy cannot be trained on.
+    """Refuse crashes on which one policy cannot be trained together.
 
     Raises:
-        UsageError: They have different scenarios or spaces.
+        UsageError: The crashes have different scenarios or spaces.
     """
     where = f"{first.title} and {other.title}"
     if first.name != other.name:
@@ -284,15 +284,15 @@ def _require_same(first: _Stage, other: _Stage) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """The recorded steps up to the one at which the caller takes over.
+    """The recorded steps up to the step at which the caller takes over.
 
     Args:
         spec: The trial of the crash.
-        crash_step: The step of the crash.
-        actions: The encoded actions of the caller's vehicle in these steps.
-        observations: The digest of what it observed in each of them; empty if the recording has no observations.
-        scenes: For the start and each step, the actors that the recording has and the digest of their states.
-        is_compact: Whether the recording has only some of the actors.
+        crash_step: The number of the step of the crash.
+        actions: The encoded actions of the caller's vehicle in the recorded steps.
+        observations: The digest of the caller's observation in each step; empty if the recording has no observations.
+        scenes: For the start and each step, the recorded actors and the digest of their states.
+        is_compact: Whether the recording contains only some of the actors.
     """
 
     spec: TrialSpec
@@ -304,7 +304,7 @@ class _Start:
 
     @classmethod
     def of(cls, rerun: Rerun, agent: str, before_s: float) -> _Start:
-        """Read the recording of a crash."""
+        """Read the recorded steps from the recording of a crash."""
         recorded: Recording = rerun.recorded
         last = max(0, recorded.steps - max(1, round(before_s / recorded.prologue.step_length_s)))
         steps = recorded.all_steps[1 : last + 1]
@@ -319,7 +319,7 @@ class _Start:
         )
 
     def repeat(self, episode: Episode, agent: str) -> str:
-        """Repeat the recorded steps; return in words where they differ from the recording, or nothing."""
+        """Repeat the recorded steps; return a description of where they differ from the recording, or an empty text."""
         if episode.result is not None:
             return f"the episode cannot be set up ({episode.result.outcome})"
         for step, action in enumerate((None, *self.actions)):
@@ -336,7 +336,7 @@ class _Start:
 
 
 def _state(scene: Scene, actors: Sequence[str] = ()) -> tuple[tuple[str, ...], bytes]:
-    """Return actors of a scene and the digest of their positions, headings and speeds; by default of all actors."""
+    """Return actors of a scene and the digest of their positions, headings and speeds; by default, of all actors."""
     rows = scene.roster.index
     present = tuple(actor for actor in actors or rows if actor in rows)
     return present, _digest(scene.data[[rows[actor] for actor in present]])
@@ -356,9 +356,10 @@ def _advance(episode: Episode, actions: Mapping[str, NDArray[np.generic]]) -> Tr
 
 @contextmanager
 def _seeded(seed: int) -> Iterator[None]:
-    """Seed the process's generators as a trial does, and restore their state afterwards.
+    """Return a context that seeds the process's random generators as a trial does, and later restores their state.
 
-    A scenario may use them. The caller's training uses them as well, and must not begin again with each episode.
+    A scenario may use these generators. The caller's training uses them as well, and must not get the same numbers in
+    each episode.
     """
     states = random.getstate(), np.random.get_state()  # noqa: NPY002 - scenarios may use the global generator
     random.seed(seed)

@@ -1,7 +1,9 @@
-"""``trained_on.json``: which traffics a policy was trained on. It lies next to the policy, and snapshots carry it.
+"""``trained_on.json``: the traffic seeds on which a policy was trained.
 
-A comparison on these traffics shows what the policy has learned by heart. `held_out_traffics` returns the rule by which
-`crashhunt compare`, `gate` and `rate` keep only the traffics of the test part, whatever their outcome.
+It lies next to the policy and is part of snapshots.
+
+A comparison on these traffic seeds shows only what the policy has memorized. `held_out_traffics` returns the rule by
+which `crashhunt compare`, `gate` and `rate` keep only the traffic seeds of the test part, regardless of their outcome.
 """
 
 from __future__ import annotations
@@ -33,12 +35,13 @@ _SCHEMA = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainedOn:
-    """The traffics that a policy was trained on.
+    """The traffic seeds on which a policy was trained.
 
     Args:
-        test: share of the test part, which the training never uses.
-        seeds: seeds of the crashes that were trained on.
-        hunt_seeds: seeds of the hunts that found them. Survived traffics of these hunts are split as well.
+        test: share of the test part, which is never used for training.
+        seeds: seeds of the crashes that were used for training.
+        hunt_seeds: seeds of the hunts that found these crashes. Traffic seeds of these hunts without a crash are split
+            as well.
     """
 
     test: float
@@ -46,7 +49,7 @@ class TrainedOn:
     hunt_seeds: frozenset[int] = frozenset()
 
     def write(self, path: Path) -> None:
-        """Write the file; add to one that exists already. Several processes may do so at once.
+        """Write the file, or add to an existing file. Several processes may do this at the same time.
 
         Raises:
             UsageError: the existing file has another split.
@@ -81,7 +84,7 @@ class TrainedOn:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder, which dies with this process."""
+    """Return a context that holds the lock of a folder; the lock ends with this process."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -91,10 +94,10 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def read_trained_on(path: Path) -> TrainedOn:
-    """Read ``trained_on.json``.
+    """Read ``trained_on.json``, and return its contents.
 
     Raises:
-        HuntDirectoryError: it is missing or damaged.
+        HuntDirectoryError: the file is missing or damaged.
     """
     try:
         data: dict[str, Any] = parse_object(path.read_bytes(), dict)
@@ -114,11 +117,11 @@ def read_trained_on(path: Path) -> TrainedOn:
 
 @dataclass(frozen=True, slots=True)
 class HeldOutTraffics:
-    """The traffics of a hunt that no agent in a comparison was trained on.
+    """The traffic seeds of a hunt on which no agent of a comparison was trained.
 
     Args:
         hunt_seed: seed of the hunt.
-        records: records of the agents.
+        records: the training records of the agents.
     """
 
     hunt_seed: int
@@ -126,14 +129,14 @@ class HeldOutTraffics:
 
     @property
     def is_empty(self) -> bool:
-        """Whether no traffic of the hunt can be held out: an agent was trained on the hunt without a test part."""
+        """Whether no traffic of the hunt is held out, because an agent was trained on the hunt without a test part."""
         return any(not record.test and self.hunt_seed in record.hunt_seeds for record in self.records)
 
     def has(self, seed: int) -> bool:
         """Return whether a comparison may use the traffic of a seed.
 
-        In a hunt that was trained on, only the hash decides. To remove only the crashes that were trained on would
-        leave the survived traffics of the training part, and favour the version before the training.
+        If the hunt was used for training, only the hash of the seed decides. Excluding only the crashes used for
+        training would keep training seeds without a crash, and would favour the version before the training.
         """
         return all(
             is_test_traffic(seed, record.test)
@@ -143,14 +146,14 @@ class HeldOutTraffics:
 
 
 def held_out_traffics(settings: HuntSettings, hunts: Iterable[Path]) -> HeldOutTraffics:
-    """Return the rule by which hunts with common traffic are compared, and by which the trials of a rate count.
+    """Return the rule that selects the trials with held-out traffic, for comparisons of hunts and for crash rates.
 
     Args:
         settings: settings of one of the hunts; all have the same seed.
-        hunts: their directories; one for the rate of a single hunt.
+        hunts: directories of the hunts; one directory for the rate of a single hunt.
 
     Raises:
-        HuntDirectoryError: a record is damaged.
+        HuntDirectoryError: a training record is damaged.
     """
     # Earlier snapshots count as well: after a change of the agent, a resumed hunt has trials of both agents.
     snapshots = [Snapshot(path) for hunt in hunts for path in sorted((hunt / layout.SNAPSHOTS).glob(layout.SHOWN))]
@@ -159,9 +162,10 @@ def held_out_traffics(settings: HuntSettings, hunts: Iterable[Path]) -> HeldOutT
 
 
 def _records_of(snapshot: Snapshot) -> list[TrainedOn]:
-    """Return the records in a snapshot.
+    """Return the training records in a snapshot.
 
-    A list of hunts asks all of their snapshots. To check a whole manifest takes 4 ms, and few manifests name a record.
+    Lists of hunts call this function for all snapshots. Checking a whole manifest takes 4 ms, and few manifests contain
+    a record.
     """
     with suppress(OSError, ValueError):
         text = (snapshot.path / layout.MANIFEST).read_bytes()

@@ -1,13 +1,14 @@
-"""Which crash an episode begins with: prioritised replay of the crashes that the agent does not survive yet.
+"""The choice of the crash with which an episode begins: prioritized replay of crashes that the agent does not survive.
 
-The rule is that of Prioritized Level Replay (M. Jiang, E. Grefenstette, T. Rocktäschel, ICML 2021, arXiv:2010.03934):
+The rule comes from Prioritized Level Replay (M. Jiang, E. Grefenstette, T. Rocktäschel, ICML 2021, arXiv:2010.03934):
 
     P = (1 - rho) P_S + rho P_C,    P_S(i) ~ S(i)^(1/beta),    P_C(i) ~ c - C(i),
 
 with the scores S, the number c of the episode, and the number C(i) of the last episode that began with crash i. The
-second part revisits crashes whose score may be out of date, so a crash that the agent unlearns returns. In the paper,
-the score is the agent's value loss. An environment does not know it, so the score here is the share of crashed
-episodes, as an exponential average that begins at 1. Scores are proportional, not ranked: most of them are equal.
+second part selects crashes whose score may be out of date, so a crash that the agent survives no longer is selected
+again. In the paper, the score is the agent's value loss. An environment does not know this loss, so the score here is
+the share of crashed episodes, as an exponential average that begins at 1. Scores are proportional, not ranked: most of
+them are equal.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ _FORGETTING_RATE = 0.2
 
 
 class CrashReplay:
-    """Draws crashes, and learns from how their episodes end.
+    """Draws crashes, with probabilities that depend on how earlier episodes ended.
 
     Args:
-        count: number of crashes, at least 1.
+        count: number of crashes; at least 1.
     """
 
     def __init__(self, count: int) -> None:
@@ -41,7 +42,7 @@ class CrashReplay:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all outcomes, so that the same seed gives the same draws. Removed crashes stay removed."""
+        """Delete all outcomes, so that the same seed gives the same draws. Removed crashes stay removed."""
         count = len(self._is_usable)
         self.scores: NDArray[np.float64] = np.ones(count)
         self._last = np.zeros(count)
@@ -64,7 +65,7 @@ class CrashReplay:
         return found
 
     def draw(self, rng: np.random.Generator) -> int:
-        """Return the index of a crash."""
+        """Draw a crash, and return its index."""
         index = int(rng.choice(len(self._is_usable), p=self.probabilities()))
         self._episodes += 1
         self._last[index] = self._episodes
@@ -75,5 +76,5 @@ class CrashReplay:
         self.scores[index] += _FORGETTING_RATE * (has_crashed - self.scores[index])
 
     def remove(self, index: int) -> None:
-        """Never draw a crash again."""
+        """Remove a crash, so that it is never drawn again."""
         self._is_usable[index] = False

@@ -1,8 +1,8 @@
-"""The split of traffics into a training part and a test part, by a hash of the seed.
+"""The split of traffic seeds into a training part and a test part, by a hash of the seed.
 
-The seed of a trial determines its traffic. The hash decides alone, so every hunt, machine and process puts a traffic
-into the same part, and a traffic that survived is split as one that crashed. That is why agents may be compared on the
-whole test part without bias. A split of the crashes alone would compare on traffics chosen by their outcome.
+The seed of a trial determines its traffic. Only the hash decides. Every hunt, machine and process therefore assigns a
+seed to the same part, whether its trial crashed or not. Agents can therefore be compared on the whole test part without
+bias. If only crashes were split, agents would be compared on traffic that was selected by its outcome.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ def is_test_traffic(seed: int, test: float) -> bool:
 
     Args:
         seed: seed of the trial.
-        test: share of the traffics in the test part, from 0 to 1.
+        test: share of the traffic seeds in the test part, from 0 to 1.
     """
     digest = hashlib.blake2b(str(seed).encode(), digest_size=_HASH_BYTES).digest()
     return bool(int.from_bytes(digest) < test * 2 ** (8 * _HASH_BYTES))
 
 
 def check_test_share(test: float, shown: str) -> float:
-    """Return the share of the test part.
+    """Return the share of the test part after checking it.
 
     Args:
         test: the share.
-        shown: how errors name it.
+        shown: name of the share in error messages.
 
     Raises:
-        UsageError: it is not from 0 to below 1.
+        UsageError: the share is not from 0 to below 1.
     """
     if not 0 <= test < 1:  # also refuses NaN
         raise UsageError(f"{shown} is {test:g}", fix="give a share from 0 to below 1, such as 0.5")
@@ -57,11 +57,11 @@ def check_test_share(test: float, shown: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class SavedCrash:
-    """A crash that can be trained on.
+    """A saved crash, for training or for tests.
 
     Args:
-        bundle: the crash.
-        is_test: whether its traffic belongs to the test part.
+        bundle: bundle of the crash.
+        is_test: whether the traffic seed of the crash belongs to the test part.
     """
 
     bundle: Bundle
@@ -69,23 +69,23 @@ class SavedCrash:
 
     @property
     def seed(self) -> int:
-        """Seed of the trial."""
+        """Seed of the crash's trial."""
         return self.bundle.result.spec.seed
 
     @property
     def name(self) -> str:
-        """Its identifier, which is unique among hunts with different directories."""
+        """Name of the crash, which is unique among hunts with different directories."""
         return f"{self.bundle.hunt.name}/{self.bundle.id}"
 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """Crashes in two parts.
+    """Saved crashes, split into a training part and a test part.
 
     Args:
-        test: share of the traffics in the test part.
-        crashes: all of them, in the order of the places and trials.
-        faults: how many software faults are omitted: an agent cannot learn to avoid them by driving.
+        test: share of the traffic seeds in the test part.
+        crashes: all crashes, in the order of the given directories and of their trials.
+        faults: number of omitted software faults, which an agent cannot learn to avoid by driving.
     """
 
     test: float
@@ -103,7 +103,7 @@ class Split:
         return tuple(crash for crash in self.crashes if crash.is_test)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the shape that ``split --json`` prints."""
+        """Return the split in the form that ``split --json`` prints."""
         return {
             "test": self.test,
             "training": [_to_json(crash) for crash in self.training],
@@ -121,11 +121,11 @@ def split_crashes(places: Iterable[Path | str], test: float) -> Split:
     """Return the crashes of hunts, corpora or single bundles, each with its part.
 
     Args:
-        places: directories of hunts, of corpora, of cases or of bundles.
-        test: share of the traffics in the test part.
+        places: directories of hunts, of corpora, of corpus cases or of bundles.
+        test: share of the traffic seeds in the test part.
 
     Raises:
-        BundleError: a place has no crash, or a crash is damaged.
+        BundleError: a directory contains no crash, or a crash is damaged.
     """
     found: dict[Path, Bundle] = {}
     for place in map(Path, places):
