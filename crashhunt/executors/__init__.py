@@ -1,4 +1,4 @@
-"""Executors: where trials run."""
+"""Executors: run trials in processes of this machine or on other machines."""
 
 import lazy_loader
 

@@ -1,14 +1,14 @@
-"""The fork server of a pool: it starts supervisors and, apart from them, the processes whose forks run trials.
+"""The fork server of a pool: it starts supervisors and, separately, the processes whose forks run trials.
 
 ::
 
     hunt -- keeper -- fork server -+- supervisor, one a slot              (no foreign code)
                                    +- template -- zygote, one a slot -- process of a trial
 
-The fork server and the supervisors are forked before anything foreign is imported. The template imports the agents and
-runs nothing. A zygote is a fork of the template that has made the simulator. Every trial runs in a fork of its slot's
-zygote, and that process ends with its trial, so that no trial finds anything that another one left behind. A zygote
-does what its supervisor says: fork, kill, report how a process ended.
+The fork server and the supervisors are forked before any foreign code is imported. The template imports the agents and
+runs no trial. A zygote is a fork of the template that has created the simulator. Every trial runs in a fork of its
+slot's zygote. This process ends with its trial, so a trial cannot be affected by another trial. A zygote carries out
+the requests of its supervisor: fork, kill, report how a process ended.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT
 
 
 def main() -> None:
-    """Run the fork server; standard error is a log."""
+    """Run the fork server; it logs to standard error."""
     control = socket.socket(fileno=int(sys.argv[1]))
     job: ForkServerJob = json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
     if job["sys_path"]:
@@ -85,7 +85,7 @@ class _Server:
     Args:
         control: connection to the pool.
         orders: connection to the template.
-        template: its process.
+        template: process of the template.
         settings: settings of the hunt.
     """
 
@@ -117,7 +117,7 @@ class _Server:
             end_descendants(frozenset(self._slots) | {self._template})
 
     def _forward_template_messages(self) -> bool:
-        """Pass on the messages of the template; return whether the template is still running."""
+        """Forward the messages of the template; return whether the template is still running."""
         while True:
             try:
                 data = self._orders.recv(_MAX_MESSAGE_BYTES, socket.MSG_DONTWAIT)
@@ -169,7 +169,7 @@ class _Server:
         return True
 
     def _reap(self) -> bool:
-        """Report which supervisors have ended; return whether the template has."""
+        """Report which supervisors have ended; return whether the template has ended."""
         while True:
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG)
@@ -187,7 +187,7 @@ class _Server:
                 self._exit_as(code)
 
     def _exit_as(self, code: int) -> NoReturn:
-        """End with the exit status of the template; the parent process interprets it."""
+        """Exit with the exit status of the template, which the parent process interprets."""
         if self._watch.importing and is_sent_from_outside(code):
             _send(self._control, {"importing": self._watch.importing})
         elif self._watch.importing:
@@ -200,7 +200,7 @@ class _Server:
 
 
 def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool) -> None:
-    """Import the modules that trials need, and fork a zygote at each request of the fork server."""
+    """Import the modules that trials need, and fork a zygote whenever the fork server requests one."""
     adopt_orphans()
     try:
         report = lambda importing: _send(orders, {"importing": importing})  # noqa: E731
@@ -263,8 +263,8 @@ def fork_zygote(settings: WorkerSettings, *, late: bool = False) -> socket.socke
         late: whether each trial imports its agents itself.
 
     Raises:
-        ImportKilledError: it was ended while it imported, by a signal that may come from outside.
-        CrashhuntError: an import takes too long, or has ended it.
+        ImportKilledError: the zygote was killed during its imports, by a signal that may come from outside.
+        CrashhuntError: an import takes too long, or has ended the zygote.
     """
     ours, theirs = socket.socketpair()
     reports, reported = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -61,7 +61,7 @@ class FreshProcessExecutor:
     Args:
         settings: settings of the hunt.
         parallel: number of processes at a time.
-        recycle_after: not used; a process is never used twice.
+        recycle_after: ignored, because every trial has a new process.
     """
 
     def __init__(self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1) -> None:
@@ -78,7 +78,7 @@ class FreshProcessExecutor:
         self._start()
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
-        """Yield the trials that have ended; wait at most this long for the first one."""
+        """Yield the trials that have ended; wait at most ``timeout_s`` for the first one."""
         deadline = time.monotonic() + timeout_s
         while True:
             found = [result for number in list(self._running) if (result := self._poll_process(number)) is not None]
@@ -104,7 +104,7 @@ class FreshProcessExecutor:
         return self._notes.fresh()
 
     def close(self) -> None:
-        """Kill every process, with all processes that it has started."""
+        """Kill every process, including all processes that it has started."""
         self.cancel()
 
     def _start(self) -> None:
@@ -193,10 +193,10 @@ class FreshProcessExecutor:
         return replace(result, why_no_escape=why_no_escape) if why_no_escape and result.escape is None else result
 
     def _account_for_end(self, running: _Running, exit_code: int, importing: str = "") -> TrialResult | None:
-        """Account for a trial whose process is gone, or run it again.
+        """Determine the result of a trial whose process has ended, or run the trial again.
 
         Raises:
-            CrashhuntError: a module ends its process whenever it is imported.
+            CrashhuntError: a module ends its process at every import.
         """
         if why := running.attempt.again(self._settings.scratch, exit_code):
             self._notes.add(why)
@@ -269,7 +269,7 @@ _STOP_CHECK_INTERVAL_S = 0.1  # how late a request to stop may be
 
 
 def snapshot_executor(settings: WorkerSettings, *, parallel: int = 1) -> Executor:
-    """Return an executor that runs trials with the code of a snapshot, crashhunt itself included.
+    """Return an executor that runs trials with the code of a snapshot, including the snapshot's crashhunt.
 
     Snapshots of crashhunt 0.1.0 and before have no fork server: with them, every trial starts a new Python process.
     """
@@ -281,7 +281,7 @@ def snapshot_executor(settings: WorkerSettings, *, parallel: int = 1) -> Executo
 def run_alone(
     settings: WorkerSettings, spec: TrialSpec, stopped: Callable[[], bool] = lambda: False
 ) -> TrialResult | None:
-    """Run one trial in a new Python process; return the result, None if it was stopped.
+    """Run one trial in a new Python process; return the result, or None if it was stopped.
 
     Raises:
         CrashhuntError: the crash cannot be run.
@@ -292,11 +292,11 @@ def run_alone(
 
 
 class SharedExecutors:
-    """Executors for trials of several threads: those whose settings are equal share one.
+    """Executors for trials from several threads; trials with equal settings share an executor.
 
     Args:
-        scratch: a folder for them.
-        parallel: trials at a time.
+        scratch: folder for the files of the executors.
+        parallel: number of trials at a time.
     """
 
     def __init__(self, scratch: Path, *, parallel: int) -> None:
@@ -308,7 +308,7 @@ class SharedExecutors:
     def run(
         self, settings: WorkerSettings, spec: TrialSpec, stopped: Callable[[], bool] = lambda: False
     ) -> tuple[TrialResult, Path] | None:
-        """Run a trial.
+        """Run one trial, and wait for its result.
 
         Returns:
             The result of the trial, and the folder with its recording; None if it was stopped.
@@ -327,18 +327,19 @@ class SharedExecutors:
         return shared.run(spec, stopped)
 
     def close(self) -> None:
-        """End every process."""
+        """End all processes of the executors."""
         for shared in self._shared.values():
             shared.executor.close()
 
 
 class _Shared:
-    """An executor of which each thread waits for its own trial.
+    """An executor for several threads, each of which waits for its own trial.
 
-    A cancelled trial may still run when the same trial is submitted again. Therefore each run has its own number,
-    which is the name of its folder.
+    A cancelled trial may still be running when the same trial is submitted again. Therefore each run has its own
+    number, which is the name of its folder.
 
-    An executor reports once that it can run no trial. The error is kept for all threads, which would wait forever.
+    An executor reports only once that it can run no trial. The error is stored for all threads, which would otherwise
+    wait forever.
     """
 
     def __init__(self, executor: Executor, scratch: Path) -> None:

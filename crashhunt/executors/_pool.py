@@ -1,4 +1,4 @@
-"""A pool of slots: each slot has a supervisor, which runs one trial after another, each in a new process."""
+"""A pool of slots: the supervisor of each slot runs one trial after another, each in a new process."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ _numbers = itertools.count()
 
 
 class ForkServerLink:
-    """A running fork server.
+    """The connection to a running fork server.
 
     Args:
         settings: settings of the hunt.
-        late: whether each trial imports its agents itself, because a process that has imported them cannot be forked.
-        deaths: number of earlier kills of the process.
-        snapshot: whether crashhunt itself comes from the code of the settings.
+        late: whether each trial imports its agents itself, because a process with imported agents cannot be forked.
+        deaths: number of times that the process was killed.
+        snapshot: whether the processes use the crashhunt of the settings' snapshot.
     """
 
     def __init__(
@@ -101,10 +101,10 @@ class ForkServerLink:
             self.control.send(json.dumps({"kill": slot}).encode())
 
     def receive(self) -> list[FromForkServer] | None:
-        """Return the supervisors that have ended, and how; None if the fork server itself has ended.
+        """Return the supervisors that have ended, and how they ended; None if the fork server itself has ended.
 
         Raises:
-            CrashhuntError: what trials need cannot be imported.
+            CrashhuntError: a module that trials need cannot be imported.
         """
         ended: list[FromForkServer] = []
         while True:
@@ -126,10 +126,10 @@ class ForkServerLink:
             self._importing = message.get("importing", self._importing)
 
     def restart(self) -> ForkServerLink:
-        """Start a new fork server after the end of this one.
+        """Start a new fork server after the previous one has ended.
 
         Raises:
-            CrashhuntError: the fork server ended by itself, or too often.
+            CrashhuntError: the fork server ended without a kill, or was killed too often.
         """
         try:
             code = self._kept.process.wait(_END_S)
@@ -152,7 +152,7 @@ class ForkServerLink:
         return ForkServerLink(self._settings, late=self._late, deaths=self.deaths + 1, snapshot=self._snapshot)
 
     def end(self) -> None:
-        """Kill the fork server and everything that it has started."""
+        """Kill the fork server and all processes that it has started."""
         self._kept.end()
         self.control.close()
 
@@ -180,8 +180,8 @@ class PoolExecutor:
     Args:
         settings: settings of the hunt.
         parallel: number of slots.
-        recycle_after: not used; no process runs two trials.
-        snapshot: whether crashhunt itself comes from the code of the settings, in new Python processes.
+        recycle_after: ignored, because no process runs two trials.
+        snapshot: whether the trials use the crashhunt of the settings' snapshot, in new Python processes.
 
     Attributes:
         held_back: number of slots that receive no further trial for now.
@@ -222,7 +222,7 @@ class PoolExecutor:
         self._wake_up.send(b".")
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
-        """Yield the trials that have ended; wait at most this long for the first one.
+        """Yield the trials that have ended; wait at most ``timeout_s`` for the first one.
 
         Raises:
             CrashhuntError: no trial can be run, for a reason outside of the trials.
@@ -266,7 +266,7 @@ class PoolExecutor:
         return self._notes.fresh()
 
     def close(self) -> None:
-        """Kill every worker, with all processes that it has started."""
+        """Kill every worker, including all processes that it has started."""
         with self._lock:
             self._closing = True
             self.cancel()
@@ -304,7 +304,7 @@ class PoolExecutor:
             self._done.put(error)
 
     def _assign_trials(self) -> None:
-        """Give trials to free slots, in the order of the queue."""
+        """Assign trials to free slots, in the order of the queue."""
         while self._waiting:
             running = [worker.attempt for worker in self._workers.values() if worker.attempt is not None]
             if any(attempt.alone for attempt in running) or (running and self._waiting[0].alone):
@@ -343,7 +343,7 @@ class PoolExecutor:
         worker.socket.setblocking(False)
 
     def _read_messages(self, worker: _Worker) -> None:
-        """Read the messages that a worker has sent completely."""
+        """Read the complete messages that a worker has sent."""
         over = False
         try:
             data = worker.socket.recv(_CHUNK_BYTES)
@@ -383,7 +383,7 @@ class PoolExecutor:
             self._stop_worker(worker)
 
     def _stop_worker(self, worker: _Worker) -> None:
-        """Give a supervisor no more trials; when it has none, it ends."""
+        """Send a supervisor no further trials; it ends when it has none left."""
         worker.retired = True
         with suppress(OSError):
             worker.socket.shutdown(socket.SHUT_WR)
@@ -398,7 +398,7 @@ class PoolExecutor:
             self._restart()
 
     def _restart(self) -> None:
-        """Start another fork server, and run the trials again that were running when the old one ended."""
+        """Start a new fork server, and run the trials again that were running when the old one ended."""
         assert self._link is not None
         for worker in list(self._workers.values()):
             self._discard(worker)
@@ -421,7 +421,7 @@ class PoolExecutor:
             self._end_attempt(worker.attempt, exit_code if exit_code < 0 else -signal.SIGKILL)
 
     def _end_attempt(self, attempt: TrialAttempt, exit_code: int) -> None:
-        """Account for a trial whose process is gone, or run it again."""
+        """Determine the result of a trial whose process has ended, or run the trial again."""
         scratch = self._settings.scratch
         if why := attempt.again(scratch, exit_code):
             self._notes.add(why)

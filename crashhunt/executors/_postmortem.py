@@ -1,4 +1,4 @@
-"""Makes the result of a trial from the remains of a process that died or hung."""
+"""Results of trials whose process died or hung, from the files that the process left."""
 
 from __future__ import annotations
 
@@ -58,16 +58,16 @@ _MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside
 
 @dataclass(slots=True)
 class TrialAttempt:
-    """A trial to run, and the ends of its processes so far.
+    """A trial to run, and the record of how its processes have ended.
 
-    A process that ends by certain signals may have been ended from outside: by an administrator, a batch system, the
-    kernel because memory ran out. Then the trial is run again, alone. If it ends in the same way at the same step, the
-    trial itself is the cause. If it ends at another step each time, the trial is not the cause. An end before the first
-    step is no evidence, because the process that forks trials may have been killed.
+    Certain signals may come from outside: from an administrator, from a batch system, or from the kernel if memory runs
+    out. After such a signal, the trial is run again, alone. If it ends in the same way at the same step, the trial
+    itself is the cause. If it ends at another step each time, the trial is not the cause. An end before the first step
+    is no evidence, because the process that forks trials may have been killed.
 
     Args:
-        spec: the trial.
-        ends: the signal and the step at which each of its processes ended.
+        spec: the trial to run.
+        ends: the signal and the step at which each process of the trial ended.
     """
 
     spec: TrialSpec
@@ -80,11 +80,11 @@ class TrialAttempt:
 
     @property
     def is_killed_from_outside(self) -> bool:
-        """Whether every allowed attempt was killed, each at another step: no attempt shows how the trial ends."""
+        """Whether every allowed attempt was killed at another step, so that the outcome of the trial is unknown."""
         return len(self.ends) >= _MAX_ATTEMPTS and len(set(self.ends)) == len(self.ends)
 
     def again(self, scratch: Path, exit_code: int) -> str:
-        """Return why the trial must run again, in words; empty if its outcome is known."""
+        """Return the reason why the trial must run again, as text; empty if its outcome is known."""
         if not is_sent_from_outside(exit_code):
             return ""
         header = where_it_is(scratch, self.spec.number)
@@ -106,13 +106,14 @@ def where_it_is(scratch: Path, number: int) -> BlackBoxHeader | None:
 def died(spec: TrialSpec, scratch: Path, exit_code: int, agents: Mapping[str, str] | None = None) -> TrialResult:
     """Return the result of a trial whose process died.
 
-    Before the first step that is a start-up failure, which makes the trial invalid; afterwards it is a crash.
+    If the process died before the first step, the trial is invalid because of a start-up failure. If it died later, the
+    result is a crash.
 
     Args:
-        spec: the trial.
-        scratch: the folder in which it recorded.
-        exit_code: exit code of its process, negative for a signal.
-        agents: identifier of each agent to its module, if only this agent's code comes from the module.
+        spec: the trial that was run.
+        scratch: scratch folder of the trial, which contains its recording.
+        exit_code: exit code of the trial's process; negative for a signal.
+        agents: module of each agent, by identifier, if no other agent uses the module.
     """
     header = where_it_is(scratch, spec.number)
     message = (
@@ -123,12 +124,13 @@ def died(spec: TrialSpec, scratch: Path, exit_code: int, agents: Mapping[str, st
 
 
 def result_of_death(attempt: TrialAttempt, scratch: Path, exit_code: int) -> TrialResult:
-    """Return the result of a trial whose process died and that is not run again.
+    """Return the result of a trial whose process died, if the trial is not run again.
 
-    The trial is invalid where its processes were killed from outside at different steps, and else as of `died`.
+    The trial is invalid if its processes were killed from outside at different steps. Otherwise, the result is that of
+    `died`.
 
     Args:
-        attempt: the trial; `TrialAttempt.again` has been called with this death.
+        attempt: the attempts to run the trial; `TrialAttempt.again` has been called for the last process.
         scratch: the folder in which the trial records.
         exit_code: exit code of the process; negative for a signal.
     """
@@ -142,12 +144,12 @@ def result_of_death(attempt: TrialAttempt, scratch: Path, exit_code: int) -> Tri
 
 
 def killed_from_outside(spec: TrialSpec, why: str, exit_code: int) -> TrialResult:
-    """Return the result of a trial that ended at no step of its own, which a resumed hunt runs again.
+    """Return the result of a trial that was killed from outside, so that a resumed hunt runs it again.
 
     Args:
-        spec: the trial.
-        why: number and places of the kills.
-        exit_code: exit code of its last process; negative for a signal.
+        spec: the trial that was run.
+        why: number of the kills, and the steps at which they happened.
+        exit_code: exit code of the trial's last process; negative for a signal.
     """
     return TrialResult(spec, Outcome.INVALID, failure=Failure(KILLED, why, exit_code=exit_code))
 
@@ -156,9 +158,9 @@ def damaged(spec: TrialSpec, scratch: Path, message: str, *, agent: str = "", re
     """Return the result of a trial whose process damaged itself or its recording.
 
     Args:
-        spec: the trial.
-        scratch: the folder in which it recorded.
-        message: what is damaged, as a sentence.
+        spec: the trial that was run.
+        scratch: scratch folder of the trial, which contains its recording.
+        message: description of the damage, as a sentence.
         agent: identifier of the agent that did the damage, if the recording cannot be read; empty if unknown.
         recorded: whether the recording can be read.
     """
@@ -171,7 +173,7 @@ def damaged(spec: TrialSpec, scratch: Path, message: str, *, agent: str = "", re
 
 
 def hung(spec: TrialSpec, scratch: Path, timeout_s: float) -> TrialResult:
-    """Return the result of a trial that was still running at its wall-clock limit, and has been killed."""
+    """Return the result of a trial that reached its wall-time limit and was killed."""
     header = where_it_is(scratch, spec.number)
     message = f"still running after {timeout_s:g} s"
     return _result(spec, scratch, header, Outcome.HANG, "timeout", message, None)
@@ -252,13 +254,14 @@ def _result(
 
 
 def agent_in_stack(stack: str, agents: Mapping[str, str]) -> str:
-    """Return the agent whose code ran when the process died; empty if the stack does not show it.
+    """Return the agent whose code was running when the process died; empty if the stack does not show an agent.
 
-    A signal handler of an agent may be called while the simulator runs. Its frames then lie above those of crashhunt.
+    The simulator may be interrupted by a signal handler of an agent. The handler's frames then lie above those of
+    crashhunt.
 
     Args:
-        stack: as `faulthandler` writes it for a fatal signal.
-        agents: identifier to module.
+        stack: the stack in the format that `faulthandler` writes for a fatal signal.
+        agents: module of each agent, by identifier.
     """
     _, _, frames = stack.rpartition("\nCurrent thread ")
     for line in frames.split("\n\n", 1)[0].splitlines():
@@ -326,9 +329,9 @@ _SUPERVISOR_OUTCOMES = (Outcome.PROCESS_DIED, Outcome.HANG)
 
 
 class Report(TypedDict):
-    """What the process of a trial reports at its end.
+    """The report that the process of a trial writes at its end.
 
-    ``result`` is without the specification, which the supervisor knows. ``notices`` are lines for the user.
+    ``result`` does not contain the specification, which the supervisor knows. ``notices`` are texts for the user.
     """
 
     result: Mapping[str, object]
@@ -340,7 +343,7 @@ class Report(TypedDict):
 
 
 class FaultReport(TypedDict):
-    """What the process of a trial reports if crashhunt itself failed in it."""
+    """The report that the process of a trial writes if crashhunt itself failed in this process."""
 
     fault: ErrorData
 
@@ -348,13 +351,13 @@ class FaultReport(TypedDict):
 def encode_report(
     report: Report | FaultReport, key: bytes, digest: str, *, dumps: Callable[[object], str] = json.dumps
 ) -> bytes:
-    """Return the bytes of a report.
+    """Return a report as bytes.
 
     Args:
-        report: what is reported.
-        key: key of the trial.
-        digest: the trace digest; empty for an invalid trial.
-        dumps: writes JSON.
+        report: the report to encode.
+        key: key of the trial, a secret that proves the origin of the report.
+        digest: digest of the trial's recording; empty for an invalid trial.
+        dumps: function that converts data to JSON text.
     """
     text = dumps(report).encode()
     return _keyed_hash(text, key, digest) + text
@@ -363,21 +366,21 @@ def encode_report(
 def check_report(
     report: bytes, *, key: bytes, spec: TrialSpec, header: BlackBoxHeader, records: bytes, pid: int
 ) -> tuple[TrialResult, Report] | str:
-    """Check the report and the records of the process of a trial.
+    """Check the report that the process of a trial wrote, and the trial's recording.
 
     Args:
-        report: the bytes of the report behind the records.
-        key: key of the trial.
+        report: the bytes that follow the recording.
+        key: key of the trial, a secret that proves the origin of the report.
         spec: the requested trial.
-        header: header of the black box.
-        records: all committed records.
+        header: header of the trial's black box.
+        records: all committed records of the trial's black box.
         pid: id of the process that should have run the trial.
 
     Returns:
-        The result and the whole report; or a description of the first disagreement.
+        The result and the whole report, or a description of the first disagreement.
 
     Raises:
-        InternalError: crashhunt itself failed in that process.
+        InternalError: crashhunt itself failed in the trial's process.
     """
     found = _walk(records)
     if isinstance(found, str):
@@ -432,7 +435,7 @@ def _contradiction(result: TrialResult, spec: TrialSpec, steps: int, time_s: flo
 
 
 def _walk(records: bytes) -> tuple[int, float, list[memoryview]] | str:
-    """Return the last step, its simulation time and the evidence of the records; or the first error in words."""
+    """Return the last step, its simulation time and the digest of the records, or the first error as text."""
     whole, offset, end = memoryview(records), 0, len(records)
     step, time_s, begins = -1, 0.0, 0
     evidence: list[memoryview] = []

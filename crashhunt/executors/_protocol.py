@@ -1,4 +1,4 @@
-"""The executor protocol: where trials run."""
+"""The executor protocol: the interface of objects that run trials."""
 
 from __future__ import annotations
 
@@ -51,35 +51,36 @@ __all__ = [
 class Executor(Protocol):
     """Runs trials in other processes or on other machines.
 
-    Contract: every submitted trial comes back from `completed` exactly once, unless it is cancelled first. A worker
-    that dies or hangs costs exactly its own trial. Trials begin in the order in which they were submitted. A trial
-    whose process was killed from outside is run again, alone; after three kills at different steps it is invalid.
+    Contract: `completed` yields every submitted trial exactly once, unless the trial is cancelled first. A worker that
+    dies or hangs costs exactly its own trial. Trials begin in the order in which they were submitted. A trial whose
+    process was killed from outside is run again, alone. After three kills at different steps, the trial is invalid.
 
-    The files of a trial are needed only if its result has ``kept``. Then, before the result is returned, the folder
-    ``scratch_of(settings.scratch, number)`` of this machine must have its black box and output. That folder or
-    ``settings.scratch`` must have the map, if the simulator has a map. An executor on another machine returns no other
-    files.
+    The files of a trial are needed only if its result has ``kept``. In this case, the folder
+    ``scratch_of(settings.scratch, number)`` of this machine must contain its black box and output before the result is
+    returned. This folder or ``settings.scratch`` must contain the map, if the simulator has a map. An executor on
+    another machine returns no other files.
     """
 
     @property
     def capacity(self) -> int:
         """The number of trials that run at a time. The hunt submits more trials, so that no worker waits.
 
-        It may change, and is at least 1: if no machine is available for a while, the hunt waits for submitted trials.
+        The capacity may change, and is at least 1. If no machine is available for a while, the hunt waits for submitted
+        trials.
         """
 
     def submit(self, spec: TrialSpec) -> None:
         """Queue a trial. Submit each number once, because a worker may still use the folder of that number."""
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
-        """Yield the trials that have ended since the last call; wait at most this long for the first one.
+        """Yield the trials that have ended since the last call; wait at most ``timeout_s`` for the first one.
 
         Raises:
             CrashhuntError: no trial can be run, for a reason outside of the trials.
         """
 
     def cancel(self, *, above: int = -1) -> None:
-        """Cancel all trials whose number is greater than ``above``, running or not, at once."""
+        """Cancel at once all trials whose number is greater than ``above``, even if they are running."""
 
     def where(self) -> Mapping[int, BlackBoxHeader]:
         """Return the progress of running trials, by number, for the status screen; empty if it is unknown."""
@@ -88,18 +89,18 @@ class Executor(Protocol):
         """Return new notices for the user on how trials were run."""
 
     def close(self) -> None:
-        """Stop every process at once. A second call does nothing."""
+        """Stop all processes at once. A second call does nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeFigures:
-    """A machine on which trials run, for the status screen.
+    """A machine on which trials run, with its figures for the status screen.
 
     Args:
-        name: name of it.
-        parallel: number of trials that run on the node at a time.
-        trials: number of trials that have ended on the node in this run of the hunt.
-        rate_per_s: trials a second since it takes part.
+        name: name of the machine.
+        parallel: number of trials that run on the machine at a time.
+        trials: number of trials that have ended on the machine in this run of the hunt.
+        rate_per_s: trials per second since the machine joined the hunt.
     """
 
     name: str
@@ -112,24 +113,24 @@ class HasNodes(Protocol):
     """An executor that runs trials on several machines."""
 
     def nodes(self) -> Sequence[NodeFigures]:
-        """Return the machines that run trials now; empty while the hunt waits for all machines."""
+        """Return the machines that currently run trials; empty while the hunt waits for all machines."""
 
 
 class ExecutorFactory(Protocol):
-    """The factory of ``--executor NAME``: makes the executor of a hunt.
+    """The factory of ``--executor NAME``, which creates the executor of a hunt.
 
-    With ``--executor NAME:ARG``, it is called with ``argument=ARG`` as well; a factory without this argument need not
-    accept it. If no trial can run, it raises a `CrashhuntError` with the fix before it has started anything. See also
-    `ChoosesParallelism`.
+    With ``--executor NAME:ARG``, the factory is also called with ``argument=ARG``. A factory without an argument need
+    not accept this keyword. If no trial can run, the factory raises a `CrashhuntError` with the fix before it starts
+    any process. See also `ChoosesParallelism`.
     """
 
     def __call__(self, settings: WorkerSettings, *, parallel: int, recycle_after: int) -> Executor:
-        """Make an executor.
+        """Create an executor for a hunt.
 
         Args:
             settings: settings of the hunt.
-            parallel: number of trials at a time.
-            recycle_after: trials after which a worker is replaced by a fresh one; 0 for never.
+            parallel: number of trials that run at a time.
+            recycle_after: number of trials after which a worker is replaced; 0 for never.
         """
 
 
@@ -140,7 +141,7 @@ class ExecutorFactory(Protocol):
 
 @final
 class Done(TypedDict):
-    """The result of a trial; ``retires`` means that the supervisor runs no other trial."""
+    """The message with the result of a trial; ``retires`` means that the supervisor can run no further trial."""
 
     result: JsonObject
     notices: NotRequired[list[str]]
@@ -149,7 +150,7 @@ class Done(TypedDict):
 
 @final
 class Lost(TypedDict):
-    """A trial that was killed from outside: the exit code, and the failed import if it still imported."""
+    """The message that a trial was killed from outside: the exit code, and the failed import if it was importing."""
 
     lost: int
     importing: NotRequired[str]
@@ -160,7 +161,7 @@ Answer: TypeAlias = Done | Lost | ErrorData
 
 
 class FreshJob(TypedDict):
-    """The job of a fresh process, and the file for its result."""
+    """The job file of a new process, with the path of the file for its result."""
 
     settings: JsonObject
     spec: JsonObject
@@ -170,7 +171,8 @@ class FreshJob(TypedDict):
 class ForkServerJob(TypedDict):
     """The job of a fork server; ``late`` is true if every trial imports its agents itself.
 
-    ``sys_path`` is empty if crashhunt itself comes from the snapshot, as its environment says.
+    ``sys_path`` is empty if crashhunt itself comes from the snapshot, because the environment variables then contain
+    it.
     """
 
     settings: JsonObject
@@ -179,16 +181,17 @@ class ForkServerJob(TypedDict):
 
 
 class ToForkServer(TypedDict, total=False):
-    """A request of the pool to its fork server: to start or to kill the supervisor of a slot."""
+    """A request of the pool to its fork server: start or kill the supervisor of a slot."""
 
     slot: int
     kill: int
 
 
 class FromForkServer(TypedDict, total=False):
-    """A message of a fork server: it is ready, cannot fork, or has failed; or a supervisor has ended.
+    """A message of a fork server: it is ready, cannot fork, or has failed, or a supervisor has ended.
 
-    ``importing`` is what has failed if its template never reports again, in words; empty if that has imported all.
+    ``importing`` describes the import in progress, which has failed if the template never reports again; empty after
+    all imports.
     """
 
     importing: str
@@ -201,13 +204,13 @@ class FromForkServer(TypedDict, total=False):
 
 
 class KillTrial(TypedDict):
-    """A supervisor asks its zygote to kill the process of the trial that runs."""
+    """A request of a supervisor to its zygote: kill the process of the running trial."""
 
     kill: bool
 
 
 class FromZygote(TypedDict, total=False):
-    """A message of a zygote: it is ready, or why not; or how the process of a trial ended.
+    """A message of a zygote: it is ready, it failed to get ready, or the process of a trial has ended.
 
     ``unfit`` means that files of the simulator have changed, so that no other trial may start from this zygote.
     """
@@ -224,10 +227,10 @@ class FromZygote(TypedDict, total=False):
 
 
 class Notes:
-    """The notes of an executor, and those that its workers leave in the scratch folder.
+    """The notices of an executor for the user, including notices that its workers leave in the scratch folder.
 
     Args:
-        scratch: the folder.
+        scratch: the scratch folder.
     """
 
     def __init__(self, scratch: Path) -> None:
@@ -253,11 +256,11 @@ class Notes:
 
 
 def make_executor(word: str, settings: WorkerSettings, *, parallel: int, recycle_after: int) -> Executor:
-    """Make the executor that ``--executor`` names.
+    """Create the executor that ``--executor`` names.
 
     Raises:
         PluginError: the executor does not exist, or its factory raises an exception.
-        CrashhuntError: no trial can run; the message has the reason.
+        CrashhuntError: no trial can run; the message contains the reason.
     """
     factory = executor_of(word)
     try:
@@ -282,17 +285,18 @@ def run_trials(
     needed: Callable[[int], bool] = lambda _: True,
     check_every_s: float = _STOP_CHECK_INTERVAL_S,
 ) -> Iterator[tuple[int, TrialResult]]:
-    """Yield the place among the specifications and the result of each trial, as the trials end.
+    """Yield for each trial its index in the specifications and its result, in the order in which trials end.
 
-    Trials that have not ended when the caller stops asking are cancelled.
+    If the caller stops the iteration, the trials that have not ended are cancelled.
 
     Args:
-        executor: runs the trials, and no others meanwhile.
-        specs: specs of the trials, in ascending order of their numbers.
-        stopped: called before each wait for results, so at least once; True ends the loop, and it may raise.
-        needed: whether the trial at a place is still needed, asked after each result. Where a trial is not, the trials
-            after it are not either.
-        check_every_s: the longest time between two calls of ``stopped``, in s of wall time.
+        executor: the executor, which must run no other trials at the same time.
+        specs: specifications of the trials, in ascending order of their numbers.
+        stopped: function called before each wait for results, and thus at least once; True ends the iteration. The
+            function may raise an exception.
+        needed: function that returns whether the trial at an index is still needed, called after each result. If a
+            trial is not needed, the trials after it are not needed either.
+        check_every_s: maximum time between two calls of ``stopped``, in s of wall time.
 
     Raises:
         CrashhuntError: no trial can be run, for a reason outside of the trials.
@@ -322,10 +326,10 @@ _MAX_COMPILED_SNAPSHOTS = 16  # of which compiled code is kept; some 3 MB each
 
 
 def worker_environment() -> dict[str, str]:
-    """Return the environment variables that make a worker's results depend on its trial alone.
+    """Return the environment variables with which a worker's results depend only on its trial.
 
-    Hashes of strings are fixed, and libraries use a single thread. With a worker on every core, more threads would
-    compete for the cores. Parallel sums are also not bit-identical from run to run.
+    Hashes of strings are fixed, and libraries use a single thread. A worker runs on every core, so more threads would
+    compete for the cores. In addition, parallel sums are not bit-identical from run to run.
     """
     names = (
         "OMP_NUM_THREADS",
@@ -338,10 +342,10 @@ def worker_environment() -> dict[str, str]:
 
 
 def snapshot_environment(settings: WorkerSettings) -> dict[str, str]:
-    """Return the environment of a process in which crashhunt itself comes from the snapshot too.
+    """Return the environment of a process that uses the crashhunt of the snapshot.
 
-    Compiled code does not lie in the snapshot, where it would pass for the code. It lies with the caches of this user,
-    by the digest of the snapshot.
+    Compiled code must not lie in the snapshot, because it would then count as code. It lies in the cache of this user,
+    in a folder named by the snapshot's digest.
     """
     if not settings.code:
         return {**os.environ, **worker_environment()}
@@ -353,13 +357,13 @@ def snapshot_environment(settings: WorkerSettings) -> dict[str, str]:
 
 
 def has_fork_server(settings: WorkerSettings) -> bool:
-    """Whether the crashhunt of the settings has a fork server and supervisors: later than 0.1.0, or this one."""
+    """Return whether the settings' crashhunt has a fork server and supervisors, as versions after 0.1.0 do."""
     package = [Path(folder) / layout.PACKAGE.name for folder in settings.code]
     return all((found / "executors" / "_fork_server.py").is_file() for found in package if found.is_dir())
 
 
 def _compiled(settings: WorkerSettings) -> Path | None:
-    """The folder for the compiled code of a snapshot; None if there is no place for it."""
+    """Return the folder for the compiled code of a snapshot; None if no such folder can be used."""
     parts = Path(settings.code[0]).parts
     if layout.SNAPSHOTS not in parts:
         return None

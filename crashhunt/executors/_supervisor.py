@@ -1,7 +1,7 @@
 """The supervisor of a slot: it gives trials to a zygote, and determines their results. It never runs foreign code.
 
-The socket to the hunt, the black box, the scratch folder of the trial and its result belong to the supervisor.
-`check_report` checks the evidence that the process of a trial leaves.
+The supervisor owns the socket to the hunt, the black box, the scratch folder of the trial and its result.
+`check_report` checks the report and the recording that the process of a trial leaves.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class LostTrialError(Exception):
     """The process of a trial was killed from outside, or by an agent that attacked its zygote.
 
     Args:
-        exit_code: exit code of the process, negative for a signal.
+        exit_code: exit code of the process; negative for a signal.
     """
 
     def __init__(self, exit_code: int) -> None:
@@ -63,7 +63,7 @@ class LostTrialError(Exception):
 
 
 class UnfitZygoteError(Exception):
-    """A process that has imported the agents cannot be forked, so each trial must import them itself."""
+    """A process with imported agents cannot be forked, so each trial must import the agents itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +71,9 @@ class EndedTrial:
     """A trial that has ended.
 
     Args:
-        result: the result.
-        notices: messages for the user.
-        braking: the full braking of the vehicle that collided, if the settings request it.
+        result: result of the trial.
+        notices: texts for the user.
+        braking: the full braking of the vehicle that collided, if the settings request it; else None.
     """
 
     result: TrialResult
@@ -82,14 +82,14 @@ class EndedTrial:
 
 
 class Supervisor:
-    """Lets a zygote run one trial after another, each in a new process.
+    """Makes a zygote run one trial after another, each in a new process.
 
     Args:
         settings: settings of the hunt.
         zygote: connection to the zygote of this slot.
 
     Attributes:
-        retires: whether the zygote may run no other trial.
+        retires: whether the zygote may run no further trial.
     """
 
     def __init__(self, settings: WorkerSettings, zygote: socket.socket) -> None:
@@ -104,12 +104,12 @@ class Supervisor:
         self._made = self._trials = 0
 
     def run(self, spec: TrialSpec) -> EndedTrial:
-        """Run a trial. Its scratch folder stays if the result says that it is kept.
+        """Run a trial, and return it. Its scratch folder remains if the trial is kept.
 
         Raises:
-            LostTrialError: its process was ended from outside, or its zygote is gone.
+            LostTrialError: the process of the trial was killed from outside, or its zygote has ended.
             UnfitZygoteError: the zygote cannot fork.
-            CrashhuntError: the disk is full, or the simulator cannot be made at all.
+            CrashhuntError: the disk is full, or the simulator cannot be created.
         """
         self._await_zygote()
         box, folder = self._prepare(spec)
@@ -168,7 +168,7 @@ class Supervisor:
         return self._keep(*found)
 
     def _modules(self) -> dict[str, str]:
-        """Return the modules that only one agent uses, by agent."""
+        """Return for each agent the modules that only this agent uses."""
         scenario = self._settings.scenario
         others = {*scenario.modules()}
         found = {name: setup.agent.partition(":")[0] for name, setup in scenario.agents.items() if ":" in setup.agent}
@@ -181,7 +181,7 @@ class Supervisor:
         return damaged(spec, self._settings.scratch, message, agent=agent, recorded=recorded)
 
     def _keep(self, result: TrialResult, report: Report) -> EndedTrial:
-        """Write the files that a trial leaves for the hunt."""
+        """Write the files of a kept trial that the hunt expects."""
         settings, folder = self._settings, scratch_of(self._settings.scratch, result.spec.number)
         kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
         kept = kept or settings.is_audited(result)
@@ -252,10 +252,10 @@ class Supervisor:
             self._zygote.sendall(json.dumps(message).encode() + b"\n")
 
     def _next(self, timeout_s: float) -> FromZygote | None:
-        """Return the next message of the zygote; None if there is none yet.
+        """Return the next message of the zygote; None if no message has arrived.
 
         Raises:
-            LostTrialError: the zygote is gone.
+            LostTrialError: the zygote has ended.
         """
         if b"\n" not in self._received:
             ready, _, _ = select.select([self._zygote], [], [], timeout_s)
@@ -276,7 +276,7 @@ class Supervisor:
         return message
 
     def _prepare(self, spec: TrialSpec) -> tuple[BlackBoxFile, Path]:
-        """Give the trial its scratch folder: the folder of the last trial, whose pages are warm, or a new one."""
+        """Provide a scratch folder for the trial: that of the last trial, whose pages are in memory, or a new one."""
         folder = scratch_of(self._settings.scratch, spec.number)
         _remove(folder)  # of an earlier attempt at the same trial
         if self._folder is None or self._box is None or not self._box.is_reusable() or not self._is_ours(self._folder):
@@ -309,7 +309,7 @@ class Supervisor:
         self._folder = folder
 
     def _is_ours(self, folder: Path) -> bool:
-        """Return whether a folder exists and has the files that this process has open."""
+        """Return whether a folder exists and contains the files that this process has opened."""
         assert self._box is not None
         try:
             return not folder.is_symlink() and all(
@@ -324,7 +324,7 @@ class Supervisor:
             return False
 
     def _secure(self, spec: TrialSpec) -> None:
-        """Restore the evidence in the folder of a trial, whatever the trial did to the folder."""
+        """Restore the files in the scratch folder of a trial, in case the trial has moved or deleted them."""
         folder = scratch_of(self._settings.scratch, spec.number)
         if self._is_ours(folder):
             for entry in os.scandir(folder):
@@ -347,13 +347,13 @@ def _remove(path: Path) -> None:
 
 
 def be_supervisor(pool: socket.socket, zygote: socket.socket, settings: WorkerSettings, parent: int) -> NoReturn:
-    """Run trials until the pool has no more; does not return.
+    """Run trials until the pool has no more trials; this function does not return.
 
     Args:
-        pool: the pool.
+        pool: connection to the pool.
         zygote: connection to the zygote of this slot.
         settings: settings of the hunt.
-        parent: the process that started this one, which ends with it.
+        parent: the process that started this one; this process ends with it.
     """
     code = 1
     try:
@@ -403,12 +403,12 @@ _FIRST_EXTRA_NUMBER = 1 << 40  # beyond the numbers of a hunt's trials: each tri
 
 
 def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: EndedTrial) -> TrialResult:
-    """Return the result of a trial with its last escape, if the settings request it and it can be determined.
+    """Return the result of a trial, with the last step at which braking avoids the crash if the settings request it.
 
     Args:
-        supervisor: the supervisor that has run the trial.
+        supervisor: the supervisor of the trial.
         settings: settings of the hunt.
-        ended: the trial.
+        ended: the ended trial.
     """
     result = ended.result
     if not settings.find_escapes or result.collision is None or supervisor.retires:

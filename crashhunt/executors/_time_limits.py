@@ -1,4 +1,4 @@
-"""Time limits of trials and imports, and the time to write a stack before a kill."""
+"""Time limits of trials and imports, including the time to write a stack before a kill."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def has_hung(
     """Return whether a trial exceeds its time limit.
 
     Args:
-        header: header of its black box; None if there is none.
-        begun: whether the process of the trial itself wrote the header; until then `START_UP_S` is added to the limit.
-        given_at: when its process received the trial, in `time.monotonic`.
-        limit_s: wall time that it may take from its beginning on, in s.
-        has_words: returns whether the process has written its stack.
+        header: header of the trial's black box; None if there is none.
+        begun: whether the process of the trial itself wrote the header. If not, `START_UP_S` is added to the limit.
+        given_at: time at which the process received the trial, on the clock `time.monotonic`.
+        limit_s: wall-time limit of the trial from its beginning on, in s.
+        has_words: function that returns whether the process has written its stack.
     """
     now, began, allowed_s = time.monotonic(), given_at, limit_s
     if header is None or not begun:
@@ -62,11 +62,11 @@ _IMPORT_FIX = "see what the module does when it is imported"
 
 
 class ImportKilledError(Exception):
-    """A process that imported what trials need was ended by a signal that may come from outside.
+    """A process was killed by a signal, possibly from outside, while it imported the modules that trials need.
 
     Args:
-        exit_code: exit code of the process, negative for a signal.
-        importing: the failed import, in words.
+        exit_code: exit code of the process; negative for a signal.
+        importing: description of the failed import.
     """
 
     def __init__(self, exit_code: int, importing: str) -> None:
@@ -75,14 +75,14 @@ class ImportKilledError(Exception):
 
 
 class ImportWatch:
-    """What a process is importing, and whether that takes too long.
+    """Records what a process is importing, and detects imports that take too long.
 
     Args:
         timeout_s: wall-clock limit of a trial, in s; imports may take `START_UP_S` longer.
 
     Attributes:
-        importing: what has failed if the process never reports again, as in "the module 'planner' of agent ego cannot
-            be imported"; empty if everything has been imported.
+        importing: the error to report if the process never reports again, such as "the module 'planner' of agent ego
+            cannot be imported"; empty if all imports are complete.
     """
 
     def __init__(self, timeout_s: float) -> None:
@@ -96,7 +96,7 @@ class ImportWatch:
 
     @property
     def has_hung(self) -> bool:
-        """Whether the imports take too long."""
+        """Return whether the imports take too long."""
         return bool(self.importing) and time.monotonic() > self._ends_at
 
     def hung(self) -> CrashhuntError:
@@ -111,8 +111,8 @@ def import_died(importing: str, exit_code: int, *, times: int = 1) -> CrashhuntE
     """Return the error of an import that ended its process.
 
     Args:
-        importing: as of `ImportWatch`.
-        exit_code: exit code of the process, negative for a signal.
+        importing: description of the failed import, as in `ImportWatch`.
+        exit_code: exit code of the process; negative for a signal.
         times: number of attempts.
     """
     again = f", {times} times" if times > 1 else ""
@@ -123,16 +123,16 @@ def import_died(importing: str, exit_code: int, *, times: int = 1) -> CrashhuntE
 
 
 def await_imports(reports: socket.socket, pid: int, timeout_s: float) -> None:
-    """Wait until a child has imported what trials need.
+    """Wait until a child process has imported the modules that trials need.
 
     Args:
-        reports: connection from the child: a message before each import, an empty one at the end.
+        reports: connection from the child, which sends a message before each import and an empty message at the end.
         pid: process id of the child.
-        timeout_s: as of `ImportWatch`.
+        timeout_s: wall-clock limit of a trial, in s, as in `ImportWatch`.
 
     Raises:
-        ImportKilledError: it was ended by a signal that may come from outside.
-        CrashhuntError: it takes too long, or has ended by itself.
+        ImportKilledError: the child was killed by a signal that may come from outside.
+        CrashhuntError: an import takes too long, or has ended the child.
     """
     watch = ImportWatch(timeout_s)
     while watch.importing:

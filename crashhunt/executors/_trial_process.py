@@ -1,4 +1,4 @@
-"""Runs one trial in its own process, a fork of a process that has run no trial."""
+"""Runs one trial in its own process, which is a fork of a process that has run no trial."""
 
 from __future__ import annotations
 
@@ -72,10 +72,11 @@ _dumps, _leave, _open, _dup2, _close = json.dumps, os._exit, os.open, os.dup2, o
 
 
 class Job(TypedDict):
-    """The job of the process of a trial.
+    """The job that the process of a trial receives.
 
-    ``folder`` is that of the trial. Its black box has ``reserved`` bytes. ``key`` is for its report, in hexadecimal.
-    ``wants_map`` asks for the map in any case, ``tries_copy`` for whether the trial can be copied.
+    ``folder`` is the folder of the trial, and ``reserved`` the size of its black box in bytes. ``key`` is a secret for
+    its report, in hexadecimal. ``wants_map`` requests the map in any case. ``tries_copy`` requests a test whether the
+    trial can be forked.
     """
 
     spec: JsonObject
@@ -87,13 +88,13 @@ class Job(TypedDict):
 
 
 class TrialProcess:
-    """Runs one trial in a fork of the process in which this was made.
+    """Runs one trial in a fork of the process that created this object.
 
-    Making it takes over the standard output and the signals of the process.
+    Creating this object redirects the standard output and the signals of the process.
 
     Args:
         settings: settings of the hunt.
-        parts: the imported parts; None to import them in the process of each trial.
+        parts: the imported agents and simulator; None to import them in the process of each trial.
     """
 
     def __init__(self, settings: WorkerSettings, parts: Parts | None) -> None:
@@ -118,10 +119,10 @@ class TrialProcess:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)  # ends a simulator that does not return to Python as well
 
     def make_simulator(self) -> Simulator:
-        """Make the simulator and everything else that the processes of trials share.
+        """Create the simulator and all other objects that the processes of trials share.
 
         Raises:
-            CrashhuntError: the simulator cannot be made.
+            CrashhuntError: the simulator cannot be created.
         """
         if self._parts is None:
             self._parts = loaded(self._settings)
@@ -135,23 +136,23 @@ class TrialProcess:
         return self._simulator
 
     def record_shared_state(self, control: int) -> str:
-        """Record which files and memory the processes of trials need to have their own.
+        """Record the files and memory of which each trial's process needs its own copy.
 
         Args:
-            control: descriptor of the zygote's own connection, which no trial has.
+            control: file descriptor of the zygote's connection to its supervisor; trials have no such connection.
 
         Returns:
-            The resources that they share nevertheless, in words; empty for nothing.
+            The resources that trials would share, as text; empty if there are none.
         """
         self._shared = SharedState(known={0, 1, 2, self._stack.fileno(), control})
         return self._shared.remaining
 
     def run(self, job: Job, reset: Reset | None = None) -> NoReturn:
-        """Run a trial, leave its report in the black box, and end this process.
+        """Run a trial, write its report to the black box, and end this process.
 
         Args:
-            job: the trial.
-            reset: a function in place of the simulator's `reset`, if it has already been reset.
+            job: the job of the trial.
+            reset: function that replaces the simulator's `reset` if the simulator has already been reset.
         """
         code = 1
         try:
@@ -298,13 +299,13 @@ class TrialProcess:
         self._questions = ()
 
     def _delay(self, wall_s: float) -> None:
-        """Count the time of copies as not the trial's own."""
+        """Add the time spent in forks to the trial's time limit."""
         assert self._box is not None
         self._box.delay(wall_s)
         watchdog.extend(wall_s)
 
     def _stop_recording(self) -> None:
-        """Keep the copy of this process that an agent forks from writing into the recording."""
+        """Prevent a fork that an agent makes from writing into the recording."""
         if self._box is not None and not copying():
             self._box.detach()
 
@@ -320,14 +321,14 @@ class TrialProcess:
 
 
 def loaded(settings: WorkerSettings, report: Callable[[str], None] = lambda _: None) -> Parts:
-    """Import everything that trials need.
+    """Import the modules that trials need, and return them.
 
     Args:
         settings: settings of the hunt.
-        report: as of `Parts.load`.
+        report: function called before each import, as in `Parts.load`.
 
     Raises:
-        CrashhuntError: something cannot be imported.
+        CrashhuntError: a module cannot be imported.
     """
     parts = Parts(settings)
     parts.load(report)

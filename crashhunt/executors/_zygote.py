@@ -1,4 +1,7 @@
-"""The zygote of a slot: every trial runs in a fork of it, which ends with the trial. The zygote itself runs none."""
+"""The zygote of a slot: every trial runs in a fork of the zygote, which ends with the trial.
+
+The zygote runs no trial.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +59,7 @@ _dumps, _loads, _write = json.dumps, json.loads, os.write
 
 
 class _Answer(TypedDict, total=False):
-    """A report of a suspended process: the duration of its reset, its failure, or the end of a trial's process."""
+    """A report of a suspended process: the duration of its reset, its failure, or how the process of a trial ended."""
 
     took_s: float
     unfit: str
@@ -65,12 +68,12 @@ class _Answer(TypedDict, total=False):
 
 
 class WarmTraffics:
-    """The suspended processes of a zygote, one for each traffic.
+    """The suspended processes of a zygote: one for each traffic, in which the simulator has been reset.
 
     Args:
-        limit: largest number of suspended processes.
-        notify: called with messages for the user.
-        worth_s: least wall time of a warm-up for which a process is kept, in s.
+        limit: maximum number of suspended processes.
+        notify: function called with texts for the user.
+        worth_s: minimum wall time of a warm-up for which a suspended process is kept, in s.
     """
 
     def __init__(self, limit: int, notify: Callable[[str], None], *, worth_s: float = _MIN_WARM_UP_S) -> None:
@@ -83,29 +86,30 @@ class WarmTraffics:
         self._simulator: Simulator | None = None
 
     def prepare(self, trial: TrialProcess, simulator: Simulator) -> None:
-        """Store the settings with which trials run."""
+        """Store the objects with which trials run."""
         self._trial, self._simulator = trial, simulator
 
     @property
     def processes(self) -> frozenset[int]:
-        """The suspended processes."""
+        """The suspended processes, by traffic."""
         return frozenset(one.pid for one in self._suspended.values())
 
     def forget(self) -> None:
-        """Close the pipes to the suspended processes in this process, which runs a trial."""
+        """Close the pipes to the suspended processes in the present process, which runs a trial."""
         for one in self._suspended.values():
             one.close()
         self._suspended.clear()
 
     def run(self, job: Job, wait: Wait) -> tuple[int, int] | None:
-        """Run a trial in a fork of the suspended process for its traffic; make that process if it is missing.
+        """Run a trial in a fork of the suspended process for its traffic; create that process if it is missing.
 
         Args:
-            job: the trial.
-            wait: waits until a descriptor can be read; its second argument kills the process behind it.
+            job: the job of the trial.
+            wait: function that waits until a descriptor can be read; its second argument is a function that kills the
+                process.
 
         Returns:
-            The process that ran it and its exit code; None if the trial has to run in a fork of the zygote.
+            The process that ran the trial and its exit code; None if the trial has to run in a fork of the zygote.
         """
         if self._trial is None or self._limit == 0:
             return None
@@ -179,13 +183,13 @@ class WarmTraffics:
 
 @dataclass(slots=True, eq=False)
 class _Suspended:
-    """A suspended process, as its zygote knows it.
+    """A suspended process and the pipes to it, as the zygote stores them.
 
     Args:
-        pid: process id.
+        pid: process id of the suspended process.
         asks: the pipe for requests to the process.
-        says: the pipe for answers of the process.
-        used: number of the trial that used it last.
+        says: the pipe for answers from the process.
+        used: number of the last trial that used the process.
     """
 
     pid: int
@@ -194,7 +198,7 @@ class _Suspended:
     used: int
 
     def ask(self, text: bytes, wait: Wait) -> _Answer | None:
-        """Return the answer of the process; None if it has ended."""
+        """Send a request to the process, and return its answer; None if the process has ended."""
         try:
             while text:
                 text = text[_write(self.asks, text) :]
@@ -216,12 +220,12 @@ class _Suspended:
             kill(pid)
 
     def close(self) -> None:
-        """Close the pipes."""
+        """Close the pipes to the process."""
         os.close(self.asks)
         os.close(self.says)
 
     def end(self) -> int:
-        """Kill the process; return its exit code."""
+        """Kill the process, and return its exit code."""
         for child in children_of(self.pid):
             kill(child)
         kill(self.pid)
@@ -231,7 +235,7 @@ class _Suspended:
 
 
 def _be_suspended(wakes: int, says: int, trial: TrialProcess, simulator: Simulator, spec: TrialSpec) -> None:
-    """Reset the simulator; then run each requested trial in a fork."""
+    """Reset the simulator, and then run each requested trial in a fork."""
     adopt_orphans()
     began = time.monotonic()
     try:
@@ -283,11 +287,11 @@ _LOOK_EVERY_S = 0.005  # where the kernel does not report when a process ends
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """The preparation of the processes of trials, done once before they are forked.
+    """The result of the preparation that is made once, before the processes of trials are forked.
 
     Args:
         parts: the imported parts; None if each trial imports its agents itself.
-        makes_simulator: whether the zygote makes the simulator; if not, each trial makes its own.
+        makes_simulator: whether the zygote creates the simulator; if not, each trial creates its own simulator.
     """
 
     parts: Parts | None
@@ -298,17 +302,17 @@ _NOTHING_IMPORTED: Final = Imported(None, makes_simulator=False)
 
 
 def import_parts(settings: WorkerSettings, report: Callable[[str], None]) -> Imported | None:
-    """Import the modules that trials need, and check whether the simulator may be made in a zygote.
+    """Import the modules that trials need, and check whether a zygote may create the simulator.
 
     Args:
         settings: settings of the hunt.
-        report: as of `Parts.load`; called with nothing at the end.
+        report: function called before each import, as in `Parts.load`, and with an empty text at the end.
 
     Returns:
-        None if this process cannot be forked any more.
+        The result; None if this process can no longer be forked.
 
     Raises:
-        CrashhuntError: something cannot be imported.
+        CrashhuntError: a module cannot be imported.
     """
     parts = loaded(settings, report)
     if not _can_be_forked():
@@ -320,10 +324,10 @@ def import_parts(settings: WorkerSettings, report: Callable[[str], None]) -> Imp
 
 
 def import_nothing(settings: WorkerSettings) -> Imported:
-    """Import the library of the simulator alone, where trials import their agents themselves.
+    """Import only the library of the simulator, because trials import their agents themselves.
 
     Raises:
-        CrashhuntError: it cannot be imported.
+        CrashhuntError: the library cannot be imported.
     """
     if settings.scenario.simulator in registered("simulators"):
         locate("simulators", settings.scenario.simulator)
@@ -331,9 +335,9 @@ def import_nothing(settings: WorkerSettings) -> Imported:
 
 
 def _is_forkable_with(parts: Parts) -> bool:
-    """Return whether a process can still be forked after it has made the simulator; a fork of this process tries it.
+    """Return whether a process can still be forked after it has created the simulator; a fork of this process tries it.
 
-    The reason for the check: an environment may start threads, which a fork does not have.
+    The check is needed because an environment may start threads, which a fork does not have.
     """
     pid = os.fork()
     if pid == 0:
@@ -349,7 +353,7 @@ def _is_forkable_with(parts: Parts) -> bool:
 
 
 def _can_be_forked() -> bool:
-    """Return whether this process can be forked after its imports, without other threads or a graphics card."""
+    """Return whether this process can be forked after its imports: it has no other threads and uses no GPU."""
     try:
         threads = len(os.listdir("/proc/self/task"))  # noqa: PTH208 - how many is enough
     except OSError:
@@ -359,7 +363,7 @@ def _can_be_forked() -> bool:
 
 
 def be_zygote(control: socket.socket, settings: WorkerSettings, imported: Imported) -> NoReturn:
-    """Fork a process for each trial that the supervisor asks for; does not return.
+    """Fork a process for each trial that the supervisor requests; this function does not return.
 
     Args:
         control: connection to the supervisor.
@@ -411,14 +415,14 @@ class _Zygote:
                 self._report(said)
 
     def _changed_at(self) -> int:
-        """When a file of the simulator was last added or removed, in ns; 0 if its folder is gone."""
+        """Return when a file of the simulator was last added or removed, in ns; 0 if its folder was deleted."""
         try:
             return self._stage.stat().st_mtime_ns
         except OSError:
             return 0
 
     def _run(self, job: Job) -> tuple[int, int]:
-        """Return the process that ran a trial, and its exit code, negative for a signal."""
+        """Run a trial, and return its process and the exit code, which is negative for a signal."""
         spared = frozenset[int]()
         if self._warm is not None:
             found = self._warm.run(job, self._wait)
@@ -466,7 +470,7 @@ class _Zygote:
                 return
 
     def _next(self) -> Job | KillTrial | None:
-        """Return the next message; None if the supervisor has ended."""
+        """Return the next message of the supervisor; None if the supervisor has ended."""
         while b"\n" not in self._received:
             try:
                 data = self._control.recv(_CHUNK_BYTES)
@@ -486,7 +490,7 @@ class _Zygote:
 
 
 def _why_not(error: BaseException) -> FromZygote:
-    """Return the message to the supervisor for an error with which no trial can run."""
+    """Return the message to the supervisor for an error that prevents all trials."""
     if isinstance(error, CrashhuntError):
         return {"error": error.to_json()["error"]}
     full = isinstance(error, OSError) and error.errno in DISK

@@ -1,4 +1,4 @@
-"""Trials on all machines of a Ray cluster; Ray itself is imported in its own process."""
+"""Trials on all machines of a Ray cluster; Ray itself is imported in a separate process."""
 
 import lazy_loader
 

@@ -1,8 +1,8 @@
-"""The process between a hunt and Ray: it assigns trials to nodes, and handles lost nodes.
+"""The process between a hunt and Ray: it assigns trials to nodes, and handles the loss of nodes.
 
-Ray ends the process that is connected to a cluster when the cluster goes, prints into its output and takes its signals.
-In a separate process, none of this affects the hunt. The hunt sends trials through a socket, and receives their
-results.
+If a cluster ends, Ray ends the process that is connected to it. Ray also writes to the output of this process, and
+handles its signals. In a separate process, none of this affects the hunt. The hunt sends trials through a socket, and
+receives their results.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ _MAX_TRIAL_LOSSES = 2  # of a trial with its node; then it runs alone on one, in
 
 @dataclass(slots=True, eq=False)
 class Trial:
-    """A trial that was submitted.
+    """A submitted trial.
 
     Args:
-        ticket: position in the order of submission. spec: as JSON.
+        ticket: position of the trial in the order of submission. spec: specification of the trial as JSON.
         losses: number of times that the node of the trial was lost.
     """
 
@@ -72,12 +72,12 @@ class Trial:
 
     @property
     def number(self) -> int:
-        """The number of the trial."""
+        """The number of the trial in the hunt."""
         return int(self.spec["number"])
 
     @property
     def alone(self) -> bool:
-        """Whether the trial runs alone on a node."""
+        """Whether the trial must run alone on a node."""
         return self.losses >= _MAX_TRIAL_LOSSES
 
 
@@ -86,17 +86,18 @@ class Node:
     """A machine that runs trials, or a part of a machine whose CPUs became free at different times.
 
     Args:
-        id: identifier of this part. machine: Ray's identifier. name: name of the machine, for people.
-        slots: number of trials at a time.
-        actor: the actor on the node.
-        stood: time at which the actor was started, in `time.monotonic`.
-        doing: the last request without an answer.
-        answer: reference to the answer of this request.
-        ready: whether it runs trials.
-        given: trials for the next request, by ticket.
-        running: ticket to trial.
-        done: trials so far.
-        since: when it became ready, as of `time.monotonic`.
+        id: identifier of this part of a machine. machine: Ray's identifier of the machine. name: name of the machine
+            for users.
+        slots: number of trials that run at a time.
+        actor: the actor that runs on the node.
+        stood: time at which the actor was started, on the clock `time.monotonic`.
+        doing: the last request that has no answer yet.
+        answer: Ray's reference to the answer of this request.
+        ready: whether the node runs trials.
+        given: trials to send with the next request, by ticket.
+        running: trials that run on the node, by ticket.
+        done: number of trials that have ended on the node.
+        since: time at which the node became ready, on the clock `time.monotonic`.
     """
 
     id: str
@@ -115,18 +116,18 @@ class Node:
 
     @property
     def has_room(self) -> bool:
-        """Whether the node can run one more trial."""
+        """Return whether the node can run one more trial."""
         return self.ready and len(self.running) < _TRIALS_PER_CPU * self.slots
 
     @property
     def rate_per_s(self) -> float:
-        """The number of ended trials per second, by the clock of the hunt's machine."""
+        """The number of ended trials per second, measured by the clock of the hunt's machine."""
         elapsed_s = time.monotonic() - self.since if self.ready else 0.0
         return self.done / elapsed_s if elapsed_s > 0 else 0.0
 
 
 class NodeScheduler:
-    """The nodes, and the trials that wait for one."""
+    """The nodes of a cluster, and the trials that wait for a node."""
 
     def __init__(self) -> None:
         self.nodes: dict[str, Node] = {}
@@ -143,7 +144,7 @@ class NodeScheduler:
         return not self.waiting and not any(node.running for node in self.nodes.values())
 
     def figures(self) -> list[Figures]:
-        """Return the numbers of the ready machines for the status screen."""
+        """Return the figures of the ready machines for the status screen."""
         found: dict[str, Figures] = {}
         for node in self.nodes.values():
             if node.ready:
@@ -155,7 +156,7 @@ class NodeScheduler:
         return list(found.values())
 
     def parts(self, machine: str) -> list[Node]:
-        """Return the nodes of a machine that run trials."""
+        """Return the nodes on a machine that run trials."""
         return [node for node in self.nodes.values() if node.machine == machine]
 
     def assign(self) -> dict[Node, list[Trial]]:
@@ -184,7 +185,7 @@ class NodeScheduler:
         return True
 
     def lose(self, node: Node) -> list[Trial]:
-        """Remove a node; return its trials that do not run again, because they ran alone on it."""
+        """Remove a node; return those of its trials that do not run again because they ran alone on the node."""
         self.nodes.pop(node.id, None)
         culprits = [trial for trial in node.running.values() if trial.alone]
         for trial in node.running.values():
@@ -195,7 +196,7 @@ class NodeScheduler:
         return culprits
 
     def cancel(self, above: int) -> None:
-        """Cancel trials whose number is greater."""
+        """Cancel the trials whose number is greater than ``above``."""
         self.waiting = deque(trial for trial in self.waiting if trial.number <= above)
         for node in self.nodes.values():
             node.running = {ticket: trial for ticket, trial in node.running.items() if trial.number <= above}
@@ -203,11 +204,11 @@ class NodeScheduler:
 
 
 def shares(free: Mapping[str, int], wanted: int | None) -> dict[str, int]:
-    """Divide trials at a time among nodes: evenly, each at most what it has free.
+    """Divide the trials that run at a time evenly among nodes, without exceeding the free slots of any node.
 
     Args:
-        free: node to the number of trials that it could run.
-        wanted: number of slots that the hunt wants; None for all free ones.
+        free: number of trials that each node could run.
+        wanted: number of slots that the hunt wants; None for all free slots.
     """
     left = {node: count for node, count in free.items() if count > 0}
     if wanted is None:
@@ -239,7 +240,7 @@ _MAX_NODE_LOSSES = 3  # of a node without a trial between
 
 
 def main() -> None:
-    """Run the bridge; standard error is a log."""
+    """Run the bridge; it logs to standard error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     control = socket.socket(fileno=int(sys.argv[1]))
     job = json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
@@ -258,11 +259,11 @@ def main() -> None:
 
 
 class Bridge:
-    """Passes trials to nodes, and their results to the hunt.
+    """Forwards trials to nodes, and results of trials to the hunt.
 
     Args:
         control: the socket to the hunt.
-        job: the job of the bridge: see `RayExecutor`.
+        job: the job of the bridge; see `RayExecutor`.
     """
 
     def __init__(self, control: socket.socket, job: BridgeJob) -> None:
@@ -290,7 +291,7 @@ class Bridge:
         self._cluster = Cluster(job["address"], cpus=job["cpus"], temporary=job["temporary"])
 
     def run(self) -> None:
-        """Run until the hunt ends the bridge."""
+        """Forward trials and results until the hunt ends the bridge."""
         threading.Thread(target=self._listen, daemon=True).start()
         while not self._closing:
             self.turn()
@@ -300,7 +301,7 @@ class Bridge:
             self._cluster.close([node.actor for node in nodes], ready, _CLOSE_S)
 
     def turn(self, wait_s: float = _WAIT_S) -> None:
-        """Update the nodes, submit trials, and process answers; wait at most this long for the first answer."""
+        """Update the nodes, submit trials, and process answers; wait at most ``wait_s`` for the first answer."""
         with self._lock:
             self._refresh_nodes()
             self._assign_trials()
@@ -322,7 +323,7 @@ class Bridge:
             self._refilled.wait_for(lambda: self._missing <= 0, timeout=min(wait_s, _REFILL_S))
 
     def _listen(self) -> None:
-        """Process the messages of the hunt, also while the bridge waits for nodes."""
+        """Process the messages of the hunt, even while the bridge waits for nodes."""
         received = b""
         try:
             while data := self._control.recv(_CHUNK_BYTES):
@@ -352,7 +353,10 @@ class Bridge:
         self._control.sendall(json.dumps(message).encode() + b"\n")
 
     def _assign_trials(self) -> None:
-        """Submit waiting trials. A node that is asked soon gets them with that call, because each call costs time."""
+        """Submit waiting trials.
+
+        A node that is called soon receives them with that call, because each call costs time.
+        """
         for node, trials in self._roster.assign().items():
             given = [(trial.ticket, trial.spec) for trial in trials]
             if node.answer is None:
@@ -361,7 +365,7 @@ class Bridge:
                 self._cluster.order(node.actor, "submit", given)
 
     def _refresh_nodes(self) -> None:
-        """Find new and lost nodes, and prepare the new ones."""
+        """Find new and lost nodes, and prepare the new nodes."""
         if time.monotonic() - self._looked < _LOOK_EVERY_S:
             return
         self._looked = time.monotonic()
@@ -423,7 +427,7 @@ class Bridge:
         return taken or waited_s > self._patience.get(node.machine, _START_S)
 
     def _release_actor(self, node: Node) -> None:
-        """Cancel an actor that was not placed; the next actor waits longer."""
+        """Cancel an actor that could not be placed; the next actor waits longer."""
         self._patience[node.machine] = 2 * self._patience.get(node.machine, _START_S)
         self._roster.lose(node)
         self._cluster.kill(node.actor)
@@ -467,7 +471,7 @@ class Bridge:
             self._refuse(node, said)
 
     def _handle_news(self, node: Node, news: News) -> None:
-        """Pass the events of a node on to the hunt."""
+        """Forward the events of a node to the hunt."""
         if news.map:
             self._maps[node.id] = news.map
         found = [ended for ended in news.ended if self._roster.ended(node, ended.ticket)]
@@ -488,7 +492,7 @@ class Bridge:
             self._refuse(node, f"{error.where}: {error.message}" if error.where else error.message)
 
     def _keep(self, node: Node, ended: EndedTrial) -> None:
-        """Write the files of a kept trial to the folder where the hunt expects them.
+        """Write the files of a kept trial to the folder in which the hunt expects them.
 
         Raises:
             RecorderError: the disk is full.
@@ -508,7 +512,7 @@ class Bridge:
             ) from error
 
     def _drop_node(self, node: Node) -> None:
-        """Continue without a node; its trials run again elsewhere."""
+        """Stop using a lost node; its trials run again on other nodes."""
         count = len(node.running)
         culprits = self._roster.lose(node)
         self._send_figures(now=True)
@@ -532,7 +536,7 @@ class Bridge:
             self._send(ticket=trial.ticket, result=result.to_json())
 
     def _refuse(self, node: Node, why: str) -> None:
-        """Continue without a node that cannot run trials."""
+        """Stop using a node that cannot run trials."""
         self._refused[node.machine] = f"{node.name}: {why}"
         for trial in node.running.values():
             trial.losses -= 1  # it is not to blame

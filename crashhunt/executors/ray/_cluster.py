@@ -1,4 +1,4 @@
-"""The part of Ray that a hunt uses: nodes, actors, calls and their answers."""
+"""The part of Ray's interface that a hunt uses: nodes, actors, calls and their answers."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ class Meant(NamedTuple):
     """The cluster that the user has chosen.
 
     Attributes:
-        address: ``HOST:PORT``; empty for one of the hunt's own.
+        address: ``HOST:PORT``; empty for the hunt's own cluster.
         environment: additional environment variables for Ray.
-        spare: further variables, for a cluster that requires a token.
+        spare: further environment variables for a cluster that requires a token.
     """
 
     address: str
@@ -71,10 +71,10 @@ class Meant(NamedTuple):
 
 
 def require_ray() -> None:
-    """Check that Ray is installed, and not too old.
+    """Check that Ray is installed in a supported version.
 
     Raises:
-        PluginError: Ray is not installed, or too old.
+        PluginError: Ray is not installed, or its version is too old.
     """
     spec = importlib.util.find_spec("ray")
     if spec is None or spec.origin is None:  # some folder of that name is none
@@ -91,19 +91,19 @@ def require_ray() -> None:
 
 
 def cluster_of(argument: str) -> Meant:
-    """Return the cluster that the argument names.
+    """Return the cluster that the executor's argument names.
 
-    Clusters may ask for a token. The hunt's own cluster gets a new token, because Ray would otherwise leave one in the
-    home folder. A cluster on this machine receives the existing token, but a cluster on another machine does not, as
-    with Ray itself. The need for a token shows when the hunt joins: a Ray process with a token cannot use a cluster
-    without one.
+    Clusters may require a token. The hunt's own cluster gets a new token, because Ray would otherwise store a token in
+    the home folder. A cluster on this machine receives the existing token, but a cluster on another machine does not,
+    as with Ray itself. Whether a token is needed is known only when the hunt joins, because a Ray process with a token
+    cannot use a cluster without a token.
 
     Args:
-        argument: ``HOST:PORT``; ``auto`` for one that runs here; ``local`` for one of the hunt's own; empty for one
-            that runs here, else one of the hunt's own.
+        argument: ``HOST:PORT``; ``auto`` for a cluster that runs on this machine; ``local`` for the hunt's own cluster;
+            empty for a cluster on this machine, or else the hunt's own.
 
     Raises:
-        UsageError: the address is invalid, or no cluster answers there.
+        UsageError: the address is invalid, or no cluster answers at the address.
     """
     wanted = argument if argument not in ("", "auto") else os.environ.get("RAY_ADDRESS", "") or argument
     ours = Meant("", {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}, {})
@@ -133,7 +133,10 @@ def cluster_of(argument: str) -> Meant:
 
 
 def silent(address: str) -> str:
-    """Return why no cluster answers at an address; empty if one may, which takes a few seconds at most."""
+    """Return why no cluster answers at an address; empty if a cluster may answer.
+
+    The check takes a few seconds at most.
+    """
     host, _, port = address.rpartition(":")
     said: queue.SimpleQueue[str] = queue.SimpleQueue()
 
@@ -154,7 +157,7 @@ def silent(address: str) -> str:
 
 
 def _protocol_error(connection: socket.socket) -> str:
-    """Return why the listening process is not the head of a Ray cluster, which uses HTTP/2; empty if it may be one."""
+    """Return why a listening process is not the head of a Ray cluster, which uses HTTP/2; empty if it may be one."""
     if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):
         return ""
     found = b""
@@ -171,7 +174,7 @@ def _protocol_error(connection: socket.socket) -> str:
 
 
 def _connect(address: str) -> Meant:
-    """Return a cluster that already runs.
+    """Return a cluster that is already running.
 
     Raises:
         UsageError: the cluster requires a token, but there is none.
@@ -195,7 +198,7 @@ def _is_local(address: str) -> bool:
 
 
 def _local_address() -> str:
-    """Return the address of the last cluster that was started on this machine, as recorded by Ray."""
+    """Return the address of the last cluster that Ray started on this machine, as recorded by Ray."""
     try:
         folder = Path(os.environ.get("RAY_TMPDIR", "/tmp"))
         return (folder / "ray" / "ray_current_cluster").read_text(encoding="utf-8").strip()
@@ -212,11 +215,11 @@ _CONCURRENCY_GROUPS |= {"submit": _ORDERS, "cancel": _ORDERS, "close": _ORDERS}
 
 
 class Lost(Exception):  # noqa: N818 - it is no fault
-    """The node, or the actor on it, is lost."""
+    """The node was lost, or the actor on it was lost."""
 
 
 class UnreachableError(UsageError):
-    """The cluster cannot be reached, now or at all."""
+    """The cluster cannot be reached, either temporarily or permanently."""
 
 
 class TokenError(UnreachableError):
@@ -225,11 +228,11 @@ class TokenError(UnreachableError):
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A node of a cluster.
+    """A node of a Ray cluster.
 
     Args:
-        id: Ray's identifier. name: name for people.
-        cpus: number of CPUs for work.
+        id: Ray's identifier of the node. name: name of the node for users.
+        cpus: number of CPUs that can be used.
         free: number of CPUs that are not in use.
     """
 
@@ -240,12 +243,12 @@ class Found:
 
 
 class Cluster:
-    """A connection to a cluster, of which a process has one.
+    """A connection to a Ray cluster; a process can have only one.
 
     Args:
-        address: address of the cluster; empty for one of our own, which ends with this process.
-        cpus: number of CPUs of a cluster of our own.
-        temporary: the folder for files of one of our own.
+        address: address of the cluster; empty for the hunt's own cluster, which ends with this process.
+        cpus: number of CPUs of the hunt's own cluster.
+        temporary: folder for the files of the hunt's own cluster.
 
     Raises:
         UnreachableError: the cluster cannot be used.
@@ -305,7 +308,7 @@ class Cluster:
         return found
 
     def stand(self, node: str, slots: int) -> Any:
-        """Start an actor on a node, with a number of its CPUs."""
+        """Start an actor on a node, with a number of the node's CPUs."""
         strategy = self._affinity(node_id=node, soft=False)
         name = f"{_ACTOR_PREFIX}{slots}-{secrets.token_hex(8)}"
         return self._kind.options(num_cpus=slots, scheduling_strategy=strategy, name=name).remote()
@@ -340,17 +343,17 @@ class Cluster:
         return getattr(actor, what).remote(*arguments)
 
     def answered(self, answers: Sequence[Any], wait_s: float) -> list[Any]:
-        """Return the answers that have arrived; wait at most this long for the first one."""
+        """Return the answers that have arrived; wait at most ``wait_s`` for the first one."""
         ready, rest = self._ray.wait(list(answers), num_returns=1, timeout=wait_s)
         more, _ = self._ray.wait(rest, num_returns=len(rest), timeout=0) if ready and rest else ([], [])
         return [*ready, *more]
 
     def value(self, answer: Any) -> Any:
-        """Return the value of an arrived answer.
+        """Return the value of an answer that has arrived.
 
         Raises:
-            Lost: the called actor is lost.
-            Exception: the exception of the method.
+            Lost: the actor that was called is lost.
+            Exception: the method raised this exception.
         """
         from ray import exceptions
 
@@ -362,7 +365,7 @@ class Cluster:
             raise Lost(str(error)) from None
 
     def shared(self, make: Callable[[], bytes]) -> Any:
-        """Return an object that can be sent to all nodes; it is made at the first use."""
+        """Return an object that can be sent to all nodes; ``make`` creates it at the first use."""
         if self._shared is None:
             self._shared = self._ray.put(make())
         return self._shared
@@ -383,7 +386,7 @@ class Cluster:
         Args:
             actors: all actors that were started.
             ready: the actors that run trials.
-            wait_s: time for the ready nodes to end their work, in s.
+            wait_s: time in which the ready actors may finish their work, in s.
         """
         with suppress(Exception):
             closed = [self.order(actor, "close") for actor in ready]
@@ -394,7 +397,7 @@ class Cluster:
 
 
 def _check_protocol(address: str) -> None:
-    """Check that a cluster answers, because Ray itself waits very long for an answer.
+    """Check that a cluster answers. Ray itself would wait very long for an answer.
 
     Raises:
         UnreachableError: the cluster does not answer.

@@ -1,4 +1,4 @@
-"""The archive that a node needs before it can run trials: scenario, code and files of a hunt, by digest."""
+"""The archive that a node needs to run trials: scenario, code and files of a hunt, identified by a digest."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _SCENARIO, _CODE, _FILES = "scenario", "code", "files"
 
 @dataclass(frozen=True, slots=True)
 class CodeArchive:
-    """The files that trials need, and the folders here that they replace.
+    """The files that trials need, and the folders on the hunt's machine that they replace.
 
     Args:
-        files: place in the parcel to file.
-        folders: folder or file here to its place in the parcel, for `settings_in`.
-        home: the place of the current folder; empty if none does.
+        files: path of each file, by its place in the archive.
+        folders: place in the archive of each folder or file of the hunt's machine, for `settings_in`.
+        home: place in the archive of the current folder; empty if the archive does not contain it.
     """
 
     files: dict[str, Path]
@@ -50,11 +50,11 @@ class CodeArchive:
 
     @classmethod
     def of(cls, settings: WorkerSettings) -> CodeArchive:
-        """Return the parcel of a hunt.
+        """Return the archive of a hunt.
 
         Raises:
             UsageError: the files are too large to send.
-            ScenarioError: the scenario names a file that is not there.
+            ScenarioError: the scenario names a file that does not exist.
         """
         files = {f"{_SCENARIO}/{name}": settings.scenario.folder / name for name in settings.scenario.files()}
         folders = {str(settings.scenario.folder): _SCENARIO}
@@ -83,7 +83,7 @@ class CodeArchive:
         )
 
     def digest(self) -> str:
-        """Return the digest of the whole content.
+        """Return the digest of all contents of the archive.
 
         Raises:
             OSError: a file cannot be read.
@@ -91,7 +91,7 @@ class CodeArchive:
         return digest_of_data({_archive_bytes(place): _described(path) for place, path in self.files.items()})
 
     def packed(self) -> bytes:
-        """Return the parcel as compressed bytes.
+        """Return the archive as compressed bytes.
 
         Raises:
             OSError: a file cannot be read.
@@ -104,13 +104,13 @@ class CodeArchive:
 
 
 def settings_in(settings: WorkerSettings, folders: dict[str, str], root: Path, scratch: Path) -> WorkerSettings:
-    """Return the settings of a hunt with the paths of an unpacked parcel.
+    """Return the settings of a hunt, with the paths of an unpacked archive.
 
     Args:
-        settings: settings of the hunt, on the machine where it was begun.
-        folders: those of the parcel.
-        root: where it lies here.
-        scratch: the folder in which workers write here.
+        settings: settings of the hunt on its own machine.
+        folders: the folders of the archive.
+        root: folder into which the archive was unpacked on this machine.
+        scratch: folder on this machine into which workers write.
     """
     here = {there: str(root / place) for there, place in folders.items()}
     scenario = replace(settings.scenario, folder=Path(here[str(settings.scenario.folder)]))
@@ -120,16 +120,16 @@ def settings_in(settings: WorkerSettings, folders: dict[str, str], root: Path, s
 
 
 def unpack(packed: bytes, digest: str, root: Path) -> None:
-    """Unpack a parcel into a new folder.
+    """Unpack an archive into a new folder.
 
     Args:
-        packed: the parcel.
-        digest: the expected digest.
-        root: the folder, which is not there yet.
+        packed: the archive as compressed bytes.
+        digest: the expected digest of the archive.
+        root: path of the new folder, which must not exist.
 
     Raises:
-        BundleError: the content differs from the sent parcel.
-        OSError: it cannot be written.
+        BundleError: the contents differ from the archive that was sent.
+        OSError: the folder cannot be written.
     """
     (root / _SCENARIO).mkdir(parents=True)
     found = {}
@@ -152,7 +152,7 @@ def unpack(packed: bytes, digest: str, root: Path) -> None:
 
 
 def _is_same_snapshot(folder: Path) -> bool:
-    """Return whether a folder of a snapshot is a copy of the current folder: same name and same files."""
+    """Return whether a folder of a snapshot is a copy of the current folder, with the same name and the same files."""
     here = Path.cwd()
     _, tree, place = folder.as_posix().rpartition(f"/{layout.CODE}/@")
     if not tree or not here.as_posix().endswith(f"/{place}"):
@@ -161,17 +161,17 @@ def _is_same_snapshot(folder: Path) -> bool:
 
 
 def _archive_bytes(place: str) -> str:
-    """A name as it is in an archive, which takes none that is not Unicode: a character for each of its bytes."""
+    """Return a file name in the form for an archive; if it is not valid Unicode, each byte becomes a character."""
     return os.fsencode(place).decode("latin-1")
 
 
 def _described(path: Path) -> str:
-    """Return the content of a file and whether it is executable, because an agent may run a program next to it."""
+    """Return the contents of a file and whether it is executable, because an agent may run a program next to it."""
     return digest_of_file(path) + ("*" if path.stat().st_mode & stat.S_IXUSR else "")
 
 
 def _modules(folder: Path) -> Iterator[tuple[str, Path]]:
-    """Return the files below a folder of code, without Python's compiled files."""
+    """Return the files below a folder of code, except Python's compiled files."""
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.suffix != ".pyc":
             yield path.relative_to(folder).as_posix(), path
@@ -184,10 +184,10 @@ _MAX_FOLDER_CHARACTERS = 40  # characters of a folder in which Ray can make its 
 
 
 class Folder:
-    """A new folder with a short name, of letters that Ray knows; those whose owners are gone are removed first.
+    """A new folder with a short name that Ray accepts; such folders whose owners have ended are removed first.
 
     Args:
-        parent: parent of it; the folder for temporary files by default, where its name is such.
+        parent: folder in which it is created; by default the folder for temporary files, if its name is acceptable.
     """
 
     def __init__(self, parent: Path | None = None) -> None:
@@ -199,17 +199,17 @@ class Folder:
         self._lock = owned(self.path / _FOLDER_LOCK)
 
     def fileno(self) -> int:
-        """Return the descriptor of its lock: a process that inherits it owns the folder as well."""
+        """Return the file descriptor of the folder's lock; a process that inherits it owns the folder as well."""
         return self._lock.fileno()
 
     def remove(self) -> None:
-        """Remove everything."""
+        """Delete the folder and its lock."""
         shutil.rmtree(self.path, ignore_errors=True)
         self._lock.close()
 
 
 def owned(lock: Path) -> IO[str]:
-    """Make the lock of a folder, which is invisible before it is held, and hold it for as long as it is open."""
+    """Create the lock of a folder and hold it as long as it is open. It becomes visible only after it is held."""
     part = lock.with_name(f".{lock.name}")
     file = part.open("w")
     fcntl.flock(file, fcntl.LOCK_EX)
@@ -218,7 +218,7 @@ def owned(lock: Path) -> IO[str]:
 
 
 def remove_if_left(lock: Path) -> None:
-    """Remove the folder of a free lock; a folder without a lock is foreign, or a moment old."""
+    """Delete a folder whose lock is free; a folder without a lock is foreign, or was created a moment ago."""
     with suppress(OSError):
         found = lock.parent.lstat()
         if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid():
@@ -235,11 +235,11 @@ _LOCK_NAME = "lock"
 
 
 class Store:
-    """The folder of this user on this machine, which all its nodes share.
+    """The folder of this user on this machine, which all nodes on this machine share.
 
     Args:
-        folder: folder of the store; one below the folder for temporary files by default.
-        kept_bytes: size of the parcels to keep, those that were used last.
+        folder: path of the folder; by default a folder below the folder for temporary files.
+        kept_bytes: total size of the archives to keep, in bytes; the most recently used archives are kept.
     """
 
     def __init__(self, folder: Path | None = None, *, kept_bytes: int = _KEPT_BYTES) -> None:
@@ -255,7 +255,7 @@ class Store:
             self._folder = Path(tempfile.mkdtemp(prefix="crashhunt-"))
 
     def find(self, digest: str) -> bytes | None:
-        """Return a parcel, or None if it is not there; the unpacking detects damage."""
+        """Return an archive, or None if it is not stored; damage is detected when it is unpacked."""
         file = self._file(digest)
         try:
             packed = file.read_bytes()
@@ -265,7 +265,7 @@ class Store:
         return packed
 
     def keep(self, digest: str, packed: bytes) -> None:
-        """Store a parcel, and delete those that were not used for longest."""
+        """Store an archive, and delete the archives that have not been used for the longest time."""
         file = self._file(digest)
         part = file.with_name(f".{digest}.{os.getpid()}")
         with suppress(OSError):  # it is sent again, then
@@ -276,12 +276,12 @@ class Store:
         self._forget()
 
     def drop(self, digest: str) -> None:
-        """Remove a parcel that is damaged."""
+        """Delete a damaged archive."""
         with suppress(OSError):
             self._file(digest).unlink()
 
     def place(self) -> Place:
-        """Make a folder for one hunt, and remove those whose process is gone.
+        """Create a folder for one hunt, and delete such folders whose processes have ended.
 
         Raises:
             OSError: the disk is full.
@@ -307,10 +307,10 @@ class Store:
 
 
 class Place:
-    """The folder of one hunt on a node, which is its own as long as this process lives.
+    """The folder of one hunt on a node, which belongs to this process as long as the process lives.
 
     Args:
-        path: path of it.
+        path: path of the folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -321,7 +321,7 @@ class Place:
         self.scratch.mkdir()
 
     def unpack(self, packed: bytes, digest: str) -> bool:
-        """Unpack an archive of code; return whether its content matches its digest."""
+        """Unpack an archive of code; return whether its contents match the digest."""
         try:
             unpack(packed, digest, self.code)
         except BundleError:
@@ -330,6 +330,6 @@ class Place:
         return True
 
     def remove(self) -> None:
-        """Remove everything."""
+        """Delete the folder."""
         shutil.rmtree(self.path, ignore_errors=True)
         self._lock.close()

@@ -42,20 +42,21 @@ _numbers = itertools.count()
 
 
 class RayExecutor:
-    """Runs trials on all machines of a Ray cluster, on each in its own pool.
+    """Runs trials on all machines of a Ray cluster, with a separate pool on each machine.
 
     A separate process, the bridge (``_bridge.py``), uses Ray and may be lost. Every submitted trial without a result
     is then submitted again to the next bridge.
 
     Args:
         settings: settings of the hunt.
-        parallel: number of trials at a time over the whole cluster; 0 for all of its CPUs, now and later.
-        recycle_after: trials after which a worker is replaced by a fresh one; 0 for never.
-        argument: argument of ``--executor ray:ADDRESS``: see `cluster_of`.
+        parallel: number of trials at a time in the whole cluster; 0 for all CPUs of the cluster, including CPUs that
+            are added later.
+        recycle_after: number of trials after which a worker is replaced; 0 for never.
+        argument: argument of ``--executor ray:ADDRESS``, as for `cluster_of`.
 
     Raises:
         PluginError: Ray is not installed.
-        UsageError: no cluster answers there, or the code is too large to send.
+        UsageError: no cluster answers at the address, or the code is too large to send.
     """
 
     sizes_itself: ClassVar[bool] = True
@@ -99,10 +100,10 @@ class RayExecutor:
         self._send({"submit": [(ticket, spec.to_json())]})
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
-        """Yield the trials that have ended; wait at most this long for the first one.
+        """Yield the trials that have ended; wait at most ``timeout_s`` for the first one.
 
         Raises:
-            CrashhuntError: no node can run any.
+            CrashhuntError: no node can run trials.
         """
         deadline = time.monotonic() + timeout_s
         while True:
@@ -125,7 +126,7 @@ class RayExecutor:
         return {number: header for number, header in found if number in running}
 
     def nodes(self) -> list[NodeFigures]:
-        """Return the nodes that run trials now."""
+        """Return the nodes that currently run trials."""
         return [NodeFigures(**figures) for figures in self._nodes]
 
     def notes(self) -> list[str]:
@@ -133,7 +134,7 @@ class RayExecutor:
         return self._notes.fresh()
 
     def close(self) -> None:
-        """End everything on every node, and the hunt's own cluster."""
+        """End all processes on every node, and the hunt's own cluster."""
         if self._closed:
             return
         self._closed = True
@@ -146,7 +147,7 @@ class RayExecutor:
         self._end()
 
     def _load_order(self) -> dict[str, str]:
-        """Return the library for the link order, which a node must also have."""
+        """Return the library that fixes the link order; a node must have the same library."""
         if load_order_of(self._settings.scenario) != FIXED:
             return {}
         return {"_crashhunt_link_order": "installed"}
@@ -184,7 +185,7 @@ class RayExecutor:
         self._send({"submit": [(ticket, spec.to_json()) for ticket, spec in self._open.items()]})
 
     def _send(self, message: ToBridge) -> None:
-        """Send a message to the bridge, and receive its messages while the bridge does not read."""
+        """Send a message to the bridge; while the bridge does not read, receive its messages."""
         if self._control is None:
             return
         left = memoryview(json.dumps(message).encode() + b"\n")
@@ -198,7 +199,7 @@ class RayExecutor:
                     return
 
     def _receive(self, wait_s: float) -> None:
-        """Receive messages of the bridge; wait at most this long for the first."""
+        """Receive messages of the bridge; wait at most ``wait_s`` for the first message."""
         if self._control is None:
             if self._closed or not self._record_return():
                 time.sleep(wait_s)
@@ -265,7 +266,7 @@ class RayExecutor:
         """Handle the loss of the bridge, and of the cluster or the connection to it.
 
         Raises:
-            CrashhuntError: it has never come up, or a cluster of our own has ended too often.
+            CrashhuntError: the bridge has never worked, or the hunt's own cluster has ended too often.
         """
         self._end()
         self._slots, self._lost_at = 0, time.monotonic()

@@ -19,8 +19,9 @@ Header = tuple[int, int, float, int, int, int, int]
 class BridgeJob(TypedDict):
     """The job of a bridge.
 
-    ``address`` is empty for a cluster of the hunt's own, which has ``cpus`` CPUs and ``temporary`` files. ``versions``
-    and ``code`` are the requirements for nodes. ``resumed`` is true if an earlier bridge of the same hunt had nodes.
+    ``address`` is empty for the hunt's own cluster, which has ``cpus`` CPUs and keeps its files in ``temporary``.
+    ``versions`` and ``code`` must be equal on nodes. ``resumed`` is true if an earlier bridge of the same hunt had
+    nodes.
     """
 
     settings: JsonObject
@@ -35,9 +36,9 @@ class BridgeJob(TypedDict):
 
 
 class NodeJob(TypedDict):
-    """The job of a node: ``folders`` to their places in the parcel, and the number of trials at a time.
+    """The job of a node: the places of ``folders`` in the archive, and the number of trials at a time.
 
-    ``home`` is the place in the parcel where trials run, as they do in the current folder there; empty for none.
+    ``home`` is the place in the archive in which trials run, instead of the current folder of the hunt; empty for none.
     """
 
     settings: JsonObject
@@ -49,14 +50,14 @@ class NodeJob(TypedDict):
 
 
 class ToBridge(TypedDict, total=False):
-    """A request of a hunt: run trials, or cancel those above a number."""
+    """A request of a hunt to its bridge: run trials, or cancel the trials above a number."""
 
     submit: list[Submitted]
     cancel: int
 
 
 class Figures(TypedDict):
-    """A node on the status screen: trials at a time, ended trials, and trials per second."""
+    """The figures of a node on the status screen: trials at a time, ended trials, and trials per second."""
 
     name: str
     parallel: int
@@ -65,10 +66,10 @@ class Figures(TypedDict):
 
 
 class FromBridge(TypedDict, total=False):
-    """A message of a bridge: a trial has ended, or the state of a node has changed.
+    """A message of a bridge to the hunt: a trial has ended, or the state of a node has changed.
 
-    ``passing`` belongs to an error that may be over at the next attempt, ``token`` to one for want of a token;
-    ``where`` belongs to a ``node``.
+    ``passing`` marks an error that may be gone at the next attempt, ``token`` an error because of a missing token.
+    ``where`` is the progress of trials on a ``node``.
     """
 
     ticket: int
@@ -87,10 +88,10 @@ class EndedTrial(NamedTuple):
     """A trial that has ended on a node.
 
     Attributes:
-        ticket: ticket under which it was submitted.
-        number: number of the trial.
-        line: the message for the hunt, which no process in between reads.
-        files: files of its scratch folder where it is kept, by name, compressed.
+        ticket: ticket with which the trial was submitted.
+        number: number of the trial in the hunt.
+        line: the message for the hunt, which the bridge forwards without reading it.
+        files: compressed files of the trial's scratch folder by name, if the trial is kept.
     """
 
     ticket: int
@@ -100,14 +101,14 @@ class EndedTrial(NamedTuple):
 
 
 class News(NamedTuple):
-    """The events on a node since the last call.
+    """The events on a node since the previous call.
 
     Attributes:
-        ended: trials.
-        where: number of each running trial to where it is; None if it was not requested.
-        notes: notes for people.
-        error: why no trial can be run here; None if they can.
-        map: map of all trials, when the first one is kept; compressed.
+        ended: trials that have ended.
+        where: progress of each running trial, by number; None if it was not requested.
+        notes: texts for the user.
+        error: reason why no trial can run on the node; None if trials can run.
+        map: compressed map of all trials, sent with the first kept trial.
     """
 
     ended: list[EndedTrial]

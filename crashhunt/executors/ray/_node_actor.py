@@ -1,7 +1,7 @@
-"""The actor on each node.
+"""The Ray actor that runs on each node.
 
-It is sent as source, so that it can report a node without crashhunt. It therefore imports nothing of crashhunt before
-it has checked the installed version.
+The actor is sent as source code, so that it can report a node without crashhunt. It therefore imports nothing of
+crashhunt before it has checked the installed version.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ _LINK_ORDER = "_crashhunt_link_order"  # the library that fixes the order of SUM
 
 
 class Site:
-    """Runs trials on a node. Everything else is in ``_work.py``, of the crashhunt that is installed there."""
+    """Runs trials on a node.
+
+    All other functions are in ``_node_worker.py`` of the crashhunt that is installed on the node.
+    """
 
     def __init__(self) -> None:
         self._work: Any = None
@@ -29,8 +32,8 @@ class Site:
         """Return the differences between the versions on this node and on the hunt's machine; empty for none.
 
         Args:
-            versions: name to version of what results depend on.
-            code: the digest of crashhunt itself, whose version stays the same while somebody works on it.
+            versions: required version by name of each package on which results depend.
+            code: the digest of crashhunt's own code, whose version number stays the same during development.
         """
         found = []
         for name, wanted in versions.items():
@@ -54,7 +57,7 @@ class Site:
         return ", ".join(found)
 
     def begin(self, job: Any) -> str:
-        """Prepare for the trials of a hunt; return ``ready``, ``lacks`` if the parcel is missing, or an error."""
+        """Prepare for the trials of a hunt; return ``ready``, ``lacks`` if the archive is missing, or an error."""
         from crashhunt.executors.ray._node_worker import Work
 
         if self._work is None:
@@ -62,7 +65,7 @@ class Site:
         return str(self._work.begin())
 
     def deliver(self, packed: bytes) -> str:
-        """Receive the parcel; return the same values as `begin`."""
+        """Receive the archive; return the same values as `begin`."""
         return str(self._work.deliver(packed))
 
     def submit(self, trials: list[tuple[int, dict[str, Any]]]) -> None:
@@ -70,24 +73,24 @@ class Site:
         self._work.submit(trials)
 
     def cancel(self, above: int, before: int) -> None:
-        """Cancel trials, also those that arrive after this message."""
+        """Cancel trials, including trials that arrive after this message."""
         self._work.cancel(above, before)
 
     def take(self, wait_s: float, trials: list[tuple[int, dict[str, Any]]]) -> Any:
-        """Queue trials as `submit` does; return what has happened since the last call."""
+        """Queue trials as `submit` does; return the events since the previous call."""
         return self._work.take(wait_s, trials)
 
     def close(self) -> None:
-        """End everything."""
+        """End all processes on the node."""
         if self._work is not None:
             self._work.close()
 
 
 def code_digest() -> str:
-    """Return the digest of the crashhunt that is installed.
+    """Return the digest of the installed crashhunt's code.
 
     Raises:
-        ImportError: none is.
+        ImportError: crashhunt is not installed.
     """
     spec = importlib.util.find_spec("crashhunt")
     if spec is None or not spec.submodule_search_locations:

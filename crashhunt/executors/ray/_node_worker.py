@@ -1,4 +1,4 @@
-"""The work of a node for a hunt: it runs the pool, and returns its results."""
+"""The work of a node for a hunt: it runs a pool of processes, and returns the results of trials."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Work:
     """The trials of one hunt on this node.
 
     Args:
-        job: the settings, the parcel's digest and folders, how many trials at a time.
+        job: the job: settings, digest and folders of the archive, and number of trials at a time.
     """
 
     def __init__(self, job: NodeJob) -> None:
@@ -62,7 +62,7 @@ class Work:
         os.environ["PYTHONDONTWRITEBYTECODE"] = "1"  # of the code of a hunt, which is there for this hunt only
 
     def begin(self) -> str:
-        """Prepare the pool; return the value for `Site.begin`."""
+        """Prepare the pool; return the value that `Site.begin` returns."""
         packed = self._store.find(self._job["digest"])
         if packed is None:
             return "lacks"
@@ -72,7 +72,7 @@ class Work:
         return "lacks"
 
     def deliver(self, packed: bytes) -> str:
-        """Prepare the pool with a received parcel."""
+        """Prepare the pool with an archive that has been received."""
         if not self._ready(packed):
             return "the parcel was damaged on its way"
         self._store.keep(self._job["digest"], packed)
@@ -118,7 +118,7 @@ class Work:
             self._pool.cancel(above=above)
 
     def take(self, wait_s: float, trials: Sequence[Submitted]) -> News:
-        """Queue trials; return the events; wait at most this long for a trial to end."""
+        """Queue trials, and return the events; wait at most ``wait_s`` for a trial to end."""
         assert self._pool is not None
         self.submit(trials)
         ended: list[EndedTrial] = []
@@ -147,7 +147,7 @@ class Work:
         )
 
     def _completed(self, wait_s: float) -> Iterator[TrialResult]:
-        """Yield what has ended, and what ends soon after it: each call from another machine costs both some time.
+        """Yield ended trials, and trials that end soon afterwards, because each call from another machine costs time.
 
         Kept trials are returned at once, and so are all results if workers may soon be idle.
         """
@@ -162,7 +162,7 @@ class Work:
                 return
 
     def close(self) -> None:
-        """End everything, and remove all files."""
+        """End all processes, and delete all files."""
         if self._pool is not None:
             self._pool.close()
         if self._place is not None:
@@ -193,7 +193,7 @@ class Work:
         return content
 
     def _with_hunt_paths(self, said: Any) -> Any:
-        """Return a result with the file names of the machine of the hunt."""
+        """Return a result with the file names of the hunt's machine."""
         if isinstance(said, dict):
             return {key: self._with_hunt_paths(value) for key, value in said.items()}
         if isinstance(said, list):
@@ -219,7 +219,7 @@ def _values(header: BlackBoxHeader) -> Header:
 
 
 def unpacked(files: dict[str, bytes], folder: Path) -> None:
-    """Write the files of a trial that is kept into a new folder.
+    """Write the files of a kept trial into a new folder.
 
     Raises:
         OSError: the disk is full.
