@@ -74,7 +74,7 @@ _NOTES_TAG = 11  # the only type of the first eleven that is no evidence, from b
 
 
 def is_evidence(tag: int) -> bool:
-    """Whether records with this tag belong to the digest of the trial."""
+    """Return whether records with this tag belong to the digest of the trial."""
     return tag < FIRST_NON_EVIDENCE_TAG and tag != _NOTES_TAG
 
 
@@ -102,7 +102,7 @@ MAPPED = 64 << 20  # bytes of addresses, not of memory: mapping again moves ever
 
 
 class Phase(IntEnum):
-    """The current task of the process. ``ACT`` before the scene of step 0 means that the agent is being made."""
+    """The current task of the process. ``ACT`` before the scene of step 0 means that the agent is being created."""
 
     SETUP = 0
     ACT = 1
@@ -130,7 +130,7 @@ class Record(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BlackBoxHeader:
-    """The position of a process at its last write, and the number of steps before the first step of the trial."""
+    """The position of a process when it last wrote, and the number of steps before the first step of the trial."""
 
     pid: int
     trial: int
@@ -143,10 +143,10 @@ class BlackBoxHeader:
 
 
 class BlackBox:
-    """Writes the records of one trial after another into one scratch file, whose warm pages are used again.
+    """Writes the records of one trial after another to the same scratch file, whose pages stay in memory.
 
     Args:
-        path: the file to create.
+        path: path of the file to create.
         begun: size that another process has reserved in the file, in bytes; 0 to create the file.
 
     Raises:
@@ -180,7 +180,7 @@ class BlackBox:
         return self._reserved
 
     def begin(self, *, pid: int, trial: int, started: float) -> None:
-        """Forget the previous trial and open the next."""
+        """Discard the previous trial, and begin the recording of the next trial."""
         self._stop_core()
         HEADER.pack_into(self._map, 0, MAGIC, pid, 0, trial, started, FIRST, 0, Phase.SETUP, 0)
         REPORT.pack_into(self._map, REPORT_OFFSET, 0)
@@ -215,7 +215,7 @@ class BlackBox:
         self.mark(Phase.SETUP if self._roster is None else Phase.SIMULATE)
 
     def report(self, report: bytes) -> None:
-        """Write a report behind the records; after that, nothing can be recorded."""
+        """Write a report after the records. Nothing can be recorded after this."""
         self._stop_core()
         end = self._offset + len(report)
         if end > self._reserved:
@@ -224,30 +224,30 @@ class BlackBox:
         REPORT.pack_into(self._map, REPORT_OFFSET, len(report))
 
     def announce_no_room(self) -> None:
-        """Report that the disk has no room for the recording; the supervisor checks this."""
+        """Announce that the disk has no room for the recording; the supervisor verifies this."""
         REPORT.pack_into(self._map, REPORT_OFFSET, NO_ROOM)
 
     def announce_damage(self) -> None:
-        """Report that this process cannot write its report, without code that an agent may have damaged."""
+        """Announce that this process cannot write its report, without code that an agent may have damaged."""
         self._map[REPORT_OFFSET:FIRST] = _DAMAGE_ANNOUNCED
 
     def note(self, payload: bytes) -> None:
-        """Record data that are no part of the digest."""
+        """Record data that do not belong to the digest."""
         self.append(NOTES.tag, 0, payload)
 
     def observation(self, agent: int, array: NDArray[np.generic]) -> None:
-        """Record what an agent is about to be shown."""
+        """Record the observation that an agent receives next."""
         self._raw(_OBSERVATION, agent, array, _ACT)
 
     def action(self, agent: int, array: NDArray[np.generic]) -> None:
-        """Record what an agent answered."""
+        """Record the action that an agent returned."""
         self._raw(_ACTION, agent, array, _SIMULATE)
 
     def lend(self, steps: UsualSteps, roster: Roster) -> None:
-        """Let the core record steps of one agent until the next call of another method of this black box.
+        """Let the core record the steps of one agent until another method of this black box is called.
 
         Args:
-            steps: steps of the core.
+            steps: steps of the core to record.
             roster: the actors of these steps, which must have been recorded.
         """
         self._stop_core()
@@ -286,7 +286,7 @@ class BlackBox:
         _PROGRESS.pack_into(mapped, _PROGRESS_OFFSET, end, self._step, phase, agent)
 
     def step(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
-        """Record a completed step; the roster of the scene must have been recorded."""
+        """Record a completed step; the scene's roster must already have been recorded."""
         if self._lent is not None:
             self._stop_core()
         offset, count = self._offset, len(scene.roster)
@@ -321,12 +321,12 @@ class BlackBox:
         self._offset, self._step = end, step
 
     def mark(self, phase: int, agent: int = 0) -> None:
-        """Write the position of the process, and commit."""
+        """Write the position of the process, and commit the records."""
         self._stop_core()
         _PROGRESS.pack_into(self._map, _PROGRESS_OFFSET, self._offset, self._step, phase, agent)
 
     def take_frames(self) -> list[Frame]:
-        """Return the scenes recorded since the last call, as bare columns."""
+        """Return the scenes recorded since the last call, as plain columns."""
         self._stop_core()
         frames: list[Frame] = []
         for roster, group in groupby(self._trail, key=itemgetter(0)):
@@ -339,19 +339,19 @@ class BlackBox:
         return frames
 
     def committed(self) -> memoryview:
-        """The bytes of all records so far."""
+        """The bytes of all records written until now."""
         self._stop_core()
         return memoryview(self._map)[FIRST : self._offset]
 
     def evidence(self) -> list[memoryview]:
-        """The bytes of all records so far that belong to the digest."""
+        """The bytes of those records that belong to the digest."""
         self._stop_core()
         whole = memoryview(self._map)
         edges = [FIRST, *chain.from_iterable(self._aside), self._offset]
         return [whole[begins:ends] for begins, ends in zip(edges[::2], edges[1::2], strict=True)]
 
     def detach(self) -> None:
-        """Discard all further records, because this process is a copy of the recording process."""
+        """Discard all further records, because this process is a fork of the recording process."""
         self._stop_core()
         self._map = mmap.mmap(-1, self._mapped)
         self._file = os.open(os.devnull, os.O_RDWR)
@@ -362,7 +362,7 @@ class BlackBox:
         HEADER.pack_into(self._map, 0, magic, pid, setup_steps, trial, started + wall_s, *where)
 
     def copy(self) -> None:
-        """Continue in private memory: this process is a fork of the recording one, and continues to record."""
+        """Continue to record in private memory, because this process is a fork of the recording process."""
         self._stop_core()
         data = bytes(memoryview(self._map)[: self._offset])
         self._file = os.memfd_create(MEMORY)
@@ -408,7 +408,7 @@ def cannot_record(error: OSError, path: Path) -> RecorderError:
 
 
 def read_header(path: Path) -> BlackBoxHeader | None:
-    """Return the header of a black box, or None if there is none (yet)."""
+    """Return the header of a black box, or None if the file has no header yet."""
     try:
         with path.open("rb") as file:
             data = file.read(HEADER.size)
@@ -418,7 +418,7 @@ def read_header(path: Path) -> BlackBoxHeader | None:
 
 
 def decode_header(data: bytes) -> BlackBoxHeader | None:
-    """Return the header that a black box begins with; None if that is damaged."""
+    """Return the header at the beginning of a black box; None if the header is damaged."""
     if len(data) < HEADER.size or not data.startswith(MAGIC):
         return None
     _, pid, setup_steps, trial, started, committed, step, phase, agent = HEADER.unpack(data)
@@ -454,14 +454,14 @@ def read_black_box(path: Path) -> Iterator[Record]:
 def readable_bytes(found: os.stat_result) -> int:
     """Return the number of bytes to read of a black box; the process of a trial may claim any size.
 
-    A file that was made longer without being written takes no space, and reading it would take all memory. A file
-    system that compresses may store records in a tenth of their size.
+    A file that was extended without being written takes no space on the disk, and reading it would fill the memory. A
+    file system with compression may store records in a tenth of their size.
     """
     return min(found.st_size, 16 * (512 * found.st_blocks + (1 << 20)))
 
 
 def decode_records(data: bytes | memoryview) -> Iterator[Record]:
-    """Yield the records in ``data``; an incomplete last one is skipped."""
+    """Yield the records in ``data``; an incomplete last record is skipped."""
     offset = 0
     while offset + _RECORD_HEAD.size <= len(data):
         tag, aux, length = _RECORD_HEAD.unpack_from(data, offset)
@@ -478,10 +478,11 @@ def decode_records(data: bytes | memoryview) -> Iterator[Record]:
 class BlackBoxFile:
     """The file of a black box, for a process that neither runs nor trusts the trial that writes it.
 
-    It never maps the file, because reading a mapped page would kill this process if the trial truncates the file.
+    The file is never mapped into memory, because reading a mapped page would kill this process if the trial truncates
+    the file.
 
     Args:
-        path: the file to create.
+        path: path of the file to create.
 
     Raises:
         RecorderError: the disk is full.
@@ -500,7 +501,7 @@ class BlackBoxFile:
 
     @property
     def reserved(self) -> int:
-        """How many bytes of the file have space on the disk."""
+        """The number of bytes of the file for which the disk has space."""
         return self._reserved
 
     @property
@@ -509,7 +510,7 @@ class BlackBoxFile:
         return os.fstat(self._file)
 
     def require_room(self) -> None:
-        """Reserve some more of the disk.
+        """Reserve further space on the disk.
 
         Raises:
             RecorderError: the disk is full.
@@ -523,12 +524,12 @@ class BlackBoxFile:
         self._reserved += CHUNK
 
     def begin(self, *, trial: int, started: float) -> None:
-        """Forget the previous trial and open the next; its process writes its own number at its start."""
+        """Discard the previous trial and prepare for the next one, whose process writes its own number at its start."""
         header = HEADER.pack(MAGIC, os.getpid(), 0, trial, started, FIRST, 0, Phase.SETUP, 0)
         os.pwrite(self._file, header + REPORT.pack(0), 0)
 
     def header(self) -> BlackBoxHeader | None:
-        """Return the header; None if it is damaged."""
+        """Return the header of the black box; None if it is damaged."""
         return decode_header(os.pread(self._file, HEADER.size, 0))
 
     def has(self, header: BlackBoxHeader) -> bool:
@@ -536,11 +537,11 @@ class BlackBoxFile:
         return FIRST <= header.committed <= readable_bytes(os.fstat(self._file))
 
     def read_records(self, header: BlackBoxHeader) -> bytes:
-        """Return the bytes of all committed records, or fewer where the file ends before."""
+        """Return the bytes of all committed records, or fewer bytes if the file ends early."""
         return self._read(FIRST, max(0, header.committed - FIRST))
 
     def read_report(self, header: BlackBoxHeader) -> bytes | None:
-        """Return the report; empty if there is none, None if the process announced that it cannot report."""
+        """Return the report; empty if there is none, None if the process announced that it cannot write a report."""
         size = self._announced()
         if size == UNREPORTABLE:
             return None
@@ -557,13 +558,13 @@ class BlackBoxFile:
         return size
 
     def copy_to(self, path: Path) -> None:
-        """Write the content to another file, up to the end of the records and the report."""
+        """Write the contents to another file, up to the end of the records and the report."""
         header = self.header()
         content = self._read(0, self._reserved if header is None else max(FIRST, header.committed))
         path.write_bytes(content)
 
     def is_reusable(self) -> bool:
-        """Return whether the next trial can be recorded here, because the file still has its size."""
+        """Return whether the next trial can be recorded in this file, because the file still has its full size."""
         found = os.fstat(self._file)
         self._reserved = max(self._reserved, min(found.st_blocks * 512 // CHUNK * CHUNK, found.st_size))
         return found.st_size >= MAPPED

@@ -1,4 +1,4 @@
-"""The view channels of a log, in Foxglove's own schemas, so that Foxglove and Lichtblick show something at once."""
+"""The view channels of a log in Foxglove's own schemas, so that Foxglove and Lichtblick can display the log at once."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ def write_views(log: LogWriter, recording: Recording, lanes: Sequence[Lane], cra
     """Write all view channels.
 
     Args:
-        log: where to.
-        recording: what happened.
+        log: the log to which channels are added.
+        recording: recording of the episode.
         lanes: lanes of the map; those far from every controlled vehicle are skipped.
         crash: description of the crash, for the marker.
     """
@@ -89,7 +89,7 @@ def write_views(log: LogWriter, recording: Recording, lanes: Sequence[Lane], cra
 
 
 def foxglove_layout(recording: Recording) -> dict[str, object]:
-    """Return a layout for Foxglove or Lichtblick: the scene from above, the metrics, the log."""
+    """Return a layout for Foxglove or Lichtblick with the scene from above, the metrics and the log."""
     ego = recording.agents[0] if recording.agents else "map"
     paths = [
         {"value": f"/metrics.{field}", "enabled": True, "timestampMethod": "receiveTime"}
@@ -163,10 +163,10 @@ def lane_borders(lanes: Sequence[Lane]) -> list[tuple[NDArray[np.float64], NDArr
 
 
 def read_lanes(path: Path) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the lanes that a log shows: the right and the left border of each, shape (n, 2), in m.
+    """Return the lanes in a log: the right and the left border of each lane, shape (n, 2), in m.
 
     Raises:
-        BundleError: it cannot be read.
+        BundleError: the log cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -354,14 +354,14 @@ _MESSAGE_RECORD = 5  # type of a record that is a message
 def messages_of(
     file: IO[bytes], reader: SeekingReader, *, topic: str = "", validate_crcs: bool = False
 ) -> Iterator[tuple[Schema | None, Channel, int, bytes]]:
-    """Yield schema, channel, sequence number and content of the messages of an MCAP file, in the order of the file.
+    """Yield schema, channel, sequence number and contents of the messages of an MCAP file, in the order of the file.
 
-    A crash has thousands of messages. mcap's own reader takes five times as long, because it makes several objects for
-    each message.
+    A crash has thousands of messages. mcap's own reader takes five times as long, because it creates several objects
+    for each message.
 
     Args:
         file: the file, open for reading.
-        reader: its reader.
+        reader: mcap's reader of the file.
         topic: the only topic to yield; empty for all.
         validate_crcs: whether to verify the checksums.
 
@@ -397,7 +397,7 @@ class LogWriter:
     """Writes protobuf messages to an MCAP file, at simulation time.
 
     Args:
-        writer: writer of the file.
+        writer: mcap's writer of the file.
     """
 
     def __init__(self, writer: Writer) -> None:
@@ -417,11 +417,11 @@ class LogWriter:
         """Write a serialised message.
 
         Args:
-            topic: its channel, made at its first message.
-            kind: its protobuf class.
-            data: the message.
-            time_ns: simulation time.
-            sequence: its number within the evidence.
+            topic: topic of the channel, which is created for its first message.
+            kind: protobuf class of the message.
+            data: the serialised message.
+            time_ns: simulation time, in ns.
+            sequence: number of the message within the evidence channels.
             metadata: metadata of the channel.
         """
         channel = self._channels.get(topic)
@@ -436,7 +436,7 @@ class LogWriter:
 
 
 def to_ns(time_s: float) -> int:
-    """Return simulation time in ns."""
+    """Convert simulation time to ns."""
     return round(time_s * 1e9) if math.isfinite(time_s) and time_s > 0 else 0
 
 

@@ -1,7 +1,7 @@
-"""``log.mcap``: the compressed records of an episode, in a file that other tools can also open.
+"""``log.mcap``: the compressed records of an episode, in a file format that other tools can also open.
 
-Evidence channels contain the records of the black box, one message for each record, in the same order. Reading them
-returns identical records, and therefore the same digest. View channels (see ``_foxglove``) are for people.
+Evidence channels contain the records of the black box, one message for each record, in the same order. Reading these
+channels returns identical records, and therefore the same digest. View channels (see ``_foxglove``) are for display.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ def write_log(
     crash: TrialResult | None = None,
     views: bool = True,
 ) -> None:
-    """Write a log; all of it or nothing.
+    """Write a log completely or not at all.
 
     Args:
         path: path of the file.
-        recording: what happened.
+        recording: recording of the episode.
         lanes: lanes of the map, for viewers.
-        metadata: further facts.
+        metadata: further metadata of the log.
         crash: description of the crash, for the marker and the log line.
         views: whether to write view channels for other tools; without them, the file is half as large.
 
@@ -78,7 +78,7 @@ def write_log(
 
 
 def read_log(path: Path) -> Recording:
-    """Read the evidence of a log.
+    """Read the evidence channels of a log.
 
     Raises:
         BundleError: the file is missing, damaged, not a log of crashhunt, or of another version.

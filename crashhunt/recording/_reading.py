@@ -24,12 +24,12 @@ __all__ = ["AgentChannel", "Divergence", "Prologue", "Reading", "SceneParts", "S
 
 @dataclass(frozen=True, slots=True)
 class AgentChannel:
-    """Types and shapes of the arrays of one agent.
+    """Types and shapes of the observations and actions of one agent.
 
     Args:
-        id: the agent, which is also the id of its vehicle among the actors.
+        id: identifier of the agent, which is also the identifier of its vehicle.
         observation_dtype: type of the observations in NumPy's notation, such as ``<f4``.
-        observation_shape: observation shape of one observation.
+        observation_shape: shape of one observation.
         action_dtype: type of the actions, in the same notation.
         action_shape: shape of one action.
         action_names: names of the elements of an action.
@@ -64,7 +64,7 @@ class Prologue:
 
     @classmethod
     def decode(cls, payload: bytes) -> Prologue:
-        """Rebuild what `encode` returned; keys that a later version has added are skipped."""
+        """Decode a payload of `encode`; keys that a later version has added are skipped."""
         data: _PrologueJson = json.loads(payload)
         agents = tuple(AgentChannel(**_columns_prologue(agent)) for agent in data["agents"])
         return cls(agents, data["step_length_s"])
@@ -85,13 +85,13 @@ class StepRecord:
     """The recorded data of one step.
 
     Args:
-        step: 0 is the start of the episode, before the first action.
+        step: number of the step; 0 is the start of the episode, before the first action.
         scene: scene after the step.
-        rewards: agent id to reward.
+        rewards: reward of each agent, by agent id.
         observations: the observation of each agent before this step; empty at step 0.
         actions: the action of each agent.
-        more: data of further types of records, by their names.
-        whole: False if the process ended inside the step, so that there is no scene after it.
+        more: data of further record types, by the name of the type.
+        whole: whether the step was completed; False if the process ended inside the step, so that no scene follows.
     """
 
     step: int
@@ -120,16 +120,16 @@ class SceneParts(TypedDict, total=False):
 
 @dataclass(slots=True)
 class Reading:
-    """The part of an episode that has been read so far.
+    """The part of an episode that has been read.
 
     Args:
         prologue: the agents and the step length of the episode.
         actors: all actors that were introduced, in the order of their numbers.
         steps: the complete steps.
-        current: the step that is being read.
+        current: the step of which records are being read.
         roster: the actors of the next scene.
         scene: further arguments of the next scene, by their names; the next step uses them.
-        events: the other events of the episode.
+        events: the traffic events of the next scene.
     """
 
     prologue: Prologue
@@ -152,9 +152,9 @@ class Divergence:
         step: step of the difference; the observation and the action of step n lead to the scene of step n.
         agent: agent or actor whose value differs; empty for a value of the whole episode.
         field: name of the value, such as ``observation[1, x]``, ``action[target_speed]``, ``scene.x`` or ``length``.
-        recorded: the value in the recording; None if there is none.
-        replayed: the value in the replay; None if there is none.
-        place: place of the value within the step: the name of the type of record, and the index in what it holds.
+        recorded: the value in the recording; None if it is missing.
+        replayed: the value in the replay; None if it is missing.
+        place: place of the value within the step: the name of the record type, and the index in the record.
     """
 
     step: int
@@ -165,7 +165,7 @@ class Divergence:
     place: tuple[str, tuple[int, ...]] | None = None
 
     def to_json(self) -> JsonObject:
-        """Return the shape that ``replay --json`` prints."""
+        """Return the divergence in the form that ``replay --json`` prints."""
         facts = asdict(self)
         del facts["place"]
         data: JsonObject = json.loads(json.dumps(facts, default=float))
@@ -177,7 +177,7 @@ class Divergence:
 
 
 def first_difference(left: NDArray[np.generic], right: NDArray[np.generic]) -> tuple[int, ...]:
-    """Return the index of the first difference in bits between two arrays of the same shape, which differ."""
+    """Return the index of the first bit difference between two different arrays of the same shape."""
     size = left.itemsize
     was, now = left.tobytes(), right.tobytes()
     flat = next(n for n in range(left.size) if was[n * size : (n + 1) * size] != now[n * size : (n + 1) * size])

@@ -1,4 +1,4 @@
-"""Recordings of episodes, from any file: whole or compact."""
+"""Recordings of episodes from any file, complete or compact."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Recording:
     """The complete recording of one episode.
 
     Args:
-        records: records of a black box or of a log, in the order in which they were written.
+        records: records of a black box or a log, in the order in which they were written.
         compact: description of the missing parts; None for a complete recording.
 
     Raises:
@@ -80,7 +80,7 @@ class Recording:
 
     @property
     def digest(self) -> str:
-        """The digest of the trace, in hexadecimal; for a compact recording, the digest of the complete one."""
+        """The digest of the trace, in hexadecimal; for a compact recording, the digest of the complete recording."""
         if self.compact is not None and self.compact.digest:
             return self.compact.digest
         return digest_of(b"".join(record.encode() for record in self.records if is_evidence(record.tag)))
@@ -91,12 +91,12 @@ class Recording:
         return max((step.step for step in self.all_steps if step.whole), default=0)
 
     def compacted(self, always: Collection[str], radius_m: float, *, observations: bool = True) -> Recording:
-        """Return the recording with the agents, some other actors, and in each step those near an agent.
+        """Return the recording with only the agents, some other actors, and in each step the actors near an agent.
 
         Args:
             always: identifiers of the actors that are kept in each step.
-            radius_m: greatest distance between an agent and another actor, in m.
-            observations: whether it contains the observations of the agents.
+            radius_m: maximum distance between an agent and another actor, in m.
+            observations: whether the result contains the observations of the agents.
         """
         compact = Compact(
             digest=self.digest,
@@ -108,7 +108,7 @@ class Recording:
         return Recording(compact_records(self.records, near, observations=observations), compact)
 
     def like(self, other: Recording) -> Recording:
-        """Return this recording with only the actors and observations of another one, which may be compact."""
+        """Return this recording reduced to the actors and observations of another recording, which may be compact."""
         if other.compact is None or self.compact is not None:
             return self
         there = PresentActors(
@@ -118,14 +118,15 @@ class Recording:
         return Recording(records, replace(other.compact, digest=self.digest))
 
     def beginning(self, records: int) -> Recording:
-        """Return a recording of the first records only."""
+        """Return a recording that consists of the first records only."""
         compact = self.compact and replace(self.compact, digest="")
         return Recording(self.records[:records], compact)
 
     def observations(self, agent: str) -> NDArray[np.generic]:
         """The observations of an agent, shape (steps with an observation, *observation shape).
 
-        Values of any length (`is_opaque`) are an array of arrays, shape (steps it saw,); `decode_value` reads each.
+        If values have no fixed size (`is_opaque`), the result is an array of arrays, shape (steps with an
+        observation,). `decode_value` reads each of them.
         """
         channel = self._channel(agent)
         found = [step.observations[agent] for step in self.all_steps if agent in step.observations]
@@ -138,7 +139,7 @@ class Recording:
         return _stacked(found, channel.action_dtype, channel.action_shape)
 
     def scene(self, step: int) -> Scene:
-        """The scene after a step (0: before the first).
+        """Return the scene after a step; 0 for the scene before the first step.
 
         Raises:
             IndexError: the recording has no such step.
@@ -149,12 +150,12 @@ class Recording:
         return found
 
     def scenes(self) -> list[Scene]:
-        """All scenes, in order."""
+        """All scenes of the episode, in order."""
         return [step.scene for step in self.all_steps if step.scene is not None]
 
     @property
     def disturbances(self) -> tuple[Disturbance, ...]:
-        """The disturbances that took place; without a target vehicle, its id is empty."""
+        """The disturbances that took place; the id of the target is empty if there was no target vehicle."""
         return tuple(one for step in self.all_steps for one in step.more.get("disturbance", ()))
 
     def _channel(self, agent: str) -> AgentChannel:
@@ -199,9 +200,9 @@ class Compact:
     """A description of the parts that a compact recording lacks.
 
     Args:
-        digest: digest of the whole recording; empty if this is only its beginning.
-        actors: number of actors of the whole recording.
-        radius_m: greatest distance to an agent, in m, up to which an actor is recorded.
+        digest: digest of the complete recording; empty if the recording is only a beginning.
+        actors: number of actors in the complete recording.
+        radius_m: maximum distance to an agent, in m, up to which an actor is recorded.
         observations: whether the recording contains observations.
     """
 
@@ -212,27 +213,27 @@ class Compact:
 
 
 class ActorSelector(Protocol):
-    """Chooses the actors of a step."""
+    """The interface of a function that selects the actors of a step to keep."""
 
     def __call__(self, step: int, actors: Sequence[str], points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether to keep each actor, shape (actors,).
+        """Return whether to keep each actor, as an array of shape (actors,).
 
         Args:
             step: number of the step.
             actors: identifiers of the actors that are present.
-            points: their positions, in m, shape (actors, 2).
+            points: positions of these actors, in m, shape (actors, 2).
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """Keeps some actors, and those near an agent.
+    """Selects some given actors, and the actors near an agent.
 
     Args:
         agents: identifiers of the controlled vehicles.
         always: identifiers of the actors that are kept in each step.
-        radius_m: greatest distance between the centres, in m.
+        radius_m: maximum distance between the centres, in m.
     """
 
     agents: Collection[str]
@@ -250,7 +251,7 @@ class Near:
 
 @dataclass(frozen=True, slots=True)
 class PresentActors:
-    """Keeps the actors that another recording has in the same step.
+    """Selects the actors that another recording contains in the same step.
 
     Args:
         actors: identifiers of the actors of each step.
@@ -265,11 +266,11 @@ class PresentActors:
 
 
 def compact_records(records: Iterable[Record], choose: ActorSelector, *, observations: bool) -> Iterator[Record]:
-    """Yield the records of a recording without some actors.
+    """Yield the records of a recording, reduced to some of the actors.
 
     Args:
-        records: records of the whole recording.
-        choose: chooses the actors of each step.
+        records: records of the complete recording.
+        choose: function that selects the actors of each step.
         observations: whether to keep the observations of the agents.
     """
     actors: list[list[object]] = []  # as their definitions say

@@ -1,9 +1,9 @@
 """Values of any class as text, for observations and actions whose space has no fixed size.
 
-The text is JSON in ASCII. Numbers, texts, None and lists are written as they are. Everything else is an object with one
-key that names its class: ``tuple``, ``dict``, ``bytes``, ``array``, ``scalar``, ``graph`` and so on. A value of another
-class is written as ``opaque``: the name of its class and a digest of its content. Equal values have equal texts, in
-every process. Pickle is not used.
+The text is JSON in ASCII. Numbers, texts, None and lists are JSON values. Any other value is a JSON object with one key
+that names its class: ``tuple``, ``dict``, ``bytes``, ``array``, ``scalar``, ``graph`` and so on. A value of an unknown
+class is written as ``opaque``, with the name of its class and a digest of its content. Equal values have equal texts,
+in every process. Pickle is not used.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class OpaqueValue:
 
     Args:
         kind: Module and name of the class.
-        digest: BLAKE2b over the content, in hexadecimal; empty if the content cannot be read.
-        content: The content, if the class is derived from a class that recordings can hold; otherwise None.
+        digest: BLAKE2b digest of the content, in hexadecimal; empty if the content cannot be read.
+        content: The content, if the class is derived from a class that recordings can store; otherwise None.
     """
 
     def __init__(self, kind: str, digest: str, content: object = None) -> None:
@@ -59,25 +59,25 @@ class OpaqueValue:
 
 
 def is_opaque(shape: Sequence[int]) -> bool:
-    """Whether the arrays of an agent's channel hold the text of values."""
+    """Return whether the arrays of an agent's channel contain values as text."""
     return tuple(shape) == OPAQUE_SHAPE
 
 
 def encode_value(value: object) -> NDArray[np.uint8]:
     """Return the text of a value of any class as an array of bytes, shape (length,).
 
-    A class that fails while its content is read is written without a digest.
+    If reading the content of a value fails, the value is written without a digest.
     """
     return np.frombuffer(json.dumps(_Encoder().plain(value), separators=(",", ":")).encode(), np.uint8)
 
 
 def decode_value(array: NDArray[np.generic]) -> tuple[Any, bool]:
-    """Return the value that `encode_value` has written, and whether it equals the original in value and class.
+    """Decode a text of `encode_value`; return the value, and whether it equals the original in value and class.
 
-    A value of a class that cannot be restored is an `OpaqueValue`.
+    A value whose class cannot be restored is returned as an `OpaqueValue`.
 
     Raises:
-        ValueError: The array does not hold a text of `encode_value`.
+        ValueError: The array does not contain a text of `encode_value`.
     """
     decoder = _Decoder()
     try:
@@ -88,7 +88,7 @@ def decode_value(array: NDArray[np.generic]) -> tuple[Any, bool]:
 
 
 def describe_value(array: NDArray[np.generic], limit: int = 400) -> str:
-    """Return a recorded value in one line, cut after ``limit`` characters; large arrays with type and shape only."""
+    """Return a recorded value as one line of at most ``limit`` characters; of large arrays, only type and shape."""
     try:
         value, _ = decode_value(array)
     except ValueError:
@@ -137,7 +137,7 @@ class _Encoder:
         self._open: list[object] = []  # the values that are being written, the outermost first
 
     def plain(self, value: Any) -> object:
-        """Return the JSON value of a value."""
+        """Convert a value of any class to a JSON value."""
         kind = type(value)
         if value is None or kind in (bool, int, str, float):
             return value
@@ -150,7 +150,7 @@ class _Encoder:
             self._open.pop()
 
     def _known(self, value: Any, kind: type) -> object:
-        """Return the JSON value of a value of a class that can be restored; None for other classes."""
+        """Convert a value of a class that can be restored to a JSON value; return None for other classes."""
         if kind is list:
             return {"list": list(map(self.plain, value))}
         if kind is tuple or _is_graph(value):
@@ -181,7 +181,7 @@ class _Encoder:
         return None
 
     def _derived(self, value: Any, kind: type) -> object:
-        """Return the JSON value of a value of a class that is derived from a known one; None for other classes."""
+        """Convert a value of a class derived from a known class to a JSON value; return None for other classes."""
         content: object = None
         if isinstance(value, np.ndarray):
             content = self._array(np.asarray(value)) if value.__class__ is kind else None
@@ -200,7 +200,7 @@ class _Encoder:
         return {"opaque": [_name_of(kind), self._digest(value)]}
 
     def _digest(self, value: Any) -> str:
-        """Return the digest of the content of a value of any class; empty if the class does not give it."""
+        """Return the digest of the content of a value of any class; empty if the content cannot be read."""
         reduce: Callable[[Any], Any] | None = copyreg.dispatch_table.get(type(value))
         try:  # this is code of the class, which may raise anything, such as that of a lock or a connection
             parts = reduce(value) if reduce is not None else value.__reduce_ex__(4)
@@ -220,7 +220,7 @@ class _Decoder:
         self.is_whole = True
 
     def value(self, plain: Any) -> Any:
-        """Return the value of a JSON value."""
+        """Convert a JSON value back to the value that it represents."""
         if not isinstance(plain, dict):
             if isinstance(plain, list):
                 raise ValueError("a list without a type is not a recorded value")

@@ -1,4 +1,4 @@
-"""What-if runs: a recorded crash is run again with something changed, many times, and the outcomes are counted."""
+"""What-if runs: the trial of a recorded crash runs again many times with a change, and the outcomes are counted."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Counterfactual analysis of a crash: reruns its trial with overridden actions, or without one cause at a time."""
+"""Counterfactual analysis of a crash: reruns its trial with an overruled agent, or without one cause at a time."""
 
 from __future__ import annotations
 
@@ -49,18 +49,18 @@ _NO_RUNS_LEFT = "no runs were left for changing lanes"
 
 
 class CannotError(Exception):
-    """A manoeuvre cannot be done at all."""
+    """The vehicle cannot carry out a manoeuvre."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """One run.
+    """One run with the agent overruled.
 
     Args:
-        step: after which the agent was overruled.
-        ending: what became of the collision.
-        deceleration: the greatest, in m/s².
-        changed: What else the agent did otherwise, besides the manoeuvre.
+        step: the step after which the agent was overruled.
+        ending: what happened to the collision.
+        deceleration: the greatest deceleration of the agent, in m/s².
+        changed: Further differences in the agent's behaviour, in addition to the manoeuvre.
     """
 
     step: int
@@ -70,12 +70,12 @@ class Tried:
 
 
 class _Enough(Exception):  # noqa: N818 - no error
-    """All runs have been used up, or no more would say anything."""
+    """All runs have been used, or further runs would give no new information."""
 
 
 @dataclass(slots=True)
 class _Tries:
-    """A manoeuvre, and its results so far."""
+    """A manoeuvre, and the results of its runs."""
 
     manoeuvre: str
     most: int
@@ -85,18 +85,20 @@ class _Tries:
 
     @property
     def last(self) -> int | None:
-        """The last step from which it helped."""
+        """The last step from which the manoeuvre avoids the crash."""
         return max((step for step, ending in self.endings.items() if ending == "avoided"), default=None)
 
 
 class AvoidanceSearch:
-    """Bisects, and then runs what is left after the last step that helped: helping need not end for good.
+    """Search for the last step from which a manoeuvre of the agent avoids a crash.
+
+    The search bisects. It then runs the steps after the last step that helped, because a later step may help again.
 
     Args:
-        end: the step of the crash.
-        start: where to begin.
-        run: runs a manoeuvre after each of some steps, and yields the result; raises `CannotError`.
-        runs: the most runs.
+        end: number of the step of the crash.
+        start: the step at which the search begins.
+        run: function that runs a manoeuvre after each of some steps and yields the results; it may raise `CannotError`.
+        runs: maximum number of runs.
         parallel: number of runs at a time.
     """
 
@@ -109,7 +111,7 @@ class AvoidanceSearch:
         self._tries: list[_Tries] = []
 
     def all(self) -> None:
-        """Try braking, and then whether changing lanes helps any longer."""
+        """Try braking, and then whether lane changes avoid the crash from a later step."""
         if self._end < 1:
             self.why_not = "it crashed in its first step"
             return
@@ -127,7 +129,7 @@ class AvoidanceSearch:
                 self.why_not = _NO_RUNS_LEFT
 
     def judgement(self) -> Judgement:
-        """Return the results so far."""
+        """Return the results of all runs as a judgement."""
         attempts = [
             Attempt(
                 manoeuvre=tried.manoeuvre,
@@ -144,7 +146,7 @@ class AvoidanceSearch:
         return Judgement(tuple(attempts), self.why_not)
 
     def _try(self, manoeuvre: str, most: int, start: int, first: int) -> int | None:
-        """AvoidanceSearch for the last step from which a manoeuvre helps; return it, None if none was found."""
+        """Search for the last step from which a manoeuvre avoids the crash; return it, or None if none was found."""
         tries = _Tries(manoeuvre, most)
         self._tries.append(tries)
         try:
@@ -158,7 +160,7 @@ class AvoidanceSearch:
         return tries.last
 
     def _find(self, tries: _Tries, start: int, first: int) -> None:
-        """Bisect between a step that helps and one that does not."""
+        """Bisect between a step that avoids the crash and a step that does not."""
         self._run_after_steps(tries, {start, self._end - 1} if self._parallel > 1 else {start})
         stride = 1
         while True:
@@ -178,7 +180,7 @@ class AvoidanceSearch:
             self._run_after_steps(tries, steps)
 
     def _run_later_steps(self, tries: _Tries, first: int) -> None:
-        """Run what is left after the last step that helped, the latest first."""
+        """Run the steps after the last step that avoided the crash, the latest first."""
         while True:
             above = first - 1 if tries.last is None else tries.last
             left = [step for step in range(self._end - 1, above, -1) if step not in tries.endings]
@@ -190,7 +192,7 @@ class AvoidanceSearch:
         """Run the manoeuvre after each of some steps.
 
         Raises:
-            _Enough: there are no runs left.
+            _Enough: no further runs are allowed.
         """
         new = sorted(step for step in steps if step not in tries.endings)
         new = new[: max(0, min(self._left, tries.most - len(tries.endings)))]
@@ -220,25 +222,26 @@ def judge(
     watch: Watch | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Judgement:
-    """Return until when a collision could have been avoided, how, and what a crash hangs on, by running it again.
+    """Return until when and how a collision could have been avoided, and the causes of the crash, by running it again.
 
-    The agent is overruled after some step: it brakes as hard as its vehicle can, or changes lanes and brakes; the
-    others react as they then do. The search begins where a calculation guesses it, bisects, and then runs the steps
-    after the last one that helped, as many as it may: that it is too late after one step does not say that it is too
-    late after the next. Causes are found by removing one candidate at a time.
+    The agent is overruled after some step: it brakes as hard as its vehicle can, or changes lanes and brakes. The other
+    vehicles react freely. The search begins at a calculated step and bisects. It then runs the steps after the last
+    step that avoided the crash, as far as the number of runs allows. The reason is that a later step may avoid the
+    crash even if an earlier step does not. Causes are found by removing one candidate at a time.
 
     Args:
         bundle: The bundle of a crash. Without a collision partner, only the runs for causes are possible.
-        options: options of the replays; only the code that drives, and whether it is trusted.
-        runs: the most trials to run to avoid it.
-        why: the most trials to run for the causes; 0 for none.
-        reference: the most trials to run with a reference driver, for what the agent omitted; 0 leaves that out.
+        options: options of the replays; only the code that drives and its trust are used.
+        runs: maximum number of trials for avoiding the crash.
+        why: maximum number of trials for the causes; 0 for none.
+        reference: maximum number of trials with a reference driver, which show what the agent omitted; 0 for none.
         parallel: number of runs at a time.
-        watch: called with the number of runs so far, and the maximum.
-        stopped: Returns whether to stop; called repeatedly. The results until then are returned.
+        watch: function called with the number of finished runs and the maximum number.
+        stopped: function that returns whether to stop; called repeatedly. After a stop, the results of the finished
+            runs are returned.
 
     Raises:
-        UsageError: it is a near miss or a hang, there is nothing to run, or ``runs`` is below 1.
+        UsageError: the crash is a near miss or a hang, no run is possible, or ``runs`` is below 1.
         BundleError: the bundle is damaged.
         CrashhuntError: the trials could not be run.
     """
@@ -286,10 +289,10 @@ def judge(
 
 
 def _require_judgeable(bundle: Bundle, *, of_two: bool, why: int) -> None:
-    """See that there is something to run.
+    """Check that some run of the analysis is possible.
 
     Raises:
-        UsageError: there is not.
+        UsageError: no run is possible.
     """
     outcome = bundle.result.outcome
     if bundle.is_near_miss:
@@ -307,7 +310,7 @@ def _require_judgeable(bundle: Bundle, *, of_two: bool, why: int) -> None:
 
 
 def _start(rerun: Rerun) -> int:
-    """The step after which braking may just have helped, as far as a calculation says it."""
+    """Return the step after which braking might just have avoided the crash, according to a calculation."""
     hit, end = rerun.bundle.result.collision, rerun.bundle.result.steps
     assert hit is not None
     guess = last_escape(rerun.recorded, hit.agent, hit.other, braking=_ASSUMED_DECELERATION_MPS2)
@@ -326,10 +329,10 @@ class _Trials:
     done: int = 0
 
     def run(self, manoeuvre: str, steps: list[int]) -> Iterator[Tried]:
-        """Yield the result of a manoeuvre after each of some steps, as soon as it is known.
+        """Yield the result of a manoeuvre after each of some steps, in the order in which the runs end.
 
         Raises:
-            CannotError: the vehicle cannot do it.
+            CannotError: the vehicle cannot carry out the manoeuvre.
             CrashhuntError: the trials could not be run.
         """
         made = [overruled_trial(self.result, self.recorded, step, None, manoeuvre) for step in steps]

@@ -1,8 +1,8 @@
 """Finds the causes of a crash: reruns its trial without one candidate cause at a time.
 
-A manoeuvre is suppressed from just before it began. Up to there, every such run must be bit-identical, or its result
-does not count. Arguments and seeds affect the whole trial, so other values change the traffic from the beginning. The
-runs and their order do not depend on how many run at a time.
+A manoeuvre is suppressed from just before its beginning. Up to that step, every run must be bit-identical to the
+recording, or its result does not count. Arguments and seeds affect the whole trial, so other values change the traffic
+from the beginning. The runs and their order do not depend on the number of runs at a time.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ class Maneuver:
     """A manoeuvre of an actor.
 
     Args:
-        actor: who.
+        actor: identifier of the actor.
         what: ``braked``, ``sped up`` or ``changed lanes``.
-        step: after which it began.
-        speed: that the actor had then, in m/s.
+        step: the step after which the manoeuvre began.
+        speed: speed of the actor after this step, in m/s.
     """
 
     actor: str
@@ -70,7 +70,7 @@ def relevant_actors(recording: Recording, agent: str, other: str, most: int) -> 
 
     Args:
         recording: recording of the collision.
-        agent: the controlled vehicle.
+        agent: identifier of the controlled vehicle.
         other: The collision partner; empty if there was none.
         most: maximum number of actors.
     """
@@ -93,12 +93,12 @@ def relevant_actors(recording: Recording, agent: str, other: str, most: int) -> 
 
 
 def maneuvers_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> list[Maneuver]:
-    """Return an actor's manoeuvres in the last seconds before a step: the last one of each type.
+    """Return an actor's manoeuvres in the last seconds before a step: the last manoeuvre of each type.
 
     Args:
         recording: recording of the collision.
-        actor: who.
-        lanes: lanes around the place.
+        actor: identifier of the actor.
+        lanes: lanes around the place of the crash.
         end: The step of the collision, which is excluded, because a collision changes speeds.
     """
     dt = recording.prologue.step_length_s
@@ -169,10 +169,10 @@ class _Candidate:
     """A candidate cause, and the runs without it.
 
     Args:
-        factor: what it is.
-        runs: each with what is given in it, and how.
-        inside: Whether the cause is suppressed within the episode, from the given step on.
-        held: The actor that is held to its speed in the runs; empty if there is none.
+        factor: description of the candidate.
+        runs: the trials without the candidate, each as the changed value and the trial's specification.
+        inside: Whether the candidate is suppressed within the episode, from the given step on.
+        held: The actor whose speed is held constant in the runs; empty if there is none.
     """
 
     factor: Factor
@@ -187,13 +187,13 @@ class _Candidate:
 
 
 def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], None]) -> Why:
-    """Return what a crash hangs on.
+    """Return the causes of a crash.
 
     Args:
-        rerun: the crash.
-        runs: which runs its trials.
-        most: number of trials to run, without the unchanged one.
-        tell: called with the number of runs so far.
+        rerun: the crash to analyse.
+        runs: object that runs trials of the crash.
+        most: maximum number of trials to run, not counting the unchanged trial.
+        tell: function called with the number of finished runs.
 
     Raises:
         CrashhuntError: no trial can be run.
@@ -230,7 +230,7 @@ def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], Non
 
 
 class _Search:
-    """The candidate causes of one crash."""
+    """The candidate causes of one crash, and the runs without each candidate."""
 
     def __init__(self, rerun: Rerun) -> None:
         result = rerun.bundle.result
@@ -246,7 +246,7 @@ class _Search:
         self._lanes = LaneMap(read_lanes(rerun.bundle.path / layout.LOG), self._crash_place())
 
     def _crash_place(self) -> tuple[float, float]:
-        """Where it was: around there, lanes are known."""
+        """Return the place of the crash, around which lanes are known."""
         hit = self._result.collision
         if hit is not None:
             return hit.x, hit.y
@@ -257,7 +257,7 @@ class _Search:
         return 0.0, 0.0
 
     def asked(self) -> list[_Candidate]:
-        """Return everything, what says most first."""
+        """Return all candidates, the most informative first."""
         found = [*self._disturbances(), *self._agents()]
         names = relevant_actors(self._recording, self._agent, self._other, _MAX_OTHER_ACTORS)
         others = {name: self._others(name) for name in names}
@@ -267,7 +267,7 @@ class _Search:
         return [one for one in found if one.runs]
 
     def ending(self, asked: _Candidate, place: int, ended: EndedRun) -> LeftOut:
-        """Return what became of the collision in a run."""
+        """Return what happened to the collision in a run."""
         given = asked.runs[place][0]
         result, recording = ended.result, ended.recording
         if result.outcome in _INCONCLUSIVE_OUTCOMES and result.outcome is not self._result.outcome:
@@ -292,7 +292,7 @@ class _Search:
         return LeftOut(given=given, ending=ending, into=into, changed=changed)
 
     def _is_same(self, result: TrialResult) -> bool:
-        """Whether a run ended in the same crash: with the same other one, or in the same failure at the same place."""
+        """Return whether a run ended in the same crash: the same collision partner, or the same failure and place."""
         was, now = self._result.collision, result.collision
         if result.outcome is not self._result.outcome:
             return False
@@ -301,7 +301,7 @@ class _Search:
         return {was.collider, was.victim} == {now.collider, now.victim}
 
     def _into(self, recording: Recording, held: str, step: int) -> str:
-        """Return the actor into which a vehicle with held speed drove, except in the examined collision."""
+        """Return the actor that a vehicle with constant speed hit, unless this is the examined collision."""
         for scene in recording.scenes()[step + 1 :]:
             row = scene.roster.index.get(held)
             if row is None:
@@ -314,7 +314,7 @@ class _Search:
         return ""
 
     def _disturbances(self) -> Iterator[_Candidate]:
-        """What the trial was disturbed by."""
+        """Return the disturbances of the trial as candidate causes."""
         planned = self._spec.disturbances
         targets = {(one.step, one.agent, one.what): one.vehicle for one in self._rerun.bundle.result.disturbances}
         for one in planned:
@@ -328,7 +328,7 @@ class _Search:
                 )
 
     def _agents(self) -> Iterator[_Candidate]:
-        """What the agent decided; and the other actor, where that is one too."""
+        """Return the decisions of the agent as candidate causes; also of the collision partner, if it is an agent."""
         agents = [name for name in (self._agent, self._other) if name in self._recording.agents]
         for doing in (doing for agent in agents for doing in self._maneuver_factors(agent)):
             runs = [
@@ -376,7 +376,7 @@ class _Search:
         return list(dict.fromkeys(max(0, step - round(each / self._dt)) for each in ago_s))
 
     def _held(self, name: str, what: str, step: int) -> TrialSpec:
-        """Return the trial with a hold of an actor after a step."""
+        """Return the trial with a hold of an actor after a given step."""
         how_long = (self._inside.max_steps - step) * self._dt
         held = Disturbance(
             step=step + 1, who="itself", what=what, how_strong=0.0, how_long=how_long, agent=self._agent, vehicle=name
@@ -384,7 +384,7 @@ class _Search:
         return replace(self._inside, disturbances=(*self._inside.disturbances, held))
 
     def _arguments(self) -> Iterator[_Candidate]:
-        """Every argument that varies: at its default, and at other values that the hunt may draw."""
+        """Return each varied argument as a candidate cause, with its default and other values of the hunt."""
         defaults = self._rerun.defaults
         for (agent, name), distribution in self._settings.space.items():
             known = self._spec.arguments.get(agent, {}) if agent else self._spec.scenario_arguments
@@ -417,7 +417,7 @@ class _Search:
         return replace(spec, arguments={**spec.arguments, agent: {**spec.arguments[agent], name: value}})
 
     def _seeds(self) -> Iterator[_Candidate]:
-        """Other traffic, and other luck of whatever draws."""
+        """Return the seed as a candidate cause; other seeds change the traffic and all other random numbers."""
         sequence = np.random.SeedSequence(self._spec.seed, spawn_key=(_TRAFFIC_STREAM,))
         seeds = [int(each) >> 1 for each in sequence.generate_state(_SEEDS)]
         spec = replace(self._spec, max_steps=self.steps)

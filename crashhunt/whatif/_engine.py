@@ -1,17 +1,18 @@
-"""The engine: runs the trial of a crash again with something changed, many times, and counts the outcomes.
+"""The engine of what-if runs: runs the trial of a crash again many times with a change, and counts the outcomes.
 
-Every run starts at step 0, so each counted crash can be repeated from its specification alone. Where the change begins
-at a step, the recording of each run is compared with that of the crash up to this step, bit by bit. A run that differs
-does not count, and the counts say why: it would answer a question about another moment.
+Every run starts at step 0, so each counted crash can be repeated from its specification alone. If the change begins at
+a later step, the recording of each run up to this step is compared bit by bit with the recording of the crash. A run
+that differs does not count, because it would start the change in another situation. The counts contain the reason.
 
-Invariant: which runs count depends on their numbers only. Runs end in the order of their lengths, and crashed runs are
-short. Where the runs are stopped, only those before the first unfinished number count.
+Invariant: which runs count depends only on their numbers. Runs end in the order of their lengths, and crashed runs are
+short. If the runs are stopped, only runs before the first unfinished number count.
 
 Cost: a run is a fork of a simulator that has been set up, so only its steps are simulated. Measured on a busy machine,
 one run at a time: 72 ms per run of 148 steps on loop, 108 ms per run of 392 steps on merge. The trial itself takes 45
 and 91 ms of that. A fork 20 steps before the end would cost about 9 ms and save all steps before it. The runs would be
-about 1.7 and 3.5 times as fast: 50 futures would take 3.4 s each instead of 4.7 s and 6.8 s, start-up included.
-It is not built: the steps before the fork would be verified once, while now each counted run is verified by itself.
+about 1.7 and 3.5 times as fast: 50 futures would take 3.4 s each instead of 4.7 s and 6.8 s, start-up included. Such
+forks are not implemented, because the steps before the fork would be verified only once. Without forks, each counted
+run is verified separately.
 """
 
 from __future__ import annotations
@@ -61,14 +62,14 @@ class WhatIfOptions:
     """Options of what-if runs.
 
     Args:
-        code: the code that drives, that of the ``snapshot`` or the ``current`` code.
-        times: number of runs; 0 for `FUTURES` where there are futures, else 1.
+        code: the code that drives: the code of the ``snapshot``, or the ``current`` code.
+        times: number of runs; 0 for `FUTURES` if futures are requested, else for 1.
         parallel: number of runs at a time.
-        time_s: limit on the wall time of all runs, in s; None for no limit.
-        trusted: whether the code of the crash may run; None to look it up.
-        force: run even from a snapshot that is damaged.
-        watch: called with the number of finished runs and the number of all runs.
-        stopped: called about twice a second; returns whether to stop.
+        time_s: wall-time limit of all runs, in s; None for no limit.
+        trusted: whether the code of the crash may run; None to determine it.
+        force: whether to run even from a damaged snapshot.
+        watch: function called with the number of finished runs and the number of all runs.
+        stopped: function that returns whether to stop; called about twice a second.
     """
 
     code: Code = "snapshot"
@@ -85,16 +86,16 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
     """Run the trial of a crash again with changes, and count how the runs end.
 
     Args:
-        bundle: the crash.
-        interventions: the changes; without any, the trial is run unchanged.
-        options: how.
+        bundle: the crash whose trial runs again.
+        interventions: the changes; without any change, the trial runs unchanged.
+        options: options of the runs.
 
     Returns:
-        The counts; where it was stopped, of the runs before the first one that had not finished.
+        The counts. If the runs were stopped, only the runs before the first unfinished run are counted.
 
     Raises:
-        UsageError: an intervention or an option is not valid, or the simulator does not support it.
-        UntrustedError: the code of the crash would run, and this user has neither made nor trusted it.
+        UsageError: an intervention or an option is invalid, or the simulator does not support it.
+        UntrustedError: the code of the crash would run, but this user has neither made nor trusted it.
         CrashhuntError: the runs could not be run.
     """
     options = options or WhatIfOptions()
@@ -147,11 +148,11 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
 
 
 def future_seed(seed: int, number: int) -> int:
-    """Return the seed of a future: the same in every call for the same trial.
+    """Return the seed of a future, which is the same in every call for the same trial.
 
     Args:
         seed: seed of the trial.
-        number: number of the future, from 0.
+        number: number of the future, counted from 0.
     """
     return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
 
@@ -168,7 +169,7 @@ def _check(bundle: Bundle, interventions: Sequence[Intervention], options: WhatI
 
 
 def _from_step(interventions: Iterable[Intervention]) -> int | None:
-    """The last step that all interventions leave as it was recorded."""
+    """Return the last step that all interventions leave as recorded."""
     steps = [one.from_step for one in interventions]
     return None if None in steps else min((step for step in steps if step is not None), default=None)
 
@@ -179,7 +180,7 @@ def _too_old(reason: str = "") -> UsageError:
 
 
 class _Stop:
-    """Whether to stop, and why."""
+    """Decides whether to stop, and stores the reason."""
 
     def __init__(self, stopped: Callable[[], bool], until: float | None) -> None:
         self._stopped, self._until = stopped, until
@@ -205,12 +206,12 @@ class _Runs:
 
     @property
     def counted(self) -> tuple[Run, ...]:
-        """The runs before the first one that has not finished, by number."""
+        """Return the runs before the first unfinished run, by number."""
         first = next(number for number in itertools.count() if number not in self.found)
         return tuple(self.found[number] for number in range(first))
 
     def leave_out(self, interventions: Sequence[LeaveOut], recorded: TrialSpec) -> None:
-        """Determine the actors of the recorded trial, and remove some."""
+        """Determine the actors of the recorded trial, and exclude some of them."""
         (ended,) = self._reruns.run([replace(recorded, only=(ALL_AGENTS,))])
         same = ended.result.digest == self._rerun.bundle.result.digest
         entered = ended.entered if same else ()
@@ -219,14 +220,14 @@ class _Runs:
         self._spec = replace(self._spec, only=entered)
 
     def run_alike(self) -> None:
-        """Run the specification as often as asked."""
+        """Run the unchanged specification as often as requested."""
         self._run(list(range(self._times)), lambda _: self._spec)
 
     def run_futures(self, after: int) -> None:
-        """Run futures, and refuse where the simulator has none.
+        """Run futures of the trial, or refuse if the simulator does not support futures.
 
         Raises:
-            UsageError: the first futures are all equal, or the same one differs when it is run again.
+            UsageError: the first futures are all equal, or a future differs when it is run again.
         """
 
         def future(number: int) -> TrialSpec:
@@ -255,7 +256,7 @@ class _Runs:
         self._run(list(range(begun, self._times)), future)
 
     def _run(self, numbers: Sequence[int], spec: Callable[[int], TrialSpec]) -> dict[int, Run]:
-        """Run some futures; return the runs by place, and keep those below the requested number."""
+        """Run some futures; return the runs by index, and keep the runs whose number is below the requested number."""
         if not numbers:
             return {}
         places: dict[int, Run] = {}
@@ -269,10 +270,10 @@ class _Runs:
         return places
 
     def _counted(self, number: int, ended: EndedRun) -> Run:
-        """Return how a run ended, and whether it counts.
+        """Return how a run ended, and whether the run counts.
 
         Raises:
-            UsageError: the trial with the change cannot be set up; its other runs would fail in the same way.
+            UsageError: the changed trial cannot be set up; all other runs would fail in the same way.
         """
         result = ended.result
         if result.outcome is Outcome.INVALID and not result.was_killed_from_outside:
@@ -305,7 +306,7 @@ class _Runs:
 
 
 def _equal_futures(runs: Iterable[Run]) -> int:
-    """Return how many futures there are where all are equal; 0 if they are not, or where there is only one."""
+    """Return the number of futures if all are equal; 0 if they differ, or if there is only one."""
     digests = {run.number: run.digest for run in runs if not run.excluded}
     return len(digests) if len(digests) > 1 and len(set(digests.values())) == 1 else 0
 
@@ -315,15 +316,15 @@ def _equal_futures(runs: Iterable[Run]) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run(Serializable):
-    """One run.
+    """The result of one run.
 
     Args:
-        number: its place among those that were asked for, from 0.
-        outcome: how it ended.
+        number: number of the run among the requested runs, counted from 0.
+        outcome: outcome of the run.
         steps: number of completed steps.
-        digest: digest of its recording; equal digests are equal runs.
-        crashed: whether the hunt counts its outcome as a crash.
-        excluded: why it does not count; empty if it counts.
+        digest: digest of the run's recording; runs with equal digests are bit-identical.
+        crashed: whether the hunt counts the outcome as a crash.
+        excluded: reason why the run does not count; empty if it counts.
     """
 
     number: int
@@ -340,17 +341,18 @@ class Counts(Serializable):
 
     Args:
         crash: the id of the crash.
-        interventions: what was changed, in words.
-        from_step: up to which step each counted run was bit-identical to the recording; None if the change holds
-            from the start, so that no step has to be.
+        interventions: the changes of the trial, as text.
+        from_step: the step up to which each counted run was bit-identical to the recording; None if the change holds
+            from the start, so that no step is compared.
         code: the code that drove, ``snapshot`` or ``current``.
         recorded_outcome: the outcome of the recorded trial.
-        recorded_steps: its length, in steps.
+        recorded_steps: number of steps of the recorded trial.
         asked: number of requested runs.
         each: the runs, by number.
-        interrupted: why there are fewer than that; empty if there are not. Then `each` ends before the first run
-            that had not finished: short runs finish first, so counting all finished runs would favour early crashes.
-        warnings: what may make a difference, in words.
+        interrupted: the reason why `each` has fewer runs than requested; empty if all runs finished. After an
+            interruption, `each` ends before the first unfinished run: short runs finish first, so counting all finished
+            runs would favour early crashes.
+        warnings: warnings about possible causes of different results, as text.
     """
 
     crash: str
@@ -377,64 +379,64 @@ class Counts(Serializable):
 
     @property
     def runs(self) -> int:
-        """How many runs count."""
+        """The number of runs that count."""
         return len(self.counted)
 
     @property
     def crashed(self) -> int:
-        """How many of them crashed."""
+        """The number of counted runs that crashed."""
         return sum(run.crashed for run in self.counted)
 
     @property
     def survived(self) -> int:
-        """How many of them did not crash."""
+        """The number of counted runs that did not crash."""
         return self.runs - self.crashed
 
     @property
     def excluded(self) -> dict[str, int]:
-        """How many runs do not count, by reason."""
+        """The number of runs that do not count, by reason."""
         return dict(Counter(run.excluded for run in self.each if run.excluded))
 
     @property
     def share(self) -> float | None:
-        """The share of counted runs that crashed; None without one."""
+        """The share of counted runs that crashed; None if no run counts."""
         return self.crashed / self.runs if self.runs else None
 
     @property
     def interval(self) -> tuple[float, float] | None:
         """The Wilson interval of the share, with 95 % confidence.
 
-        None if it says nothing: without runs, and where all runs are equal, as they then are one run.
+        The interval is None if there are no runs, or if all runs are equal and thus count as one run.
         """
         return wilson(self.crashed, self.runs) if self.different > 1 else None
 
     @property
     def outcomes(self) -> dict[str, int]:
-        """How many counted runs ended in which outcome, the most frequent first."""
+        """The number of counted runs with each outcome, the most frequent outcome first."""
         return dict(Counter(str(run.outcome) for run in self.counted).most_common())
 
     @property
     def crash_steps(self) -> list[int]:
-        """The steps of the crashes, in order."""
+        """The numbers of the steps in which counted runs crashed, sorted."""
         return sorted(run.steps for run in self.counted if run.crashed)
 
     @property
     def earliest_crash_step(self) -> int | None:
-        """The step of the earliest crash; None without a crash."""
+        """The number of the step of the earliest crash; None without a crash."""
         return min(self.crash_steps, default=None)
 
     @property
     def median_crash_step(self) -> float | None:
-        """The median step of the crashes; None without a crash."""
+        """The median of the steps in which counted runs crashed; None without a crash."""
         return statistics.median(self.crash_steps) if self.crash_steps else None
 
     @property
     def different(self) -> int:
-        """How many counted runs differ from each other."""
+        """The number of different recordings among the counted runs."""
         return len({run.digest for run in self.counted})
 
     def lines(self) -> list[str]:
-        """Return what people read: the answer first, then the evidence."""
+        """Return the results as lines of text: the answer first, then the evidence."""
         answer = f"{self.crash}: {self.crashed} of {self.runs} runs crashed"
         if self.interval is not None and self.share is not None:
             low, high = self.interval

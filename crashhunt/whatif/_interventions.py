@@ -1,7 +1,8 @@
-"""Interventions: what is changed in the trial of a crash before it is run again.
+"""Interventions: changes of the trial of a crash before the trial runs again.
 
-Each is a value with one method, `applied`, which returns the run with the change. An intervention that begins at a step
-leaves everything before it as recorded, and the engine verifies that. One that holds from the start says so.
+An intervention is a value with one method, `applied`, which returns the run with the change. An intervention that
+begins at a step leaves everything before this step as recorded, and the engine verifies this. The property `from_step`
+is None for an intervention that holds from the start.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ _FACULTIES = {"reference_speed": "longitudinal", "reference_lanes": "lateral", "
 
 
 class Intervention(Protocol):
-    """What is changed in a trial."""
+    """A change of a trial."""
 
     @property
     def from_step(self) -> int | None:
@@ -50,29 +51,30 @@ class Intervention(Protocol):
         """Return the run with the change.
 
         Raises:
-            UsageError: it cannot be made in this trial.
+            UsageError: the change is not possible in this trial.
         """
 
     def __str__(self) -> str:
-        """What is changed, in words."""
+        """Return a description of the change."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetArguments:
-    """Other values for arguments and disturbances, from the start; the same as ``replay --set``.
+    """Other values of arguments and disturbances from the start, as with ``replay --set``.
 
     Args:
-        changes: ``NAME`` or ``AGENT.NAME`` to value. The engine gives them to `prepare`, which checks them.
+        changes: new value by name, ``NAME`` or ``AGENT.NAME``. The engine passes the values to `prepare`, which checks
+            them.
     """
 
     changes: Mapping[str, str]
 
     @property
     def from_step(self) -> None:
-        """No step: it holds from the start."""
+        """None, because the change holds from the start."""
 
     def applied(self, rerun: Rerun) -> Rerun:
-        """Return the run; `prepare` has made the change."""
+        """Return the run unchanged, because `prepare` has already made the change."""
         return rerun
 
     def __str__(self) -> str:
@@ -84,14 +86,14 @@ class Disturb:
     """Disturbances in addition to those of the trial.
 
     Args:
-        disturbances: disturbances; at least one.
+        disturbances: the disturbances; at least one.
     """
 
     disturbances: tuple[Disturbance, ...]
 
     @property
     def from_step(self) -> int:
-        """The step before the first one; what an agent sees is decided one step earlier."""
+        """The step before the first disturbance; disturbances of an observation take effect one step earlier."""
         return max(0, min(one.step - (2 if one.what in SENSOR_KINDS else 1) for one in self.disturbances))
 
     def applied(self, rerun: Rerun) -> Rerun:
@@ -105,14 +107,14 @@ class Disturb:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overrule:
-    """An agent that does not drive as its code says.
+    """An agent that is overruled: its actions are replaced.
 
     Args:
         from_step: the last step that stays as recorded.
         manoeuvre: ``brake`` as hard as the vehicle can, change lanes to the ``left`` or ``right`` and brake, or
             ``keep_lane`` or ``keep_speed``. With ``reference_speed``, ``reference_lanes`` or ``reference``, a reference
             driver corrects unsafe speeds, unsafe lane changes, or both.
-        agent: its id; empty for the only agent.
+        agent: id of the agent; empty for the only agent.
     """
 
     from_step: int
@@ -137,30 +139,30 @@ class Overrule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeaveOut:
-    """Actors that do not take part, from the start.
+    """Actors that are excluded from the start.
 
     Args:
-        actors: their ids.
+        actors: ids of the actors.
     """
 
     actors: tuple[str, ...]
 
     @property
     def from_step(self) -> None:
-        """No step: it holds from the start."""
+        """None, because the change holds from the start."""
 
     def applied(self, rerun: Rerun) -> Rerun:
-        """Return the run; the engine first determines the actors."""
+        """Return the run unchanged, because the engine determines the remaining actors first."""
         return rerun
 
     def taking_part(self, entered: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the actors that are left.
+        """Return the actors that remain.
 
         Args:
-            entered: all that have entered in the recorded trial.
+            entered: all actors that entered in the recorded trial.
 
         Raises:
-            UsageError: an actor to exclude is not among them.
+            UsageError: an actor to exclude is not among the actors that entered.
         """
         for actor in self.actors:
             if actor not in entered:
@@ -174,17 +176,17 @@ class LeaveOut:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HandOver:
-    """Another agent, or the same with other arguments, that takes over at a step.
+    """Another agent, or the same agent with other arguments, that takes control at a step.
 
-    Up to the step the recorded actions are played, and no code of the agent runs. Then the new agent is reset with the
-    seed of the trial. The first observation that it is shown is that after the step: it has seen nothing before.
+    Up to this step, the recorded actions are repeated, and no code of the agent runs. Then the new agent is reset with
+    the seed of the trial. The first observation that the new agent receives is the observation after this step.
 
     Args:
-        from_step: number of recorded actions to play.
-        driver: ``module:Name`` of the new agent; empty for the recorded one.
-        arguments: arguments of the new agent. Of the recorded agent, all others keep their recorded values.
-        agent: the id of the vehicle; empty for the only one.
-        option: how the user wrote the arguments, for errors.
+        from_step: number of recorded actions to repeat.
+        driver: ``module:Name`` of the new agent; empty for the recorded agent.
+        arguments: arguments of the new agent. For the recorded agent, all other arguments keep their recorded values.
+        agent: id of the vehicle; empty for the only controlled vehicle.
+        option: option with which the user gave the arguments, for error messages.
     """
 
     from_step: int
@@ -194,7 +196,7 @@ class HandOver:
     option: str = "--arg"
 
     def applied(self, rerun: Rerun) -> Rerun:
-        """Return the run with the agent that takes over."""
+        """Return the run in which the new agent takes control."""
         agent = _agent_of(self.agent, rerun)
         was = rerun.worker.scenario.agents[agent].agent
         driver = self.driver or was
@@ -222,16 +224,16 @@ class HandOver:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reseed:
-    """Other seeds of the simulator's random generators, another one in each run.
+    """Other seeds of the simulator's random generators after a step; each run has a different seed.
 
     Args:
-        from_step: the last step that draws from the seed of the trial.
+        from_step: the last step whose random numbers come from the seed of the trial.
     """
 
     from_step: int
 
     def applied(self, rerun: Rerun) -> Rerun:
-        """Return the run; the engine gives each run its seed."""
+        """Return the run unchanged, because the engine gives each run its seed."""
         return rerun
 
     def __str__(self) -> str:
@@ -239,14 +241,14 @@ class Reseed:
 
 
 def step_before(bundle: Bundle, seconds: float) -> int:
-    """Return the last step that is at least so long before the end of a crash.
+    """Return the last step that is at least the given time before the end of a crash.
 
     Args:
         bundle: the crash.
         seconds: simulation time, in s.
 
     Raises:
-        UsageError: that is before the start, or not before the crash.
+        UsageError: the time lies before the start, or not before the crash.
     """
     length_s, steps = bundle.recording().prologue.step_length_s, bundle.result.steps
     step = steps - round(seconds / length_s) if 0 < seconds < 1e9 else -1
@@ -288,23 +290,23 @@ def interventions_of(
     code: str | None = None,
     more: tuple[Intervention, ...] = (),
 ) -> list[Intervention]:
-    """Return the interventions that the options of ``crashhunt whatif`` ask for.
+    """Return the interventions that the options of ``crashhunt whatif`` request.
 
     Args:
-        bundle: the crash.
-        changes: changes of ``--set``; from a step on they are for the agent alone.
+        bundle: the crash that runs again.
+        changes: new values from ``--set``; with a step, they apply only to the agent from this step on.
         from_step: the last step that stays as recorded.
-        before_s: the same, in s before the crash.
-        agent: ``module:Name`` of an agent that takes over, or ``ID=module:Name``.
-        arguments: arguments of that agent.
-        futures: whether each run has other random numbers from that step on.
-        overrule: a manoeuvre from that step on.
-        leave_out: the ids of actors that do not take part.
-        code: the code that drives, if the user chooses it.
-        more: interventions that need none of these options.
+        before_s: time before the crash at which the change begins, in s, instead of ``from_step``.
+        agent: ``module:Name`` of an agent that takes control, or ``ID=module:Name``.
+        arguments: arguments of the agent that takes control.
+        futures: whether each run has other random numbers from the given step on.
+        overrule: name of a manoeuvre that replaces the agent's actions from the given step on.
+        leave_out: ids of actors that are excluded.
+        code: the code that drives, if the user selects it.
+        more: further interventions, which no option can express.
 
     Raises:
-        UsageError: they contradict each other, or nothing would be changed at the step.
+        UsageError: the options contradict each other, or nothing would change at the step.
     """
     step = step_before(bundle, before_s) if before_s is not None else from_step
     option = "--before" if before_s is not None else "--from-step"

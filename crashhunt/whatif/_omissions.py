@@ -1,12 +1,14 @@
-"""Finds what an agent omitted: runs the trial of a crash with a reference driver that takes one faculty over at a time.
+"""Finds what an agent omitted: reruns the trial of a crash with a reference driver that controls a part of the driving.
 
-First the reference driver only watches. That run must be bit-identical to the recording, and reports where the agent
-was not safe. Then the reference driver takes over from the beginning of such a period, and from 0.5 s and 1 s before.
-The period is the cause if no such run ends in a crash. The run from its beginning is made twice, with the same digest.
-Where all crashes of such runs are other ones, the agent may have brought them about with its other faculty. Then the
-reference driver takes both faculties over, from the same steps, and no run may end in a crash.
+First the reference driver only watches. That run must be bit-identical to the recording, and reports the periods in
+which the agent was not safe. Then the reference driver takes control of speed or lanes from the beginning of such a
+period, and from 0.5 s and 1 s before. The period is the cause if no such run ends in a crash. The run from its
+beginning is made twice, and must have the same digest. If all crashes of such runs differ from the recorded crash, the
+part of the driving that the agent kept may have caused them. Then the reference driver takes control of speed and lanes
+from the same steps, and no run may end in a crash.
 
-Cost: one run that watches, three or six for each candidate, and one repetition; at most `_MAX_CANDIDATES` candidates.
+Cost: one run in which the reference driver watches, three or six for each candidate, and one repetition; at most
+`_MAX_CANDIDATES` candidates.
 """
 
 from __future__ import annotations
@@ -69,17 +71,18 @@ def find_omission(
     stopped: Callable[[], bool],
     tell: Callable[[int], None],
 ) -> Reference:
-    """Return what the agent omitted, as far as runs with a reference driver say it.
+    """Return what the agent omitted, according to runs with a reference driver.
 
-    The runs use this crashhunt, also where the snapshot has an older one: the first run must then be bit-identical.
+    The runs use the current crashhunt, even if the snapshot has an older one. The first run must therefore be
+    bit-identical.
 
     Args:
-        rerun: the crash.
-        scratch: a folder for the workers.
-        most: largest number of runs.
+        rerun: the crash to analyse.
+        scratch: folder for the files of the workers.
+        most: maximum number of runs.
         parallel: number of runs at a time.
-        stopped: returns True when the search should stop.
-        tell: called with the number of runs so far.
+        stopped: function that returns whether to stop.
+        tell: function called with the number of finished runs.
 
     Raises:
         CrashhuntError: no trial can be run.
@@ -120,7 +123,7 @@ class _Search:
         self._lanes = LaneMap(read_lanes(rerun.bundle.path / layout.LOG), place)
 
     def find(self, differs: str) -> Reference:
-        """Return the cause; `differs` says why there is none where the watching run is not bit-identical."""
+        """Return the cause; `differs` is the reason for no result if the watching run is not bit-identical."""
         (watched,) = self._run([self._rerun.spec], "none", [0])
         if watched.result.outcome is Outcome.INVALID and watched.result.failure is not None:
             return Reference(why_not=watched.result.failure.message)
@@ -147,11 +150,11 @@ class _Search:
         return Reference(runs=tuple(self.runs))
 
     def _candidates(self, responses: tuple[JsonObject, ...]) -> list[JsonObject]:
-        """Return the periods that may be the cause: lane changes first, then the latest.
+        """Return the periods that may be the cause: lane changes first, then the latest period.
 
-        A lane change is the cause before the gap that it closed: the period of the gap then begins with the change.
-        Other periods than those with the collision partner, red lights and missing lanes are excluded: a run without
-        them may avoid the crash by chance, because everything after it differs.
+        A lane change takes precedence over the small gap that follows it, because the period of the small gap begins
+        with the lane change. Only periods with the collision partner, red lights and missing lanes are returned. A run
+        without another period may avoid the crash by chance, because everything after that period differs.
         """
         since = self._end - round(_BEFORE_S / self._dt)
         recent = [one for one in responses if int(one["last"]) >= since and one["actor"] in ("", self._other)]
@@ -162,7 +165,7 @@ class _Search:
         return sorted(recent, key=order)[:_MAX_CANDIDATES]
 
     def _try(self, candidate: JsonObject, faculty: str) -> Reference | None:
-        """Return the cause if no run with the reference driver crashes from the beginning of a period on."""
+        """Return the cause if no run with the reference driver from the beginning of a period on crashes."""
         first = int(candidate["first"])
         steps = list(dict.fromkeys(max(0, first - round(each / self._dt)) for each in _EARLIER_S))
         if self._left <= len(steps):
@@ -180,7 +183,7 @@ class _Search:
         return Reference(omission=self._omission(candidate, faculty), runs=tuple(self.runs))
 
     def _run(self, specs: list[TrialSpec], faculty: str, steps: list[int]) -> list[EndedRun]:
-        """Run a reference driver from each of some steps on."""
+        """Run the trial with the reference driver in control from each of some steps on."""
         made = [
             replace(spec, overruled=Overruled(self._agent, step, reference=faculty))
             for spec, step in zip(specs, steps, strict=True)
@@ -229,7 +232,7 @@ class _Search:
         )
 
     def _instead(self, first: int) -> str:
-        """Return what the agent did from a step to the crash, without the change of speed in the crash itself."""
+        """Return the agent's behaviour from a step to the crash, without the change of speed in the crash itself."""
         scenes = [scene for scene in self._recording.scenes()[first:-1] if self._agent in scene.roster.index]
         speeds = [scene.speeds[scene.roster.index[self._agent]] for scene in scenes]
         if speeds and speeds[-1] <= speeds[0] - _SPEED_CHANGED_MPS:

@@ -1,15 +1,15 @@
-"""Runs of the trial of a crash with changes: many, several at a time, each compared with the recording.
+"""Runs of the trial of a crash with changes: several at a time, each compared with the recording.
 
-Everything that asks "what if" about a crash runs its trials here: `what_if`, the search for the last avoidable step,
-the search for causes, and the minimization of a crash. A change is a changed `TrialSpec`. Each caller decides which
-specifications to run next and what the results mean.
+This module runs the trials of all analyses that change a crash: `what_if`, the search for the last avoidable
+step, the search for causes, and the minimization. A change is a changed `TrialSpec`. Each caller decides
+which specifications to run next and what the results mean.
 
-Invariant: the place of a run among the specifications identifies it. Which runs end first, and how many run at a time,
-changes no result.
+Invariant: a run is identified by the index of its specification. The order in which runs end, and the number of runs at
+a time, change no result.
 
-Cost: with today's crashhunt, each run is a fork of a process that has imported the agents. Where the traffic is the
-same, it is a fork of a simulator that has been set up. A snapshot with another crashhunt needs a new Python process for
-each run.
+Cost: with the current crashhunt, each run is a fork of a process that has imported the agents. If the traffic stays the
+same, a run is a fork of a simulator that has already been set up. A snapshot with another crashhunt needs a new Python
+process for each run.
 """
 
 from __future__ import annotations
@@ -49,20 +49,20 @@ class StoppedError(Exception):
 
 
 class NotUnderstoodError(CrashhuntError):
-    """The crashhunt in a snapshot ignored a part of a specification, and so ran another trial."""
+    """The crashhunt in a snapshot ignored a part of a specification, and therefore ran another trial."""
 
 
 @dataclass(frozen=True, slots=True)
 class EndedRun:
-    """A run that has ended.
+    """A run that has ended, with its recording.
 
     Args:
-        place: place of its specification among those of the call.
+        place: index of the run's specification among the specifications of the call.
         result: result of the trial.
-        recording: recording of the trial; None if it was not wanted, or where the process died before there was one.
-        folder: folder with the files of the trial, until the next run is asked for.
-        entered: the ids of all actors that entered, where the specification asked for them (`EVERYBODY`).
-        responses: responses of the reference driver, where the specification has one; None if the trial left none.
+        recording: recording of the trial; None if it was not requested, or if the process died before it could record.
+        folder: folder with the files of the trial; it exists until the next run is requested.
+        entered: ids of all actors that entered, if the specification requested them (`EVERYBODY`).
+        responses: responses of the reference driver, if the specification has one; None if the trial reported none.
     """
 
     place: int
@@ -74,16 +74,17 @@ class EndedRun:
 
 
 class Reruns:
-    """Runs trials like that of a crash.
+    """Runs trials that differ from the trial of a crash.
 
     Args:
-        rerun: the crash.
-        scratch: a folder for the workers.
-        parallel: trials at a time.
-        stopped: called before each wait for results, about twice a second; returns whether to stop, or raises.
-        keep_all: whether trials without a crash leave a recording too.
-        warm_copies: suspended set-ups of the simulator per worker.
-        todays: whether they run with this crashhunt and not with that of the snapshot; None to find out.
+        rerun: the crash whose trial is changed.
+        scratch: folder for the files of the workers.
+        parallel: number of trials at a time.
+        stopped: function called before each wait for results, about twice a second; it returns whether to stop, or
+            raises an exception.
+        keep_all: whether trials without a crash are recorded as well.
+        warm_copies: number of suspended simulators for each worker, which have already been set up.
+        todays: whether trials run with the current crashhunt and not with the snapshot's; None to determine it.
     """
 
     def __init__(
@@ -107,16 +108,16 @@ class Reruns:
     def run(
         self, specs: Sequence[TrialSpec], *, recorded: bool = True, needed: Callable[[int], bool] = lambda _: True
     ) -> Iterator[EndedRun]:
-        """Yield trials as they end; those that have not ended when the caller stops asking are cancelled.
+        """Yield trials as they end; if the caller stops the iteration, the unfinished trials are cancelled.
 
         Args:
-            specs: the trials.
-            recorded: whether their recordings are wanted.
-            needed: as of `run_trials`.
+            specs: specifications of the trials.
+            recorded: whether their recordings are needed.
+            needed: function that returns whether a trial is still needed, as in `run_trials`.
 
         Raises:
             StoppedError: the user has stopped the runs.
-            NotUnderstoodError: the crashhunt that runs them does not know a part of a specification.
+            NotUnderstoodError: the crashhunt that runs the trials does not know a part of a specification.
             CrashhuntError: the trials could not be run.
         """
         numbered = [replace(spec, number=number) for spec, number in zip(specs, self._numbers, strict=False)]
@@ -130,7 +131,7 @@ class Reruns:
                     shutil.rmtree(folder, ignore_errors=True)
 
     def close(self) -> None:
-        """End every process."""
+        """End all processes of the workers."""
         self._executor.close()
 
     def _raise_stop(self) -> bool:
@@ -165,7 +166,7 @@ def _require_same_trial(asked: TrialSpec, run: TrialSpec) -> None:
     """Check that the specification of a trial came back unchanged, because early versions ignore unknown keys.
 
     Raises:
-        NotUnderstoodError: a part did not.
+        NotUnderstoodError: a part of the specification was ignored.
     """
     named = attrgetter("overruled", "disturbances", "only", "handover", "reseeding")
     if named(asked) != named(run):

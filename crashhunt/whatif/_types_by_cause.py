@@ -1,4 +1,4 @@
-"""Divides crash types by cause: judges some crashes of each type, and gives the others the cause of the nearest one."""
+"""Division of crash types by cause: some crashes of each type are judged, the others get the nearest cause."""
 
 from __future__ import annotations
 
@@ -42,15 +42,16 @@ def find_cause(
     parallel: int = 1,
     stopped: Callable[[], bool] = lambda: False,
 ) -> tuple[Cause, Bundle]:
-    """Return the cause of a crash, and its bundle with the runs that say so; runs only what is not known yet.
+    """Return the cause of a crash, and its bundle with the results of runs; runs are made only for missing results.
 
-    A reference driver comes first. Only where it finds no omission, one thing at a time is removed, as `judge` does.
+    The runs with a reference driver are made first. Only if they find no omission, one factor at a time is removed, as
+    `judge` does.
 
     Args:
-        bundle: the crash.
+        bundle: the crash to judge.
         options: options of the replays.
-        parallel: runs at a time.
-        stopped: returns True when the search should stop.
+        parallel: number of runs at a time.
+        stopped: function that returns whether to stop.
 
     Raises:
         CrashhuntError: no trial can be run.
@@ -86,12 +87,13 @@ def divide_by_cause(
     """Return the crashes of one type divided by cause, the most frequent cause first.
 
     Args:
-        group: the crashes of one type.
+        group: the crashes of one crash type.
         options: options of the replays.
-        most: how many of them to judge at most.
-        parallel: runs at a time.
-        write: whether to write what the runs have shown into the bundles, so that the next call needs no run.
-        stopped: returns whether to stop; the rest then has the cause of the nearest crash that was judged.
+        most: maximum number of crashes to judge.
+        parallel: number of runs at a time.
+        write: whether to write the results of the runs into the bundles, so that the next call needs no run.
+        stopped: function that returns whether to stop; all further crashes then get the cause of the nearest judged
+            crash.
     """
     bundles, division = group.bundles, Division(most)
     for number, bundle in enumerate(bundles):

@@ -1,4 +1,4 @@
-"""The types of records: tag, codec, topic of the evidence in the log, reading and comparison of each.
+"""The types of records, each with its tag, codec, topic in the log, reading and comparison.
 
 To add a type, define a `RecordType` in one of the modules here, list it in `RECORD_TYPES`, and call `BlackBox.append`
 with its tag and the data to record.

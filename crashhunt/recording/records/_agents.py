@@ -43,10 +43,10 @@ PROLOGUE = RecordType(tag=1, name="prologue", topic="/prologue", form=TextForm()
 
 
 class ArrayForm(Form):
-    """Arrays of the type that the prologue gives.
+    """The conversion of an array whose type is given in the prologue.
 
     Args:
-        what: the field of the agent's channel that has the type.
+        what: name of the `AgentChannel` field that contains the type.
     """
 
     messages: Mapping[str, Mapping[str, str]] = {
@@ -59,19 +59,19 @@ class ArrayForm(Form):
         self._what = what
 
     def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
-        """Return the numbers in a message that can represent this type without loss."""
+        """Return the numbers in a message that can represent the array's type without loss."""
         dtype = getattr(prologue.agents[aux], self._what)
         return message_of(dtype), {"values": np.frombuffer(payload, dtype).tolist()}
 
     def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
-        """Return the bytes of the array."""
+        """Return the array of the message as bytes."""
         if prologue is None:
             raise ValueError("an array of an agent comes before the first record")
         return np.array(list(message.values), getattr(prologue.agents[aux], self._what)).tobytes()
 
 
 def message_of(dtype: str) -> str:
-    """Return the name of the message that holds arrays of a NumPy type, such as ``<f4``, without losing a bit."""
+    """Return the name of the message that stores arrays of a NumPy type, such as ``<f4``, without losing a bit."""
     kind, size = dtype[1], int(dtype[2:])
     if kind == "f" and size in (4, 8):
         return "FloatArray" if size == 4 else "DoubleArray"
@@ -90,16 +90,16 @@ def array_difference(
     *,
     opaque: bool = False,
 ) -> Divergence | None:
-    """Return the first difference between two arrays of an agent, either of which may be missing.
+    """Return the first difference between two arrays of an agent; either array may be missing.
 
     Args:
         step: number of the step.
-        agent: the agent.
+        agent: identifier of the agent.
         kind: ``observation`` or ``action``.
-        columns: the names of the columns, if they are known.
+        columns: names of the columns, if they are known.
         was: the recorded array.
         now: the replayed array.
-        opaque: whether the arrays hold the texts of values.
+        opaque: whether the arrays contain values as text.
     """
     if was is None and now is None:
         return None
@@ -122,7 +122,7 @@ def array_difference(
 
 
 def _array_record(tag: int, what: str) -> RecordType:
-    """Return the type of a record of one array per agent and step, as raw bytes; ``aux`` is the agent's number.
+    """Return the record type for one array per agent and step, as raw bytes; ``aux`` is the agent's number.
 
     Args:
         tag: tag of the record.

@@ -31,7 +31,7 @@ class _Events(TypedDict, total=False):
 
 
 def encode_events(scene: Scene) -> bytes:
-    """Return the payload with the contacts and the vehicles that left the road."""
+    """Return the payload with the contacts, and with the vehicles that left the road."""
     contacts = [[getattr(contact, name) for name in Contact.__slots__] for contact in scene.contacts]
     return json.dumps({"contacts": contacts, "off_road": list(scene.off_road)}).encode()
 
@@ -75,7 +75,7 @@ _DISTURBANCES_NOTHING = "nothing"
 
 
 def encode_disturbance(disturbance: Disturbance) -> bytes:
-    """Return the payload of a disturbance that takes place."""
+    """Return the payload of an active disturbance."""
     return json.dumps({"vehicle": "", **disturbance.to_json()}).encode()
 
 

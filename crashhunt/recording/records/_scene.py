@@ -116,7 +116,7 @@ _STEP_HEAD = struct.Struct("<qd")
 
 
 def time_of(payload: bytes) -> float:
-    """Return the simulation time of a step, in s."""
+    """Return the simulation time of a step from its payload, in s."""
     time_s: float = _STEP_HEAD.unpack_from(payload)[1]
     return time_s
 
@@ -325,7 +325,7 @@ LANES = RecordType(
 
 
 def step_of(payload: bytes) -> int:
-    """Return the number of a step."""
+    """Return the number of a step from its payload."""
     step: int = _STEP_HEAD.unpack_from(payload)[0]
     return step
 
@@ -337,11 +337,11 @@ def points_of(payload: bytes, agents: int) -> NDArray[np.float64]:
 
 
 def select_actors(tag: int, payload: bytes, mask: NDArray[np.bool_], agents: int) -> bytes:
-    """Return the payload of a record about some of the actors of its roster; of another type, the payload as it is.
+    """Return the payload of a record, reduced to some actors of its roster; other types are unchanged.
 
     Args:
         tag: tag of the record.
-        payload: payload of the record, about all actors of the roster.
+        payload: payload of the record, which covers all actors of the roster.
         mask: whether to keep each actor of the roster, shape (actors,).
         agents: number of controlled vehicles.
     """

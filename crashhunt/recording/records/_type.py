@@ -1,4 +1,4 @@
-"""The definition of a type of record."""
+"""The definition of a record type."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ Fields: TypeAlias = "Mapping[str, object]"
 
 
 class Form:
-    """The conversion of a payload to a message of a log and back, without losing a bit.
+    """The conversion of a payload to a log message and back, without losing a bit.
 
     Args:
-        messages: the possible protobuf messages: name to a mapping from field name to type.
+        messages: the possible protobuf messages, by name; each maps field names to types.
     """
 
     messages: Mapping[str, Mapping[str, str]]
@@ -48,7 +48,7 @@ class Form:
         raise NotImplementedError
 
     def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
-        """Return the payload that was given to `to_message`; the prologue itself is read without one."""
+        """Return the payload from which `to_message` made the message; for the prologue record, `prologue` is None."""
         raise NotImplementedError
 
 
@@ -58,7 +58,7 @@ class TextForm(Form):
     messages: Mapping[str, Mapping[str, str]] = {"Text": {"text": "string"}}
 
     def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
-        """Return the text."""
+        """Return the payload as text in a message."""
         return "Text", {"text": payload}
 
     def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
@@ -73,7 +73,7 @@ class BytesForm(Form):
     messages: Mapping[str, Mapping[str, str]] = {"Bytes": {"data": "bytes"}}
 
     def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
-        """Return the argument unchanged."""
+        """Return the payload unchanged in a message."""
         return "Bytes", {"data": payload}
 
     def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
@@ -84,19 +84,20 @@ class BytesForm(Form):
 
 @dataclass(frozen=True, slots=True)
 class RecordType:
-    """The properties of a type of record.
+    """The properties of a record type.
 
     Args:
-        tag: unique number of the type in the black box; types from `FIRST_ASIDE` on are no evidence.
-        name: name for people, and for the place of a value.
+        tag: unique number of the type in the black box; types from `FIRST_ASIDE` on do not belong to the digest.
+        name: name for users, and for the place of a value.
         topic: topic of its messages in a log; ``{agent}`` is replaced by the agent whose number is the record's
             ``aux``.
-        form: the conversion to a message. Types after the first eleven are text or bytes. A crashhunt that does not
-            know such a type can therefore read the record and include it in the digest.
-        read: adds a record, given as ``aux`` and payload, to the `Reading`.
-        difference: the first difference between the records of two equal steps; for one agent if the topic has
-            ``{agent}``. None if it is never compared, or with another type.
-        value: value of the agent or actor of a divergence, the value at an index, for the steps around.
+        form: the conversion to a message. Types after the first eleven are text or bytes, so that a version of
+            crashhunt that does not know the type can read the record and include it in the digest.
+        read: function that adds a record, given as ``aux`` and payload, to the `Reading`.
+        difference: function that returns the first difference between the records of two equal steps; for one agent if
+            the topic contains ``{agent}``. None if the record is never compared, or is compared with another type.
+        value: function that returns the value of the agent or actor of a divergence, or the value at an index, for the
+            steps around.
     """
 
     tag: int
@@ -114,7 +115,7 @@ class RecordType:
 
 
 def scene_texts(*fields: str) -> Difference:
-    """Return a comparison of some fields of the scenes."""
+    """Return a function that compares some fields of the scenes."""
 
     def difference(left: StepRecord, right: StepRecord, _: AgentChannel | None) -> Divergence | None:
         if left.scene is None or right.scene is None:  # which the step reports
