@@ -1,4 +1,4 @@
-"""Hunts: the loop, the directory, and the results that can be read afterwards."""
+"""Hunts: the main loop, the directory, and results that can be read afterwards."""
 
 import lazy_loader
 

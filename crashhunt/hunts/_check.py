@@ -39,10 +39,10 @@ class CheckFinding(Serializable):
     """A problem that the check has found.
 
     Args:
-        where: the file or folder.
-        what: the problem.
-        lost: the data that are lost; empty if nothing is lost.
-        fix: how to recover the rest.
+        where: path of the file or folder.
+        what: description of the problem.
+        lost: the data that are lost, as text; empty if nothing is lost.
+        fix: how to recover the remaining data.
         damaged: whether the problem is damage; otherwise it is harmless.
     """
 
@@ -61,11 +61,11 @@ class Checked:
         dir: path of the hunt or crash.
         kind: ``hunt``, ``crash`` or ``file``.
         protected: whether every trial has a digest; the ledgers of early versions have none.
-        trials: the numbers of the trials whose rows are as they were written.
+        trials: the numbers of the trials whose rows are unchanged since they were written.
         damaged_trials: reason for each damaged trial.
-        crashes: the names of the bundles that are as they were written.
+        crashes: the names of the bundles that are unchanged since they were written.
         damaged_crashes: reason for each damaged crash.
-        findings: the problems.
+        findings: the problems that were found.
         dropped: the trials whose bundles were deleted, because shorter crashes of their type were kept.
     """
 
@@ -81,11 +81,11 @@ class Checked:
 
     @property
     def fine(self) -> bool:
-        """Whether nothing is damaged."""
+        """Whether no data are damaged."""
         return not any(finding.damaged for finding in self.findings)
 
     def to_json(self) -> JsonObject:
-        """Return the shape of one hunt in ``check --json``."""
+        """Return the result for one hunt in the form that ``check --json`` prints."""
         return {
             "dir": str(self.dir),
             "kind": self.kind,
@@ -103,7 +103,7 @@ def check(directory: Path) -> list[Checked]:
     """Check a hunt, the hunts of a suite, a crash, or an exported file.
 
     Raises:
-        HuntDirectoryError: it is none of these.
+        HuntDirectoryError: the directory or file is none of these.
     """
     if directory.is_file():
         return [_check_file(directory)]
@@ -117,7 +117,7 @@ def check(directory: Path) -> list[Checked]:
 
 
 def intact_snapshots(hunt: Path) -> Iterator[Snapshot]:
-    """Yield the snapshots of a hunt that are as they were written."""
+    """Yield the snapshots of a hunt that are unchanged since they were written."""
     for path in sorted((hunt / layout.SNAPSHOTS).glob(layout.SHOWN)):
         with suppress(CrashhuntError):
             snapshot = Snapshot(path)
@@ -176,7 +176,7 @@ def _ledger(hunt: Path) -> Path:
 
 
 def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> dict[int, TrialResult] | None:
-    """Check the rows of the ledger; return its crashes, or nothing if the ledger cannot be read."""
+    """Check the rows of the ledger; return its crashes, or an empty result if the ledger cannot be read."""
     path = _ledger(hunt)
     if not has_begun(path):
         if (hunt / layout.CRASHES).is_dir() and not (hunt / layout.CASE).is_file():
@@ -285,7 +285,7 @@ def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
 
 
 def _check_other_bundles(found: Checked, hunt: Path) -> list[Bundle]:
-    """Return the intact bundles of near misses, probes and branches; the ledger can make the damaged ones again."""
+    """Return the intact bundles of near misses, probes and branches; damaged ones can be made again from the ledger."""
     whole = []
     options = {layout.NEAR_MISSES: "--near-misses", layout.PROBES: "--probe", layout.BRANCHES: "--branch"}
     for place, option in options.items():
@@ -340,7 +340,7 @@ def _check_snapshot(found: Checked, path: Path, crash: str) -> None:
 def _compare(
     found: Checked, rows: dict[int, TrialResult], bundles: dict[str, Bundle], settings: HuntSettings | None
 ) -> None:
-    """Compare the crashes of the ledger with the bundles."""
+    """Compare the crashes in the ledger with the bundles."""
     # One that was made smaller is another trial, of which the ledger knows nothing.
     own = (bundle for name, bundle in bundles.items() if not name.endswith(layout.SMALL))
     by_trial = {bundle.result.spec.number: bundle for bundle in own}
@@ -398,17 +398,18 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
 
 
 def salvage(found: Checked, to: Path) -> dict[str, int]:
-    """Copy the intact part of a hunt, so that it can resume there; return the number of trials and crashes.
+    """Copy the intact part of a hunt, so that the copy can resume; return the number of trials and of crashes.
 
     A crash with a damaged bundle is skipped together with its row, so its trial runs again.
 
     Args:
-        found: the hunt, as it was found.
-        to: a new or an empty directory. It gets its name when everything is in it. If it already has exactly the copied
-            data, because an earlier call was killed at its end, nothing is done.
+        found: result of the check of the hunt.
+        to: path of a new or empty directory. The copy is moved to this path when it is complete. If the directory
+            already contains exactly the copied data, because an earlier call was killed at its end, the call does
+            nothing.
 
     Raises:
-        HuntDirectoryError: the directory has other content or cannot be written, or the settings of the hunt are lost.
+        HuntDirectoryError: the directory has other contents or cannot be written, or the settings of the hunt are lost.
     """
     if found.kind != "hunt":
         raise HuntDirectoryError(
@@ -432,7 +433,7 @@ def salvage(found: Checked, to: Path) -> dict[str, int]:
 
 
 def _copy(found: Checked, settings: HuntSettings, building: Path, to: Path) -> int:
-    """Copy everything into a temporary folder, which is renamed later; return the number of trials in it."""
+    """Copy all files into a temporary folder, which is renamed later; return the number of trials in it."""
     for snapshot in intact_snapshots(found.dir):
         shutil.copytree(snapshot.path, building / layout.SNAPSHOTS / snapshot.digest)
     for name in found.crashes:
@@ -451,7 +452,7 @@ def _copy(found: Checked, settings: HuntSettings, building: Path, to: Path) -> i
 
 
 def _is_same(found: Checked, settings: HuntSettings, to: Path) -> bool:
-    """Return whether a directory already has the data to copy, and no hunt has resumed there."""
+    """Return whether a directory already contains the data to copy, and no hunt has resumed in it."""
     with suppress(HuntDirectoryError), closing(Ledger(to / layout.LEDGER)) as ledger:
         facts = ledger.facts()
         return (
@@ -492,7 +493,7 @@ def _copy_rows(found: Checked, settings: HuntSettings, to: Path) -> int:
 
 
 def _copied_rows(found: Checked, settings: HuntSettings, ledger: Ledger) -> Iterator[tuple[int, Row]]:
-    """Yield the numbers and rows of trials that are copied."""
+    """Yield the number and the row of each trial that is copied."""
     bundles = {int(name.partition("-")[0]) for name in found.crashes if name.partition("-")[0].isdecimal()}
     for number, row in ledger.intact_rows(sorted(found.trials)):
         if row is not None and (row[2] not in settings.crash_on or number in bundles):

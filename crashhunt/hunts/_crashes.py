@@ -1,4 +1,4 @@
-"""The crashes of a hunt: their number, whether or not bundles are kept; their types; which bundles are kept."""
+"""The crashes of a hunt: their number, with or without a bundle; their types; and which bundles are kept."""
 
 from __future__ import annotations
 
@@ -61,8 +61,9 @@ class CrashTally:
     Args:
         found: number of crashes.
         disturbed: number of crashes with disturbances.
-        likeliest: identifier of the crash with disturbances that has the greatest log-likelihood; empty for none.
-        log_likelihood: log likelihood of that crash.
+        likeliest: identifier of the crash with disturbances that has the greatest log-likelihood; empty if there is
+            none.
+        log_likelihood: log-likelihood of this crash.
     """
 
     found: int = 0
@@ -71,7 +72,7 @@ class CrashTally:
     log_likelihood: float = -math.inf
 
     def add(self, result: TrialResult) -> None:
-        """Count a crash."""
+        """Add a crash to the counts."""
         self.found += 1
         if not result.disturbed:
             return
@@ -82,12 +83,12 @@ class CrashTally:
 
 
 def tally_crashes(ledger: Ledger, crash_on: Sequence[str], *, disturbed: bool) -> CrashTally:
-    """Return the counts of the crashes of a ledger.
+    """Return the counts of the crashes in a ledger.
 
     Args:
         ledger: ledger of the hunt.
         crash_on: the outcomes that count as a crash.
-        disturbed: whether the hunt has disturbances, so that those are counted.
+        disturbed: whether the hunt has disturbances, so that crashes with disturbances are counted.
     """
     outcomes = ledger.outcomes()
     found = CrashTally(sum(outcomes.get(name, 0) for name in crash_on))
@@ -100,7 +101,7 @@ def tally_crashes(ledger: Ledger, crash_on: Sequence[str], *, disturbed: bool) -
 
 
 def outcomes_of_crashes(directory: Path, facts: Facts) -> Sequence[str] | None:
-    """Return the outcomes that count as a crash in a hunt; None if neither its ledger nor its settings say."""
+    """Return the outcomes that count as a crash in a hunt; None if its ledger and its settings do not contain them."""
     noted = facts.get("crash_on")
     if noted is not None:
         return noted
@@ -112,15 +113,15 @@ def outcomes_of_crashes(directory: Path, facts: Facts) -> Sequence[str] | None:
 
 @dataclass(frozen=True, slots=True)
 class FoundCrashes:
-    """The crashes of a hunt: how many, of which types, and those to show.
+    """The crashes of a hunt: their number, their types, and the crashes to show.
 
     Args:
-        tally: counts over all trials.
+        tally: counts of the crashes over all trials.
         saved: number of crashes that have a bundle.
-        types: number of crashes of each type, in words, over all trials, the most frequent type first.
-        shortest: identifier of the shortest saved crash of each of these types.
-        untyped: number of crashes whose type is not determined, because a log is missing or not read yet.
-        shown: the crashes to show: the shortest of each type, then the shortest of all.
+        types: number of crashes of each crash type (as text) over all trials, the most frequent type first.
+        shortest: identifier of the shortest saved crash of each crash type.
+        untyped: number of crashes whose type is unknown, because a log is missing or has not been read yet.
+        shown: the crashes to show: the shortest crash of each type, then the shortest of all other crashes.
     """
 
     tally: CrashTally
@@ -132,11 +133,11 @@ class FoundCrashes:
 
 
 def find_crashes(directory: Path, limit: int) -> FoundCrashes:
-    """Return the crashes of a hunt; reads at most `limit` bundles where the ledger has the types of all crashes.
+    """Return the crashes of a hunt. If the ledger has the types of all crashes, at most `limit` bundles are read.
 
     Args:
         directory: directory of the hunt; its ledger may be missing, as in an exported crash.
-        limit: number of crashes to show, at most.
+        limit: maximum number of crashes to show.
 
     Raises:
         BundleError: a crash that is to be shown is damaged.
@@ -180,12 +181,12 @@ def find_crashes(directory: Path, limit: int) -> FoundCrashes:
 
 
 def _noted_types(facts: Facts) -> Sequence[KindData] | None:
-    """Return the crash types that the hunt has noted; None if another version has determined them."""
+    """Return the crash types that the hunt has recorded; None if another version of crashhunt determined them."""
     return facts.get("kinds") if facts.get("kinds_version") == SIGNATURE_VERSION else None
 
 
 def _types_of(bundles: Sequence[Bundle], dropped: Mapping[str, int]) -> tuple[dict[str, int], dict[str, str]]:
-    """Return the crash types of bundles, from their logs, with those of crashes without a bundle."""
+    """Return the crash types of bundles, from their logs, and of crashes without a bundle."""
     groups = group_crashes(bundles, dropped, faults=False).groups
     types = {**dropped, **{str(group.signature): group.count for group in groups}}
     ranked = sorted(types.items(), key=lambda entry: -entry[1])
@@ -217,12 +218,12 @@ def _listed_crashes(
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A crash whose cause was searched for.
+    """A crash whose cause has been searched for.
 
     Args:
-        bundle: the crash, with its judgement.
+        bundle: bundle of the crash, with its judgement.
         cause: the cause; None if the crash cannot be run again.
-        is_stopped: whether the search was interrupted, so that nothing is known.
+        is_stopped: whether the search was interrupted, so that the cause is unknown.
     """
 
     bundle: Bundle
@@ -234,13 +235,13 @@ class Kinds:
     """The crash types of a hunt, and the crashes to keep, to judge and to show.
 
     Args:
-        wanted: number of crash types that ends the hunt; 0 for no limit.
+        wanted: number of crash types after which the hunt ends; 0 for no limit.
         crashes: the crashes that earlier runs of the hunt have saved.
-        newest: time of the last new crash type, in s since the epoch; None if unknown.
-        only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
-        dropped: for each crash type, in words, the trials whose bundles were deleted before.
-        dropped_at_fault: of these trials, the ones whose crashes are the agent's own fault.
-        by_cause: number of crashes of each type to judge, so that each cause of a type counts; 0: types count.
+        newest: time at which the last new crash type was found, in s since the epoch; None if it is unknown.
+        only_at_fault: whether only crashes that are the agent's fault count towards the number of wanted crash types.
+        dropped: trials of each crash type (as text) whose bundles were deleted in earlier runs of the hunt.
+        dropped_at_fault: those of the trials in `dropped` whose crashes are the agent's fault.
+        by_cause: number of crashes of each type to judge, so that each cause of a type counts; 0 if types count.
     """
 
     def __init__(
@@ -279,8 +280,8 @@ class Kinds:
         """Add a saved crash.
 
         Args:
-            bundle: the crash.
-            ended: number of trials that have ended.
+            bundle: bundle of the crash.
+            ended: number of finished trials.
         """
         if self._add_signature(bundle):
             self.newest, self.newest_trial = time.time(), ended
@@ -289,8 +290,8 @@ class Kinds:
         """Return the crash types, the most frequent first, each with its crashes in the order of their trials.
 
         Args:
-            running: whether the groups of some moments ago are good enough, as for a screen that is refreshed ten times
-                a second. With 10,000 crashes, new groups would take too long.
+            running: whether groups some moments old are sufficient, as for a screen that is refreshed ten times a
+                second. With 10,000 crashes, new groups would take too long.
         """
         began = time.monotonic()
         if running and self._groups is None and began < self._due:
@@ -303,13 +304,14 @@ class Kinds:
         return self._groups
 
     def drop_excess(self, keep: int, *, final: bool = False) -> list[Bundle]:
-        """Return the crashes beyond the `keep` shortest of each crash type, or of each cause, and forget them.
+        """Remove and return the crashes beyond the `keep` shortest of each crash type, or of each cause.
 
-        They still count, but are no members any more. A type whose crashes are still being judged keeps all of them.
+        The removed crashes still count, but are no longer members of a group. A type whose crashes are still being
+        judged keeps all crashes.
 
         Args:
             keep: number of bundles to keep of each crash type.
-            final: whether no more crashes are judged.
+            final: whether no more crashes will be judged.
         """
         found = []
         for group in groups_of(self._signed.values()):
@@ -346,7 +348,7 @@ class Kinds:
         return list(parts.values())
 
     def next_to_judge(self) -> Bundle | None:
-        """Return the next crash whose cause is wanted; None if there is none for now."""
+        """Return the next crash to judge; None if there is currently none."""
         for division in self._divisions.values():
             if (number := division.choose()) is not None:
                 return self._signed[number][1]
@@ -357,7 +359,7 @@ class Kinds:
         return sum(division.left for division in self._divisions.values())
 
     def settle(self, judged: Judged) -> None:
-        """Add the cause of a crash."""
+        """Add the cause of a judged crash."""
         number = judged.bundle.result.spec.number
         if judged.is_stopped:
             self._divisions[self._signed[number][0]].postpone(number)
@@ -371,7 +373,7 @@ class Kinds:
 
     @property
     def types_by_cause(self) -> int | None:
-        """The number of causes, counted for each type separately; None if types count."""
+        """The number of causes, counted for each type separately; None if the hunt counts types."""
         return len(self._counted()) if self._by_cause else None
 
     def _count(self, number: int, signature: Signature, cause: Cause | None) -> None:
@@ -380,20 +382,20 @@ class Kinds:
             self._first[signature, known] = min(number, self._first.get((signature, known), number))
 
     def _counted(self) -> list[int]:
-        """Return the first trial of each counted type or cause; a type without a known cause counts once."""
+        """Return the first trial of each type or cause that counts; a type without a known cause counts once."""
         caused = {signature for signature, cause in self._first if cause is not None}
         return sorted(
             number for (signature, cause), number in self._first.items() if cause is not None or signature not in caused
         )
 
     def _priority(self, bundle: Bundle) -> tuple[bool, int, int]:
-        """Return the sort key of crashes to keep: wanted crashes first, and among them the shortest."""
+        """Return the sort key of crashes to keep: wanted crashes first, and shorter crashes before longer ones."""
         result = bundle.result
         return self._only_at_fault and result.spec.number not in self._at_fault, result.steps, result.spec.number
 
     @property
     def until(self) -> int | None:
-        """The least number of a trial up to which there are enough crash types; None if there are not enough."""
+        """The least trial number up to which enough crash types were found; None if there are not enough."""
         firsts = self._counted()
         return firsts[self._wanted - 1] if 0 < self._wanted <= len(firsts) else None
 
@@ -404,7 +406,7 @@ class Kinds:
 
     @property
     def dropped_at_fault(self) -> list[int]:
-        """The trials whose bundles were deleted and whose crashes are the agent's fault."""
+        """The trials with deleted bundles whose crashes are the agent's fault."""
         return sorted(self._dropped_at_fault)
 
     def refresh(self, crashes: Sequence[Bundle]) -> None:
@@ -455,10 +457,11 @@ def prune_bundles(
 
     Args:
         ledger: ledger of the hunt.
-        kinds: The crash types of the hunt, which forget the removed crashes; None where the first crash ends the hunt.
+        kinds: The crash types of the hunt, from which removed crashes are deleted; None if the hunt ends at its first
+            crash.
         crashes: The crashes with a bundle.
-        keep: Number of bundles that stay of each crash type; 0 for all.
-        final: whether no more crashes are judged.
+        keep: Number of bundles to keep of each crash type; 0 for all.
+        final: whether no more crashes will be judged.
 
     Raises:
         HuntDirectoryError: the ledger cannot be written.
@@ -474,7 +477,7 @@ def prune_bundles(
 
 
 def dropped_crashes(hunts: Iterable[Path]) -> dict[str, int]:
-    """Return for each crash type, in words, the number of crashes that have no bundle, only a row in a ledger."""
+    """Return the number of crashes without a bundle, which have only a row in a ledger, by crash type (as text)."""
     found: Counter[str] = Counter()
     for hunt in hunts:
         if not (hunt / layout.LEDGER).is_file():

@@ -1,7 +1,7 @@
-"""Runs from the start after the last trial: crashes of copies, and the most dangerous trials without a crash.
+"""Runs from the start after the last trial: of crashes of forks, and of the most critical trials without a crash.
 
-The branches and probes of all trials are summed up. A copy only shows a possible crash. A run from the start confirms
-it, because its bundle can be replayed.
+The results of the branches and robustness probes of all trials are summed up. A fork shows only a possible crash. A run
+from the start confirms the crash, because the bundle of the run can be replayed.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ _MAX_VERIFIED_BRANCHES = 10  # trials; each takes two processes of its own
 
 
 def verify_branches(copies: VerificationRuns) -> BranchReport | None:
-    """Sum up the branches of all trials, and run the likeliest that crashed again from the start in new processes.
+    """Sum up the branches of all trials, and run the likeliest crashed ones from the start in new processes.
 
     Args:
-        copies: runs crashes of copies again.
+        copies: object that runs crashes of forks from the start.
 
     Returns:
         The report; None for a hunt without branches.
@@ -103,7 +103,7 @@ def verify_branches(copies: VerificationRuns) -> BranchReport | None:
 
 
 def likeliest(result: TrialResult) -> Found | None:
-    """Return the likeliest crashed branch of a trial, as a specification from the start; None if no branch crashed."""
+    """Return the likeliest crashed branch of a trial as a trial from the start; None if no branch crashed."""
     if result.branches is None or not result.branches.crashes:
         return None
     return _specification(result, max(result.branches.crashes, key=_log_likelihood))
@@ -124,10 +124,10 @@ _MAX_VERIFIED_PROBES = 3  # trials; each takes two processes of its own
 
 
 def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
-    """Sum up the probes of all trials, and run the mildest that crashed again from the start in new processes.
+    """Sum up the probes of all trials, and run the mildest crashed ones from the start in new processes.
 
     Args:
-        copies: runs crashes of copies again.
+        copies: object that runs crashes of forks from the start.
 
     Returns:
         The report; None for a hunt without probes.
@@ -175,7 +175,7 @@ def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
 
 
 def _as_it_took_place(stress: Stress | None, result: TrialResult) -> Disturbance:
-    """Return the disturbance of a probe as it took place in the run from the start."""
+    """Return the disturbance of a probe with the values that it actually had in the run from the start."""
     assert stress is not None
     planned = stress.disturbance
     assert planned is not None
@@ -184,7 +184,7 @@ def _as_it_took_place(stress: Stress | None, result: TrialResult) -> Disturbance
 
 
 def mildest(result: TrialResult) -> Found | None:
-    """Return a trial with the mildest disturbance that made a probe crash, from the start; None if no probe crashed."""
+    """Return a trial from the start with the mildest disturbance that made a probe crash; None if no probe crashed."""
     stress = result.stress
     if stress is None or stress.disturbance is None:
         return None
@@ -196,15 +196,15 @@ def mildest(result: TrialResult) -> Found | None:
 
 
 class ForkCrashes:
-    """Runs crashes of copies from the start, if such a crash may end the hunt.
+    """Runs crashes of forks from the start, if such a crash may end the hunt.
 
-    Only crashes by the hunt's own kinds of disturbances may end it. Probes also try all other kinds, and with the
-    strongest plausible disturbance nearly every trial crashes. Such a crash measures the trial, but is not one that the
-    hunt searches. If the hunt counts crash types or crashes at fault, only trials end it.
+    Only crashes with the disturbance kinds of the hunt may end the hunt. Probes also try all other kinds, and with the
+    strongest plausible disturbance nearly every trial crashes. Such a crash measures the robustness of the trial, but
+    the hunt does not search for it. If the hunt counts crash types or crashes at fault, only trials end the hunt.
 
     Args:
-        copies: runs crashes of copies from the start.
-        progress: progress of the hunt, which receives these crashes.
+        copies: object that runs crashes of forks from the start.
+        progress: progress of the hunt, to which these crashes are added.
         trials: trials of the hunt that are still to run.
     """
 
@@ -217,7 +217,7 @@ class ForkCrashes:
         self._waiting: list[TrialResult] = []
 
     def resume(self) -> None:
-        """Add trials of earlier runs of the hunt, which may have been killed before it examined them."""
+        """Add trials of earlier runs of the hunt, which may have been killed before they examined these trials."""
         ledger = self._copies.again.ledger
         if not self._ends or self._progress.is_done:
             return
@@ -231,15 +231,15 @@ class ForkCrashes:
         self.look()
 
     def add(self, result: TrialResult) -> None:
-        """Add a trial that has ended without a crash."""
+        """Add a finished trial that did not crash."""
         if self._ends and self._crashes_of_copies(result):
             self._waiting.append(result)
 
     def look(self, tell: Callable[[], None] = lambda: None) -> bool:
-        """Run the crashes of copies of the added trials from the start; return whether one ends the hunt.
+        """Run the crashes of the added trials' forks from the start; return whether one of them ends the hunt.
 
         Args:
-            tell: called before the first run.
+            tell: function called before the first run.
         """
         waiting = sorted(self._waiting, key=lambda result: result.spec.number)
         self._waiting = [result for result in waiting if self._comes_later(result.spec.number)]
@@ -258,12 +258,12 @@ class ForkCrashes:
         return ends
 
     def _comes_later(self, number: int) -> bool:
-        """Return whether a trial with a lower number has not begun, as after a kill of the hunt."""
+        """Return whether a trial with a lower number has not begun, for example after the hunt was killed."""
         upcoming = self._trials.upcoming
         return self._deterministic and upcoming is not None and upcoming < number
 
     def _crashes_of_copies(self, result: TrialResult) -> list[tuple[str, Found]]:
-        """Return the crash of a copy by the hunt's own kinds of disturbances: the likeliest branch, or a probe."""
+        """Return the crash of a fork with the disturbance kinds of the hunt: the likeliest branch, or a probe."""
         every = ((layout.BRANCHES, likeliest(result)), (layout.PROBES, mildest(result)))
         return [(folder, one) for folder, one in every if one is not None and self._is_of_the_hunt(one)]
 
@@ -277,10 +277,10 @@ class ForkCrashes:
 
 
 def verify_fork_results(copies: VerificationRuns) -> tuple[ProbeReport | None, BranchReport | None]:
-    """Run crashes of copies from the start, and record how many are confirmed.
+    """Run crashes of forks from the start, and record how many are confirmed.
 
     Args:
-        copies: runs crashes of copies from the start.
+        copies: object that runs crashes of forks from the start.
     """
     probes, branches = verify_probes(copies), verify_branches(copies)
     found = {PROBES: probes, BRANCHES: branches}
@@ -296,14 +296,14 @@ def verify_fork_results(copies: VerificationRuns) -> tuple[ProbeReport | None, B
 
 
 def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport | None:
-    """Estimate the rate, and run the weightiest crashes of copies from the start, in fresh processes.
+    """Estimate the crash rate, and run the fork crashes with the greatest weights from the start, in new processes.
 
     Args:
-        copies: runs them.
-        differences: number of trials of the audit that were not bit-identical.
+        copies: object that runs crashes of forks from the start.
+        differences: number of audited trials that were not bit-identical.
 
     Returns:
-        None if the hunt is not in rare mode.
+        The report; None if the hunt is not in rare mode.
     """
     again = copies.again
     rule = rare_watch(again.settings, again.ledger, copies.disturber)
@@ -341,11 +341,12 @@ def _crash_of_copy(result: TrialResult, copy: ForcedCopy) -> Found:
 
 
 def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
-    """Save bundles of the most critical trials of a hunt, and delete others; return the bundles in that order.
+    """Save bundles of the most critical trials of a hunt, and delete other bundles; return them in this order.
 
     Args:
-        again: runs trials of the hunt again. Its settings have the number of bundles; with 0, existing bundles stay.
-            Its notes get a line for each trial that could not be kept, with the reason.
+        again: object that runs trials of the hunt again. Its settings contain the number of bundles to keep; if this is
+            0, existing bundles are not changed. For each trial that could not be kept, a line with the reason is added
+            to its notes.
     """
     directory, ledger, keep = again.place.path, again.ledger, again.settings.run.near_misses
     if not keep or len(again.stops):

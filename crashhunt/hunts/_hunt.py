@@ -1,4 +1,4 @@
-"""The hunt: samples trials, runs them in parallel, stops at the first crash, and saves it."""
+"""The hunt: draws trials, runs them in parallel, stops at the first crash, and saves the crash."""
 
 from __future__ import annotations
 
@@ -61,19 +61,19 @@ _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker wa
 
 
 class Hunt:
-    """One hunt in one directory.
+    """One hunt, which belongs to one directory.
 
-    A hunt with the same settings on the same directory resumes. Settings that make other trials are refused.
+    A hunt with the same settings in the same directory resumes. Settings that would result in other trials are refused.
 
     Args:
         directory: directory of the hunt, created if it does not exist.
         scenario: scenario of the trials.
         settings: settings of the hunt.
-        command: the command line, as a comment in ``hunt.toml``.
+        command: the command line, which is written to ``hunt.toml`` as a comment.
         overwrite: whether a new hunt replaces an existing one.
         seed_given: whether the user chose the seed; if not, a resumed hunt keeps its own seed.
         snapshot: options of the snapshot of the code.
-        imported: the modules that trials import, as `take_snapshot` takes them.
+        imported: the modules that trials import, in the form for `take_snapshot`.
     """
 
     def __init__(
@@ -101,14 +101,15 @@ class Hunt:
         self._progress: Progress | None = None  # once the ledger says that the hunt runs
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
-        """Hunt until a crash, the last trial or an interrupt.
+        """Run the hunt until a crash, the last trial or an interrupt.
 
         Args:
-            watch: called about ten times a second.
+            watch: function called with the progress about ten times a second.
 
         Raises:
-            HuntDirectoryError: the directory is busy, foreign, unwritable or full.
-            CrashhuntError: a process or a file failed; an `InternalError` if crashhunt has a defect.
+            HuntDirectoryError: the directory is in use, belongs to another hunt, or cannot be written, or the disk is
+                full.
+            CrashhuntError: a process or a file failed; `InternalError` if crashhunt has a defect.
         """
         with self._place.locked(), stop_requests() as self._stops:
             self.settings = self._place.claim(
@@ -306,7 +307,7 @@ class Hunt:
     def _show_phase(
         self, ledger: Ledger, progress: Progress, watch: Callable[[HuntStatus], None]
     ) -> Callable[[PhaseStatus], None]:
-        """Return a function that shows the progress after the last trial, on the screen and in the ledger."""
+        """Return a function that shows the progress after the last trial, and records it in the ledger."""
         noted = -math.inf
 
         def show(phase: PhaseStatus) -> None:
@@ -322,7 +323,7 @@ class Hunt:
         return show
 
     def _resume_counts(self, ledger: Ledger, progress: Progress, before: Facts, settings: HuntSettings) -> None:
-        """Add the trials of earlier runs to the counts of the screen."""
+        """Add the trials of earlier runs of the hunt to the counts on the screen."""
         if before.get("origins"):
             progress.searching.resume(sum(progress.outcomes.values()), ledger.tried_by_origin(settings.crash_on))
         branches, probes = sums_of_branches(ledger, before), sums_of_probes(ledger, before)
@@ -420,7 +421,7 @@ class Hunt:
         return "all_trials" if trials.exhausted else "time"
 
     def _expect_end(self, progress: Progress, parallel: int) -> None:
-        """Estimate when the last trial ends."""
+        """Estimate the time at which the last trial ends."""
         left = self.settings.trials - sum(progress.outcomes.values())
         found = progress.remaining.seconds_left(time.monotonic(), left, parallel) if left > 0 else 0.0
         found = min(found, progress.time_left_s)
@@ -428,13 +429,13 @@ class Hunt:
         progress.ends_at = time.time() + found if self.settings.trials and math.isfinite(found) else None
 
     def _cancelled(self, executor: Executor, in_flight: set[int], wanted: int) -> set[int]:
-        """Cancel trials that a wanted crash makes unnecessary; return the running trials that are still needed."""
+        """Cancel trials that are no longer needed after a wanted crash; return the running trials still needed."""
         above = wanted if self.settings.run.deterministic else -1
         executor.cancel(above=above)
         return {number for number in in_flight if number <= above}
 
     def _result_lag(self, before: Facts) -> tuple[int, bool]:
-        """Return the delay of results for the sampler, in trials, and whether the delay is smaller at first."""
+        """Return the number of trials by which results reach the sampler late, and whether it is smaller at first."""
         under_way = _under_way(self.settings.run.parallel or self._parallel_here)
         if not self.settings.run.deterministic:
             return under_way, False
@@ -445,7 +446,7 @@ class Hunt:
     def _receive_results(
         self, executor: Executor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0
     ) -> None:
-        """Record notices about how the trials were run, and the results of the audit."""
+        """Record notices about the execution of trials, and the results of the audit."""
         for note in self._heard.take(executor):
             ledger.remark(note)
             progress.notes.append(note)
@@ -472,7 +473,7 @@ class Hunt:
         """Write the ledger again if its file was removed while the hunt ran.
 
         Raises:
-            HuntDirectoryError: another file is in its place, or the directory is gone.
+            HuntDirectoryError: another file has replaced the ledger, or the directory was removed.
         """
         if ledger.restore():
             note = "ledger.sqlite was removed while the hunt ran, and was written anew with everything that was in it"
@@ -482,7 +483,7 @@ class Hunt:
     def _record_trial(
         self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, trials: Trials, progress: Progress
     ) -> None:
-        """Write the row of a trial that has ended, after the files that belong to it; then count the trial."""
+        """Write the files of a finished trial, then its row in the ledger; then count the trial."""
         settings = self.settings
         if self._disturber is not None:
             result = replace(result, log_likelihood=self._disturber.log_likelihood_of(result))
@@ -500,7 +501,7 @@ class Hunt:
         trials.ended(result)
 
     def _save(self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, progress: Progress) -> None:
-        """Save a crash: first the bundle, then the row, so that a crash in the ledger always has its bundle."""
+        """Save a crash: first the bundle, then the row, so that every crash in the ledger has a bundle."""
         trial = scratch_of(self._place.scratch, result.spec.number)
         bundle = write_bundle(
             self.directory,
@@ -515,7 +516,7 @@ class Hunt:
 
     @property
     def _parallel_here(self) -> int:
-        """Return the number of trials that this machine runs again at a time, independent of the executor."""
+        """Return how many trials this machine can run again at a time, independently of the executor."""
         return parallel_here(self.settings.run.executor, self.settings.run.parallel)
 
     def _status(
@@ -551,7 +552,7 @@ class Hunt:
 
 
 def _rate_of(directory: Path, watch: BarWatch | None, stopped: StoppedBecause) -> CrashRate | None:
-    """Return the final rate of a hunt with a bar."""
+    """Return the final crash rate of a hunt that compares its rate with a threshold."""
     if watch is None:
         return None
     why_not = "" if stopped in ("rate", "all_trials") else "the number of trials was not fixed ahead"
@@ -566,5 +567,5 @@ def _rate_of(directory: Path, watch: BarWatch | None, stopped: StoppedBecause) -
 
 
 def _under_way(parallel: int) -> int:
-    """Return the number of submitted trials for a number of running ones."""
+    """Return the number of submitted trials that are needed for a number of running trials."""
     return parallel * (1 + _QUEUED_PER_WORKER)

@@ -1,4 +1,7 @@
-"""The specification of each trial of a hunt. If a trial does not follow from the seed, the ledger has it in advance."""
+"""The specification of each trial of a hunt.
+
+A trial that does not follow from the seed is in the ledger before it starts.
+"""
 
 from __future__ import annotations
 
@@ -50,43 +53,43 @@ _FIRST_LAG, _TRIALS_PER_LAG = 4, 8  # delay of the first trials, and trials afte
 
 
 def growing_lag(number: int, most: int) -> int:
-    """Return the delay of results before a trial of a deterministic hunt, in trials: it grows to the greatest.
+    """Return the delay, in trials, with which a learning sampler receives results; it grows up to a maximum.
 
     A sampler learns most from its first results, and a delay costs it about as many trials as its length (Joulani,
-    György and Szepesvári 2013, for stochastic bandits). Two workers are never idle for the small delay, and 16 only
-    before trial 96.
+    György and Szepesvári 2013, for stochastic bandits). With this growing delay, two workers are never idle, and 16
+    workers are idle only before trial 96.
 
     Args:
         number: number of the trial.
-        most: the greatest delay.
+        most: the maximum delay.
     """
     return min(most, _FIRST_LAG + number // _TRIALS_PER_LAG)
 
 
 class Trials:
-    """Hands out the trials of a hunt that are still to run, in order of their numbers.
+    """Provides the trials of a hunt that are still to run, in the order of their numbers.
 
-    If the sampler does not learn, a trial follows from the hunt's seed and its number. If it learns, the ledger has
-    each proposal before its trial starts, with the results that the sampler had received. `crashhunt.samplers.Sampler`
-    defines when it receives results.
+    If the sampler does not learn, a trial follows from the hunt's seed and the number of the trial. If the sampler
+    learns, the ledger contains each proposal before its trial starts, with the results that the sampler had received.
+    `crashhunt.samplers.Sampler` defines when the sampler receives results.
 
     Args:
         settings: settings of the hunt.
-        sampler: the sampler.
+        sampler: sampler that proposes the trials.
         ledger: ledger of the hunt.
-        finished: the numbers of the trials that have ended.
-        unanswered: the ended trials that run again, in order of their numbers, because an outside cause prevented some
-            results. The sampler receives the result in the ledger, not that of the second run, so a resumed hunt
-            proposes the same trials.
+        finished: the numbers of the finished trials.
+        unanswered: the finished trials that run again, in the order of their numbers, because some of their results are
+            missing for an external reason. The sampler receives the result in the ledger, not the result of the second
+            run, so a resumed hunt proposes the same trials.
         lag: number of trials that run at a time; in a deterministic hunt, the maximum number.
         lag_grows: whether the first trials of a deterministic hunt have a smaller lag (`growing_lag`).
-        disturber: draws the disturbances of trials; None if trials have none.
-        forcings: the forcing of each root, in rare mode; None in any other hunt.
+        disturber: object that draws the disturbances of trials; None if trials have no disturbances.
+        forcings: object that returns the forcing of each root in rare mode; None in any other hunt.
 
-        begun_with: the version of the sampler's proposals in the hunt so far; None if the hunt has none.
+        begun_with: version of the proposals that the hunt already contains; None if it contains none.
 
     Raises:
-        CrashhuntError: the sampler fails, or the ledger is damaged.
+        CrashhuntError: the sampler failed, or the ledger is damaged.
     """
 
     def __init__(
@@ -125,7 +128,10 @@ class Trials:
 
     @property
     def upcoming(self) -> int | None:
-        """The number of the next trial; all lower ones are running or have ended. None if there is none."""
+        """The number of the next trial; trials with lower numbers are running or have ended.
+
+        None if no trial is left.
+        """
         upcoming = [one.number for one in list(self._unanswered)[:1]] + [
             one for one in (self._next,) if one is not None
         ]
@@ -133,14 +139,14 @@ class Trials:
 
     @property
     def exhausted(self) -> bool:
-        """Whether all trials were handed out."""
+        """Whether all trials have been provided."""
         return self._next is None and not self._unanswered
 
     def take(self, room: int) -> list[TrialSpec]:
-        """Return at most a number of next trials; fewer if there are no more, or if the sampler needs a result first.
+        """Return at most ``room`` next trials; fewer if no more exist, or if the sampler needs a result first.
 
         Raises:
-            CrashhuntError: the sampler fails, or the ledger cannot be written.
+            CrashhuntError: the sampler failed, or the ledger cannot be written.
         """
         found: list[TrialSpec] = []
         while self._unanswered and len(found) < room:
@@ -174,7 +180,7 @@ class Trials:
         return found
 
     def ended(self, result: TrialResult) -> None:
-        """Register the result of a trial, which is already in the ledger or is written next."""
+        """Register the result of a trial, which is already in the ledger or will be written next."""
         number = result.spec.number
         if number in self._running_again:
             self._running_again.discard(number)
@@ -185,7 +191,7 @@ class Trials:
             heappush(self._untold, number)
 
     def _refuse_other_version(self) -> None:
-        """Refuse to mix proposals of two versions: the seed of the hunt would no longer repeat it."""
+        """Refuse to mix proposals of two versions, because the hunt's seed could then no longer repeat the hunt."""
         name, version = self._settings.sampler, self._sampler.version
         if version != self._begun_with:
             raise HuntDirectoryError(
@@ -195,14 +201,14 @@ class Trials:
             )
 
     def _must_wait(self, number: int) -> bool:
-        """Whether a result that the sampler must receive before this proposal is missing."""
+        """Return whether a result that the sampler must receive before the next proposal is missing."""
         return self._settings.run.deterministic and min(self._open, default=number) <= number - self._lag_of(number)
 
     def _lag_of(self, number: int) -> int:
         return growing_lag(number, self._lag) if self._lag_grows else self._lag
 
     def _report_to_sampler(self, last: int) -> tuple[int, ...]:
-        """Pass finished results up to a number to the sampler; return their numbers."""
+        """Pass the results of finished trials up to a number to the sampler; return the numbers of these trials."""
         told = []
         while self._untold and self._untold[0] <= last:
             number = heappop(self._untold)
@@ -213,7 +219,7 @@ class Trials:
         return tuple(told)
 
     def _resume(self, finished: set[int]) -> None:
-        """Pass earlier results to the sampler in the same order, and find the proposals that have not finished."""
+        """Pass earlier results to the sampler in their original order, and find the proposals without a result."""
         told = set()
         for turn in self._ledger.turns():
             for number in turn.told:
@@ -233,16 +239,16 @@ def spec_of(
     disturber: DisturbanceSampler | None = None,
     forcing: Forcing | None = None,
 ) -> TrialSpec:
-    """Return a trial as a sampler proposes it, with the disturbances that follow from its seed.
+    """Return the trial that a sampler proposes, with the disturbances that follow from the trial's seed.
 
-    With `--seeds`, trials use the traffics in turns. A traffic fixes the seed and, with an independent sampler, the
-    scenario's arguments. Other samplers propose these arguments themselves.
+    With `--seeds`, trials use the given number of traffic seeds in turn. A traffic seed also determines the scenario's
+    arguments if the sampler is independent. Other samplers propose these arguments themselves.
 
-    With a forcing the trial is a root, in which nothing is drawn from the step on in which a first onset can be forced.
-    With splitting, a root has the disturbances of a plain trial.
+    With a forcing, the trial is a root. In a root, no disturbance is drawn from the first step on in which one may be
+    forced. With splitting, a root has the disturbances of a plain trial.
 
     Raises:
-        CrashhuntError: the sampler fails.
+        CrashhuntError: the sampler failed.
     """
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
     seed = int(rng.integers(2**31))
@@ -274,7 +280,7 @@ def spec_of(
 
 
 def _drawn(disturber: DisturbanceSampler, seed: int, steps: int, forcing: Forcing | None) -> tuple[Disturbance, ...]:
-    """Return the disturbances of a trial; for a root, only those before the first step with a forced onset."""
+    """Return the disturbances of a trial; for a root, only those before the first step with a forced disturbance."""
     forces = forcing is not None and forcing.levels is None
     return disturber.draw(seed, min(steps, FIRST_STEP - 1) if forces else steps)
 
@@ -283,9 +289,9 @@ def _drawn(disturber: DisturbanceSampler, seed: int, steps: int, forcing: Forcin
 
 
 def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
-    """Return the settings for workers of a hunt.
+    """Return the settings for the workers of a hunt.
 
-    Trials run from the snapshot: the saved code is the code that ran, even if the user edits the originals.
+    Trials run from the snapshot, so the saved code is the code that ran, even if the user edits the original files.
     """
     run = settings.run
     return replace(
@@ -302,12 +308,12 @@ def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Pat
 
 
 def settings_again(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
-    """Return the settings for processes that run single trials of a hunt again, to record them."""
+    """Return the settings for processes that run single trials of a hunt again to record them."""
     return replace(_settings(settings, snapshot, scratch), keep_trials=True)
 
 
 def _settings(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
-    """Return the settings that `settings_of_workers` and `settings_again` have in common."""
+    """Return the settings that are common to `settings_of_workers` and `settings_again`."""
     return WorkerSettings(
         scenario=with_settings(snapshot.scenario(), settings),
         oracles=settings.oracles,
@@ -327,10 +333,10 @@ _UNANSWERED_SQL = """instr(result, '"may_be_asked_again": true') > 0"""
 
 
 def find_unanswered(ledger: Ledger) -> list[TrialResult]:
-    """Return the trials that are to run again, as the ledger of a hunt has them.
+    """Return the trials that are to run again, from the ledger of a hunt.
 
     Raises:
-        HuntDirectoryError: a row of the ledger has changed.
+        HuntDirectoryError: a row of the ledger has changed since it was written.
     """
     where = (
         _WAS_KILLED_SQL if not ledger.facts().get("copies") else f"{_WAS_KILLED_SQL} OR {_UNANSWERED_SQL}"
@@ -351,20 +357,20 @@ class Unanswered:
         self._open: set[int] = set()  # of this run of the hunt
 
     def __len__(self) -> int:
-        """Return the number of trials that are still to run again."""
+        """Return the number of trials that are still to be run again."""
         return len(self._open | self._before.keys())
 
     @property
     def specs(self) -> list[TrialSpec]:
-        """Return the trials that run again, in order of their numbers."""
+        """Return the trials to run again, in the order of their numbers."""
         return [result.spec for result in self._before.values()]
 
     def account(self, result: TrialResult, progress: Progress) -> bool:
-        """Register an ended trial; return whether its result is to be recorded.
+        """Register a finished trial; return whether its result is to be recorded.
 
         Args:
             result: result of the trial.
-            progress: progress of the hunt, which has counted the trial before if it runs again.
+            progress: progress of the hunt, which has already counted the trial once if it runs again.
         """
         if result.is_to_be_run_again:
             self._open.add(result.spec.number)

@@ -1,4 +1,4 @@
-"""Checks before the first trial: report an agent that cannot start once, not as many invalid trials."""
+"""Checks at the start of a hunt, so that an agent that cannot start causes one error and not many invalid trials."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ _ENOUGH_CANDIDATES = 4
 
 
 class Preflight:
-    """Holds back the first results of a hunt while all of them are the same failure of an agent to start.
+    """Holds back the first results of a hunt as long as all of them are the same start-up failure of an agent.
 
-    This takes no time, because these are the hunt's own first trials. If an argument of the agent varies, another value
-    may work, so no result is held back.
+    This check takes no additional time, because it uses the hunt's own first trials. If an argument of the agent
+    varies, another value may work, so no result is held back.
 
     Args:
         settings: settings of the hunt.
         planned: number of planned trials.
-        files: files of arguments that name files, to where the snapshot has them.
+        files: paths in the snapshot by path, for files that arguments name.
         code: folders of the snapshot from which agents are imported.
-        listen: called before the first result is accounted for; it may refuse the hunt.
+        listen: function called before the first result is counted; it may refuse the hunt.
     """
 
     def __init__(
@@ -69,10 +69,10 @@ class Preflight:
         self._listen = listen
 
     def filter_setup_failures(self, result: TrialResult) -> list[TrialResult]:
-        """Return the results to account for now: none yet, or this result and those that were held back.
+        """Return the results to count: none as long as results are held back, or this result and the held-back ones.
 
         Raises:
-            ArgumentError: the agent does not start, whatever the trial.
+            ArgumentError: the agent does not start in any trial.
         """
         if self._passed or not self._is_of_an_agent(result):
             if not self._passed:
@@ -121,18 +121,18 @@ class Preflight:
         )
 
     def _refusal_as_requested(self, text: str) -> str:
-        """Return the result with the file names that the user gave, instead of the files in the snapshot."""
+        """Return the result with the file names that the user gave, instead of those in the snapshot."""
         for there, here in self._names.items():
             text = text.replace(there, here)
         return text
 
 
 class WorkerNotices:
-    """Notices of workers; they are read before the first result is recorded, because they may refuse the hunt.
+    """Notices of workers. They are read before the first result is recorded, because a notice may refuse the hunt.
 
     Args:
         settings: settings of the hunt.
-        outcomes: outcome to the number of ended trials with this outcome.
+        outcomes: number of finished trials with each outcome.
     """
 
     def __init__(self, settings: HuntSettings, outcomes: Mapping[str, int]) -> None:
@@ -144,8 +144,8 @@ class WorkerNotices:
         """Read the notices of an executor's workers.
 
         Raises:
-            UsageError: trials cannot be copied, as the first ones have shown after their first step. Once any has
-                ended, the hunt continues without copies.
+            UsageError: trials cannot be forked, which the first trials show after their first step. If a trial has
+                already ended, the hunt continues without forks.
         """
         for note in executor.notes():
             what, left_out, why = note.partition(EXCLUDED_WORDS)
@@ -157,7 +157,7 @@ class WorkerNotices:
         """Return the notices that were not returned before.
 
         Raises:
-            UsageError: as of `hear`.
+            UsageError: trials cannot be forked, as for `hear`.
         """
         self.hear(executor)
         notes, self._notes = self._notes, []
@@ -176,11 +176,11 @@ class WorkerNotices:
 
 
 def is_hopeless(settings: HuntSettings, outcomes: Mapping[str, int]) -> bool:
-    """Return whether so many trials have failed in their setup, and none succeeded, that the hunt should end.
+    """Return whether the hunt should end because many trials failed in their setup and no trial succeeded.
 
     Args:
         settings: settings of the hunt.
-        outcomes: outcome to the number of its trials.
+        outcomes: number of trials with each outcome.
     """
     enough = min(settings.most_trials, max(_MAX_INVALID_AT_START, 2 * settings.run.parallel))
     invalid = outcomes.get(str(Outcome.INVALID), 0)
@@ -188,7 +188,7 @@ def is_hopeless(settings: HuntSettings, outcomes: Mapping[str, int]) -> bool:
 
 
 def why_invalid(result: TrialResult, scenario: Scenario) -> str:
-    """Return why a trial could not be set up, with the last message of the simulator."""
+    """Return the reason why a trial could not be set up, including the last message of the simulator."""
     explained = scenario.backend.explained
     if explained is not None and result.failure is not None:
         error = explained(result.summary, result.failure.last_output, scenario)
@@ -216,11 +216,11 @@ SURVEY_OUTPUT = "output.log"
 
 
 class TrafficSurveyor:
-    """Replaces the candidates from the route files by the vehicles that really enter.
+    """Replaces the candidates from the route files by the vehicles that really enter in a simulation.
 
     Args:
         directory: directory of the hunt. An existing hunt keeps its candidates.
-        overwrite: whether that hunt is to be removed.
+        overwrite: whether an existing hunt is replaced.
     """
 
     def __init__(self, directory: Path, *, overwrite: bool) -> None:
@@ -232,11 +232,11 @@ class TrafficSurveyor:
 
         Args:
             scenario: the loaded scenario.
-            request: the request of the user.
+            request: the user's request.
             settings: the settings without a survey.
 
         Raises:
-            ScenarioError: no trial can be valid.
+            ScenarioError: no trial of the scenario can be valid.
         """
         survey = scenario.backend.survey
         if survey is None or request.ego not in ("", "any") or Path(scenario.file).suffix == ".toml":
@@ -262,7 +262,7 @@ class TrafficSurveyor:
         return refined
 
     def _has_begun_with(self, settings: HuntSettings) -> bool:
-        """Return whether the existing hunt has the candidates of the route files, because its survey failed."""
+        """Return whether the existing hunt uses the candidates from the route files, because its survey failed."""
         if self._overwrite:
             return False
         with suppress(CrashhuntError, OSError):
@@ -277,7 +277,7 @@ class TrafficSurveyor:
 
 
 def _runs(settings: HuntSettings, drawn: set[str]) -> list[RunToSurvey]:
-    """Return a run with the scenario's arguments at the low ends of their ranges, and one with the high ends."""
+    """Return two runs: all scenario arguments at the low ends of their ranges, and all at the high ends."""
     shares = [index / (len(SURVEY_SEEDS) - 1) for index in range(len(SURVEY_SEEDS))]
     return [
         {
@@ -293,14 +293,14 @@ def _runs(settings: HuntSettings, drawn: set[str]) -> list[RunToSurvey]:
 
 
 class _SurveyKilledError(SimulatorError):
-    """Another process, or the kernel, ended the process that simulates the plain traffic."""
+    """Another process or the kernel killed the process that simulates the unmodified traffic."""
 
 
 def _survey_despite_kills(scenario: Scenario, runs: list[RunToSurvey]) -> Json:
-    """Return the completed runs, of another process where one was killed from outside.
+    """Return the completed runs of a process; if it is killed from outside, another process is started.
 
     Raises:
-        SimulatorError: the process failed or took too long, or each process was killed.
+        SimulatorError: the process failed or took too long, or every process was killed.
     """
     for _ in range(MAX_ATTEMPTS - 1):
         with suppress(_SurveyKilledError):
@@ -309,7 +309,7 @@ def _survey_despite_kills(scenario: Scenario, runs: list[RunToSurvey]) -> Json:
 
 
 def _survey(scenario: Scenario, runs: list[RunToSurvey]) -> Json:
-    """Return the completed runs.
+    """Return the completed runs of one process.
 
     Raises:
         _SurveyKilledError: the process was killed from outside.

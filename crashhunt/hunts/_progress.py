@@ -1,4 +1,4 @@
-"""Progress of a hunt: the numbers for the status screen, ``status`` and the page; phases and the time left."""
+"""Progress of a hunt: the figures for the status screen, ``status`` and the dashboard; phases and the time left."""
 
 from __future__ import annotations
 
@@ -58,10 +58,11 @@ class StrategyStatus:
 
     Args:
         name: name of the strategy.
-        trials: number of ended trials that the strategy proposed.
-        share: share of all ended trials, 0 to 1.
-        danger: mean criticality of its trials, 0 to 1, where a crash counts as 1; None if it is unknown.
-        crashes: crashes among its trials.
+        trials: number of finished trials that the strategy proposed.
+        share: share of all finished trials, from 0 to 1.
+        danger: mean criticality of the strategy's trials, from 0 to 1, in which a crash counts as 1; None if it is
+            unknown.
+        crashes: number of crashes among the strategy's trials.
     """
 
     name: str
@@ -73,12 +74,13 @@ class StrategyStatus:
 
 @dataclass(frozen=True, slots=True)
 class SearchStatus:
-    """Progress of a search, for the status screen.
+    """Progress of the search, for the status screen.
 
     Args:
-        strategies: the strategies with trials, the most frequent first; empty if the sampler names none.
-        grown_trials: number of trials since the last rise of the greatest danger; None without a rise in this run.
-        grown_s: time since this rise, in s of wall time; None likewise.
+        strategies: strategies that have proposed trials, the most frequent first; empty if the sampler reports no
+            strategies.
+        grown_trials: number of trials since the greatest criticality last rose; None if it did not rise in this run.
+        grown_s: time since the greatest criticality last rose, in s of wall time; None if it did not rise in this run.
     """
 
     strategies: tuple[StrategyStatus, ...] = ()
@@ -96,25 +98,26 @@ class _Tally:
 
 @dataclass(slots=True)
 class StrategyTally:
-    """Counts the trials of each strategy, also those of earlier runs of the hunt."""
+    """Counts the trials of each strategy, including those of earlier runs of the hunt."""
 
     ended: int = 0
     _tallies: dict[str, _Tally] = field(default_factory=dict)
     _grown: tuple[int, float] | None = None  # after how many trials, and when
 
     def resume(self, ended: int, tried: Iterable[tuple[str, int, int, float, int]]) -> None:
-        """Count the trials of earlier runs.
+        """Add the counts of trials of earlier runs.
 
         Args:
-            ended: number of trials that have ended.
-            tried: for each origin its name, trials, trials with a danger, their sum of danger, and crashes.
+            ended: number of finished trials.
+            tried: for each origin: name, number of trials, number of trials with criticality, sum of their criticality,
+                and number of crashes.
         """
         self.ended = ended
         for name, trials, measured, danger, crashes in tried:
             self._tallies[name] = _Tally(trials=trials, measured=measured, danger=danger, crashes=crashes)
 
     def take(self, result: TrialResult, *, crashed: bool) -> None:
-        """Count a trial that has ended."""
+        """Count a finished trial."""
         self.ended += 1
         if not result.spec.origin:
             return
@@ -131,7 +134,7 @@ class StrategyTally:
         self._grown = self.ended, time.monotonic()
 
     def status(self) -> SearchStatus:
-        """Return the progress of the search."""
+        """Return the present progress of the search."""
         strategies = [
             StrategyStatus(
                 name=name,
@@ -154,28 +157,28 @@ class HuntStatus:
 
     Args:
         phase: ``hunting``, ``saving``, ``auditing``, ``done``, or a name of `PhaseStatus`.
-        planned: trials in all; 0 if only the time is limited.
-        done: trials that have ended, in earlier runs of the hunt too.
+        planned: total number of trials; 0 if only the time is limited.
+        done: number of finished trials, including those of earlier runs of the hunt.
         outcomes: number of trials with each outcome.
-        rate_per_s: trials a second in this run.
-        elapsed_s: wall time of this run.
+        rate_per_s: trials per second in this run of the hunt.
+        elapsed_s: wall time of this run of the hunt, in s.
         nearest: the trial without a crash that came nearest to one.
-        workers: trial number to the progress of the trial.
-        crashes: found so far, with or without a bundle.
-        nodes: the machines that run trials now; None if it is only this machine.
-        kinds: kinds of crashes, the most frequent first; None if the first crash ends the hunt.
+        workers: progress of each running trial, by number.
+        crashes: number of crashes, with or without a bundle.
+        nodes: the machines that currently run trials; None if only this machine does.
+        kinds: crash types, the most frequent first; None if the hunt ends at its first crash.
         newest_kind_s: time since the last new crash type, in s; None if unknown.
         newest_kind_trials: number of trials since the last new crash type; None if an earlier run of the hunt found it.
-        types_by_cause: number of causes, each type on its own; None if types count.
+        types_by_cause: number of causes, counted separately for each crash type; None if the hunt counts types.
         time_left_s: time until no more trials begin, in s of wall time; infinite without a limit.
         disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
-        stressed: the trial with the least stress margin; None if no copy was asked, or if no copy crashed.
+        stressed: the trial with the least robustness margin; None if there were no probes, or if no probe crashed.
         branched: number of branches that have crashed.
         not_fully_asked: number of trials in which a probe or branch has no result.
-        search: trials of each strategy, and the last rise of the greatest danger in this run.
-        rate: the crash rate so far; None if there is none.
-        trials_left_s: time until the last trial ends, in s of wall time; None for an estimate by the mean rate.
-        progress: progress of the work after the last trial; None before.
+        search: trials of each strategy, and the last rise of the greatest criticality in this run.
+        rate: the current crash rate; None if there is none.
+        trials_left_s: time until the last trial ends, in s of wall time; None to estimate it from the mean rate.
+        progress: progress of the work after the last trial; None before that.
     """
 
     phase: str
@@ -214,7 +217,7 @@ class HuntStatus:
 
     @property
     def share_done(self) -> float:
-        """The completed share of the hunt, from 0 to 1: the larger one of trials and time."""
+        """The completed share of the hunt, from 0 to 1: the larger of the shares of trials and of time."""
         by_count = self.done / self.planned if self.planned else 0.0
         whole_s = self.elapsed_s + self.time_left_s
         return max(by_count, self.elapsed_s / whole_s if whole_s > 0 else 1.0)
@@ -272,12 +275,12 @@ class Progress:
             )
 
     def count(self, result: TrialResult, *, crashed: bool, planned: int) -> None:
-        """Count a trial that has ended.
+        """Count a finished trial.
 
         Args:
-            result: The result. A crash has been saved before, or ends the hunt and is saved then.
+            result: The result of the trial. A crash has already been saved, or ends the hunt and is then saved.
             crashed: Whether the outcome counts as a crash.
-            planned: Number of trials of the hunt.
+            planned: Planned number of trials of the hunt.
         """
         self.ended_here += 1
         self.outcomes[str(result.outcome)] += 1
@@ -293,7 +296,7 @@ class Progress:
             self.found[result.spec.number] = result
 
     def _compare(self, result: TrialResult) -> None:
-        """Update the nearest miss and the least stress margin with a trial that has not crashed."""
+        """Compare a trial without a crash with the nearest miss and the least robustness margin of the hunt."""
         if result.collision is None and result.failure is None:
             before = self.nearest
             self.nearest = max(before or result, result, key=lambda one: one.nearness)
@@ -307,14 +310,14 @@ class Progress:
         self.not_fully_asked += not result.is_fully_asked
 
     def save(self, bundle: Bundle) -> None:
-        """Take in a crash that has been saved."""
+        """Add a crash that has been saved."""
         self.crashes.append(bundle)
         self.tally.add(bundle.result)
         if self.kinds is not None:
             self.kinds.add(bundle, self.ended_here + 1)  # counted after its row is written
 
     def replace(self, crashes: list[Bundle]) -> None:
-        """Take the crashes as they are now: they have been confirmed."""
+        """Replace the crashes by their confirmed versions."""
         self.crashes = crashes
         if self.kinds is not None:
             self.kinds.refresh(crashes)
@@ -329,7 +332,7 @@ class Progress:
 
     @property
     def ended_by_copy(self) -> Bundle | None:
-        """The crash of a copy that ends the hunt; None if there is none, or if a trial ends the hunt."""
+        """The crash of a fork that ends the hunt; None if there is none, or if a trial ends the hunt."""
         return self.copied.get(self.last_wanted) if self.last_wanted is not None else None
 
     @property
@@ -340,7 +343,7 @@ class Progress:
         return bool(self.crashes or self.copied) if self.kinds is None else self.kinds.until is not None
 
     def why_stopped(self, *, keep_going: bool) -> StoppedBecause:
-        """The reason why a hunt ends after it has found the wanted crashes."""
+        """Return the reason why a hunt ends after it has found the wanted crashes."""
         if self.rate is not None:
             return "rate"
         return "distinct" if keep_going else "crash"
@@ -374,10 +377,10 @@ class Progress:
         self.nodes = tuple(executor.nodes()) if supports(executor, HasNodes) else None
 
     def running_rate(self, *, now: bool = False) -> RunningRate | None:
-        """Return the crash rate so far; None if the trials bound none.
+        """Return the current crash rate; None if the trials give no bound.
 
         Args:
-            now: whether the rate must be new; otherwise a rate of some moments ago is returned.
+            now: whether the rate must be up to date; otherwise it may be some moments old.
         """
         watch = self.rare or self.counted
         return None if watch is None else watch.running(now=now)
@@ -386,7 +389,7 @@ class Progress:
         """Return the facts about the present progress for the ledger.
 
         Args:
-            now: whether the rate must be new; otherwise it may be some moments old.
+            now: whether the rate must be up to date; otherwise it may be some moments old.
         """
         nodes: Noted = {} if self.nodes is None else {"nodes": [asdict(node) for node in self.nodes]}
         kinds: Noted = {}
@@ -404,7 +407,7 @@ class Progress:
         return {"heartbeat": time.time(), **audits, **nodes, **kinds, **in_vain, **bar, **phase, **rate}
 
     def about_kinds(self, *, running: bool = False) -> tuple[tuple[Group, ...] | None, float | None, int | None]:
-        """Return the last three of `HuntStatus`; `running` as of `Kinds.groups`."""
+        """Return the fields of `HuntStatus` about crash types; `running` is that of `Kinds.groups`."""
         if self.kinds is None:
             return None, None, None
         newest, trial = self.kinds.newest, self.kinds.newest_trial
@@ -434,10 +437,10 @@ _STALL_BATCHES = 2  # durations of a batch without an end of a trial, after whic
 class RemainingTime:
     """Estimates when the last of several trials ends, from the times at which trials end.
 
-    Cost: constant for each trial and each question, but for O(`_MAX_SPAN`) memory.
+    Cost: constant time for each trial and each estimate, and O(`_MAX_SPAN`) memory.
 
     Args:
-        began: when the first trial began, in s of a monotonic clock.
+        began: time at which the first trial began, in s of a monotonic clock.
     """
 
     def __init__(self, began: float) -> None:
@@ -448,10 +451,10 @@ class RemainingTime:
         self._rate = 0.0
 
     def ended(self, now: float, left: int, parallel: int) -> None:
-        """Count a trial that has ended.
+        """Count a finished trial.
 
         Args:
-            now: when, in s of the same clock.
+            now: time at which the trial ended, in s of the same clock.
             left: number of trials that have not ended.
             parallel: number of trials that run at a time.
         """
@@ -471,7 +474,7 @@ class RemainingTime:
         """Return the time until the last trial ends, in s; infinite before the first trial has ended.
 
         Args:
-            now: in s of the same clock.
+            now: current time, in s of the same clock.
             left: number of trials that have not ended.
             parallel: number of trials that run at a time.
         """
@@ -485,13 +488,13 @@ class RemainingTime:
 
 @dataclass(frozen=True, slots=True)
 class PhaseStatus(Serializable):
-    """Progress of a phase.
+    """Progress of a phase of a hunt.
 
     Args:
         name: name of the phase.
-        done: number of runs that have ended.
-        total: number of runs.
-        seconds_left: until the phase ends; None where that is unknown.
+        done: number of finished runs.
+        total: total number of runs.
+        seconds_left: time until the phase ends, in s; None if it is unknown.
     """
 
     name: PhaseName
@@ -504,7 +507,7 @@ class PhaseClock:
     """Reports the progress of the work after the last trial of a hunt.
 
     Args:
-        show: receives the progress about ten times a second, in the thread of the hunt.
+        show: function that receives the progress about ten times a second, in the thread of the hunt.
         parallel: number of runs at a time.
     """
 
@@ -521,20 +524,20 @@ class PhaseClock:
         Args:
             name: name of the phase.
             total: number of runs.
-            done: number of these that earlier runs of the hunt have finished.
+            done: number of runs that earlier runs of the hunt have finished.
         """
         self._name, self._total, self._done = name, total, done
         self._left = RemainingTime(time.monotonic())
         self.tick(force=True)
 
     def advance(self) -> None:
-        """Count a run that has ended."""
+        """Count a finished run."""
         self._done += 1
         self._left.ended(time.monotonic(), self._total - self._done, self._parallel)
         self.tick(force=True)
 
     def tick(self, *, force: bool = False) -> None:
-        """Show the progress, if that was not done in the last 0.1 s; nothing before the first phase."""
+        """Show the progress, unless it was shown in the last 0.1 s, or the first phase has not begun."""
         now = time.monotonic()
         if self._name is None or (now - self._shown < _TICK_S and not force):
             return
@@ -552,12 +555,12 @@ class PhaseClock:
     def run(
         self, function: Callable[[T], R], items: Sequence[T], *, counts: Callable[[R], bool] = lambda _: True
     ) -> list[R]:
-        """Run a function of each item in threads that wait for processes; return the results in their order.
+        """Call a function for each item in threads that wait for processes; return the results in that order.
 
         Args:
-            function: is called in a thread.
-            items: its arguments.
-            counts: whether a result counts as a run that has ended.
+            function: function to call in a thread.
+            items: arguments of the calls, one for each call.
+            counts: function that returns whether a result counts as a finished run.
         """
         with ThreadPoolExecutor(self._parallel) as threads:
             futures = [threads.submit(function, item) for item in items]

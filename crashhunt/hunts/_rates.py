@@ -62,12 +62,12 @@ __all__ = [
 
 
 def counting_rule(settings: HuntSettings, facts: Facts, held_out: HeldOutTraffics | None = None) -> CountingRule:
-    """Return how the trials of a hunt count.
+    """Return the rule by which the trials of a hunt count.
 
     Args:
         settings: settings of the hunt.
-        facts: facts of its ledger.
-        held_out: rule for the traffics that agents were trained on; None if the caller excludes them itself.
+        facts: facts from the hunt's ledger.
+        held_out: rule for the traffic on which agents were trained; None if the caller excludes these trials itself.
     """
     independent = bool(facts.get("independent", settings.sampler == "random"))
     origin = "" if independent or settings.seeds else facts.get("plain_origin") or ""
@@ -82,10 +82,10 @@ def counting_rule(settings: HuntSettings, facts: Facts, held_out: HeldOutTraffic
 
 
 def refuse_training_traffic(settings: HuntSettings, held_out: HeldOutTraffics) -> None:
-    """Refuse a hunt that ends with a rate, if the training of its agents leaves it without such a rate.
+    """Refuse a hunt that ends with a rate, if the training of its agents makes such a rate impossible.
 
     Raises:
-        UsageError: an agent was trained on these traffics.
+        UsageError: an agent was trained on the traffic of the hunt.
     """
     fix = "give another --seed"
     if settings.rare and any(settings.seed in record.hunt_seeds for record in held_out.records):
@@ -95,7 +95,7 @@ def refuse_training_traffic(settings: HuntSettings, held_out: HeldOutTraffics) -
 
 
 def why_no_interval(settings: HuntSettings, facts: Facts) -> str:
-    """Return why the trials of a hunt give no rate; empty if they give one."""
+    """Return the reason why the trials of a hunt give no rate; empty if they give a rate."""
     if settings.rare:
         return "in rare mode, one of five trials runs without disturbances; crashhunt status reports the rate"
     if settings.seeds:
@@ -110,7 +110,7 @@ def why_no_interval(settings: HuntSettings, facts: Facts) -> str:
 
 
 def bar_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics) -> BarWatch | None:
-    """Return the object that compares the rate with the bar, with the trials of earlier runs; None without a bar."""
+    """Return an object that compares the rate with the threshold, with earlier trials added; None without threshold."""
     if not settings.run.until_rate:
         return None
     bar, per = rate_of(settings.run.until_rate)
@@ -127,7 +127,7 @@ def bar_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics)
 
 
 def rate_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics) -> RateWatch | None:
-    """Return the object that computes the rate per trial, with the trials of earlier runs; None if there is no rate."""
+    """Return an object that computes the rate per trial, with earlier trials added; None if there is no rate."""
     facts = ledger.facts()
     if why_no_interval(settings, facts):
         return None
@@ -161,12 +161,12 @@ _MAX_VERIFIED_ROOTS = 5  # roots; a crash of a copy is a crash only where it com
 
 
 class Forcings:
-    """The forcing of each root, learned from the blocks before the previous one.
+    """The forcing of each root, learned from the blocks of roots before the previous block.
 
     Args:
         settings: settings of the hunt.
         ledger: ledger of the hunt.
-        sampler: sampler of its disturbances.
+        sampler: sampler of the hunt's disturbances.
     """
 
     def __init__(self, settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler) -> None:
@@ -178,13 +178,13 @@ class Forcings:
 
     @staticmethod
     def needed(number: int) -> int:
-        """Return the number of first trials that must have ended before a trial begins."""
+        """Return the number of trials, from number 0 on, that must have ended before the given trial begins."""
         if not is_root(number):
             return 0
         return max(0, number // TRIALS_PER_ROOT // BLOCK - 1) * BLOCK * TRIALS_PER_ROOT
 
     def of(self, number: int) -> Forcing | None:
-        """Return the forcing of a root; None for a plain trial. Call it in the order of trial numbers."""
+        """Return the forcing of a root; None for a plain trial. Call this method in the order of trial numbers."""
         if not is_root(number):
             return None
         needed = self.needed(number)
@@ -199,19 +199,19 @@ class Forcings:
 
 
 class RareWatch:
-    """Reads trials in order of their numbers, and finds the block at which the hunt may end.
+    """Reads trials in the order of their numbers, and finds the block after which the hunt may end.
 
-    A root counts once its plain trials have ended as well.
+    A root counts after its plain trials have ended as well.
 
     Args:
         settings: settings of the hunt.
         ledger: ledger of the hunt.
-        sampler: sampler of its disturbances; None for splitting.
+        sampler: sampler of the hunt's disturbances; None for splitting.
 
     Attributes:
-        weightiest: the greatest weights of roots with a crash of a copy, in descending order.
-        is_met: whether the interval is narrow enough; no trial is read after that.
-        refusal: why the hunt is of no use, as its first trials show; empty if they do not.
+        weightiest: the greatest weights of roots with a crashed copy, in descending order.
+        is_met: whether the interval is narrow enough; no further trial is then read.
+        refusal: reason why the hunt is of no use according to its first trials; empty if it is of use.
     """
 
     def __init__(self, settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler | None) -> None:
@@ -235,19 +235,19 @@ class RareWatch:
 
     @property
     def is_over(self) -> bool:
-        """Whether the hunt ends at the trials that were read."""
+        """Whether the hunt ends after the trials that were read."""
         return self.is_met or bool(self.refusal)
 
     @property
     def lines(self) -> list[str]:
-        """What the user should know of the hunt besides the estimate."""
+        """Return notes on the hunt for the user, in addition to the estimate."""
         return []
 
     def read(self, finished: int | None = None) -> None:
-        """Read the trials that have ended, up to the first one that has not.
+        """Read the finished trials, up to the first trial that has not finished.
 
         Args:
-            finished: number of first trials that have ended; None to read it from the ledger.
+            finished: number of first trials that have finished; None to read it from the ledger.
         """
         while not self.is_over and (finished is None or self._read < finished):
             result = self._ledger.result(self._read)
@@ -278,25 +278,25 @@ class RareWatch:
         return None if root is None else with_plain(root, plain, self._settings.crash_on)
 
     def _crashes_of(self, plain: Sequence[TrialResult]) -> tuple[list[bool], int]:
-        """Return which of the valid plain trials crashed, and how many are invalid."""
+        """Return for each valid plain trial whether it crashed, and the number of invalid plain trials."""
         valid = [one for one in plain if one.outcome is not Outcome.INVALID]
         return [one.outcome in self._settings.crash_on for one in valid], len(plain) - len(valid)
 
     def estimate(self) -> RareEstimate:
-        """Return the estimate of the trials that were read."""
+        """Return the estimate from the trials that were read."""
         return self._counter.estimate()
 
     def running(self, *, now: bool = False) -> RunningRate:
-        """Return the rate so far.
+        """Return the current crash rate.
 
         Args:
-            now: whether the rate must be new; otherwise it may be some moments old.
+            now: whether the rate must be up to date; otherwise it may be some moments old.
         """
         return self._paced(self.roots, now=now)
 
 
 class SplittingForcings:
-    """The levels of each root of ``--rare splitting``: none of the first pilots, then what those suggest.
+    """The levels of each root of ``--rare splitting``: none for the first pilots, then levels chosen from these pilots.
 
     Args:
         settings: settings of the hunt.
@@ -309,11 +309,11 @@ class SplittingForcings:
 
     @staticmethod
     def needed(number: int) -> int:
-        """Return how many trials, from number 0 on, have to have ended before a trial begins."""
+        """Return the number of trials, from number 0 on, that must have ended before the given trial begins."""
         return min(2, number // TRIALS_PER_ROOT // PILOT_ROOTS) * PILOT_ROOTS * TRIALS_PER_ROOT
 
     def of(self, number: int) -> Forcing | None:
-        """Return the forcing of a root, None of a plain trial."""
+        """Return the forcing of a root; None for a plain trial."""
         if not is_root(number):
             return None
         if number < PILOT_ROOTS * TRIALS_PER_ROOT:
@@ -325,15 +325,16 @@ class SplittingForcings:
 
 
 class SplittingWatch(RareWatch):
-    """The same for ``--rare splitting``; the pilots do not count for the estimate, but for the certain bounds.
+    """Like `RareWatch`, for ``--rare splitting``. Pilots do not count for the estimate, but for the certain interval.
 
     Args:
         settings: settings of the hunt.
         ledger: ledger of the hunt.
 
     Attributes:
-        levels: the levels; empty until the pilots have ended that they are chosen from.
-        shares: crash probability in the pilot trees, of all paths and from each level; empty until they have ended.
+        levels: the levels; empty until the pilots from which they are chosen have ended.
+        shares: crash probability in the test trees, of all paths and of the paths from each level; empty until these
+            trees have ended.
     """
 
     def __init__(self, settings: HuntSettings, ledger: Ledger) -> None:
@@ -370,7 +371,7 @@ class SplittingWatch(RareWatch):
         return replace(counted, undisturbed=tree.undisturbed, counted=0.0)
 
     def estimate(self) -> RareEstimate:
-        """Return the estimate of the trials that were read."""
+        """Return the estimate from the trials that were read."""
         found = super().estimate()
         if self.refusal:
             return replace(found, why_not=self.refusal, why_not_disturbed=self.refusal)
@@ -381,7 +382,7 @@ class SplittingWatch(RareWatch):
 
     @property
     def lines(self) -> list[str]:
-        """The levels, and the crash probability from each."""
+        """Return the levels, and the crash probability from each level, as lines for the user."""
         if not self.shares:
             return []
         levels = ", ".join(f"{level:.2g}" for level in self.levels)
@@ -397,7 +398,7 @@ def _peaks_of(pilots: Iterable[TrialResult]) -> list[float]:
 def forcings_of(
     settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler | None
 ) -> Forcings | SplittingForcings | None:
-    """Return the forcing of roots; None if the hunt is not in rare mode."""
+    """Return the object that determines the forcing of roots; None if the hunt is not in rare mode."""
     if not settings.rare:
         return None
     if settings.splitting:
@@ -407,7 +408,7 @@ def forcings_of(
 
 
 def rare_watch(settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler | None) -> RareWatch | None:
-    """Return what estimates the rate; None if the hunt is not in rare mode."""
+    """Return the object that estimates the crash rate; None if the hunt is not in rare mode."""
     if not settings.rare:
         return None
     return SplittingWatch(settings, ledger) if settings.splitting else RareWatch(settings, ledger, sampler)
@@ -419,5 +420,5 @@ def crashed_copies(result: TrialResult) -> Iterator[ForcedCopy]:
 
 
 def greatest_weight(result: TrialResult) -> float:
-    """Return the greatest weight among the crashed copies of a root that has some."""
+    """Return the greatest weight among the crashed copies of a root with at least one crashed copy."""
     return max(copy.weight for copy in crashed_copies(result))

@@ -1,4 +1,4 @@
-"""The report of a hunt, with the reports of its audit, probes and branches."""
+"""The report of a hunt, including the reports on its audit, probes and branches."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Difference(Serializable):
 
     Args:
         trial: number of the trial.
-        step: the first step that differs; None if no recording was kept, so that only the digest was compared.
+        step: the first step that differs; None if only the digests were compared, because no recording was kept.
         agent: identifier of the agent or actor; empty if the difference concerns neither.
         field: name of the value that differs.
         recorded: the value in the hunt.
@@ -67,7 +67,7 @@ class AuditReport(Serializable):
 
     Args:
         trials: number of trials that were run again to their end.
-        differences: one for each trial that differed.
+        differences: the first difference of each trial that differed.
         not_finished: number of trials whose second run did not reach its end.
     """
 
@@ -80,19 +80,20 @@ class AuditReport(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class ProbeReport:
-    """The result of the probes of a hunt.
+    """The result of the robustness probes of a hunt.
 
     Args:
-        margins: the stress margin of each trial whose probes were all evaluated.
+        margins: the robustness margin of each trial whose probes all have a result.
         not_fully_asked: number of further trials, in which a probe has no result.
         why_unasked: the reason for the first of these trials; empty if there is none.
-        probes: number of copies that were run.
-        steps: number of steps of the copies.
-        skipped: number of probes that were skipped because the copies had used up their steps.
-        run_again: number of crashes with the mildest disturbance that were run again from the start.
+        probes: number of forks that were run.
+        steps: number of simulated steps of the forks.
+        skipped: number of probes that were skipped because the forks had used up their steps.
+        run_again: number of crashes with the mildest disturbance that were run from the start.
         not_finished: number of these runs that did not reach their end, for example because they were killed.
-        crashes: runs that crashed in the same way at the same step, and again bit-identically.
-        by: for each of these, the disturbance as it took place. The trial may have drawn others in addition.
+        crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
+        by: the disturbance of each of these crashes with its actual values. The trial may have drawn further
+            disturbances.
     """
 
     margins: tuple[float, ...]
@@ -107,7 +108,7 @@ class ProbeReport:
     by: tuple[Disturbance, ...]
 
     def to_json(self) -> JsonObject:
-        """Return the shape that ``run --json`` prints."""
+        """Return the result in the form that ``run --json`` prints."""
         return {
             "trials": len(self.margins),
             "not_fully_asked": self.not_fully_asked,
@@ -129,17 +130,17 @@ class BranchReport:
 
     Args:
         trials: number of trials that could have branches.
-        moments: number of steps from which copies continued.
-        branches: number of copies.
-        steps: number of steps of the copies.
-        skipped: number of branches that were skipped because the copies had used up their steps.
+        moments: number of steps after which forks continued.
+        branches: number of forks.
+        steps: number of simulated steps of the forks.
+        skipped: number of branches that were skipped because the forks had used up their steps.
         crashed: number of branches that crashed.
         crashed_trials: number of trials with a branch that crashed.
         not_fully_asked: number of trials in which a branch has no result.
         why_unanswered: the reason for the first of these trials; empty if there is none.
-        run_again: number of crashed branches that were run again from the start: the likeliest of each trial.
+        run_again: number of crashed branches that were run from the start: the likeliest branch of each trial.
         not_finished: number of these runs that did not reach their end, for example because they were killed.
-        crashes: runs that crashed in the same way at the same step, and again bit-identically.
+        crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
     """
 
     trials: int
@@ -156,7 +157,7 @@ class BranchReport:
     crashes: tuple[Bundle, ...]
 
     def to_json(self) -> JsonObject:
-        """Return the shape that ``run --json`` prints."""
+        """Return the result in the form that ``run --json`` prints."""
         return {
             "trials": self.trials,
             "moments": self.moments,
@@ -179,9 +180,9 @@ class RareReport:
 
     Args:
         estimate: estimate of the crash probability per trial.
-        verified: number of the weightiest crashes of copies that were run from the start.
+        verified: number of fork crashes, those with the greatest weights, that were run from the start.
         not_finished: number of these runs that did not finish.
-        crashes: the runs that crashed in the same way at the same step, and again bit-identically.
+        crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
         more: further lines for the user, such as the levels of splitting.
     """
 
@@ -192,7 +193,7 @@ class RareReport:
     more: tuple[str, ...] = ()
 
     def to_json(self) -> JsonObject:
-        """Return the shape that ``run --json`` prints."""
+        """Return the result in the form that ``run --json`` prints."""
         return {
             **self.estimate.to_json(),
             "run_again": self.verified,
@@ -203,7 +204,7 @@ class RareReport:
 
     @property
     def lines(self) -> list[str]:
-        """The estimate, its evidence and its limits, as lines for the user."""
+        """Return the estimate, its evidence and its limits, as lines for the user."""
         found = self.estimate
         if found.estimate is None:
             certain = [] if found.roots else self._certain_lines  # bounds that rest on plain trials alone
@@ -253,7 +254,7 @@ _MAX_SHOWN_CELLS = 5  # parts of the estimate of rare mode
 
 
 def kind_data(group: Group) -> KindData:
-    """Return a crash type in a few words, with the identifiers of its crashes."""
+    """Return a crash type as a short description, with the identifiers of its crashes."""
     return {
         "words": str(group.signature),
         "count": group.count,
@@ -273,16 +274,17 @@ class HuntReport:
 
     Args:
         directory: directory of the hunt.
-        settings: the settings that it ran with.
-        stopped_because: the reason why it ended.
+        settings: the settings of the hunt.
+        stopped_because: the reason why the hunt ended.
         outcomes: number of trials with each outcome.
         trial_steps: number of steps of the trials.
-        steps_total: number of simulated steps. It includes warm-up traffic, copies, and confirmations that failed.
-        wall_s: wall time of this run, in s.
-        crashes: the crashes that have a bundle, the one with the fewest steps first.
-        reason: reason in words, where no trial was valid.
+        steps_total: number of simulated steps. The number includes warm-ups, forks, and confirmations that failed.
+        wall_s: wall time of this run of the hunt, in s.
+        crashes: the crashes that have a bundle, the crash with the fewest steps first.
+        reason: the reason why no trial was valid, as text.
         notes: facts about the run that users should know, such as trials that were run again.
-        events: traffic events of all trials: kind to their number, and the number of trials that had one.
+        events: traffic events of all trials: for each type, the number of events, and the number of trials with such
+            events.
         audit: the result of the audit; None without ``--audit``.
         kinds: crash types, the most frequent first; None if the first crash ended the hunt.
         types_by_cause: number of causes, counted for each crash type on its own; None without ``--by-cause``.
@@ -290,12 +292,13 @@ class HuntReport:
         probes: the result of the probes; None without ``--probe``.
         at_fault: numbers of the trials whose crash is the agent's fault; None without ``--only-at-fault``.
         branches: the result of the branches; None without ``--branch``.
-        copied: the crash of a copy that ended the hunt. It was confirmed by a run from the start.
+        copied: the crash of a fork that ended the hunt, after it was confirmed by a run from the start.
         rare: the result of rare mode; None without ``--rare``.
         tally: counts of the crashes of all trials, with or without a bundle.
-        unconfirmed: number of crashes that the same command runs again, because Ctrl-C came before their confirmation.
-        unanswered: number of trials that the same command runs again, because they or their copies were killed.
-        rate: the rate, compared with the bar of ``until_rate``; None if there is no bar.
+        unconfirmed: number of crashes that the same command confirms when it runs again, because Ctrl-C came before
+            their confirmation.
+        unanswered: number of trials that the same command runs again, because they or their forks were killed.
+        rate: the rate, compared with the threshold in ``until_rate``; None if there is no threshold.
     """
 
     directory: Path
@@ -324,7 +327,7 @@ class HuntReport:
     tally: CrashTally = field(default_factory=CrashTally)
 
     def to_json(self) -> JsonObject:
-        """Return the shape that ``run --json`` prints."""
+        """Return the report in the form that ``run --json`` prints."""
         found: JsonObject = {
             "dir": str(self.directory),
             "hunt_seed": self.settings.seed,

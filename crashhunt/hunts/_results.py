@@ -85,13 +85,13 @@ Cell: TypeAlias = "Value | None"
 
 @dataclass(frozen=True, slots=True)
 class TrialRow:
-    """One trial of a table.
+    """One trial as a row of a table.
 
-    Values that an earlier version did not write are missing. It is made of plain data, as ledgers yield them: a table
-    has a million trials, and a `TrialResult` takes three times as long.
+    Values that an earlier version did not write are missing. The row is based on the JSON data of a ledger, because a
+    table may have a million trials, and creating a `TrialResult` takes three times as long.
 
     Args:
-        data: data of the trial.
+        data: JSON data of the trial.
     """
 
     data: JsonObject
@@ -108,12 +108,12 @@ class TrialRow:
 
     @property
     def time_to_collision_s(self) -> float | None:
-        """The least time to collision, in s; None if no courses crossed."""
+        """The least time to collision, in s; None if no paths crossed."""
         return _closest(self.data).get("time_to_collision_s")
 
     @property
     def danger(self) -> float | None:
-        """Criticality, 0 to 1; None if it was not measured."""
+        """Criticality of the trial, from 0 to 1; None if it was not measured."""
         return self.data.get("danger")
 
     @property
@@ -129,7 +129,7 @@ class TrialRow:
 
     @property
     def stress_margin(self) -> float | None:
-        """The stress margin, 0 to 1; None if it was not measured, or not completely."""
+        """The robustness margin of the trial, from 0 to 1; None if it was not measured, or not completely."""
         stress = self.data.get("stress")
         return stress.get("margin") if stress else None
 
@@ -152,11 +152,11 @@ class TrialRow:
         return found
 
     def cells(self, columns: Sequence[str]) -> dict[str, Cell]:
-        """Return the trial as a row of a table with some columns.
+        """Return the trial as a row of a table with the given columns.
 
         Args:
-            columns: some of `FACTS`, `DISTURBANCES`, `STRESS`, `BRANCHES` and `ORIGINS`, ``AGENT.ARGUMENT`` and
-                ``scenario.ARGUMENT``.
+            columns: names of columns from `FACTS`, `DISTURBANCES`, `STRESS`, `BRANCHES` and `ORIGINS`, and
+                ``AGENT.ARGUMENT`` and ``scenario.ARGUMENT``.
         """
         data = self.data
         spec, closest, events = data["spec"], _closest(data), data.get("events")
@@ -205,17 +205,17 @@ def _closest(data: JsonObject) -> JsonObject:
 
 
 class IncompleteHuntWarning(UserWarning):
-    """The loaded hunt or suite has not finished."""
+    """Warning that a loaded hunt or suite has not finished."""
 
 
 class HuntResults:
-    """A finished or running hunt.
+    """The results of a finished or running hunt.
 
     Args:
         directory: directory of the hunt.
 
     Raises:
-        HuntDirectoryError: the directory has no hunt.
+        HuntDirectoryError: the directory contains no hunt.
     """
 
     def __init__(self, directory: Path | str) -> None:
@@ -233,7 +233,7 @@ class HuntResults:
     def settings(self) -> HuntSettings:
         """The settings of the hunt.
 
-        Raises: HuntDirectoryError: hunt.toml is missing or damaged, or the ledger is that of another hunt.
+        Raises: HuntDirectoryError: hunt.toml is missing or damaged, or the ledger belongs to another hunt.
         """
         settings = read_settings(self.directory / layout.HUNT)
         if not has_begun(self.directory / layout.LEDGER):
@@ -256,7 +256,7 @@ class HuntResults:
 
     @cached_property
     def plain_origin(self) -> str:
-        """The origin of the independently drawn trials, if not all trials are independent; else empty."""
+        """The origin of the independently drawn trials, if only a part of the trials is independent; else empty."""
         with closing(self._ledger()) as ledger:
             return ledger.facts().get("plain_origin") or ""
 
@@ -264,8 +264,8 @@ class HuntResults:
     def columns(self) -> tuple[str, ...]:
         """The columns of a table of the trials, with ``parent`` and ``origin`` if the sampler reports them.
 
-        If the hunt has disturbances, also ``disturbances`` and ``log_likelihood``; with probes, those of `STRESS`; with
-        branches, those of `BRANCHES`.
+        If the hunt has disturbances, the columns also contain ``disturbances`` and ``log_likelihood``; with probes,
+        those in `STRESS`; with branches, those in `BRANCHES`.
         """
         with closing(self._ledger()) as ledger:
             origins = ORIGINS if ledger.facts().get("origins") else ()
@@ -276,7 +276,7 @@ class HuntResults:
 
     @property
     def crashes(self) -> list[Bundle]:
-        """The saved crashes, in order of the trials; `Bundle.recording` has the arrays."""
+        """The saved crashes, in the order of their trials; `Bundle.recording` returns the recorded arrays."""
         return list_bundles(self.directory)
 
     @property
@@ -285,7 +285,7 @@ class HuntResults:
         return with_settings(self._snapshot().scenario(), self.settings)
 
     def results(self, *, outcomes: Sequence[str] = ()) -> Iterator[TrialResult]:
-        """Yield the trials in order of their numbers: all, or those with the given outcomes."""
+        """Yield the trials in the order of their numbers: all trials, or those with the given outcomes."""
         with closing(self._ledger()) as ledger:
             yield from ledger.results(outcomes=tuple(outcomes))
 
@@ -297,12 +297,12 @@ class HuntResults:
                 yield TrialRow(data).cells(names)
 
     def trial_rows(self) -> Iterator[TrialRow]:
-        """Yield the trials as rows of the ledger, which takes a third of the time of `results`."""
+        """Yield the trials as `TrialRow` objects, which takes a third of the time of `results`."""
         with closing(self._ledger()) as ledger:
             yield from map(TrialRow, ledger.plain_results())
 
     def trial(self, number: int) -> TrialResult:
-        """Return one trial.
+        """Return the result of one trial.
 
         Raises:
             UsageError: the trial has not ended.
@@ -316,10 +316,10 @@ class HuntResults:
         return found
 
     def trials(self) -> NDArray[np.generic]:
-        """Return a row per trial, as a structured array, shape (trials,).
+        """Return a table with a row for each trial, as a structured array of shape (trials,).
 
-        Its fields are those of ``crashhunt trials``; times in s, distances in m, decelerations in m/s². A missing
-        number is NaN.
+        Its fields are the columns of ``crashhunt trials``; times are in s, distances in m, decelerations in m/s². A
+        missing number is NaN.
         """
         names = self.columns
         columns: dict[str, list[Cell]] = {name: [] for name in names}
@@ -345,15 +345,15 @@ class HuntResults:
         return pd.DataFrame(self.trials())
 
     def agent(self, trial: int, agent: str = "", *, trust: bool = False) -> Agent:
-        """Return an agent made as in a trial, with today's code.
+        """Return an agent with the arguments of a trial, created from the current code.
 
         Args:
             trial: number of the trial.
             agent: id of the vehicle; may be empty if the hunt has a single controlled vehicle.
-            trust: import the modules that the hunt names, even if the hunt is neither made here nor trusted.
+            trust: whether to import the modules that the hunt names, even if the hunt is neither made here nor trusted.
 
         Raises:
-            UsageError: there is no such vehicle or trial.
+            UsageError: the vehicle or the trial does not exist.
             UntrustedError: code of the hunt would run, but the hunt is neither made on this machine nor trusted.
         """
         if not trust and not is_hunt_trusted(self.directory, self._snapshot()):
@@ -383,7 +383,7 @@ class HuntResults:
 
 
 class SuiteResults(dict[str, HuntResults]):
-    """The hunts of a suite: id and run, such as ``town/0``, to the hunt."""
+    """The hunts of a suite: a mapping from id and run, such as ``town/0``, to the results of the hunt."""
 
     def __init__(self, directory: Path, hunts: Sequence[Path]) -> None:
         super().__init__({path.relative_to(directory).as_posix(): HuntResults(path) for path in hunts})
@@ -397,10 +397,10 @@ class SuiteResults(dict[str, HuntResults]):
 
 @clear_calls()
 def load(directory: Path | str) -> HuntResults | SuiteResults:
-    """Load a hunt, or all hunts of a suite. Of an unfinished hunt, load the trials that have ended, with a warning.
+    """Load a hunt, or all hunts of a suite. For an unfinished hunt, the finished trials are loaded, with a warning.
 
     Raises:
-        HuntDirectoryError: there is no hunt.
+        HuntDirectoryError: the directory contains no hunt.
     """
     place = Path(directory)
     hunts = find_hunts(place)
@@ -437,13 +437,13 @@ _MAX_INSPECTED_ROWS = 1000  # rows, to infer the type of an argument without a d
 
 
 def write_text(hunt: HuntResults, out: IO[str], form: str, *, outcomes: Sequence[str] = ()) -> int:
-    """Write the trials of a hunt as text; return how many.
+    """Write the trials of a hunt as text; return the number of trials.
 
     Args:
         hunt: the hunt.
         out: the text file to write to.
-        form: ``csv``, ``json`` (one array) or ``jsonl`` (an object per line).
-        outcomes: only those; empty for all.
+        form: ``csv``, ``json`` (one array) or ``jsonl`` (one object per line).
+        outcomes: outcomes of the trials to write; empty for all trials.
     """
     names = hunt.columns
     count = 0
@@ -464,7 +464,7 @@ def write_text(hunt: HuntResults, out: IO[str], form: str, *, outcomes: Sequence
 
 
 def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()) -> int:
-    """Write the trials of a hunt as a Parquet file; return how many.
+    """Write the trials of a hunt as a Parquet file; return the number of trials.
 
     Raises:
         UsageError: polars is not installed.
@@ -488,7 +488,7 @@ def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()
 
 
 def _kinds(hunt: HuntResults, batch: list[dict[str, Cell]]) -> dict[str, str]:
-    """Return the type of each column, because a single row group may not show it."""
+    """Return the type of each column, because a single row group may not show the type."""
     settings = hunt.settings
     specs = {f"scenario.{name}": spec for name, spec in settings.scenario_arguments.items()}
     for agent, chosen in settings.agents.items():

@@ -62,18 +62,18 @@ PROBES, BRANCHES, RARE = "probes", "branches", "rare"
 
 
 class ProbeSums(TypedDict):
-    """The probes of a hunt in ``status --json``.
+    """The results of the robustness probes of a hunt in ``status --json``.
 
     Args:
         trials: number of trials in which all probes have a result.
         not_fully_asked: number of further trials in which a probe has no result.
-        least: the least stress margin of the trials with all results; None if there is none.
-        trial: the number of the trial that has it.
+        least: the least robustness margin of the trials in which all probes have a result; None if there is none.
+        trial: the number of the trial with this margin; None if there is none.
         probes: number of probes.
-        steps: number of steps of the copies.
-        left_out: number of probes that were skipped because copies had used their budget of steps.
-        crashed_trials: number of trials without a crash of their own that a probe made crash.
-        run_again: number of the mildest disturbances that were run from the start; None before these runs.
+        steps: number of simulated steps of the forks.
+        left_out: number of probes that were skipped because the forks had used up their steps.
+        crashed_trials: number of trials without a crash in which a probe crashed.
+        run_again: number of the mildest crashing disturbances that were run from the start; None before these runs.
         confirmed: number of these runs that crashed.
     """
 
@@ -90,18 +90,18 @@ class ProbeSums(TypedDict):
 
 
 class BranchSums(TypedDict):
-    """The branches of a hunt in ``status --json``, as in `ProbeSums`.
+    """The results of the branches of a hunt in ``status --json``, with fields as in `ProbeSums`.
 
     Args:
-        trials: number of trials that may have had some.
-        moments: number of moments from which copies continued.
+        trials: number of trials that could have branches.
+        moments: number of steps after which forks continued.
         branches: number of branches.
-        steps: number of steps of the copies.
-        left_out: number of skipped branches, because branches had used their share of steps.
+        steps: number of simulated steps of the forks.
+        left_out: number of branches that were skipped because the forks had used up their steps.
         crashed: number of branches that crashed.
-        crashed_trials: number of trials whose copies crashed.
+        crashed_trials: number of trials with a crashed branch.
         not_fully_asked: number of trials in which a branch has no result.
-        run_again: number of the likeliest crashes that were run from the start; None before these runs.
+        run_again: number of the likeliest crashed branches that were run from the start; None before these runs.
         confirmed: number of these runs that crashed.
     """
 
@@ -118,13 +118,13 @@ class BranchSums(TypedDict):
 
 
 def copies_to_come(settings: HuntSettings) -> list[str] | None:
-    """Return whether the trials of a hunt have probes, branches or both; None for neither."""
+    """Return the kinds of forks that a hunt's trials have: probes, branches or both; None for neither."""
     every = ((PROBES, settings.probe), (BRANCHES, settings.branch), (RARE, settings.rare))
     return [name for name, wanted in every if wanted] or None
 
 
 def sums_of_probes(ledger: Ledger, facts: Facts) -> ProbeSums | None:
-    """Return the results of the probes of a hunt so far; None if it has no probes."""
+    """Return the present results of the probes of a hunt; None if it has no probes."""
     if PROBES not in (facts.get("copies") or ()):
         return None
     (row,) = ledger.summed(
@@ -144,7 +144,7 @@ def sums_of_probes(ledger: Ledger, facts: Facts) -> ProbeSums | None:
 
 
 def sums_of_branches(ledger: Ledger, facts: Facts) -> BranchSums | None:
-    """Return the results of the branches of a hunt so far; None if it has no branches."""
+    """Return the present results of the branches of a hunt; None if it has no branches."""
     if BRANCHES not in (facts.get("copies") or ()):
         return None
     (row,) = ledger.summed(
@@ -164,7 +164,7 @@ def sums_of_branches(ledger: Ledger, facts: Facts) -> BranchSums | None:
 
 
 def _verified_counts(facts: Facts, name: str) -> tuple[int | None, int | None]:
-    """Return the number of runs from the start, and how many of them crashed."""
+    """Return the number of fork crashes that were run from the start, and how many of these runs crashed."""
     found = None if facts.get("state") == "running" else (facts.get("confirmed") or {}).get(name)  # of an earlier run
     return (found[0], found[1]) if found else (None, None)
 
@@ -188,31 +188,32 @@ class HuntState(Serializable):
 
     Args:
         dir: directory of the hunt.
-        state: ``queued``, ``running``, ``finished`` (no crash), ``crashed`` (found one), ``error``, ``interrupted``
-            or ``killed`` (its process is gone and did not say why).
+        state: ``queued``, ``running``, ``finished`` (no crash), ``crashed`` (found one), ``error``, ``interrupted`` or
+            ``killed`` (its process ended without recording a reason).
         detail: the reason of an error.
         trials_planned: number of planned trials; 0 if only the time is limited.
-        trials_run: number of ended trials.
+        trials_run: number of finished trials.
         outcomes: number of trials with each outcome.
         crashes: number of crashes, with or without a bundle.
-        crashes_saved: number of crashes with a bundle, if there are fewer (``--keep``); else None.
+        crashes_saved: number of crashes with a bundle, if it is smaller (``--keep``); else None.
         errors: number of trials that could not be set up, or ended in a software fault.
         rate_per_s: trials per second in the last run of the hunt.
         seconds_left: expected time to the last trial, to the time limit, or to the end of the phase, in s; None if
             unknown.
         owner_alive: whether the process of the hunt is running.
-        damaged: whether its ledger cannot be read, so that the counts say nothing.
-        phase: what it does after its last trial: fields of `PhaseStatus` but the time; None before, and where it does
-            not run.
+        damaged: whether the ledger of the hunt cannot be read, so that the counts are meaningless.
+        phase: phase of the hunt after its last trial: fields of `PhaseStatus` without the time; None before these
+            phases, and if the hunt is not running.
         disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
-        probes: results of the probes so far; None if the hunt has no probes.
-        branches: likewise.
-        rate: the crash rate, as it was at its last heartbeat: fields of `RunningRate`; None if none is known.
-        core: whether the simulator's compiled core is used; None if it has none.
-        nodes: the machines of its last run: fields of `NodeFigures`; None if it was only this machine.
-        kinds: kinds of crashes, the most frequent first: fields of `KindData`; None if the first crash ends the hunt.
-        newest_kind_s: how long ago the last new one came, in s; None if that is unknown.
-        types_by_cause: number of causes, each type on its own; None without ``--by-cause``.
+        probes: present results of the probes; None if the hunt has no probes.
+        branches: present results of the branches; None if the hunt has no branches.
+        rate: the crash rate at the hunt's last heartbeat, with the fields of `RunningRate`; None if it is unknown.
+        core: whether the simulator's compiled core is used; None if the simulator has none.
+        nodes: the machines of the hunt's last run, with the fields of `NodeFigures`; None if it used only this machine.
+        kinds: crash types, the most frequent first, with the fields of `KindData`; None if the hunt ends at its first
+            crash.
+        newest_kind_s: time since the last new crash type was found, in s; None if it is unknown.
+        types_by_cause: number of causes, counted separately for each crash type; None without ``--by-cause``.
     """
 
     dir: str
@@ -246,7 +247,7 @@ class HuntState(Serializable):
 
 
 def is_hunt(directory: Path) -> bool:
-    """Whether a directory is that of a hunt, or of one that is planned."""
+    """Return whether a directory contains a hunt or a planned hunt."""
     return any((directory / name).exists() for name in _HUNT_FILES)
 
 
@@ -258,10 +259,10 @@ def _explain_missing(directory: Path, what: str) -> HuntDirectoryError:
 
 
 def find_hunts(directory: Path) -> list[Path]:
-    """Return the directories of hunts: this one, or those below it.
+    """Return the directories of hunts: the given directory itself, or those below it.
 
     Raises:
-        HuntDirectoryError: there is none.
+        HuntDirectoryError: the directory contains no hunt.
     """
     if not directory.is_dir():
         raise _explain_missing(directory, "a hunt or a suite")
@@ -282,10 +283,10 @@ def find_hunts(directory: Path) -> list[Path]:
 
 
 def hunt_state(directory: Path) -> HuntState:
-    """Return the state of a hunt.
+    """Return the state of a hunt, read from its directory.
 
     Raises:
-        HuntDirectoryError: it is not the directory of a hunt.
+        HuntDirectoryError: the directory contains no hunt.
     """
     if not has_begun(directory / layout.LEDGER) and is_hunt(directory):
         if any((directory / layout.SNAPSHOTS).glob(layout.SHOWN)):  # which comes after the ledger
@@ -310,13 +311,13 @@ def hunt_state(directory: Path) -> HuntState:
 
 
 def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last: float | None) -> HuntState:
-    """Return the state of a hunt from the facts of its ledger, without its crashes and the sums over its copies.
+    """Return the state of a hunt from the facts in its ledger, without its crashes and the results of forks.
 
     Args:
         directory: directory of the hunt.
-        facts: facts of its ledger.
-        outcomes: outcome to its number of trials.
-        last: when the last trial ended, in s since the epoch; None if none has.
+        facts: facts from the hunt's ledger.
+        outcomes: number of trials with each outcome.
+        last: time at which the last trial ended, in s since the epoch; None if no trial has ended.
     """
     said = facts.get("state", "queued")
     owner = facts.get("owner")
@@ -387,19 +388,20 @@ def _with_crashes(state: HuntState, ledger: Ledger, facts: Facts) -> HuntState:
 
 
 def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
-    """Whether every trial of a hunt was drawn independently of the others, as its sampler said when it ran.
+    """Return whether every trial of a hunt was drawn independently of the others, as recorded by the hunt.
 
-    Trials in the same traffic are not.
+    Trials in the same traffic are not independent.
 
     Args:
-        facts: facts of its ledger.
-        settings: settings of the hunt; in early ledgers without this fact, the sampler `random` is independent.
+        facts: facts from the hunt's ledger.
+        settings: settings of the hunt. In early ledgers without this fact, only the sampler `random` counts as
+            independent.
     """
     return bool(facts.get("independent", settings.sampler == "random")) and not settings.seeds
 
 
 def ledger_owner() -> HuntOwner:
-    """Return a description that identifies this process, to check later whether it still runs."""
+    """Return a description that identifies this process, so that others can check whether it is still running."""
     return {"host": socket.gethostname(), "pid": os.getpid(), "started": _started(os.getpid())}
 
 
@@ -434,7 +436,7 @@ def _started(pid: int) -> int:
 
 
 def _ordered_states(path: Path) -> tuple[tuple[int, int, str], ...]:
-    """Return the sort key of runs by number: 2 before 10."""
+    """Return the sort key of folders of runs, which sorts by number: 2 before 10."""
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in path.parts)
 
 
@@ -457,13 +459,13 @@ _PERMITTED_FILES = (".lock", _SCRATCH, ".hunt.")  # what may be there before: of
 
 
 class HuntDirectory:
-    """The directory of a hunt.
+    """The directory of a hunt, with its lock and scratch folder.
 
     Args:
         path: path of the directory; the directory itself is created if it does not exist.
 
     Attributes:
-        has_begun: whether the hunt runs. Until then, an error removes a directory that was made for it.
+        has_begun: whether the hunt has begun. Before that, an error deletes a directory that was created for the hunt.
     """
 
     def __init__(self, path: Path) -> None:
@@ -472,7 +474,7 @@ class HuntDirectory:
 
     @property
     def scratch(self) -> Path:
-        """The folder in which running trials write.
+        """The folder into which running trials write.
 
         A resumed hunt has another folder, because processes of a killed hunt may still write for a moment.
         """
@@ -483,7 +485,7 @@ class HuntDirectory:
         """Lock the directory against other hunts; the lock ends with this process.
 
         Raises:
-            HuntDirectoryError: the directory is busy, foreign or unwritable.
+            HuntDirectoryError: the directory is in use, belongs to something else, or cannot be written.
         """
         try:
             is_new = self._make()
@@ -517,7 +519,7 @@ class HuntDirectory:
                 raise
 
     def _make(self) -> bool:
-        """Make the directory; return whether it is new."""
+        """Create the directory; return whether it is new."""
         try:
             self.path.mkdir()
         except FileExistsError:
@@ -537,12 +539,12 @@ class HuntDirectory:
 
         Args:
             settings: settings of the hunt.
-            command: the command line, as a comment in ``hunt.toml``.
+            command: the command line, which is written to ``hunt.toml`` as a comment.
             overwrite: whether a new hunt replaces an existing one.
             seed_given: whether the user chose the seed; if not, a resumed hunt keeps its own seed.
 
         Raises:
-            HuntDirectoryError: the hunt that is there makes other trials, or the directory is unwritable.
+            HuntDirectoryError: the existing hunt has other trials, or the directory cannot be written.
         """
         if overwrite:
             self._remove_own()
@@ -606,7 +608,7 @@ class LogReader:
     Args:
         hunt: directory of the hunt.
         kinds: the kinds of logs to read.
-        trial: number of the only trial to read; None for all.
+        trial: number of the only trial whose logs are read; None for all.
     """
 
     def __init__(self, hunt: Path, kinds: tuple[LogKind, ...], *, trial: int | None = None) -> None:
@@ -618,7 +620,7 @@ class LogReader:
         self._told = 0
 
     def fresh(self) -> Iterator[tuple[str, str]]:
-        """Yield title and text of the lines that are new since the last call."""
+        """Yield the title and the text of lines that are new since the previous call."""
         if self._trial is None:
             if "state" in self._kinds:
                 yield from self._states()
@@ -666,9 +668,9 @@ class LogReader:
                 yield f"{title}{kind}{changed}", text
 
     def _as_written(self, path: Path) -> bool:
-        """Return whether a file has the digest that its crash records.
+        """Return whether a file still has the digest that its crash recorded.
 
-        Files of hunts and of early crashes have no digest.
+        Files of hunts and of early crashes have no recorded digest.
         """
         if path.parent not in self._files:
             self._files[path.parent] = files_of(path.parent)

@@ -1,4 +1,4 @@
-"""Confirmation during a hunt: each saved crash is run again, on one of the hunt's own slots."""
+"""Confirmation during a hunt: each saved crash is run again in one of the hunt's own slots."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ __all__ = [
 class Confirmation:
     """Confirms crashes one at a time, in its own thread. Meanwhile, the hunt has one slot less.
 
-    With ``--by-cause``, the same thread judges crashes, which come before those to confirm. One thread does both, so
-    that neither overwrites in a bundle what the other has found. Crashes that are not confirmed or judged at the end of
+    With ``--by-cause``, the same thread also judges crashes, before it confirms others. Only one thread does both, so
+    that the two results of a bundle cannot overwrite each other. Crashes that are not confirmed or judged at the end of
     the hunt are confirmed and judged then.
 
     Args:
-        again: runs crashes again.
+        again: object that runs crashes again.
         executor: executor of the hunt.
     """
 
@@ -82,7 +82,7 @@ class Confirmation:
         self._is_judging = False
 
     def look(self, progress: Progress) -> None:
-        """Start with new crashes, and collect those that have been confirmed or judged."""
+        """Start the confirmation of new crashes, and collect crashes that have been confirmed or judged."""
         if progress.kinds is None:
             return  # the first crash ends the hunt, and is confirmed then
         for bundle in progress.crashes:
@@ -102,7 +102,7 @@ class Confirmation:
             self._request_run(_JUDGE, wanted)
 
     def close(self, progress: Progress) -> None:
-        """Cancel the running confirmation, so that no stop waits for it."""
+        """Cancel the running confirmation, so that the hunt can stop at once."""
         self._over.set()
         if self._thread is not None:
             self._request_run(_END, None)
@@ -154,16 +154,16 @@ class TrialReruns:
     """Runs trials of a hunt again.
 
     Args:
-        place: place of the hunt.
-        ledger: ledger of the hunt, which has the snapshot of each trial.
+        place: directory of the hunt.
+        ledger: ledger of the hunt, which records the snapshot of each trial.
         settings: settings of the hunt.
         parallel: number of runs at a time.
-        notes: receives a line for each problem.
-        failed: receives runs that should have confirmed a crash, and ended otherwise.
-        stops: non-empty as soon as a stop is requested.
+        notes: list to which a line is added for each problem.
+        failed: list to which runs are added that should have confirmed a crash, but ended differently.
+        stops: list that becomes non-empty as soon as a stop is requested.
         executors: the executors that run crashes again.
-        phases: receive the progress of these runs.
-        taken: the digest of the snapshot that this process has taken; without it, each snapshot has to be trusted.
+        phases: object to which the progress of these runs is reported.
+        taken: digest of the snapshot that this process has taken; if empty, each snapshot has to be trusted.
     """
 
     place: HuntDirectory
@@ -181,11 +181,11 @@ class TrialReruns:
         """Yield each trial as it ends, until a stop is requested.
 
         Args:
-            specs: specifications of different trials of the hunt; their other fields may have been changed.
-            folder: folder of the hunt, into which bundles of them are written.
+            specs: specifications of different trials of the hunt; fields other than the number may have been changed.
+            folder: subfolder of the hunt's directory into which bundles of the runs are written.
 
         Raises:
-            CrashhuntError: they cannot be run.
+            CrashhuntError: the trials cannot be run.
         """
         by_snapshot: dict[str, list[TrialSpec]] = {}
         for spec in specs:
@@ -212,7 +212,7 @@ class TrialReruns:
                 remove_scratch(scratch)
 
     def confirm(self, crashes: Sequence[Bundle]) -> list[Bundle]:
-        """Run every crash again that is not fully confirmed; return all crashes in their order."""
+        """Run every crash again that is not fully confirmed; return all crashes in their original order."""
         left = [bundle for bundle in crashes if not is_settled(bundle)]
         if not left:
             return list(crashes)
@@ -229,8 +229,8 @@ class TrialReruns:
         """Run a crash again that is not fully confirmed; return the updated crash.
 
         Args:
-            bundle: the crash.
-            stopped: called regularly; true to cancel.
+            bundle: the crash to confirm.
+            stopped: function that returns whether to cancel; called regularly.
         """
         if is_settled(bundle) or len(self.stops) or stopped():
             return bundle
@@ -256,8 +256,8 @@ class TrialReruns:
         """Find the cause of a crash by runs, and write the result into its bundle.
 
         Args:
-            bundle: the crash.
-            stopped: called regularly; true to cancel.
+            bundle: the crash to judge.
+            stopped: function that returns whether to cancel; called regularly.
         """
 
         def is_stopped() -> bool:
@@ -278,7 +278,7 @@ class TrialReruns:
         return Judged(found, cause)
 
     def judge(self, progress: Progress) -> None:
-        """Find the causes of the crashes that are still to be judged, one after the other."""
+        """Find the causes of the crashes that are still to be judged, one after another."""
         if progress.kinds is None or (total := progress.kinds.count_to_judge()) == 0:
             return
         self.phases.begin("causes", total)
@@ -288,7 +288,7 @@ class TrialReruns:
             progress.replace([judged.bundle if judged.bundle.id == one.id else one for one in progress.crashes])
 
     def _is_made_now(self, bundle: Bundle) -> bool | None:
-        """Return whether a bundle has the snapshot that this process has just made, so that its files need no check."""
+        """Return whether a bundle has the snapshot that this process has just taken, whose files need no check."""
         return True if bundle.snapshot == self.taken and is_bundle_made_here(bundle) else None
 
 
@@ -302,11 +302,11 @@ class Again:
     """A trial that has been run again.
 
     Args:
-        result: the result.
+        result: result of the second run.
         runs: the object that ran the trial.
-        snapshot: digest of the snapshot.
-        scratch: the folder of the workers.
-        folder: folder of the hunt, for its bundle.
+        snapshot: digest of the snapshot that was run.
+        scratch: scratch folder of the workers.
+        folder: subfolder of the hunt's directory for the bundle.
     """
 
     result: TrialResult
@@ -329,12 +329,12 @@ class Again:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A crash of a copy of a trial.
+    """A crash of a fork of a trial.
 
     Args:
-        spec: specification of the crash from the start.
-        outcome: outcome of the copy.
-        step: step at which the copy ended.
+        spec: specification that should repeat the crash from the start.
+        outcome: outcome of the fork.
+        step: step at which the fork ended.
     """
 
     spec: TrialSpec
@@ -344,12 +344,12 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class VerificationRuns:
-    """Runs crashes of copies from the start.
+    """Runs crashes of forks from the start, to verify them.
 
     Args:
-        again: runs trials of the hunt again.
-        disturber: computes the likelihood of disturbances; None if the hunt has no models.
-        kept: the crashes that were already run, by folder and trial; they are not run again.
+        again: object that runs trials of the hunt again.
+        disturber: object that computes the likelihood of disturbances; None if the hunt has no disturbance models.
+        kept: the crashes that have already been run, by folder and trial; they are not run again.
     """
 
     again: TrialReruns
@@ -358,18 +358,18 @@ class VerificationRuns:
 
     @property
     def is_stopped(self) -> bool:
-        """Whether a stop is requested: crashes of copies may then not have been run from the start."""
+        """Whether a stop is requested; some crashes of forks may then not have been run from the start."""
         return bool(len(self.again.stops))
 
     def crashes(self, found: Sequence[Found], folder: str, name: PhaseName) -> tuple[tuple[Bundle, ...], int]:
-        """Return the crashes that reproduce at the same step, and again bit-identically, in their order.
+        """Return the crashes that reproduce at the same step, and are then confirmed bit-identically, in their order.
 
         The second value is the number of runs that did not finish.
 
         Args:
-            found: crashes of copies of different trials.
-            folder: folder of the hunt, for the bundles; what it had before is gone, but for what is kept. If a stop is
-                requested, it stays.
+            found: crashes of forks of different trials.
+            folder: subfolder of the hunt's directory for the bundles. Its former contents are deleted, except bundles
+                that are kept. If a stop is requested, nothing is deleted.
             name: name of the phase.
         """
         if self.is_stopped:
@@ -386,11 +386,11 @@ class VerificationRuns:
         return tuple(crashed[one.spec.number] for one in found if one.spec.number in crashed), len(unanswered)
 
     def crash(self, found: Found, folder: str) -> Bundle | None:
-        """Return the bundle of a crash that reproduces at the same step, and once more bit-identically; it is kept.
+        """Return the bundle of a crash that reproduces at the same step, and again bit-identically; it is kept.
 
         Args:
-            found: how a copy crashed.
-            folder: folder of the hunt, for its bundle.
+            found: the crash of a fork.
+            folder: subfolder of the hunt's directory for the bundle.
         """
         if self.is_stopped:
             return None
@@ -399,7 +399,7 @@ class VerificationRuns:
         return crashed.get(found.spec.number)
 
     def _run(self, found: Sequence[Found], folder: str) -> tuple[dict[int, Bundle], set[int]]:
-        """Return the bundles of runs that crashed like their copies, and the numbers of trials without a result."""
+        """Return the bundles of runs that crashed like their forks, and the numbers of trials without a result."""
         wanted = {one.spec.number: one for one in found}
         unanswered = set(wanted)
         bundles: dict[int, Bundle] = {}
@@ -441,11 +441,11 @@ class VerificationRuns:
 
 
 class Audit:
-    """Runs the sampled trials again during the hunt, one at a time.
+    """Runs sampled trials again during the hunt, one at a time, and compares them.
 
     Args:
-        settings: settings of the hunt; they say which trials.
-        failed: receives the trials that differed.
+        settings: settings of the hunt, which determine the sampled trials.
+        failed: list to which the trials that differed are added.
     """
 
     def __init__(self, settings: WorkerSettings, failed: list[TrialResult]) -> None:
@@ -472,12 +472,12 @@ class Audit:
 
     @property
     def report(self) -> AuditReport:
-        """The results so far."""
+        """Return the present results of the audit."""
         return AuditReport(self._done, tuple(self._differences), len(self.left))
 
     @property
     def parallel(self) -> int:
-        """The number of trials that run at a time."""
+        """The number of audited trials that run at a time."""
         return self._executor.capacity
 
     @parallel.setter
@@ -485,7 +485,7 @@ class Audit:
         self._executor.capacity = parallel
 
     def add(self, result: TrialResult) -> TrialResult:
-        """Take over the recording of a trial of the sample; return the trial as the hunt continues with it."""
+        """Keep the recording of a sampled trial, and return the trial in the form with which the hunt continues."""
         if not self._settings.is_audited(result):
             return result
         number = result.spec.number
@@ -500,7 +500,7 @@ class Audit:
         return replace(result, kept=False)
 
     def look(self, timeout_s: float = 0.0) -> list[Difference]:
-        """Return the results since the last call; wait at most this long for a running trial."""
+        """Return the results since the previous call; wait at most ``timeout_s`` for a running trial."""
         if not self._waiting:
             return []
         found = []
@@ -553,7 +553,7 @@ class Audit:
         return None
 
     def _folders(self, number: int) -> tuple[Path, Path]:
-        """Return where the recordings of a trial are: that of the hunt, and that of the fresh process."""
+        """Return the paths of a trial's two recordings: from the hunt, and from the new process."""
         return self._scratch / f"recorded-{number:06d}", scratch_of(self._scratch, number)
 
     def _clean_up(self, number: int) -> None:
@@ -573,8 +573,8 @@ class PendingAudits:
 
     Args:
         ledger: ledger of the hunt.
-        before: its facts, as the earlier runs left them.
-        settings: settings of the workers; they say which trials belong to the sample.
+        before: facts in the ledger at the end of the earlier runs.
+        settings: settings of the workers, which determine the sampled trials.
 
     Attributes:
         numbers: numbers of these trials.
@@ -594,7 +594,7 @@ class PendingAudits:
         progress.audits_left = sorted({*audit.left, *self.numbers})
 
     def finish(self, again: TrialReruns, progress: Progress) -> None:
-        """Run these trials again, and add the results to the progress of the hunt."""
+        """Run the pending trials again, and add the results to the progress of the hunt."""
         left_now = set(progress.audits_left) - set(self.numbers)
         now, (late, left) = progress.audit or AuditReport(), _finish(again, self.numbers)
         progress.audit = AuditReport(
@@ -604,10 +604,10 @@ class PendingAudits:
 
 
 def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, list[int]]:
-    """Run trials again that are to be audited; return the result, and the numbers that are still left.
+    """Run audited trials again; return the result, and the numbers of the trials that are still pending.
 
     Args:
-        again: runs trials of the hunt again. Its ledger gets a remark for each trial that differs.
+        again: object that runs trials of the hunt again. A remark is added to its ledger for each trial that differs.
         numbers: numbers of the trials.
     """
     ledger = again.ledger
