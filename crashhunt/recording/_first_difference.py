@@ -21,8 +21,8 @@ __all__ = ["first_divergence", "has_same_scenes", "values_around"]
 def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | None:
     """Return the first difference between two recordings; None if they are bit-identical.
 
-    Within a step, observations come before actions and actions before the scene, as in the episode. If the first is
-    compact, the values of its actors are compared, and the digest of the whole recording.
+    Within a step, observations come before actions and actions before the scene, as in the episode. If the first
+    recording is compact, the values of its actors and the digest of the complete recording are compared.
     """
     whole, replayed = replayed, replayed.like(recorded)
     if recorded.prologue != replayed.prologue:
@@ -61,9 +61,10 @@ def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | N
 def values_around(
     recorded: Recording, replayed: Recording, divergence: Divergence, *, reach: int
 ) -> list[tuple[int, object, object]]:
-    """Return (step, recorded value, replayed value) of the field that diverges, in the steps around.
+    """Return (step, recorded value, replayed value) of the divergent field in the steps around the divergence.
 
-    The result is empty if the divergence is not about one value. A value is None if a recording lacks the step.
+    The result is empty if the divergence does not concern a single value. A value is None if a recording lacks the
+    step.
     """
     if divergence.place is None:
         return []
@@ -83,20 +84,20 @@ def _value(recording: Recording, number: int, divergence: Divergence) -> object:
 
 
 def _differences(agents: tuple[AgentChannel, ...]) -> list[tuple[Difference, AgentChannel | None]]:
-    """Return the comparisons of the steps of two recordings, in their order."""
+    """Return the comparisons of the steps of two recordings, in the order of the comparison."""
     kinds = [(kind.per_agent, kind.difference) for kind in RECORD_TYPES.values() if kind.difference is not None]
     of_agents = [(difference, agent) for agent in agents for per_agent, difference in kinds if per_agent]
     return [*of_agents, *((difference, None) for per_agent, difference in kinds if not per_agent)]
 
 
 def has_same_scenes(recorded: Recording, rerun: Recording, step: int) -> bool:
-    """Return whether the scenes of a run are bit-identical to the recorded ones up to and including a step.
+    """Return whether the scenes of a run are bit-identical to the recorded scenes up to and including a step.
 
-    Where a change begins after this step, only such a run says something about the recorded trial. Observations and
+    If a change begins after this step, only such a run gives information about the recorded trial. Observations and
     actions are not compared: other versions may record them in another form.
 
     Args:
-        recorded: the recording of the trial, which reaches the step.
+        recorded: the recording of the trial; it must contain the step.
         rerun: the recording of the run.
         step: the last step to compare.
     """

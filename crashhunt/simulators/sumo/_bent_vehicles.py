@@ -27,7 +27,7 @@ Point = tuple[float, float]
 
 
 def is_articulated(actor: Actor) -> bool:
-    """Whether a vehicle has joints: rail vehicles, trailers, and vehicles longer than a rigid bus."""
+    """Return whether a vehicle has joints: rail vehicles, trailers, and vehicles longer than a rigid bus."""
     jointed = actor.kind in _RAIL_CLASSES or actor.kind == "trailer"
     return actor.length > (_JOINT_M if jointed else _RIGID_M)
 
@@ -49,7 +49,7 @@ class Bends:
         self._used: dict[str, dict[str, str]] = {}
 
     def reset(self) -> None:
-        """Forget the vehicles of an episode."""
+        """Delete the stored vehicles of the last episode."""
         self._used.clear()
 
     def spine(self, vehicle: str, length: float, front: Point, heading: float, *, high: bool) -> Spine | None:
@@ -60,7 +60,7 @@ class Bends:
             length: Length of the vehicle, in m.
             front: Centre of the front bumper.
             heading: SUMO's heading, in rad; for a train, the heading of its first carriage.
-            high: Whether the map has heights; otherwise z is 0.
+            high: Whether the network has heights; otherwise z is 0.
         """
         lane = sumo.vehicle_getLaneID(vehicle)
         if not lane:
@@ -87,7 +87,7 @@ class Bends:
         return None if _is_straight(found, length, heading) else tuple(found)
 
     def _behind(self, vehicle: str, lane: str, position: float, length: float) -> Iterator[tuple[Point, str, float]]:
-        """Yield the points of the lanes from a vehicle's front backwards, each with its lane and position on it."""
+        """Yield the points of the lanes backwards from a vehicle's front, each with its lane and its position."""
         route = sumo.vehicle_getRoute(vehicle)
         edge = sumo.vehicle_getRouteIndex(vehicle) - (not lane.startswith(":"))  # index of the edge before this lane
         driven = 0.0
@@ -141,7 +141,7 @@ class Bends:
 
 
 def _shifted(line: list[tuple[Point, str, float]], left: float) -> list[tuple[Point, str, float]]:
-    """Return a line, whose points run backwards, moved to the left as seen in driving direction."""
+    """Return a line, whose points run backwards, after moving it to the left as seen in driving direction."""
     moved = []
     for index, ((x, y), lane, place) in enumerate(line):
         (ax, ay), (bx, by) = line[max(index - 1, 0)][0], line[min(index + 1, len(line) - 1)][0]
@@ -152,7 +152,7 @@ def _shifted(line: list[tuple[Point, str, float]], left: float) -> list[tuple[Po
 
 
 def height_at(lane: str, position: float) -> float:
-    """Return z of the centre line of a lane at a position, in m; a position beyond an end is moved to that end."""
+    """Return z of a lane's centre line at a position, in m; a position beyond an end is replaced by that end."""
     edge, _, index = lane.rpartition("_")
     # SUMO refuses a position that exceeds the length of the lane by a rounding error.
     position = max(0.0, min(position, sumo.lane_getLength(lane) - 1e-6))
@@ -161,7 +161,7 @@ def height_at(lane: str, position: float) -> float:
 
 
 def _is_straight(spine: Sequence[tuple[float, float, float]], length: float, heading: float) -> bool:
-    """Whether one rectangle with this heading covers the vehicle within `_STRAIGHT_M`."""
+    """Return whether one rectangle with this heading covers the vehicle within `_STRAIGHT_M`."""
     (x, y, _), c, s = spine[0], math.cos(heading), math.sin(heading)
     if math.dist(spine[-1][:2], (x - length * c, y - length * s)) > _STRAIGHT_M:
         return False

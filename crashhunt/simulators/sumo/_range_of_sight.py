@@ -153,7 +153,7 @@ class Sight:
 
     @property
     def plain(self) -> tuple[Vehicles, tuple[str, ...]] | None:
-        """The vehicles in sight, for the core, and their ids; None if the scene has more than the core reads."""
+        """The ids of the vehicles in sight and their data for the core; None if the core cannot read the scene."""
         if self._plain is None or self._high or self._all_persons:
             return None
         return self._plain, self._ids
