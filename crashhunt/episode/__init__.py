@@ -1,4 +1,4 @@
-"""The episode: the only place where agent, simulator, oracle and recorder meet."""
+"""The episode: the only place where agent, simulator, oracle and recorder interact."""
 
 import lazy_loader
 

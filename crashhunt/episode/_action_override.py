@@ -1,6 +1,6 @@
-"""Drivers that override an agent from a step on, and an agent that takes over from a recording at a step.
+"""Drivers that overrule an agent from a step on, and an agent that takes control after recorded actions.
 
-An overruled agent brakes, changes lanes and brakes, keeps its lane or its speed, or has a reference driver.
+An overruled agent brakes, changes lanes and brakes, keeps its lane or its speed, or is corrected by a reference driver.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SPEED_ACTIONS = ("FASTER", "SLOWER")
 
 
 def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -> Agent:
-    """Return an agent that drives like a given agent up to a step, and is overridden after it.
+    """Return an agent that drives like the given agent up to a step, and is overruled after it.
 
     Args:
         driver: the given agent.
@@ -47,17 +47,17 @@ def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -
 
 
 class Braking:
-    """Lets an agent drive up to a step. From then on, the vehicle brakes as hard as it can, or changes lanes.
+    """Lets an agent drive up to a step. After this step, the vehicle brakes as hard as it can, or changes lanes.
 
     Args:
-        driver: the agent.
+        driver: the agent that drives up to the step.
         simulator: the simulator, which provides the action for full braking.
-        agent: the vehicle.
-        after: the step after which it brakes.
-        manoeuvre: as in `Overruled`.
+        agent: identifier of the controlled vehicle.
+        after: the step after which the vehicle brakes.
+        manoeuvre: name of the manoeuvre, as in `Overruled`.
 
     Raises:
-        InvalidEpisodeError: the simulator does not know.
+        InvalidEpisodeError: the simulator has no action for this manoeuvre.
     """
 
     def __init__(self, driver: Agent, simulator: Simulator, agent: str, after: int, manoeuvre: str = "brake") -> None:
@@ -75,26 +75,26 @@ class Braking:
         self._driver.reset(seed)
 
     def act(self, observation: object) -> object:
-        """Return the driver's action, or the braking action after the step."""
+        """Return the agent's action, or the braking action after the step."""
         step, self._step = self._step, self._step + 1
         if step == self._after:
             return self._first
         return self._driver.act(observation) if step < self._after else self._action
 
     def close(self) -> None:
-        """Close the driver."""
+        """Close the agent."""
         if supports(self._driver, Closes):
             self._driver.close()
 
 
 class Keeping:
-    """Lets an agent drive, and from a step on prevents lane changes or speed changes of its vehicle.
+    """Lets an agent drive, and after a step prevents lane changes or speed changes of its vehicle.
 
     Args:
-        driver: the agent.
+        driver: the agent that drives.
         simulator: the simulator, which reports the speed of the vehicle.
-        agent: the vehicle.
-        after: the step after which the vehicle is held.
+        agent: identifier of the controlled vehicle.
+        after: the step after which lane or speed are kept.
         keeps: ``lane`` prevents lane changes, ``speed`` holds the speed.
 
     Raises:
@@ -118,7 +118,7 @@ class Keeping:
         self._driver.reset(seed)
 
     def act(self, observation: object) -> object:
-        """Return the driver's action, without the overridden parts."""
+        """Return the agent's action, with the overruled parts replaced."""
         step, self._step = self._step, self._step + 1
         if step == self._after:
             scene = self._simulator.scene()
@@ -127,7 +127,7 @@ class Keeping:
         return action if step < self._after else self._kept(action)
 
     def close(self) -> None:
-        """Close the driver."""
+        """Close the agent."""
         if supports(self._driver, Closes):
             self._driver.close()
 
@@ -143,14 +143,15 @@ class Keeping:
 
 
 class HandedOver:
-    """Plays the recorded actions of a vehicle up to a step, and lets its agent act from that step on.
+    """Repeats the recorded actions of a vehicle up to a step, and lets its agent act after that.
 
-    The agent is made before the first step, as in every trial. The agent is reset after the last recorded action, with
-    the seed of the trial. Its first observation is the one after this step, so it has no observation of earlier steps.
+    The agent is created before the first step, as in every trial. It is reset after the last recorded action, with the
+    seed of the trial. Its first observation is the observation after this step, so it has no observation of earlier
+    steps.
 
     Args:
-        driver: the agent.
-        handover: the vehicle, its log and the step.
+        driver: the agent that takes control.
+        handover: the vehicle, its recording and the step.
     """
 
     def __init__(self, driver: Agent, handover: Handover) -> None:
@@ -179,7 +180,7 @@ class HandedOver:
 
 
 def _idle(form: ActionForm) -> int | None:
-    """Return the action that changes nothing; None if there is none."""
+    """Return the action that changes neither speed nor lane; None if there is none."""
     space = form.space
     return (
         tuple(space.meanings).index("IDLE") if supports(space, NamesMetaActions) and "IDLE" in space.meanings else None
@@ -239,12 +240,12 @@ class _Response:
 
 
 class ReferenceDriver:
-    """Lets an agent drive, and from a step on corrects its unsafe speeds, lane changes, or both.
+    """Lets an agent drive, and after a step corrects its unsafe speeds, lane changes, or both.
 
     Args:
-        driver: the agent.
+        driver: the agent that drives.
         simulator: the simulator, which reports the surroundings of the vehicle.
-        overruled: the vehicle, the step, and the faculty.
+        overruled: the vehicle, the step, and what is corrected: speed, lane changes, or both.
 
     Raises:
         InvalidEpisodeError: the simulator does not know the surroundings, or the actions have no known speeds.
@@ -349,10 +350,11 @@ class ReferenceDriver:
         )
 
     def _stop_before(self, crossing: Crossing, target: float, around: Surroundings) -> Neighbor | None:
-        """Return the place where the agent must stop for an actor that crosses; None if both can pass.
+        """Return the position at which the agent must stop for a crossing actor; None if both can pass.
 
-        Both have a time window in the conflict area: the agent accelerates to its target speed, the actor keeps its
-        speed. RSS: right of way is given, not taken, so the agent also stops for an actor that can no longer yield.
+        Both have a time window in the conflict area: the agent accelerates to its target speed, and the actor keeps its
+        speed. According to RSS, right of way is given and not taken, so the agent also stops for an actor that can no
+        longer yield.
         """
         if crossing.distance_m <= 0 or (crossing.speed_mps < _STANDS_MPS and crossing.actor_distance_m > 0):
             return None  # it is in the area already and clears it, or the actor waits
@@ -377,7 +379,7 @@ class ReferenceDriver:
         )
 
     def _allowed_change(self, step: int, change: int, around: Surroundings) -> bool:
-        """Return whether a lane change is safe: the gaps ahead and behind in the target lane are safe."""
+        """Return whether a lane change is safe, that is, whether both gaps in the target lane are safe."""
         side = around.sides.get(change) if change else None
         if side is None:
             return True
@@ -391,9 +393,9 @@ class ReferenceDriver:
         return not found
 
     def _unsafe_neighbors(self, side: Side, around: Surroundings) -> list[tuple[str, Neighbor | None, float]]:
-        """Return each reason why a lane change is not safe: the word, the vehicle, and the gap that it needs, in m.
+        """Return each reason why a lane change is unsafe: the reason's name, the vehicle, and the required gap in m.
 
-        All reasons count. The collision partner need not be the vehicle whose gap is the least safe.
+        All reasons are returned, because the collision partner need not be the vehicle with the least safe gap.
         """
         if not side.exists:
             return [("no lane", None, 0.0)]
@@ -407,7 +409,7 @@ class ReferenceDriver:
         return found
 
     def _needed_m(self, neighbor: Neighbor, around: Surroundings, *, is_ahead: bool) -> float:
-        """Return the gap that is safe between the vehicle and a neighbor of the target lane, in m."""
+        """Return the safe gap between the vehicle and a neighbour in the target lane, in m."""
         rear, front = (around, neighbor) if is_ahead else (neighbor, around)
         return safe_distance(
             rear.speed_mps,
@@ -429,10 +431,11 @@ class ReferenceDriver:
 
 
 def _brakings(rear_mps2: float, front_mps2: float) -> dict[str, float]:
-    """Return the decelerations of a safe distance.
+    """Return the decelerations from which a safe distance is computed.
 
-    RSS compares the stopping distances only, so it holds where the front vehicle brakes at least as hard as the rear
-    one. A rear vehicle that brakes harder would otherwise be allowed to drive through a slower one.
+    RSS compares only the stopping distances, so its formula is valid if the front vehicle brakes at least as hard as
+    the rear vehicle. Otherwise, it would allow a rear vehicle that brakes harder to drive through a slower front
+    vehicle.
     """
     planned = min(rear_mps2, MAX_PLANNED_BRAKING_MPS2)
     return {"braking_mps2": planned, "front_braking_mps2": max(front_mps2, planned)}

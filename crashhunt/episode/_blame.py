@@ -1,4 +1,4 @@
-"""Finds the party whose code raised an exception: the simulator, a user's environment or oracle, or crashhunt."""
+"""Finds the origin of an exception: the simulator, a user's environment or oracle, or crashhunt."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ _ISSUES_URL: Final = "https://github.com/crashhunt/crashhunt/issues"
 
 @dataclass(frozen=True, slots=True)
 class Blame:
-    """The party that an exception comes from.
+    """The origin of an exception.
 
     Args:
         error: The exception itself, without its wrapper.
-        party: The party whose code raised the exception.
-        place: What that code was called for; empty if it is not known.
-        is_resource: Whether memory or files ran out in crashhunt's own code, so that the party is not known.
+        party: The origin, as text: the owner of the code that raised the exception.
+        place: The purpose for which that code was called; empty if it is unknown.
+        is_resource: Whether memory or file handles ran out in crashhunt's own code, so that the origin is unknown.
     """
 
     error: BaseException
@@ -63,21 +63,20 @@ class Blame:
 
 
 def party_of_simulator(simulator: Simulator) -> Party:
-    """Return the party whose code a simulator runs: an environment or a simulator."""
+    """Return the owner of the code that a simulator runs: a user's environment or the simulator."""
     return simulator.party if supports(simulator, RunsForeignCode) else Party.SIMULATOR
 
 
 def blame(error: BaseException, simulator: Simulator, place: str = "") -> Blame:
-    """Return the party that wrote the code of an exception, if it is not an agent.
+    """Return the owner of the code that raised an exception, if the code is not an agent's.
 
-    The wrapper of a boundary names the party. An exception without a wrapper is crashhunt's own, with two exceptions:
-    an error that an adapter raises on purpose (`SimulatorError`), and an error that has passed through
-    `foreign_packages`.
+    Code at a boundary wraps an exception and names the owner. Exceptions without a wrapper are crashhunt's own, except
+    for two cases: an adapter has raised a `SimulatorError`, or the exception has passed through `foreign_packages`.
 
     Args:
         error: The exception.
         simulator: The simulator of the episode.
-        place: What the simulator was called for, if it was called.
+        place: The purpose for which the simulator was called, if it was called.
     """
     if type(error) is ForeignError:
         return Blame(error.error, error.party, error.place)
@@ -112,7 +111,7 @@ def has_users_code(error: BaseException) -> bool:
 
 
 def _has_passed(error: BaseException, packages: Sequence[str]) -> bool:
-    """Return whether an exception's class belongs to these packages, or it passed through their code."""
+    """Return whether an exception's class belongs to the given packages, or the exception passed through their code."""
     modules: set[object] = {type.__dict__["__module__"].__get__(type(error))}
     link: TracebackType | None = error.__traceback__
     while link is not None:
@@ -125,7 +124,7 @@ def _has_passed(error: BaseException, packages: Sequence[str]) -> bool:
 
 
 def guarded_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the reset of a foreign simulator inside a boundary."""
+    """Return the reset function of a foreign simulator, wrapped so that its exceptions name their origin."""
 
     def checked(**given: object) -> tuple[dict[str, NDArray[Any]], object]:
         observations, info = reset(**given)
@@ -135,7 +134,7 @@ def guarded_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def guarded_step(step: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return the step of a foreign simulator inside a boundary."""
+    """Return the step function of a foreign simulator, wrapped so that its exceptions name their origin."""
 
     def checked(actions: object) -> tuple[object, ...]:
         observations, rewards, terminations, truncations, infos = step(actions)
@@ -149,7 +148,7 @@ def guarded_step(step: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def guarded_scene(scene: Callable[[], Any]) -> Callable[[], Scene]:
-    """Return the method ``scene`` of a foreign simulator inside a boundary."""
+    """Return the method ``scene`` of a foreign simulator, wrapped so that its exceptions name their origin."""
 
     def checked() -> Scene:
         found = scene()
@@ -161,7 +160,7 @@ def guarded_scene(scene: Callable[[], Any]) -> Callable[[], Scene]:
 
 
 def guarded_check(check: Callable[..., Any]) -> Callable[..., Sequence[Finding]]:
-    """Return the check of a user's oracle inside a boundary."""
+    """Return the check of a user's oracle, wrapped so that its exceptions name their origin."""
 
     def checked(scene: Scene, agents: Sequence[str]) -> Sequence[Finding]:
         found = list(check(scene, agents) or ())
@@ -186,8 +185,8 @@ def internal_error(error: BaseException, trial: int | None = None, steps: int | 
 
     Args:
         error: The exception.
-        trial: Number of the trial; None if it is not known.
-        steps: Number of completed steps; -1 if the trial was being set up; None if unknown.
+        trial: Number of the trial; None if it is unknown.
+        steps: Number of completed steps; -1 if the trial was being set up; None if it is unknown.
     """
     if type(error) is InternalError:
         return error

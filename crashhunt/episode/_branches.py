@@ -1,12 +1,12 @@
-"""Branches: near other actors, forks of an episode continue with other disturbances.
+"""Branches: forks of an episode that continue with other disturbances, when other actors are near.
 
 In every second of simulation with a near actor, the episode leaves a suspended fork. At intervals the fork runs at once
-with all possible disturbances at their greatest strength. A moment that survives them mostly survives milder ones as
-well, so one branch answers many questions. If the branch crashes, disturbances are removed one by one while it still
-crashes.
+with all possible disturbances at their greatest strength. If the fork does not crash, milder disturbances would hardly
+cause a crash either, so one branch replaces many. If the branch crashes, disturbances are removed one by one while it
+still crashes.
 
-The criticality of a moment is known only some seconds later. Then the forks of a critical moment, and of some seconds
-before, run with disturbances from the usual distributions.
+The criticality of a step is known only some seconds later. The forks of a critical step, and of some seconds before,
+then run with disturbances from the usual distributions.
 """
 
 from __future__ import annotations
@@ -68,14 +68,14 @@ class _StoredFork:
 
 @dataclass(frozen=True, slots=True)
 class _Crashed:
-    """A branch that crashed.
+    """A branch that crashed, with its disturbances.
 
     Args:
         took_place: the disturbances of the branch that took place.
-        branched: step after which the branch began.
+        branched: the step after which the branch began.
         outcome: outcome of the branch.
         step: step at which the branch ended.
-        log_likelihood: as in `Branch`.
+        log_likelihood: log-likelihood of the disturbances, as in `Branch`.
     """
 
     took_place: tuple[Disturbance, ...]
@@ -89,13 +89,13 @@ class Brancher(Observer):
     """Runs branches of one episode after another.
 
     Args:
-        words: The rates of disturbances, ``NAME=RATE`` each, or disturbances in given steps.
+        words: The rates of disturbances, each as ``NAME=RATE``, or disturbances in given steps.
         crash_on: The outcomes that count as a crash.
-        delay: Called with the wall time that branches have taken, in s.
-        tell: Called with notices for the user.
+        delay: Function called with the wall time that branches have taken, in s.
+        tell: Function called with texts for the user.
 
     Attributes:
-        questions: Runs the copies, and counts those without a result.
+        questions: Object that runs the forks, and counts those without a result.
     """
 
     def __init__(
@@ -133,15 +133,15 @@ class Brancher(Observer):
         self._any = False
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
-        """Keep the last scenes."""
+        """Store the last scenes of the episode."""
         self._frames.append(scene.frame)
 
     def is_due(self, episode: Episode) -> bool:
-        """Whether to leave a suspended fork after the last step."""
+        """Return whether to leave a suspended fork after the last step."""
         return episode.steps % self._second == 0
 
     def ask(self, episode: Episode) -> None:
-        """Leave a suspended fork if an actor is near, and run the due branches of this fork and of older ones."""
+        """Leave a suspended fork if an actor is near, and run the due branches of this fork and of earlier ones."""
         began = time.monotonic()
         try:
             self._ask(episode)
@@ -180,12 +180,12 @@ class Brancher(Observer):
         return self._asleep[-1]
 
     def close(self) -> None:
-        """End all copies, except in a process that an agent has forked itself: the copies are not its children."""
+        """End all forks, except in a process that an agent has forked, because the forks are not its children."""
         while self._asleep and os.getpid() == self._owner:
             self._asleep.pop().copy.end()
 
     def result(self, result: TrialResult) -> TrialResult:
-        """Return the result of the trial with the results of its copies."""
+        """Return the result of the trial, with the results of its forks added."""
         if not self._any:
             return result  # no branch could run, so there is no result
         if str(result.outcome) in self._crashes:
@@ -207,7 +207,7 @@ class Brancher(Observer):
         return self._disturber
 
     def _is_near(self, episode: Episode) -> bool:
-        """Whether a disturbance may have an effect soon: an actor is within 50 m, or on a collision course."""
+        """Return whether a disturbance may soon have an effect: an actor is within 50 m, or on a collision course."""
         frames = [self._frames[-1]]
         found = (approaches(frames, name)[:2] for name in episode.names)
         return any(math.isfinite(float(measured[-1])) for both in found for measured in both)
@@ -247,7 +247,7 @@ class Brancher(Observer):
                 self._record_crash(episode, found)
 
     def _ask_dangerous_moment(self, episode: Episode, now: int) -> None:
-        """Run branches from a moment whose criticality is high, and higher than that of the moments around it."""
+        """Run branches from a step whose criticality is high, and higher than that of the steps around it."""
         second = self._second
         if not self._asleep or now < self._rests_until:
             return
@@ -288,10 +288,10 @@ class Brancher(Observer):
     def _branch(
         self, episode: Episode, sleeper: _StoredFork, choices: Sequence[Sequence[Disturbance]], until: int
     ) -> _Crashed | None:
-        """Run a branch with other disturbances: from each choice, the first disturbance with a target vehicle.
+        """Run a branch with other disturbances: the first disturbance of each choice that has a target vehicle.
 
         Returns:
-            None if the branch has not crashed, or has no result.
+            The crashed branch; None if the branch has not crashed, or has no result.
         """
         job: Plain = {"choices": [[one.to_json() for one in some] for some in choices], "until": until}
 
@@ -328,7 +328,7 @@ class Brancher(Observer):
         return self._asleep[-1].copy
 
     def _record_crash(self, episode: Episode, found: _Crashed) -> None:
-        """Add a crashed branch, as a specification from the start."""
+        """Add a crashed branch to the result, with a specification that repeats it from the start."""
         begun = [one for one in episode.spec.disturbances if one.step <= found.branched + _STEPS_TO_FIRST_ONSET - 1]
         planned = in_turn([*begun, *found.took_place])
         branch = Branch(
@@ -368,7 +368,7 @@ class Brancher(Observer):
 
 
 def _choice(copy: Episode, some: Sequence[Disturbance]) -> Disturbance | None:
-    """Return the first disturbance with a target vehicle; a single disturbance is returned unchecked."""
+    """Return the first disturbance that has a target vehicle; a single disturbance is returned without a check."""
     simulator = copy.simulator
     if len(some) == 1 or not supports(simulator, SupportsDisturbances):
         return some[0]

@@ -1,7 +1,8 @@
-"""Injects the disturbances of a trial between the agents and the simulator.
+"""Injects the disturbances of a trial between its agents and the simulator.
 
-The target vehicle of a disturbance is determined just before the step in which the disturbance begins. Late or noisy
-observations are recorded as the agent receives them. Late actions are recorded when the agent decides.
+The target vehicle of a disturbance is determined just before the step in which the disturbance begins. Delayed or noisy
+observations are recorded in the form in which the agent receives them. Delayed actions are recorded when the agent
+returns them.
 """
 
 from __future__ import annotations
@@ -42,21 +43,21 @@ _NOISELESS_COLUMNS = (
 
 
 class _Filter(Protocol):
-    """Changes an agent's observation or action in each step of its disturbance."""
+    """The interface of an object that changes an agent's observation or action in each step of a disturbance."""
 
     def __call__(self, array: Array) -> Array: ...
 
 
 @dataclass(slots=True)
 class _OngoingDisturbance:
-    """An active disturbance.
+    """A disturbance that has begun and has not ended.
 
     Args:
         last: The last step of the disturbance.
         vehicle: The disturbed vehicle, or the agent if its observations or actions are disturbed.
-        what: The type.
+        what: The kind of the disturbance.
         active: The simulator's disturbance of a vehicle; None if the agent itself is disturbed.
-        filters: Changes the agent's observations or actions; None if a vehicle is disturbed.
+        filters: Object that changes the agent's observations or actions; None if a vehicle is disturbed.
     """
 
     last: int
@@ -72,11 +73,11 @@ class DisturbanceInjector:
     Args:
         spec: The specification of the trial.
         simulator: The simulator, after its reset.
-        callbacks: Called with each disturbance that takes place; the caller may extend this list later.
-        advance: Runs a step of the simulator; by default its method ``step``.
+        callbacks: Functions called with each disturbance that takes place; the caller may extend this list later.
+        advance: Function that runs a step of the simulator; by default its method ``step``.
 
     Raises:
-        InvalidEpisodeError: The simulator does not support a type of disturbance.
+        InvalidEpisodeError: The simulator does not support a kind of disturbance.
     """
 
     def __init__(
@@ -112,7 +113,7 @@ class DisturbanceInjector:
         self._before: Mapping[str, Array] = {}
 
     def add(self, disturbance: Disturbance) -> None:
-        """Plan one more disturbance, which begins at the earliest in the step after the next."""
+        """Plan one more disturbance, which begins no earlier than in the step after the next."""
         waits = self._agent_waits if disturbance.what in SENSOR_KINDS else self._traffic_waits
         waits.append(disturbance)
         waits.sort(key=lambda one: (one.agent, one.what))  # as a specification has those of one step
@@ -126,7 +127,7 @@ class DisturbanceInjector:
             self.add(one)
 
     def took_place(self, planned: Disturbance) -> bool:
-        """Whether a disturbance that has begun had a target vehicle."""
+        """Return whether a disturbance that has begun had a target vehicle."""
         return any(
             one.vehicle and (one.step, one.agent, one.what) == (planned.step, planned.agent, planned.what)
             for one in self._reported
@@ -157,7 +158,7 @@ class DisturbanceInjector:
         return in_effect(result, self._reported)
 
     def _is_due(self, step: int) -> bool:
-        """Return whether a disturbance begins: of a vehicle in this step, or of an agent in the next step."""
+        """Return whether a disturbance begins: for a vehicle in the current step, for an agent in the next step."""
         traffic, agents = self._traffic_waits, self._agent_waits
         return bool((traffic and traffic[-1].step <= step) or (agents and agents[-1].step <= step + 1))
 
@@ -173,7 +174,7 @@ class DisturbanceInjector:
         return steps_of(seconds, self._dt)
 
     def _begin(self, planned: Disturbance) -> None:
-        """Disturb a vehicle from this step on, if there is a suitable vehicle."""
+        """Disturb a vehicle from the current step on, if there is a suitable vehicle."""
         last = self._step + self._steps(planned.how_long) - 1
         vehicle = self._target(planned)
         active = None
@@ -211,7 +212,7 @@ class DisturbanceInjector:
         return found
 
     def _filtered_observations(self, observations: Observations) -> Observations:
-        """Return the observations of the agents for the next step, with their disturbances."""
+        """Return the observations that the agents receive for the next step, with their disturbances."""
         step, found = self._step + 1, dict(observations)
         while self._agent_waits and self._agent_waits[-1].step <= step:
             self._begin_of_agent(self._agent_waits.pop(), found)
@@ -253,11 +254,11 @@ class DisturbanceInjector:
 
 
 class _Late:
-    """Returns the value of an earlier step; before that, a value derived from the first one.
+    """Delays a value: returns the value of an earlier step; before that, a value derived from the first value.
 
     Args:
-        delay: The delay in steps.
-        held: Returns the value for the first steps, from the first value.
+        delay: The delay, in steps.
+        held: Function that returns the value for the first steps, given the first value.
     """
 
     def __init__(self, delay: int, held: Callable[[Array], Array] = lambda first: first) -> None:
@@ -274,7 +275,7 @@ class _Late:
 
 
 class _Held:
-    """Returns the action of a vehicle while no decision reaches it: the same speed, and no lane change.
+    """Returns the action of a vehicle that receives no decision: it keeps the speed and the lane.
 
     Args:
         form: The vehicle's action form.
@@ -296,14 +297,14 @@ class _Held:
 
 
 class _Noisy:
-    """Makes every number wrong by up to a share of itself, within the bounds of the space.
+    """Adds to every number an error of up to a share of the number, within the bounds of the space.
 
     Args:
         share: The largest relative error.
-        names: The names of the columns, if known; directions, presence and class stay exact.
+        names: The names of the columns, if known; directions, presence and class are not changed.
         low: The lower bound of each number.
         high: The upper bound of each number.
-        rng: A random generator of its own.
+        rng: The random generator of the disturbance.
     """
 
     def __init__(self, share: float, names: Sequence[str], low: Array, high: Array, rng: np.random.Generator) -> None:

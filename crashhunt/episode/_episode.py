@@ -1,4 +1,4 @@
-"""One episode: the only place where agent, simulator and oracle meet."""
+"""One episode: the only place where agent, simulator and oracle interact."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ C = TypeVar("C")
 
 
 class Forkable:
-    """The part of an `Episode` that forks it."""
+    """The part of an `Episode` that forks the episode."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -57,22 +57,23 @@ class Forkable:
         raise NotImplementedError
 
     def fork(self, work: Callable[[Self], Plain], *, observed: bool = True) -> Copy:
-        """Fork this process between two steps; the fork continues exactly as the original would.
+        """Fork this process between two steps; the fork continues exactly as the original process would.
 
         Args:
-            work: Runs in the fork, which then ends; it may fork again. Its return value is the answer of the fork.
-            observed: Whether observers are still called in the fork. Their recordings go to other files.
+            work: Function that runs in the fork, which then ends; it may fork again. Its return value is sent to the
+                original process.
+            observed: Whether observers are still called in the fork. Their recordings then go to other files.
 
         Raises:
-            CannotForkError: The process has something that a fork cannot copy, such as threads.
+            CannotForkError: The process has resources that a fork cannot copy, such as threads.
         """
         return self._copied(Copy, work, observed=observed)
 
     def suspend_fork(self, work: Callable[..., Plain]) -> SuspendedFork:
-        """Leave a suspended fork; for each request, a fork of it resumes from here, without observers.
+        """Leave a suspended fork. For each request, a fork of the suspended fork resumes here, without observers.
 
         Args:
-            work: Runs in the resumed fork, with the request.
+            work: Function that runs in the resumed fork, with the request as its argument.
 
         Raises:
             CannotForkError: As for `fork`.
@@ -108,33 +109,34 @@ ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # never written to
 
 
 class Episode(Forkable, Ending):
-    """One trial that runs step by step; between two steps, its whole state can be examined.
+    """One trial that runs step by step. Between two steps, its whole state can be examined.
 
-    An exception of agent, simulator, oracle or observer ends the episode and is in its result. If a process can have
-    only one simulator of a kind, only one episode may run at a time. The episode does not seed the random generators of
-    the process.
+    An exception of agent, simulator, oracle or observer ends the episode, and its result describes the exception. If a
+    process can have only one simulator of a kind, only one episode may run at a time. The episode does not seed the
+    random generators of the process.
 
     Args:
-        spec: which trial.
-        simulator: where.
-        make_agent: called with agent id, simulator and arguments; returns the agent that drives.
+        spec: specification of the trial.
+        simulator: the simulator in which the trial runs.
+        make_agent: function called with agent id, simulator and arguments; it returns the agent that drives.
         oracles: the oracles, which decide whether a step is a crash.
-        crash_on: The outcomes that end the episode; after other traffic crashes and events, the episode continues.
-        observers: Observers, called in this order.
-        forks: Whether the episode may be forked; it then notes the open files before the agents are made.
-        reset: a function that resets the simulator; None for the simulator's own `reset`.
+        crash_on: The outcomes that end the episode. After other traffic crashes and events, the episode continues.
+        observers: Observers of the episode, called in this order.
+        forks: Whether the episode may be forked; it then records the open files before the agents are created.
+        reset: function that resets the simulator; None for the simulator's own `reset`.
 
     Attributes:
         spec: which trial.
         simulator: where.
-        names: all actors, in the order of their numbers; empty before the start.
-        agents: agents by name; an agent that is replaced between two steps acts from the next step on.
+        names: names of all actors, in the order of their numbers; empty before the start.
+        agents: agents by name. An agent that is replaced between two steps acts from the next step on.
         acting: the numbers of the agents that act in the next step.
         steps: number of completed steps.
         result: The result; None while the episode runs.
         error: the exception that ended the episode, until `close`; None if there was none.
         setup_s: wall time that `start` took, in s.
-        setup_steps: number of steps before the first one; None if the simulator does not report it.
+        setup_steps: number of simulated steps before the first step of the trial; None if the simulator does not report
+            it.
     """
 
     def __init__(
@@ -214,10 +216,10 @@ class Episode(Forkable, Ending):
         return self._scene
 
     def start(self) -> TrialResult | None:
-        """Reset the simulator and make the agents.
+        """Reset the simulator and create the agents.
 
         Returns:
-            None if the first step can be taken, otherwise the result.
+            None if the first step can be run, otherwise the result.
 
         Raises:
             RecorderError: the disk is full.
@@ -231,13 +233,13 @@ class Episode(Forkable, Ending):
         return self.result
 
     def step(self, given: Mapping[str, NDArray[np.generic]] = ASK_ALL) -> TrialResult | None:
-        """Get the actions of the agents, advance the simulator by one step, and check the result with the oracles.
+        """Get the actions of the agents, advance the simulator by one step, and let the oracles check the new scene.
 
         Args:
-            given: agent id to encoded action, for agents that do not act themselves in this step.
+            given: encoded actions, by agent id, of agents that do not act themselves in this step.
 
         Returns:
-            None if the next step can be taken, the result where not.
+            None if the next step can be run, otherwise the result.
 
         Raises:
             RecorderError: the disk is full.
@@ -287,7 +289,7 @@ class Episode(Forkable, Ending):
         actions: dict[str, NDArray[np.generic]],
         advance: Callable[[Mapping[str, NDArray[np.generic]]], StepResult],
     ) -> TrialResult | None:
-        """Advance the simulator with the actions of a step; return the result if the step is the last one."""
+        """Advance the simulator with the actions of a step; return the result if this was the last step."""
         try:
             simulator = self.simulator
             try:
@@ -316,7 +318,7 @@ class Episode(Forkable, Ending):
             return self._break(error)
 
     def close(self) -> None:
-        """Close the agents; may be called twice. What `result` says stays."""
+        """Close the agents; a second call does nothing. The result of the episode does not change."""
         # An exception holds the frames that it came through, and with them this episode and all that agents had open.
         self.error = None
         agents, self.agents = self.agents, {}
@@ -326,27 +328,27 @@ class Episode(Forkable, Ending):
         self._detach_observers()  # observers may hold the episode
 
     def disturb(self, disturbance: Disturbance) -> None:
-        """Add a disturbance that was not planned; it begins at the earliest in the step after the next.
+        """Add an unplanned disturbance, which begins no earlier than in the step after the next.
 
         Raises:
-            RuntimeError: the episode was not made with ``forks``.
+            RuntimeError: the episode was not created with ``forks``.
         """
         if self._disturbed is None:
             raise RuntimeError("only an episode that may be forked can get disturbances while it runs")
         self._disturbed.add(disturbance)
 
     def replan(self, disturbances: Sequence[Disturbance]) -> None:
-        """Replace the disturbances that are planned for the steps after the next, also in the specification."""
+        """Replace the disturbances that are planned for the steps after the next, in the specification as well."""
         if self._disturbed is not None:
             self._disturbed.replan(disturbances)
         begun = [one for one in self.spec.disturbances if one.step <= self.steps + 1]
         self.spec = replace(self.spec, disturbances=in_turn([*begun, *disturbances]))
 
     def reseed(self, seed: int) -> TrialResult | None:
-        """Give the simulator's generators another seed from the next step on.
+        """Give the simulator's random generators another seed from the next step on.
 
         Returns:
-            None if the next step can be taken, the result where not.
+            None if the next step can be run, otherwise the result.
         """
         try:
             assert supports(self.simulator, SupportsReseeding)  # looked at when it was set up
@@ -356,7 +358,7 @@ class Episode(Forkable, Ending):
         return None
 
     def takes_place(self, disturbance: Disturbance) -> bool:
-        """Whether a disturbance that has begun had a target vehicle."""
+        """Return whether a disturbance that has begun had a target vehicle."""
         return self._disturbed is not None and self._disturbed.took_place(disturbance)
 
     def _is_running(self) -> bool:
@@ -426,7 +428,7 @@ class Episode(Forkable, Ending):
         return self._end(Outcome.SURVIVED) if spec.max_steps < 1 else None
 
     def _make(self, number: int, agent: str) -> TrialResult | None:
-        """Make and reset an agent; return the result if that fails."""
+        """Create and reset an agent; return the result of the episode if this fails."""
         place = "constructor"
         try:
             made = self.agents[agent] = self._make_agent(agent, self.simulator, self.spec.arguments.get(agent, {}))
@@ -447,7 +449,7 @@ class Episode(Forkable, Ending):
     def _judge(
         self, finding: Finding | None, actions: Mapping[str, object], truncations: Mapping[str, bool]
     ) -> TrialResult | None:
-        """Return the result if a step was the last one; otherwise note the remaining agents."""
+        """Return the result if a step was the last one; otherwise update the agents that still act."""
         if finding is not None:
             return self._end(finding.outcome, collision=finding.collision, event=finding.event)
         if len(self.simulator.agents) != len(self.acting) or True in truncations.values():
@@ -469,10 +471,10 @@ class Episode(Forkable, Ending):
 
 
 def _require_reseeding(simulator: Simulator) -> None:
-    """Check that a simulator's generators can get another seed.
+    """Check that a simulator's random generators can get another seed.
 
     Raises:
-        InvalidEpisodeError: the generators cannot get another seed.
+        InvalidEpisodeError: the random generators cannot get another seed.
     """
     if not supports(simulator, SupportsReseeding):
         raise InvalidEpisodeError("its simulator offers no way to re-seed its random generators")

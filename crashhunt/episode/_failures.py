@@ -1,4 +1,4 @@
-"""Failures of episodes: the part that raised an exception, the reported evidence, and the end of the episode."""
+"""Failures of episodes: the origin of an exception, the reported evidence, and the end of the episode."""
 
 from __future__ import annotations
 
@@ -58,14 +58,14 @@ _PARTY_BY_ERROR: tuple[tuple[type[BaseException], str], ...] = (
 
 
 def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str = "", place: str = "") -> Failure:
-    """Return the evidence of an exception for the result of a trial.
+    """Return the evidence on an exception for the result of a trial.
 
     Args:
-        error: The exception. A long message or traceback is cut, with a note.
-        agent: The agent whose code failed; empty if it was no agent's code.
-        cause: Why the exception was raised, as a clause; empty if its message says so.
-        party: The party whose code failed; empty if unknown.
-        place: What that code was called for; empty if it is not known.
+        error: The exception. A long message or traceback is cut, and a note says so.
+        agent: The agent whose code failed; empty if it was not an agent's code.
+        cause: Why the exception was raised, as a clause; empty if its message contains the reason.
+        party: The owner of the code that failed; empty if it is unknown.
+        place: The purpose for which that code was called; empty if it is unknown.
     """
     with blocked_signals(), _deep_enough():
         # crashhunt's own messages are complete, so they need no traceback.
@@ -90,7 +90,7 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str 
 
 @contextmanager
 def _deep_enough() -> Iterator[None]:
-    """Restore Python's default recursion limit, which an agent may have changed."""
+    """Return a context with Python's default recursion limit, which an agent may have changed."""
     limit = sys.getrecursionlimit()
     sys.setrecursionlimit(max(limit, _MIN_RECURSION_LIMIT))
     try:
@@ -101,20 +101,21 @@ def _deep_enough() -> Iterator[None]:
 
 
 def is_emptied() -> bool:
-    """Whether imported modules have been removed from ``sys.modules``.
+    """Return whether imported modules have been removed from ``sys.modules``.
 
-    No simulator does that. The next import then fails, such as an import inside NumPy.
+    No simulator removes modules. If an agent has removed them, the next import fails, for example an import inside
+    NumPy.
     """
     return __name__ not in sys.modules
 
 
 def message_of_error(error: BaseException) -> str:
-    """Return the message of an exception, also if its class cannot produce one; a long message is cut."""
+    """Return the message of an exception, even if its class cannot produce one; a long message is cut."""
     return message_of(error)
 
 
 def close_agent(agent: Agent) -> None:
-    """Close an agent, and ignore its exceptions, because the episode is over."""
+    """Close an agent; its exceptions are ignored because the episode is over."""
     try:
         if supports(agent, Closes):
             agent.close()
@@ -150,11 +151,12 @@ _LIMITS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Attribution:
-    """An exception that comes from an agent.
+    """The agent that caused an exception, and how.
 
     Args:
-        agent: identifier of the agent; empty if it is one of several.
-        cause: the action of an agent that made another part fail, as a clause; empty if the agent's own code raised.
+        agent: identifier of the agent; empty if one of several agents caused it.
+        cause: the action by which the agent made another part fail, as a clause; empty if the agent's own code raised
+            the exception.
     """
 
     agent: str
@@ -163,7 +165,7 @@ class Attribution:
 
 @dataclass(slots=True)
 class _Originals:
-    """The functions and limits of the process before a trial ran."""
+    """The functions and limits of the process before any trial ran."""
 
     packages: frozenset[str]
     functions: dict[str, dict[str, object]]
@@ -179,8 +181,8 @@ _originals: list[_Originals] = []
 def record_originals() -> None:
     """Record the functions of simulators and their libraries, and the limits of this process.
 
-    After a failure, a comparison shows which functions an agent has replaced. Call it once all code is imported and
-    before a trial runs.
+    After a failure, a comparison shows which functions an agent has replaced. Call this function after all imports and
+    before the first trial.
     """
     packages = _packages_of_simulators()
     functions: dict[str, dict[str, object]] = {}
@@ -212,10 +214,10 @@ def _callables(thing: ModuleType | type) -> dict[str, object]:
 
 
 def is_tampered() -> bool:
-    """Whether functions of crashhunt, or functions that it needs, have been replaced since `record_originals`.
+    """Return whether functions of crashhunt, or functions that it needs, have been replaced since `record_originals`.
 
-    Then a failure of crashhunt itself is not its own fault. A library or a simulator may replace functions of its own
-    by some of its own, so only functions that come from elsewhere count.
+    If so, a failure of crashhunt itself is not a defect of crashhunt. A library or a simulator may replace its own
+    functions by other functions of its own, so only replacements from elsewhere count.
     """
     if is_emptied():
         return True
@@ -238,12 +240,12 @@ def is_tampered() -> bool:
 
 
 def _is_users_or_nothing(value: object) -> bool:
-    """Return whether the replacement of a function is no function, or a function of the user."""
+    """Return whether the replacement of a function is not a function, or is a function of the user."""
     return not callable(value) or _is_users_module(_module_of_value(value))
 
 
 def _packages_of_simulators() -> frozenset[str]:
-    """Return crashhunt and the installed packages that its simulators use, among them NumPy."""
+    """Return the names of crashhunt and of the installed packages that its simulators use, including NumPy."""
     found = {"crashhunt"}
     for name, module in list(sys.modules.items()):
         if name.startswith("crashhunt.simulators"):
@@ -254,19 +256,19 @@ def _packages_of_simulators() -> frozenset[str]:
 def attribute_error(
     error: BaseException, agents: Mapping[str, object], simulator: object, observing: Sequence[object] = ()
 ) -> Attribution | None:
-    """Return which agent an exception comes from; None if it comes from another part, or the part is not known.
+    """Return the agent that caused an exception; None if another part caused it, or if the cause is unknown.
 
     The exception is attributed to an agent if
 
-    - a function on its traceback, or on that of its cause, is a method of the agent's class, or defined in a module
-      that only the agent uses. A module that environment, oracles or observers use as well counts as theirs.
-    - a function that the traceback refers to has been replaced since `record_originals`.
-    - memory, files or recursion ran out and their limit was lowered since then.
+    - a function on its traceback, or on the traceback of its cause, is a method of the agent's class, or is defined in
+      a module that only the agent uses. A module that environment, oracles or observers use as well does not count.
+    - a function on the traceback has been replaced since `record_originals`.
+    - memory, file handles or recursion depth ran out, and their limit was lowered since then.
 
     Args:
         error: the exception, with its traceback.
-        agents: agents by identifier; those made so far.
-        simulator: the simulator.
+        agents: agents by identifier, as far as they have been created.
+        simulator: the simulator of the episode.
         observing: oracles and observers of the episode.
     """
     for _ in range(_MAX_ATTRIBUTION_ATTEMPTS):
@@ -309,7 +311,7 @@ def _agent_on_stack(
     classes: Mapping[str, set[tuple[str, str]]],
     others: set[str],
 ) -> str | None:
-    """Return the agent whose code is the innermost on a stack; empty if several share it, None if none is."""
+    """Return the agent whose code is the innermost on a stack; empty if several share it, None if none has."""
     own = {name: {module for module, _ in found} - others for name, found in classes.items()}
     helpers = {name: _with_helpers(found) - others for name, found in own.items()}
     for frame in frames:
@@ -347,7 +349,7 @@ def _frames_of(error: BaseException) -> Iterator[FrameType]:
 
 
 def _classes_of(thing: object) -> Iterator[tuple[str, str]]:
-    """Yield module and qualified name of the classes of an object and of its parts, except crashhunt's classes."""
+    """Yield module and qualified name of the classes of an object and its parts, except crashhunt's classes."""
     left: list[tuple[object, int]] = [(thing, 0)]
     seen: set[int] = set()
     while left and len(seen) < _MAX_HELD:
@@ -364,7 +366,7 @@ def _classes_of(thing: object) -> Iterator[tuple[str, str]]:
 
 
 def _own_classes_of(agent: object) -> Iterator[tuple[str, str]]:
-    """Yield module and qualified name of the classes of an agent, without those of libraries that it only uses."""
+    """Yield module and qualified name of the classes of an agent, except classes of libraries that it only uses."""
     itself = vars(type(agent)).get("__module__")
     yield from (found for found in _classes_of(agent) if found[0] == itself or _is_users_module(found[0]))
 
@@ -378,12 +380,12 @@ def _attributes(thing: object) -> dict[str, object]:
 
 
 def _is_instance(value: object) -> bool:
-    """Whether a value is an object of a class with attributes of its own, not a function, class or module."""
+    """Return whether a value is an instance of a class with attributes, not a function, class or module."""
     return not isinstance(value, type | FunctionType | ModuleType) and bool(_attributes(value))
 
 
 def _with_helpers(modules: Iterable[str]) -> set[str]:
-    """Return some modules of a user, and all modules of the user that they refer to, directly or indirectly."""
+    """Return the given modules of a user, and all modules of the user to which they refer, directly or indirectly."""
     found: set[str] = set()
     left = list(modules)
     while left and len(found) < _MAX_MODULES:
@@ -416,9 +418,9 @@ def _is_users_module(name: str) -> bool:
 
 
 def _replaced_function(frames: list[FrameType], others: set[str]) -> str:
-    """Return which function on the frames an agent has replaced, as a clause; empty for none.
+    """Return the function on the given frames that an agent has replaced, as a clause; empty if there is none.
 
-    Replacements by crashhunt, the watched libraries, environments and oracles do not count.
+    Replacements by crashhunt, by the watched libraries, by environments and by oracles do not count.
     """
     if not _originals:
         return ""
@@ -444,7 +446,7 @@ def _replaced_function(frames: list[FrameType], others: set[str]) -> str:
 
 
 def _lowered_limit(error: BaseException) -> str:
-    """Return which limit that caused an exception was lowered by an agent, as a clause; empty for none."""
+    """Return the limit whose lowering by an agent caused an exception, as a clause; empty if there is none."""
     if not _originals:
         return ""
     before = _originals[0]
@@ -464,7 +466,7 @@ def _lowered_limit(error: BaseException) -> str:
 
 
 class Ending:
-    """The part of an `Episode` that ends it."""
+    """The part of an `Episode` that ends the episode."""
 
     spec: TrialSpec
     simulator: Simulator
@@ -489,7 +491,7 @@ class Ending:
         party: Party = Party.AGENT,
         place: str = "",
     ) -> TrialResult:
-        """End the episode with an exception of foreign code, by default of an agent."""
+        """End the episode with an exception that foreign code raised, by default an agent's code."""
         self.error = error
         return self._end(outcome, failure=failure_of(error, agent, cause=cause, party=party, place=place))
 
@@ -498,7 +500,7 @@ class Ending:
 
         Raises:
             RecorderError: the disk is full.
-            InternalError: it is crashhunt's own.
+            InternalError: the exception is crashhunt's own.
         """
         blamed, found = self._blame(error, place)
         if found is not None:
@@ -513,7 +515,7 @@ class Ending:
 
         Raises:
             RecorderError: the disk is full.
-            InternalError: it is crashhunt's own.
+            InternalError: the exception is crashhunt's own.
         """
         blamed, found = self._blame(error, "reset")
         if found is not None:
@@ -528,7 +530,7 @@ class Ending:
 
         Raises:
             RecorderError: the disk is full.
-            InternalError: it is crashhunt's own.
+            InternalError: the exception is crashhunt's own.
         """
         # crashhunt raises no other than ordinary exceptions: the rest comes from methods of the agent's object.
         if type(error) is ActionError or not issubclass(type(error), Exception):
@@ -536,7 +538,7 @@ class Ending:
         return self._break(error)
 
     def _blame(self, error: BaseException, place: str = "") -> tuple[Blame, Attribution | None]:
-        """Return the party that wrote the code of an exception, and the agent if it is an agent.
+        """Return the owner of the code that raised an exception, and the agent if it is an agent's code.
 
         Raises:
             RecorderError: the disk is full.
@@ -552,10 +554,10 @@ class Ending:
         return blamed, found
 
     def end_by_agent(self, error: BaseException) -> TrialResult | None:
-        """End the episode with an exception that an agent's code raised between two steps, as in a signal handler.
+        """End the episode with an exception that an agent raised between two steps, as in a signal handler.
 
         Returns:
-            The result; None if the exception does not come from an agent.
+            The result; None if no agent caused the exception.
         """
         if self.result is not None:
             return self.result
@@ -567,7 +569,7 @@ class Ending:
         return attribute_error(error, self.agents, self.simulator, (*self._oracles, *self._observers))
 
     def _end(self, outcome: Outcome, **evidence: Any) -> TrialResult:
-        """End the episode, and let all observers add their results."""
+        """End the episode, and let all observers add their data to the result."""
         # A user's simulator that has failed may fail again. The last scene of crashhunt's own may not have been read.
         scene = self._scene if self._scene is None or self._look is not None else self.simulator.scene()
         time_s = 0.0 if scene is None else scene.time_s

@@ -1,16 +1,16 @@
-"""Episodes on SUMO whose uneventful steps the compiled core runs, each in one call.
+"""Episodes on SUMO whose uneventful steps run in the compiled core, each in one call.
 
 `FastEpisode` is an `Episode` with the same results, bit by bit. It is the only class that knows the core: `Episode`
 runs each part of each step in Python. After a step of the core, the simulator and the attributes of the episode hold an
-older state. Every public attribute first brings them to the state of the core.
+older state. Reading a public attribute first updates them to the state of the core.
 
 The core does not complete a step if an event needs Python code: an agent appears, a vehicle has an unknown property, a
-signal changes the action. `FastPath` then completes the step, or gives its rest to `Episode`. An observer, oracle or
-simulator that needs each part of each step gets an episode without the core (`make_fast_path`).
+signal changes the action. `FastPath` then completes the step, or passes the rest of the step to `Episode`. An observer,
+oracle or simulator that needs each part of each step gets an episode without the core (`make_fast_path`).
 
-Why: on the scenario ``loop``, trials of 600 steps take 1.20 times the processor time without the core's own steps
-(median of 7 pairs, in turns). A subclass, compared with branches in `Episode`, takes 1.02 times the time, which is
-within the noise.
+Reason: on the scenario ``loop``, trials of 600 steps take 1.20 times the CPU time if the core runs no steps (median of
+7 alternating pairs). A subclass takes 1.02 times the CPU time of ``if`` statements in `Episode`, a difference within
+the noise.
 """
 
 from __future__ import annotations
@@ -57,16 +57,16 @@ _EVENT_ORACLES = (ReportedCollision, OffRoad, TrafficEvents, RedLight, WrongWay,
 
 
 class FastPath:
-    """Completes steps that the core has left, as long as no event needs Python code.
+    """Completes steps that the core could not complete, as long as no event needs Python code.
 
     Args:
         at_once: the simulator's object that runs uneventful steps.
         recorder: recorder of the episode.
         agent: the only agent of the episode.
-        encode: encodes the agent's actions.
+        encode: function that encodes the agent's actions.
 
     Attributes:
-        cannot_record: whether a failure was in the recording.
+        cannot_record: whether a failure occurred in the recording.
         is_resuming: whether a failure occurred while the core read the simulator's state.
         is_encoding: whether a failure occurred while the agent's action was encoded.
     """
@@ -80,9 +80,9 @@ class FastPath:
         at_once.core.listen(at_once.enter, self._record_roster)
 
     def resume_after(self, come: int, agents: dict[str, Agent]) -> tuple[int, dict[str, NDArray[np.generic]] | None]:
-        """Return the final status of a step, and the agent's action; None if the agent has not acted.
+        """Return the final status of a step and the agent's action; None if the agent has not acted.
 
-        With the status `ANSWERED`, observers have not been called for the action yet.
+        If the status is `ANSWERED`, observers have not been called for the action yet.
 
         Args:
             come: The status that the core has returned.
@@ -112,7 +112,7 @@ class FastPath:
         return True
 
     def _record_roster(self) -> None:
-        """Make the core record steps of the visible actors."""
+        """Make the core record the steps of the actors in sight."""
         self.cannot_record = True
         self._recorder.lend(self.at_once.core, self.at_once.roster)
         self.cannot_record = False
@@ -125,14 +125,14 @@ def make_fast_path(
     max_steps: int,
     encoders: Sequence[Callable[[object], NDArray[np.generic]]],
 ) -> FastPath | None:
-    """Return the fast path; None if an observer needs each part of each step.
+    """Return the fast path; None if an observer, an oracle or the simulator needs each part of each step.
 
     Args:
         simulator: the simulator, after its reset.
         observers: observers of the episode.
         oracles: oracles of the episode.
-        max_steps: largest number of steps of the episode.
-        encoders: agent id to the function that encodes its actions.
+        max_steps: maximum number of steps of the episode.
+        encoders: function that encodes the actions of each agent, by agent id.
     """
     first = observers[0] if observers else None
     if not isinstance(first, Recorder) or type(first) is not Recorder or not supports(simulator, SupportsFastSteps):
@@ -181,7 +181,7 @@ class FastEpisode(Episode):
         return self._scene
 
     def step(self, given: Mapping[str, NDArray[np.generic]] = ASK_ALL) -> TrialResult | None:
-        """Run a step as `Episode.step` does, in the core if possible."""
+        """Run a step like `Episode.step`, in the core if possible."""
         if self._take is None or given:
             self._catch_up()
             return super().step(given)
@@ -196,14 +196,14 @@ class FastEpisode(Episode):
         return None
 
     def _catch_up(self) -> None:
-        """Bring the episode to the state of the core."""
+        """Update the episode to the state of the core."""
         if self._is_behind and self._fast is not None:
             self._is_behind = False
             self._observations, self._rewards, self._terminations, *_ = self._fast.at_once.catch_up()
             self._scene = self.simulator.scene()
 
     def _finish_step(self, come: int) -> TrialResult | None:
-        """Complete a step that the core has left to Python because of an event."""
+        """Complete a step that the core has passed to Python because of an event."""
         fast = self._fast
         assert fast is not None
         try:

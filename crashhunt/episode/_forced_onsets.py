@@ -1,15 +1,15 @@
-"""Forced onsets: copies of a root run to the end of its trial, each with a first disturbance that is forced on it.
+"""Forced onsets: copies of a root trial that run to its end, each with a first disturbance that is forced to begin.
 
-`crashhunt.disturbances.FirstOnsets` proposes the onsets with their weights. After every step of the root, this module
-makes a copy for each proposed onset, and records how the copy ended.
+`crashhunt.disturbances.FirstOnsets` proposes the beginnings (onsets) of disturbances, with weights. After every step of
+the root, this module forks a copy for each proposed onset, and records how the copy ended.
 
-Invariant: the root itself is a plain trial without disturbances after step 1. Looking for vehicles and making copies
-changes no bit of it.
+Invariant: the root itself is a plain trial without disturbances after step 1. Searching for target vehicles and making
+copies changes no bit of the root.
 
-Where second onsets are forced too, a copy runs without later disturbances and is copied again for each of them. The
-copy makes these further copies itself, and returns the results of all of them. A copy always runs to the end of its
-trial, because a shorter run would miss later crashes and bias the estimate. If a copy has no result, its root counts as
-incomplete, since this copy may have crashed.
+If second onsets are forced as well, a copy runs without later disturbances, and is copied again for each second onset.
+The copy makes these further copies itself, and returns all their results. A copy always runs to the end of its trial,
+because a shorter run would miss later crashes and bias the estimate. If a copy has no result, its root counts as
+incomplete, because this copy may have crashed.
 
 Cost: the steps of the copies, and a fork of the process for each.
 """
@@ -44,17 +44,17 @@ _WAIT_FACTOR_WITH_SECONDS: Final = 2 + SECONDS_PER_COPY  # such a copy waits for
 
 
 class OnsetForcer:
-    """Makes the copies of one root after another.
+    """Forks the copies of one root trial after another.
 
     Args:
-        words: the rates of disturbances, ``NAME=RATE`` each.
+        words: the rates of disturbances, each as ``NAME=RATE``.
         crash_on: the outcomes that count as a crash.
         patience_s: time limit of a copy, in s of wall time.
-        delay: called with the wall time that copies have taken, in s.
-        tell: called with messages for the user.
+        delay: function called with the wall time that copies have taken, in s.
+        tell: function called with texts for the user.
 
     Attributes:
-        questions: runs the copies, and counts those without a result.
+        questions: object that runs the forks, and counts those without a result.
     """
 
     def __init__(
@@ -76,11 +76,11 @@ class OnsetForcer:
         self._steps = 0
 
     def is_due(self, episode: Episode) -> bool:
-        """Return whether the trial is a root; every step of a root is needed."""
+        """Return whether the trial is a root trial; every step of a root trial is needed."""
         return episode.spec.forcing is not None
 
     def ask(self, episode: Episode) -> None:
-        """Make the copies that leave the root after the completed step; also called before the first step."""
+        """Fork the copies that begin after the completed step; this method is also called before the first step."""
         if self._onsets is None:
             self._onsets = self._begin(episode)
         for onset in self._onsets.after(episode.steps, partial(_has_target, episode)):
@@ -97,7 +97,7 @@ class OnsetForcer:
                 self._delay(time.monotonic() - began)
 
     def result(self, result: TrialResult) -> TrialResult:
-        """Return the result of the root with the results of its copies, and begin the next trial."""
+        """Return the result of the root trial with the results of its copies, and begin the next trial."""
         onsets, copies, steps, asked = self._onsets, tuple(self._copies), self._steps, self.questions
         self._onsets, self._copies, self._steps = None, [], 0
         if onsets is None:
@@ -122,7 +122,7 @@ class OnsetForcer:
         return FirstOnsets(self._sampler, spec.forcing, spec.seed, spec.max_steps)
 
     def _follow(self, episode: Episode, onset: Onset) -> None:
-        """Run a copy to the end of its trial, with further copies for second onsets, and record how they ended."""
+        """Run a copy to the end of its trial, with further copies for second disturbances; record how they ended."""
         assert self._onsets is not None
         seconds = self._onsets.following(onset)
         patience_s = self._patience_s * (1 if seconds is None else _WAIT_FACTOR_WITH_SECONDS)
@@ -148,7 +148,7 @@ class OnsetForcer:
             self._note(onset, end)
 
     def _run_with_seconds(self, copy: Episode, onset: Onset, seconds: FirstOnsets) -> Plain:
-        """Run a copy without later disturbances, and copies of it with second onsets; return their results."""
+        """Run a copy without later disturbances, and copies of it with second disturbances; return their results."""
         ends: list[Plain] = []
         branched = copy.steps
         while copy.result is None:
@@ -219,7 +219,7 @@ def _end_of(copy: Episode, onset: Onset, branched: int, *, within: float, second
 
 
 def _has_target(episode: Episode, planned: Disturbance) -> bool:
-    """Whether a disturbance that begins in the next step finds a vehicle, as `DisturbanceInjector` looks for it."""
+    """Return whether a disturbance that begins in the next step has a target vehicle, as in `DisturbanceInjector`."""
     simulator = episode.simulator
     if planned.agent not in simulator.agents or not supports(simulator, SupportsDisturbances):
         return False

@@ -1,6 +1,6 @@
-"""Observers of an episode: their protocol, their connections, and the two observers of every trial.
+"""Observers of an episode: their protocol, their registration, and the two observers of every trial.
 
-One measures the criticality of the episode, and one records the episode in the black box.
+The first measures the criticality of the episode, and the second records the episode in the black box.
 """
 
 from __future__ import annotations
@@ -80,13 +80,13 @@ class Observer:
     """
 
     def begin(self, episode: Episode) -> None:
-        """Called after the simulator's reset, when `Episode.names` has all actors; no agent exists yet."""
+        """Called after the simulator's reset, when `Episode.names` contains all actors and no agent exists yet."""
 
     def making(self, number: int) -> None:
-        """Called before an agent is made and reset.
+        """Called before an agent is created and reset.
 
         Args:
-            number: number of the agent, in `Episode.names`; -1 when all agents have been made.
+            number: number of the agent in `Episode.names`; -1 after all agents have been created.
         """
 
     def observation(self, number: int, observation: NDArray[np.generic]) -> None:
@@ -94,7 +94,7 @@ class Observer:
 
         Args:
             number: number of the agent, in `Episode.names`.
-            observation: the observation as it is recorded; a structured observation is flattened.
+            observation: the observation in its recorded form; a structured observation is flattened.
         """
 
     def action(self, number: int, action: NDArray[np.generic]) -> None:
@@ -117,17 +117,17 @@ class Observer:
 
         Args:
             step: number of the step; 0 for the scene before the first step.
-            scene: the current scene.
+            scene: scene after the step.
             rewards: reward of every agent, in the order of `Episode.names`; 0 if the agent did not act.
         """
 
     def copied(self) -> None:
-        """Called in a fork of the process in which the episode runs; the fork must not affect the original."""
+        """Called in a fork of the process in which the episode runs. The fork must not affect the original."""
 
     def end(self, result: TrialResult) -> TrialResult:
-        """Called at the end of the episode; return its result, with the data of this observer added.
+        """Called at the end of the episode; returns the result with the data of this observer added.
 
-        The hook is called again, with another result, if an observer has failed at the end.
+        If an observer fails at the end, this method is called again with another result.
         """
         return result
 
@@ -170,12 +170,12 @@ def observation_restorers(simulator: Simulator) -> dict[str, Callable[[NDArray[n
 
 
 def callbacks_for(observers: Sequence[Observer], name: str) -> Any:
-    """Return the hooks of this name of all observers that override it."""
+    """Return the methods with the given name of all observers that override this method."""
     return [getattr(one, name) for one in observers if overrides_hook(one, name)]
 
 
 def overrides_hook(observer: Observer, name: str) -> bool:
-    """Whether an observer overrides a hook."""
+    """Return whether an observer overrides a hook."""
     return getattr(type(observer), name) is not getattr(Observer, name)
 
 
@@ -185,10 +185,10 @@ _SCENES_PER_BATCH = 2048  # scenes
 
 
 class Nearness(Observer):
-    """Measures the closest approach, the criticality and the driven distance, and adds them to the result.
+    """Observer that measures the closest approach, the criticality and the driven distance of a trial.
 
     Args:
-        take_frames: returns the scenes since its last call as columns, such as `BlackBox.take_frames`.
+        take_frames: function that returns the scenes since its last call as columns, such as `BlackBox.take_frames`.
     """
 
     EVERY: ClassVar = 256
@@ -204,7 +204,7 @@ class Nearness(Observer):
 
     @property
     def closest(self) -> ClosestApproach:
-        """The closest approach so far, up to the last complete step."""
+        """The closest approach until the last complete step."""
         self._measure_frames()
         self._measure()
         return self._meter.closest
@@ -217,14 +217,14 @@ class Nearness(Observer):
         self._driven = DrivenMeter(episode.names, episode.simulator.step_length_s)
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
-        """Measure the new scenes from time to time."""
+        """Measure the new scenes, once for several steps."""
         if step and step % self.EVERY == 0:
             self._measure_frames()
             if sum(len(frame.columns) for frame in self._waiting) >= _SCENES_PER_BATCH:
                 self._measure()
 
     def end(self, result: TrialResult) -> TrialResult:
-        """Add the closest approach, the criticality and the driven distance."""
+        """Add the closest approach, the criticality and the driven distance to the result."""
         closest = self.closest
         if result.collision is not None and "overlap" in result.collision.seen_by:
             closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
@@ -260,13 +260,13 @@ class Nearness(Observer):
 
 
 class Recorder(Observer):
-    """Writes the records of an episode; adds the digest and the number of traffic events to the result.
+    """Observer that records an episode; it adds the digest and the number of traffic events to the result.
 
-    It is the first of all observers, because a step is complete when it is recorded.
+    It is the first observer, because a step is complete only after it is recorded.
 
     Args:
-        box: the black box, after a call of `BlackBox.begin`.
-        simulator: simulator of the episode.
+        box: the black box, for which `BlackBox.begin` has been called.
+        simulator: the simulator of the episode.
     """
 
     def __init__(self, box: BlackBox, simulator: Simulator) -> None:
@@ -282,13 +282,13 @@ class Recorder(Observer):
         self.action = box.action  # type: ignore[assignment, method-assign]
 
     def lend(self, steps: UsualSteps, roster: Roster) -> None:
-        """Let the core record steps of these actors."""
+        """Let the core record the steps of the given actors."""
         if roster is not self._roster:
             self._note_roster(roster)
         self._box.lend(steps, roster)
 
     def begin(self, episode: Episode) -> None:
-        """Record the actors."""
+        """Record the actors of the episode."""
         simulator = episode.simulator
         columns = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()
         channels = []
@@ -300,7 +300,7 @@ class Recorder(Observer):
         self._box.prologue(Prologue(tuple(channels), simulator.step_length_s).encode(), len(channels))
 
     def making(self, number: int) -> None:
-        """Record which agent is being made, because its constructor may end the process."""
+        """Record which agent is being created, because its constructor may end the process."""
         self._box.mark(Phase.SETUP if number < 0 else Phase.ACT, max(number, 0))
 
     def observation(self, number: int, observation: NDArray[np.generic]) -> None:
@@ -312,7 +312,7 @@ class Recorder(Observer):
         self._box.action(number, action)
 
     def disturbance(self, disturbance: Disturbance) -> None:
-        """Record the disturbance and its target."""
+        """Record a disturbance and its target vehicle."""
         self._box.append(Tag.DISTURBANCE, 0, encode_disturbance(disturbance))
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
@@ -356,7 +356,7 @@ class Recorder(Observer):
         self._box.copy()
 
     def end(self, result: TrialResult) -> TrialResult:
-        """Record the end, and add the digest of the recording."""
+        """Record the end of the episode, and add the digest of the recording to the result."""
         self._box.mark(Phase.DONE)
         digest = digest_of(*self._box.evidence()) if result.outcome is not Outcome.INVALID else ""
         return replace(result, digest=digest, events=None if self._events is None else dict(self._events))
@@ -368,8 +368,9 @@ _ready: dict[int, tuple[ActionForm, NDArray[np.generic]]] = {}  # by identity, w
 def ready_recorder(simulator: Simulator) -> None:
     """Encode an action of each agent before the first episode, so that its recorder starts faster.
 
-    Seeding a space takes longer than many steps. A fork inherits the generators of the spaces as this leaves them, so
-    an agent that samples from its action space gets the same. Only for simulators whose `reset` leaves them alone.
+    Seeding a space takes longer than many steps. A fork inherits the random generators of the spaces in their state
+    after this call, so an agent that samples from its action space gets the same samples. Call this function only for
+    simulators whose `reset` does not use these generators.
     """
     for form in simulator.actions.values():
         if supports(form, OfAnyLength):
@@ -378,7 +379,7 @@ def ready_recorder(simulator: Simulator) -> None:
 
 
 def _type_of(form: ActionForm) -> tuple[str, tuple[int, ...]]:
-    """Return type and shape of encoded actions, as in `AgentChannel`."""
+    """Return the type and the shape of encoded actions, as in `AgentChannel`."""
     if supports(form, OfAnyLength):
         return "|u1", tuple(form.encoded_shape)
     sample = _sample_of(form)

@@ -1,4 +1,4 @@
-"""Robustness probes: at intervals, forks of a running episode search the minimal disturbance that causes a crash.
+"""Robustness probes: at intervals, forks of a running episode search for the mildest disturbance that causes a crash.
 
 Each fork continues with one disturbance and ends after some seconds. Only disturbances milder than the mildest known
 crash are tried, so most searches need only one fork.
@@ -41,16 +41,16 @@ _STEPS_TO_ONSET = 2  # steps on: what an agent sees late is noticed a step befor
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """A kind of disturbance that probes try, and the order of its strengths.
+    """A kind of disturbance that probes try, and the order in which its strengths are tried.
 
     Args:
-        what: the kind.
-        who: the places in the grid around the agent, tried in this order.
+        what: kind of the disturbance.
+        who: the places around the agent at which an actor is disturbed, tried in this order.
         most: the strongest plausible value, in the unit of the kind.
         how_long: the longest duration, in s.
-        least: the greatest value without an effect, in the unit of the kind.
-        grade: the varied property: strength or duration. A kind without either happens or not; a crash then counts as
-            half.
+        least: the greatest value that has no effect, in the unit of the kind.
+        grade: the property that varies: strength or duration. If neither varies, the disturbance happens or not, and a
+            crash counts as half the maximum strength.
     """
 
     what: str
@@ -63,7 +63,8 @@ class Probed:
     def shares(self, step_length_s: float) -> tuple[float, ...]:
         """Return the strengths to try, as shares of the maximum, from the mildest on, in steps of a sixteenth.
 
-        For durations, only shares that differ in whole steps are tried: with steps of 1 s, nothing can be a sixteenth
+        For durations, only shares that differ in whole steps are tried, because with steps of 1 s no delay can be a
+        sixteenth
             of a second late. The maximum itself counts as a sixteenth less.
         """
         if self.grade == "whether":
@@ -82,8 +83,8 @@ class Probed:
 
         Args:
             share: share of the plausible maximum, from 0 to 1.
-            who: the chosen place.
-            agent: The agent at the centre of the grid.
+            who: the place at which an actor is disturbed.
+            agent: Identifier of the agent around which the place is chosen.
             step: the step in which the disturbance begins.
         """
         strong = self.least + share * (self.most - self.least) if self.grade == "strength" else self.most
@@ -124,12 +125,12 @@ class Prober:
     Args:
         every_s: time between two probes, in s of simulation time.
         crash_on: the outcomes that count as a crash.
-        delay: called with the wall time that copies have taken, in s.
-        budget: steps that copies may take for each step of their trial.
-        tell: called with messages for the user.
+        delay: function called with the wall time that forks have taken, in s.
+        budget: maximum number of steps of forks for each step of their trial.
+        tell: function called with texts for the user.
 
     Attributes:
-        questions: runs the copies, and counts those without a result.
+        questions: object that runs the forks, and counts those without a result.
     """
 
     def __init__(
@@ -154,7 +155,7 @@ class Prober:
         return episode.steps % steps_of(self._every_s, episode.simulator.step_length_s) == 0
 
     def ask(self, episode: Episode) -> None:
-        """Find the mildest disturbance of each kind with which the episode crashes soon, if there is a milder one."""
+        """Find the mildest disturbance of each kind with which the episode soon crashes, if milder than before."""
         before = self.questions.unanswered
         self._ask(episode)
         asked = self.questions.unanswered == before
@@ -185,7 +186,7 @@ class Prober:
 
     @property
     def _find_mildest(self) -> float:
-        """Return the least share that has made a probe crash so far; 1 if no probe has crashed."""
+        """Return the least strength with which a probe has crashed, as a share; 1 if no probe has crashed."""
         assert self._stress.margin is not None
         return self._stress.margin
 
@@ -193,7 +194,7 @@ class Prober:
         return self._stress.steps >= self._budget * episode.steps
 
     def _questions_at(self, episode: Episode) -> list[_Question]:
-        """Return the probes that have a target vehicle; the target is looked up in a fork."""
+        """Return the probes that have a target vehicle, which is looked up in a fork."""
         simulator = episode.simulator
         kinds = simulator.disturbing_kinds if supports(simulator, SupportsDisturbances) else ()
         every = [
@@ -220,7 +221,7 @@ class Prober:
         return [one for one in every if one not in absent]
 
     def result(self, result: TrialResult) -> TrialResult:
-        """Return the result of the trial with the results of its copies, and begin the next one."""
+        """Return the result of the trial with the results of its forks, and begin the next trial."""
         stress, self._stress, self._moment = self._stress, Stress(1.0), 0
         why, may_be_answered = self.questions.why_unanswered, self.questions.may_be_answered
         self.questions.begin_trial()
@@ -239,7 +240,7 @@ class Prober:
         return replace(result, stress=stress)
 
     def _mildest(self, episode: Episode, question: _Question) -> bool:
-        """Search the mildest strength of one kind; return whether other kinds need to be tried."""
+        """Search for the mildest strength of one kind; return whether other kinds need to be tried."""
         kind, step = question.kind, episode.steps + _STEPS_TO_ONSET
         every = kind.shares(episode.simulator.step_length_s)
         shares = [share for share in every if share < self._find_mildest - _MIN_STRENGTH]
@@ -290,7 +291,7 @@ class Prober:
         return (outcome, cast(int, answer["step"])) if crashed else ("", 0)
 
     def _in_copy(self, episode: Episode, work: Callable[[Episode], Plain]) -> Plain:
-        """Return the result of a copy; empty if no copy gives a result."""
+        """Return the result of a fork; empty if no fork returns a result."""
 
         def attempt() -> tuple[Plain | None, NoAnswer | None]:
             began = time.monotonic()

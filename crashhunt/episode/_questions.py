@@ -1,4 +1,4 @@
-"""Runs of copies of an episode (questions): which are repeated, which stay without a result, and when they end."""
+"""Runs forks of an episode (questions): decides which run again, which have no result, and when no more are run."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ _MAX_REASON_LENGTH: Final = 200  # characters; an agent's exception may say anyt
 
 
 class Questions:
-    """Runs copies, and counts the questions without a result.
+    """Runs forks, and counts those without a result.
 
-    A copy that something outside ended (the kernel's out-of-memory killer, an administrator) is replaced by another
-    copy. A copy that raised an exception, crashed or hung by itself would do so again, so it is not replaced. After
-    three questions in a row without a result, no more copies run: in this trial if the cause was outside, in this
-    process if copies failed by themselves.
+    A fork that was killed from outside, by the kernel because of memory or by an administrator, is replaced by another
+    fork. A fork that raised an exception, crashed or hung by itself would do so again, so it is not replaced. After
+    three consecutive forks without a result, no more forks run. This applies to the trial if the cause was outside, and
+    to the process if forks failed by themselves.
 
     Args:
-        what: name of the questions, in the plural: ``probes``.
-        tell: called with messages for the user.
+        what: name of the forks in the plural, such as ``probes``.
+        tell: function called with texts for the user.
 
     Attributes:
-        what: as given.
-        why_not: why this process runs no more copies, in words; empty if it does.
-        unanswered: number of questions of this trial without a result.
-        why_unanswered: the reason for the first missing result, in words; empty if all have a result.
-        may_be_answered: whether a cause was outside, so that another run of the trial may have all results.
-        has_answer: whether the last question has a result.
+        what: name of the questions in the plural, as given to the constructor.
+        why_not: why this process runs no more forks, as text; empty if it still runs forks.
+        unanswered: number of forks of this trial without a result.
+        why_unanswered: the reason for the first missing result, as text; empty if all forks have a result.
+        may_be_answered: whether the cause was outside, so that another run of the trial may have all results.
+        has_answer: whether the last fork has a result.
     """
 
     def __init__(self, what: str, tell: Callable[[str], None] = lambda _: None) -> None:
@@ -65,7 +65,7 @@ class Questions:
 
     @property
     def is_over(self) -> bool:
-        """Return whether no more copies of this trial run."""
+        """Return whether no more forks of this trial run."""
         return bool(self.why_not or self._paused_because)
 
     def ask(
@@ -73,11 +73,11 @@ class Questions:
         attempt: Callable[[], tuple[Plain | None, NoAnswer | None]],
         can_retry: Callable[[], bool] = lambda: True,
     ) -> Plain | None:
-        """Return the result of a copy; None if no copy gives one, which is counted.
+        """Return the result of a fork; None if no fork returns a result, which is counted.
 
         Args:
-            attempt: runs one copy; returns its result, or None and the reason.
-            can_retry: whether another copy of the same moment can be made.
+            attempt: function that runs one fork; it returns the result, or None and the reason.
+            can_retry: whether another fork can be made at the same step.
         """
         reason = NoAnswer("")
         for number in range(_MAX_ATTEMPTS):
@@ -102,7 +102,7 @@ class Questions:
         return None
 
     def miss(self, reason: NoAnswer) -> None:
-        """Count a question without a result."""
+        """Count a fork without a result."""
         why = f"a copy {reason.why}"
         if reason.is_from_outside:
             self._killed += 1
@@ -116,10 +116,10 @@ class Questions:
         self.skip(why, is_from_outside=reason.is_from_outside)
 
     def skip(self, why: str = "", *, is_from_outside: bool = False) -> None:
-        """Count a question without a result, without an effect on the next questions.
+        """Count a fork without a result, without consequences for the next forks.
 
         Args:
-            why: the reason, in words; empty if no more copies run.
+            why: the reason, as text; empty if no more forks run.
             is_from_outside: whether another run of the trial may have a result.
         """
         if not why:
@@ -130,7 +130,7 @@ class Questions:
         self.may_be_answered = self.may_be_answered or is_from_outside
 
     def stop(self, why_not: str) -> None:
-        """Run no more copies in this process."""
+        """Run no more forks in this process."""
         self.why_not = self.why_not or why_not
 
 
@@ -142,10 +142,10 @@ def _shortened(reason: NoAnswer) -> NoAnswer:
 
 
 class FirstCopy:
-    """Makes one copy of the first episode of a process, only to check that copies are possible.
+    """Makes one fork of the first episode of a process, to check that episodes can be forked.
 
     Args:
-        refused: called with the reason why the episode cannot be copied.
+        refused: function called with the reason why the episode cannot be forked.
     """
 
     def __init__(self, refused: Callable[[str], None]) -> None:
@@ -153,11 +153,11 @@ class FirstCopy:
         self._tried = False
 
     def is_due(self, episode: Episode) -> bool:
-        """Return whether the check is still to be done."""
+        """Return whether the check has not been done yet."""
         return not self._tried and episode.steps > 0
 
     def ask(self, episode: Episode) -> None:
-        """Check that the episode can be copied."""
+        """Check that the episode can be forked."""
         try:
             episode.fork(lambda _copy: {}, observed=False).end()
         except NoProcessError:

@@ -1,4 +1,4 @@
-"""A trial from its specification: an episode, recorded and measured, with the generators of the process seeded."""
+"""Runs a trial from its specification: an episode that is recorded and measured, with seeded random generators."""
 
 from __future__ import annotations
 
@@ -76,24 +76,25 @@ def run_episode(
     first_copy: FirstCopy | None = None,
     forcer: OnsetForcer | Splitter | None = None,
 ) -> TrialResult:
-    """Run one trial from its specification, recorded and measured, with the generators of the process seeded.
+    """Run one trial from its specification, recorded and measured, with seeded random generators of the process.
 
     Args:
-        spec: which trial.
-        simulator: where.
-        make_agent: called with agent id, simulator and arguments; returns the agent that drives.
-        box: the black box that records the trial, after `BlackBox.begin`.
+        spec: specification of the trial.
+        simulator: the simulator in which the trial runs.
+        make_agent: function called with agent id, simulator and arguments; it returns the agent that drives.
+        box: the black box that records the trial; `BlackBox.begin` has been called.
         oracles: the oracles, which decide whether a step is a crash.
-        crash_on: The outcomes that end the episode; other traffic crashes and events are only recorded.
+        crash_on: The outcomes that end the episode. Other traffic crashes and events are only recorded.
         observers: Further observers, called after the recorder.
-        reset: a function that resets the simulator; None for the simulator's own `reset`.
-        prober: runs robustness probes; None for none.
-        first_copy: checks in the first step whether the episode can be copied.
-        brancher: Runs forks with other disturbances where another actor is near.
-        forcer: Makes forks with a forced first onset, or with other noise; None if the trial is not a root.
+        reset: function that resets the simulator; None for the simulator's own `reset`.
+        prober: object that runs robustness probes; None for no probes.
+        first_copy: object that checks in the first step whether the episode can be forked.
+        brancher: Object that runs branches: forks with other disturbances, when other actors are near.
+        forcer: Object that makes forks with a forced first disturbance or with other random numbers; None if the trial
+            is not a root trial.
 
     Returns:
-        The result. Exceptions of agent and simulator are in the result.
+        The result of the trial, including exceptions of agent and simulator.
 
     Raises:
         RecorderError: the disk is full.
@@ -139,7 +140,7 @@ def run_episode(
 
 
 def seed_everything(seed: int) -> None:
-    """Seed the generators of the process: `random`, `numpy.random`, and torch where it has been imported."""
+    """Seed the random generators of the process: `random`, `numpy.random`, and torch if it has been imported."""
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - agents may use the global generator
     torch = sys.modules.get("torch")
@@ -177,13 +178,13 @@ def bound_recursion() -> None:
     """Make `sys.setrecursionlimit` accept at most `MAX_RECURSION_LIMIT`.
 
     Python allocates the frames of Python functions on the heap, so endless recursion without a limit fills the memory
-    of the machine in minutes. With the bound it ends in a `RecursionError`.
+    of the machine in minutes. With this bound, endless recursion ends in a `RecursionError`.
     """
     sys.setrecursionlimit = setrecursionlimit
 
 
 def setrecursionlimit(limit: int, /) -> None:
-    """Set how deep Python may recurse, at most `MAX_RECURSION_LIMIT`."""
+    """Set Python's recursion limit, to at most `MAX_RECURSION_LIMIT`."""
     _set_limit(min(limit, MAX_RECURSION_LIMIT))
 
 
@@ -191,7 +192,7 @@ def setrecursionlimit(limit: int, /) -> None:
 
 
 class Parts:
-    """Makes the parts of trials in this process, from the code that the settings name.
+    """Creates the parts of trials (oracles, simulator, agents) in this process, from the code that the settings name.
 
     Args:
         settings: settings of the hunt.
@@ -210,17 +211,18 @@ class Parts:
         return [choice.make() for choice in self._oracles]
 
     def load(self, report: Callable[[str], None] = lambda _: None) -> None:
-        """Import everything that trials need, always in the same order.
+        """Import all modules that trials need, always in the same order.
 
-        Modules may, for example, set constants of a simulator's classes when they are imported. Because all imports
-        come before the first episode, these settings hold in every episode.
+        Modules may, for example, set constants of a simulator's classes when they are imported. All imports happen
+        before the first episode, so these constants are the same in every episode.
 
         Args:
-            report: Called before each import with the error to show if the import does not return, such as "the module
-                'm' cannot be imported". An import that hangs or ends the process cannot report that itself.
+            report: Function called before each import with the error to show if the import does not return, such as
+                "the module 'm' cannot be imported". An import that hangs or ends the process cannot report this error
+                itself.
 
         Raises:
-            CrashhuntError: something cannot be imported.
+            CrashhuntError: a module cannot be imported.
         """
         record_shared_memory(self._settings.scratch)
         bound_recursion()  # before a module is imported that recurses
@@ -245,7 +247,7 @@ class Parts:
         record_originals()
 
     def simulator(self) -> Simulator:
-        """Make a simulator, with a folder for files of its own."""
+        """Create a simulator, with a private folder for its files."""
         stage = stage_of(self._settings.scratch, os.getpid())
         stage.mkdir(parents=True, exist_ok=True)
         scenario = self._settings.scenario
@@ -253,11 +255,11 @@ class Parts:
         return made
 
     def agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Value]) -> Agent:
-        """Make the agent of a vehicle; files that its arguments name come from the snapshot.
+        """Create the agent of a vehicle; files that its arguments name come from the snapshot.
 
         Raises:
-            CrashhuntError: the module comes from another place than the snapshot that contains it.
-            ForeignError: its constructor failed.
+            CrashhuntError: the module was not imported from the snapshot, although the snapshot contains it.
+            ForeignError: the agent's constructor failed.
             InternalError: crashhunt itself failed.
         """
         try:
@@ -300,12 +302,12 @@ class Parts:
 
 
 def stage_of(scratch: Path, pid: int) -> Path:
-    """Return the folder for files of the simulator that a process has made."""
+    """Return the folder for the files of a simulator that the given process has created."""
     return scratch / f"stage-{pid}"
 
 
 def seal(settings: WorkerSettings) -> None:
-    """Confine this process to its scratch folder, and work there, if it runs untrusted code."""
+    """If this process runs untrusted code, restrict it to its scratch folder, and change to this folder."""
     if settings.sealed is None:
         return
     home = settings.scratch / "home"
@@ -316,7 +318,7 @@ def seal(settings: WorkerSettings) -> None:
 
 
 def require_origin(module: str, code: tuple[str, ...]) -> None:
-    """Check that a module of the snapshot was imported from the snapshot, not from the developer's folder."""
+    """Check that a module of the snapshot was imported from the snapshot, not from the user's folder."""
     top = module.partition(".")[0]
     file = getattr(sys.modules[module], "__file__", None)
     for folder in code:

@@ -42,28 +42,30 @@ _SCHEMA = 1  # a replay starts the crashhunt of a snapshot, which may be another
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerSettings(Serializable):
-    """Everything that a worker needs to run the trials of one hunt. It crosses process boundaries.
+    """Everything that a worker needs to run the trials of one hunt; it is sent to other processes.
 
     Args:
         scenario: scenario of the trials.
         oracles: the oracles that detect crashes, each as in ``--oracle``.
         crash_on: the outcomes that end a trial as a crash.
-        scratch: the folder in which workers keep black boxes and output while trials run.
-        code: folders whose modules win over installed ones, the first one first: the snapshot. Empty for none.
+        scratch: the folder into which workers write black boxes and output while trials run.
+        code: folders whose modules take precedence over installed modules, the first folder first: those of the
+            snapshot. Empty for none.
         argument_files: The file of the snapshot for each argument value that names a file.
         timeout_s: wall-clock limit of a trial, in s.
         keep_trials: whether the scratch folder of every trial is kept, not only of crashes.
         sealed: for an untrusted crash, the files that the process may read in addition to installed packages and its
             scratch folder. It may write only in the scratch folder. None for no restrictions.
         find_escapes: whether further runs of the trial find the last step at which braking avoids a collision; only in
-            a fresh process.
+            a new process.
         audit: the share of trials without a crash whose scratch folder is kept, because they are run again.
         hunt_seed: seed of the hunt, which determines the audited trials.
-        warm_copies: number of traffics for which a worker keeps a suspended fork after the warm-up; 0 for none.
+        warm_copies: number of traffic seeds for which a worker keeps a suspended fork after the warm-up; 0 for none.
         probe_s: time between two probes of a trial, in s of simulation time; 0 for no probes.
-        branch: The rates of disturbances in branches, ``NAME=RATE`` each; empty for no branches.
-        force: The rates of disturbances of forks with a forced first onset, ``NAME=RATE`` each; empty for none.
-        splits: Whether roots have forks with other noise of the traffic, in place of forced onsets.
+        branch: The rates of disturbances in branches, each as ``NAME=RATE``; empty for no branches.
+        force: The rates of disturbances in forks with a forced first disturbance, each as ``NAME=RATE``; empty for
+            none.
+        splits: Whether root trials have forks with other random numbers of the traffic, instead of forced disturbances.
     """
 
     scenario: Scenario
@@ -91,7 +93,7 @@ class WorkerSettings(Serializable):
     )  # fmt: skip
 
     def is_audited(self, result: TrialResult) -> bool:
-        """Return whether a trial belongs to the audited sample; its number and the hunt's seed determine this."""
+        """Return whether a trial belongs to the audited sample, which its number and the hunt's seed determine."""
         if self.audit <= 0.0 or result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
             return False
         draw = np.random.SeedSequence(self.hunt_seed, spawn_key=(result.spec.number, _AUDIT_STREAM)).generate_state(1)[
@@ -100,7 +102,7 @@ class WorkerSettings(Serializable):
         return bool(draw < self.audit * 2**32)
 
     def to_json(self) -> JsonObject:
-        """Return plain dicts, strings and numbers."""
+        """Return the settings as JSON-compatible data."""
         # A replay hands this to the crashhunt of the snapshot, and an older one refuses keys that it does not know:
         # what has come since is written only where it is asked for. For this the defaults may never change.
         scenario = as_in_file(_asked(replace(self.scenario, file=type(self.scenario).file, added={})))
@@ -134,7 +136,7 @@ class WorkerSettings(Serializable):
 
 
 def _asked(value: object) -> Any:
-    """Return plain data in which a dataclass has only the fields that differ from their defaults."""
+    """Return plain data in which a dataclass contains only the fields that differ from their defaults."""
     if is_dataclass(value):
         pairs = ((item, getattr(value, item.name)) for item in fields(value))
         return {item.name: _asked(held) for item, held in pairs if held != _default(item)}
@@ -153,5 +155,5 @@ def scratch_of(scratch: Path, number: int) -> Path:
 
 
 def answer_file(scratch: Path, number: int) -> Path:
-    """Return the file for the result of a trial whose process cannot report it otherwise."""
+    """Return the path of the file for the result of a trial whose process cannot report it otherwise."""
     return scratch / layout.numbered(number, layout.ANSWER)

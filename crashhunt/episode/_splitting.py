@@ -1,18 +1,19 @@
-"""Splitting: a path of a root that reaches a level continues as several, which differ by the noise of the traffic.
+"""Splitting: when a path of a root trial reaches a level, it is copied, and the copies get other random numbers.
 
-A level is a threshold on a measure of the present scene: the closing speed by gap of the vehicle ahead. A path that
-reaches the next level for the first time continues as `COPIES_PER_LEVEL` paths with an equal share of its weight. The
-path itself keeps its random numbers. The simulator of each copy gets new seeds. The root and its copies form a tree.
+A level is a threshold for a measure of the current scene: the closing speed divided by the gap to the vehicle ahead. A
+path that reaches the next level for the first time continues as `COPIES_PER_LEVEL` paths with an equal share of its
+weight. The path itself keeps its random numbers. The simulator of each copy gets new seeds. The root and its copies
+form a tree.
 
-Invariant: the weights of a tree have the sum 1, and each copy has the law of the original from its state on. So the
-expected weight of the crashes of a tree is the crash probability of a plain trial, for any levels that are fixed before
-the root begins. This needs a measure of the past and the present only: one that looks ahead would choose paths by their
-ends. The root is a plain trial, bit by bit.
+Invariant: the weights of a tree have the sum 1, and each copy has the law of the original from its state on. Therefore,
+the expected weight of the crashes of a tree is the crash probability of a plain trial, for any levels that are fixed
+before the root begins. The measure may depend only on past and current scenes, because a measure of later scenes would
+select paths by their ends. The root is bit-identical to a plain trial.
 
-Draws of the agent and of disturbances are the same in all copies. That correlates the paths of a tree, and biases
-nothing. Trees are independent.
+The random numbers of the agent and of disturbances are the same in all copies. This correlates the paths of a tree, but
+causes no bias. Trees are independent.
 
-A copy always runs to the end of its trial. A tree with a copy that has no answer counts as incomplete.
+A copy always runs to the end of its trial. A tree in which a copy has no result counts as incomplete.
 
 Source: P. Glasserman, P. Heidelberger, P. Shahabuddin and T. Zajic, Multilevel splitting for estimating rare event
 probabilities, Operations Research 47(4), 1999.
@@ -52,13 +53,13 @@ _SPLITS = 0x73706C69  # separates the seeds of copies from others with the seed 
 
 
 class SplitPath(Protocol):
-    """A running trial, or a copy of it.
+    """A running trial, or a copy of a running trial.
 
     Attributes:
-        reached: number of levels that it has reached.
-        weight: its share of the tree.
-        measure: of the present scene, to which levels are compared.
-        is_over: whether it has ended.
+        reached: number of levels that the path has reached.
+        weight: share of the path in the weight of the tree.
+        measure: measure of the current scene, which is compared with the levels.
+        is_over: whether the path has ended.
     """
 
     reached: int
@@ -70,17 +71,17 @@ class SplitPath(Protocol):
     def is_over(self) -> bool: ...
 
     def step(self) -> None:
-        """Run one step."""
+        """Run one step of the path."""
 
     def fork(self, grow: Callable[[SplitPath], list[ForcedCopy]]) -> list[ForcedCopy]:
-        """Make a copy with new random numbers, and return what `grow` returns for it."""
+        """Make a copy of the path with new random numbers, and return the result of `grow` for it."""
 
     def end(self) -> ForcedCopy:
-        """Return how it ended."""
+        """Return how the path ended."""
 
 
 def split_path(path: SplitPath, levels: Sequence[float]) -> list[ForcedCopy]:
-    """Copy a path for each level that it has reached by now; return how these copies and their own copies ended."""
+    """Copy a path for each level that it has reached; return how these copies and their own copies ended."""
     ends: list[ForcedCopy] = []
     while path.reached < len(levels) and path.measure >= levels[path.reached]:
         path.reached += 1
@@ -91,7 +92,7 @@ def split_path(path: SplitPath, levels: Sequence[float]) -> list[ForcedCopy]:
 
 
 def run_path(path: SplitPath, levels: Sequence[float]) -> list[ForcedCopy]:
-    """Run a path to its end, with copies of it; return how they ended, the path itself first."""
+    """Run a path to its end, and copies of it; return how they ended, the path itself first."""
     ends: list[ForcedCopy] = []
     while not path.is_over:
         ends += split_path(path, levels)
@@ -100,17 +101,17 @@ def run_path(path: SplitPath, levels: Sequence[float]) -> list[ForcedCopy]:
 
 
 class Splitter:
-    """Grows the tree of one root after another.
+    """Runs the tree of copies of one root trial after another.
 
     Args:
         crash_on: the outcomes that count as a crash.
-        patience_s: time limit of a copy without copies, in s of wall time.
-        delay: called with the wall time that copies have taken, in s.
-        tell: called with what the user should know.
-        refuse: called with the reason, where the simulator has no noise to draw again.
+        patience_s: time limit of a copy that has no copies itself, in s of wall time.
+        delay: function called with the wall time that copies have taken, in s.
+        tell: function called with texts for the user.
+        refuse: function called with the reason if the simulator has no random numbers to change.
 
     Attributes:
-        questions: runs the copies, and counts those without a result.
+        questions: object that runs the forks, and counts those without a result.
     """
 
     def __init__(
@@ -131,11 +132,11 @@ class Splitter:
         self._peak = 0.0
 
     def is_due(self, episode: Episode) -> bool:
-        """Whether the trial is a root of splitting: the peak is that of every step."""
+        """Return whether the trial is a root trial of splitting, in which the measure of every step is needed."""
         return episode.spec.forcing is not None and episode.spec.forcing.levels is not None
 
     def ask(self, episode: Episode) -> None:
-        """Make the copies that leave the root after the step that is complete; also called before the first step."""
+        """Make the copies that begin after the completed step; this method is also called before the first step."""
         assert episode.spec.forcing is not None
         if self._path is None:
             self._path = _EpisodePath(episode, self._crashes, self._patience_s, (), questions=self.questions)
@@ -159,7 +160,7 @@ class Splitter:
                 self._delay(time.monotonic() - began)
 
     def result(self, result: TrialResult) -> TrialResult:
-        """Return the result of the root with what its copies have found; the next trial begins."""
+        """Return the result of the root trial with the results of its copies, and begin the next trial."""
         path, copies, peak, asked = self._path, tuple(self._copies), self._peak, self.questions
         self._path, self._copies, self._peak = None, [], 0.0
         if path is None:
@@ -179,24 +180,25 @@ class Splitter:
 
 
 class _LostError(Exception):
-    """A copy of a copy has no answer."""
+    """A copy of a copy has no result."""
 
 
 class _EpisodePath:
     """An episode as a path; copies are forks of its process.
 
     Args:
-        episode: it runs.
+        episode: the running episode.
         crashes: the outcomes that count as a crash.
-        patience_s: time limit of a copy without copies, in s of wall time.
-        key: numbers of the forks that led to it; they give the seeds of its copies.
+        patience_s: time limit of a copy that has no copies itself, in s of wall time.
+        key: numbers of the forks that led to this path, from which the seeds of its copies are derived.
         reseedings: step and seed of each of these forks.
-        reached: number of levels that it has reached.
-        weight: its share of the tree.
-        questions: what counts copies without an answer, for the root; None for a copy, which is lost with its own.
+        reached: number of levels that the path has reached.
+        weight: share of the path in the weight of the tree.
+        questions: object that counts copies without a result, for the root path; None for a copy, which fails if one of
+            its own copies fails.
 
     Attributes:
-        has_forked: whether it has made a copy.
+        has_forked: whether the path has been copied.
     """
 
     def __init__(
@@ -219,7 +221,7 @@ class _EpisodePath:
 
     @property
     def measure(self) -> float:
-        """The greatest closing speed by gap of a vehicle ahead of an agent, in 1/s."""
+        """The greatest closing speed divided by gap, over the vehicles ahead of agents, in 1/s."""
         scene = self.episode.scene
         return 0.0 if scene is None else max(closing_rate(scene.frame, name) for name in self.episode.names)
 
@@ -229,14 +231,14 @@ class _EpisodePath:
         return self.episode.result is not None
 
     def step(self) -> None:
-        """Run one step."""
+        """Run one step of the episode."""
         self.episode.step()
 
     def fork(self, grow: Callable[[SplitPath], list[ForcedCopy]]) -> list[ForcedCopy]:
-        """Make a copy with new seeds of its simulator, and return what `grow` returns for it.
+        """Make a copy with new seeds of its simulator, and return the result of `grow` for it.
 
         Raises:
-            _LostError: it has no answer, and this is a copy itself.
+            _LostError: the copy has no result, and this path is a copy itself.
         """
         self._forks += 1
         self.has_forked = True
@@ -282,10 +284,10 @@ class _EpisodePath:
         return len(forcing.levels or ()) - self.reached if forcing is not None else 0
 
     def end(self) -> ForcedCopy:
-        """Return how it ended.
+        """Return how the path ended.
 
         Raises:
-            _LostError: its simulator failed, perhaps because it is a copy.
+            _LostError: the simulator failed, possibly because the path is a copy.
         """
         result = self.episode.result
         assert result is not None
@@ -307,7 +309,7 @@ class _EpisodePath:
 
 
 def _why_no_noise(episode: Episode) -> str:
-    """Return why copies of an episode cannot get other random numbers; empty if they can."""
+    """Return why copies of an episode cannot get other random numbers; empty if they can get them."""
     simulator = episode.simulator
     if not supports(simulator, SupportsReseeding):
         return "its simulator offers no way to re-seed its random generators"
