@@ -1,6 +1,7 @@
 """Foundations of every other package: errors, plugin names, files, processes and text.
 
-Its modules are independent, so import each by its own name. Every other package offers its names in its ``__init__``.
+Its modules are independent, so import each module by its own name. Every other package exports its names in its
+``__init__``.
 """
 
 __all__: list[str] = []

@@ -50,19 +50,19 @@ _MODULE = "see what the module does when it is imported, or give it more time wi
 
 
 def work_apart(work: Callable[[Report], Plain], *, task: str, timeout_s: float) -> Plain:
-    """Return what some work returns. The work is done in a fork of this process.
+    """Return the result of a function that imports foreign code. The function runs in a fork of this process.
 
-    If this process cannot be forked, or other threads of Python run, the work is done in this process. With other
-    threads, this is a program of the user that calls crashhunt, and that imports the user's modules anyway.
+    If this process cannot be forked, or has other Python threads, the function runs in this process. A process with
+    other threads is a user's program that calls crashhunt, and that imports the user's modules anyway.
 
     Args:
-        work: the function to call; its result must be expressible as JSON. It is given a function that it calls with
-            its next task.
-        task: what has failed if there is no result, as in "'planner:Planner' cannot be imported".
+        work: the function to call; its result must be expressible as JSON. Its argument is a function that it calls
+            with each new task.
+        task: the error to report if there is no result, such as "'planner:Planner' cannot be imported".
         timeout_s: time limit, in s of wall time.
 
     Raises:
-        CrashhuntError: an error that the work has raised.
+        CrashhuntError: the function raised this error.
         PluginError: the fork ended without a result, or exceeded the time limit.
     """
     if _is_embedded():
@@ -83,15 +83,15 @@ def work_apart(work: Callable[[Report], Plain], *, task: str, timeout_s: float) 
 
 
 class ServerApart:
-    """Work that a fork of this process does, once for each request, until `close` or the end of this process.
+    """A function that a fork of this process calls once for each request, until `close` or the end of this process.
 
-    Unlike `work_apart`, the fork keeps what it has imported.
+    Unlike `work_apart`, the fork keeps the modules that it has imported.
 
     Args:
-        work: returns the answer to a request; both must be expressible as JSON.
-        task: what has failed if there is no answer, as in "the disturbance 'trucks:CutIn' cannot be drawn".
-        fix: what to do about it.
-        timeout_s: time limit of an answer, in s of wall time.
+        work: function that returns the answer to a request; both must be expressible as JSON.
+        task: the error to report if there is no answer, such as "the disturbance 'trucks:CutIn' cannot be drawn".
+        fix: the fix for this error.
+        timeout_s: maximum wall time for an answer, in s.
     """
 
     def __init__(self, work: Callable[[Plain], Plain], *, task: str, fix: str, timeout_s: float) -> None:
@@ -116,7 +116,7 @@ class ServerApart:
         """Return the answer to a request.
 
         Raises:
-            CrashhuntError: an error that the work has raised.
+            CrashhuntError: the function raised this error.
             PluginError: the fork ended without an answer, or exceeded the time limit.
         """
         if self._keeper is None:
@@ -148,7 +148,7 @@ class ServerApart:
         return _result(answered, self._keeper, self._task, self._fix)
 
     def close(self) -> None:
-        """End the fork; may be called twice."""
+        """End the fork; a second call does nothing."""
         if self._keeper is not None and self._requests >= 0:
             self._close()
             self._keeper.end()
@@ -161,7 +161,7 @@ class ServerApart:
 
 
 def _serve(work: Callable[[Plain], Plain], requests: int, answers: int) -> Plain:
-    """Answer requests until there are no more."""
+    """Answer requests until the pipe for requests is closed."""
     with os.fdopen(requests, "rb", closefd=False) as lines:
         for line in lines:
             try:
@@ -175,7 +175,7 @@ def _serve(work: Callable[[Plain], Plain], requests: int, answers: int) -> Plain
 
 
 class _Task:
-    """What some work does at the moment, in words that outlive its process."""
+    """The present task of a function, as text that remains readable after its process has ended."""
 
     def __init__(self, text: str) -> None:
         self._words = mmap.mmap(-1, _TASK)
@@ -189,11 +189,11 @@ class _Task:
 
 
 class _Keeper(Copy):
-    """A fork that ends every program below it before it ends."""
+    """A process that ends every program below it before it ends itself."""
 
     @property
     def end_of_answer(self) -> int:
-        """Descriptor of the pipe from it, which can be read when its work has ended."""
+        """The file descriptor of a pipe from the keeper, which becomes readable when the work has ended."""
         return self._end
 
     def end(self) -> None:
@@ -210,7 +210,7 @@ class _Keeper(Copy):
 
 
 def _keeper_of(answer: Callable[[], Plain], timeout_s: float, keeps: Collection[int] = ()) -> _Keeper:
-    """Fork a keeper, which forks the process that does some work.
+    """Fork a keeper, which forks the process that does the work.
 
     Raises:
         CannotForkError: this process cannot be forked.
@@ -239,11 +239,11 @@ def _is_embedded() -> bool:
 
 
 def _result(answered: Any, keeper: Copy, task: str, fix: str) -> Plain:
-    """Return the result in an answer.
+    """Return the result from an answer.
 
     Raises:
-        CrashhuntError: an error that the work has raised.
-        PluginError: there is none.
+        CrashhuntError: the work raised this error.
+        PluginError: the answer contains no result.
     """
     if isinstance(answered, dict) and "result" in answered:
         result: Plain = answered["result"]
@@ -256,7 +256,7 @@ def _result(answered: Any, keeper: Copy, task: str, fix: str) -> Plain:
 
 
 def _end_when_asked(owner: int) -> None:
-    """Have this process, the keeper, end with all programs below it on SIGTERM, also when its owner has ended."""
+    """Make this process, the keeper, end with all programs below it on SIGTERM, even after its owner has ended."""
 
     def end(_number: int, _frame: object) -> None:
         end_descendants()

@@ -1,7 +1,7 @@
-"""The boundaries of crashhunt: calls of foreign code in an episode, by the party that wrote the code.
+"""Boundaries around calls of foreign code in an episode; each belongs to the owner of the called code.
 
-Every call of foreign code stands alone inside a boundary. An exception that comes out of the call is wrapped, and the
-wrapper says whose code raised it. Therefore an exception without a wrapper is crashhunt's own.
+Each call of foreign code is inside a boundary of its own. An exception that leaves the call is wrapped, and the wrapper
+names the owner of the code that raised it. An exception without a wrapper is therefore crashhunt's own.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ R = TypeVar("R")
 
 
 class Party(StrEnum):
-    """The parties whose code runs in an episode."""
+    """The owners of code that runs in an episode."""
 
     AGENT = "agent"
     ENVIRONMENT = "environment"
@@ -32,12 +32,12 @@ class Party(StrEnum):
 
 
 class ForeignError(SimulatorError):
-    """An exception of foreign code; its cause is the exception itself.
+    """An exception of foreign code; its cause is the original exception.
 
     Args:
-        party: The party whose code raised the exception.
-        place: What the code was called for, such as ``step``.
-        error: The exception.
+        party: The owner of the code that raised the exception.
+        place: The purpose of the call, such as ``step``.
+        error: The original exception.
     """
 
     def __init__(self, party: Party, place: str, error: BaseException) -> None:
@@ -48,11 +48,11 @@ class ForeignError(SimulatorError):
 
 
 class Boundary:
-    """Surrounds calls of one party's code for one purpose: ``with boundary: call()``.
+    """Surrounds calls of one owner's code for one purpose: ``with boundary: call()``.
 
     Args:
-        party: The party whose code is called.
-        place: Task of the call, such as ``step``.
+        party: The owner of the called code.
+        place: The purpose of the call, such as ``step``.
     """
 
     __slots__ = ("_party", "_place")
@@ -71,11 +71,11 @@ class Boundary:
             self.wrap(error)
 
     def wrap(self, error: BaseException) -> NoReturn:
-        """Raise the wrapper of an exception that a call inside this boundary has raised."""
+        """Raise the wrapper of an exception that was raised by a call inside this boundary."""
         raise ForeignError(self._party, self._place, error) from error
 
     def around(self, function: Callable[P, R]) -> Callable[P, R]:
-        """Return a function whose calls are inside this boundary."""
+        """Return a function whose calls run inside this boundary."""
 
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
             try:
@@ -87,6 +87,6 @@ class Boundary:
 
 
 def is_ours(thing: Any) -> bool:
-    """Whether the class of an object, or a function, is defined in crashhunt itself."""
+    """Return whether an object's class, or a function, is defined in crashhunt itself."""
     kind = thing if isinstance(thing, type) else type(thing)
     return str(type.__dict__["__module__"].__get__(kind)).startswith("crashhunt.")

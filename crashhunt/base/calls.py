@@ -1,4 +1,4 @@
-"""Calls from Python with wrong arguments: raise the same clear line as the command line, not a bare TypeError."""
+"""Calls from Python with wrong arguments raise the same clear message as the command line, not a plain TypeError."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 def clear_calls() -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Return a decorator for public functions: an unknown keyword raises a `CallError` that proposes the likely one."""
+    """Return a decorator for public functions: an unknown keyword raises a `CallError` that suggests the likely one."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         signature = inspect.signature(function)
@@ -52,23 +52,23 @@ def clear_constructor(kind: type[T]) -> type[T]:
 
 
 class Documented(Protocol):
-    """An argument that describes itself."""
+    """An argument that provides its own description."""
 
     @property
     def line(self) -> str:
-        """``name: meaning``."""
+        """The description of the argument, as ``name: meaning``."""
 
 
 def called_with(
     shape: Callable[P, T], *, documents: Iterable[Documented] = ()
 ) -> Callable[[Callable[[T], R]], Callable[P, R]]:
-    """Return a decorator for a public function of one dataclass, which is then called with the fields of the dataclass.
+    """Return a decorator for a function with one dataclass as its argument; its caller passes the fields as keywords.
 
     Type checkers and editors see the fields as its arguments. Unknown keywords are refused as by `clear_calls`.
 
     Args:
-        shape: the dataclass; its ``Args`` become those of the function.
-        documents: descriptions of arguments that are not fields of the dataclass.
+        shape: the dataclass; its ``Args`` section becomes that of the function.
+        documents: descriptions of further arguments that the ``Args`` section of the dataclass lacks.
     """
     known = _signature_of(shape)
 
@@ -88,7 +88,7 @@ def called_with(
 
 
 def _signature_of(shape: Any) -> inspect.Signature:
-    """Return the signature of a dataclass's constructor, with default values in place of ``<factory>``."""
+    """Return the signature of a dataclass's constructor, with default values instead of ``<factory>``."""
     known = inspect.signature(shape)
     made = {item.name: item.default_factory() for item in fields(shape) if item.default_factory is not MISSING}
     return known.replace(
@@ -100,7 +100,7 @@ def _signature_of(shape: Any) -> inspect.Signature:
 
 
 def _with_arguments(doc: str, of_shape: str, documents: Iterable[Documented]) -> str:
-    """Return a docstring with the arguments of a dataclass added, as `help` shows them."""
+    """Return a docstring with the arguments of a dataclass added, in the form that `help` shows."""
     _, _, arguments = inspect.cleandoc(of_shape).partition("Args:\n")
     lines = [*arguments.rstrip().splitlines(), *(f"    {known.line}" for known in documents)]
     purpose, parts, rest = inspect.cleandoc(doc).partition("\n\nRaises:")
@@ -125,7 +125,7 @@ def _keywords(signature: inspect.Signature) -> dict[str, None]:
 
 
 def _shown(signature: inspect.Signature) -> str:
-    """Return the required arguments, such as ``(directory, parallel, trials, max_steps, …)``."""
+    """Return the required arguments of a signature as text, such as ``(directory, parallel, trials, max_steps, …)``."""
     needed = [
         f"*{name}" if parameter.kind is parameter.VAR_POSITIONAL else name
         for name, parameter in signature.parameters.items()

@@ -1,4 +1,4 @@
-"""Optional capabilities of an object beyond its protocol; each capability is its own protocol."""
+"""Optional capabilities of an object in addition to its protocol; each capability is a protocol of its own."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ T = TypeVar("T")
 def supports(thing: object, faculty: Callable[..., T]) -> TypeIs[T]:
     """Return whether an object has every member of a protocol; a member that is None counts as missing.
 
-    Unlike `isinstance` with a runtime-checkable protocol, this finds members that an object gets through
+    Unlike `isinstance` with a runtime-checkable protocol, this function finds members that an object gets through
     ``__getattr__``, in every version of Python. A user's wrapper around an agent or simulator therefore has the
     capabilities of the object inside it.
 
     Args:
-        thing: the object.
-        faculty: the protocol, typed as a callable, since type checkers refuse protocols as ``type[T]``.
+        thing: the object to check.
+        faculty: the protocol; its type is a callable, because type checkers refuse protocols as ``type[T]``.
     """
     return all(getattr(thing, name, None) is not None for name in members(faculty))
 

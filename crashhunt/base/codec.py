@@ -1,16 +1,16 @@
 """Converts dataclasses to the JSON objects of files and messages, and back.
 
-The annotations of a dataclass say how each field is converted, so that every shape of data is spelled once. What
-differs from the annotations is declared in the metadata of the field: `OMIT_DEFAULT`, `null_is`, `written_if`.
+The annotations of a dataclass determine how each field is converted, so each data format is defined only once.
+Deviations from the annotations are declared in the metadata of a field: `OMIT_DEFAULT`, `null_is`, `written_if`.
 
 Invariants: keys are written in the order of `Serializable.json_keys`, which is part of the file formats. A missing key
-means the default of its field. A key that this version does not know is ignored; `known_part` and `merged` keep it
-where a file is written again.
+means the default of its field. Unknown keys are ignored; `known_part` and `merged` preserve them when a file is written
+again.
 
-Why not a library: cattrs and pydantic support all of this, and add 30 and 60 ms to the start of every command. msgspec
-adds 15 ms. For a dataclass, msgspec has no option for null as infinity, for omitted keys or for the order of keys, so
-many dataclasses would still need their own functions. To convert an ordinary result, msgspec takes 2 us and this module
-10 us. `json.loads` takes 15 us before that.
+Reason for not using a library: cattrs and pydantic have all these features, but add 30 and 60 ms to the start of every
+command. msgspec adds 15 ms. For a dataclass, msgspec has no option for null as infinity, for omitted keys or for the
+order of keys, so many dataclasses would still need their own functions. The conversion of a typical result takes
+msgspec 2 us and this module 10 us. `json.loads` takes 15 us before that.
 """
 
 from __future__ import annotations
@@ -80,17 +80,17 @@ OMIT_DEFAULT: Mapping[str, object] = {"omit_default": True}
 
 
 def null_is(value: float | None) -> Mapping[str, object]:
-    """Return the metadata of a number that is written as null if it is not finite; null is read as ``value``."""
+    """Return the metadata of a numeric field that is written as null if not finite; null is read as ``value``."""
     return {"null": value}
 
 
 def written_if(condition: Callable[[Any], object]) -> Mapping[str, object]:
-    """Return the metadata of a field that is written only where a condition holds for its object."""
+    """Return the metadata of a field that is written only if its object satisfies a condition."""
     return {"written_if": condition}
 
 
 class Serializable:
-    """Base of the dataclasses that have a shape in JSON."""
+    """Base class of the dataclasses that can be converted to JSON."""
 
     __slots__ = ()
 
@@ -98,26 +98,26 @@ class Serializable:
     """The fields and properties that are written, in this order; by default all fields. ``NAME?``: not where None."""
 
     def to_json(self) -> JsonObject:
-        """Return plain dicts, lists, strings and numbers."""
+        """Return the object as dicts, lists, strings and numbers."""
         return to_plain(self)
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
-        """Rebuild what `to_json` returned, of any version: unknown keys are ignored, missing ones are the defaults.
+        """Rebuild an object from data of `to_json` of any version: unknown keys are ignored, missing ones get defaults.
 
         Raises:
-            ValueError: a key that has no default is missing, or a value cannot be converted; the message has the key.
+            ValueError: a key without a default is missing, or a value cannot be converted; the message names the key.
         """
         return from_plain(cls, data)
 
 
 def to_plain(value: Serializable) -> JsonObject:
-    """Return the JSON object of a dataclass, as its annotations say."""
+    """Convert a dataclass to a JSON object, according to its annotations."""
     return cast(JsonObject, _write_function(cast(Any, type(value)))(value))
 
 
 def from_plain(kind: type[_T], data: Mapping[str, Any]) -> _T:
-    """Return the dataclass of a JSON object, as its annotations say; see `Serializable.from_json`."""
+    """Convert a JSON object to a dataclass, according to its annotations; see `Serializable.from_json`."""
     if not isinstance(data, dict):
         raise TypeError(f"{str(data)[:60]!r} is not a JSON object")
     values: JsonObject = {}
@@ -133,7 +133,7 @@ def from_plain(kind: type[_T], data: Mapping[str, Any]) -> _T:
 
 
 def prepare(kind: type[Serializable]) -> None:
-    """Make the converters of a class and of all classes inside it; forks of this process inherit the converters."""
+    """Create the converters of a class and of all classes inside it; forks of this process inherit the converters."""
     _write_function(cast(Any, kind))
     _readers(cast(Any, kind))
     inside = [tuple(_hints(cast(Any, kind)).values())]
@@ -147,7 +147,7 @@ def prepare(kind: type[Serializable]) -> None:
 
 @cache
 def plain_types(kind: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-    """Return two dicts from key to the type of its JSON value: one of the required keys, one of all keys of a class."""
+    """Return two dicts from each key of a class to the type of its JSON value: for required keys, and for all keys."""
     found: dict[str, Any] = {}
     for item in fields(kind):
         plain = _plain_type(_hints(kind)[item.name])
@@ -217,7 +217,7 @@ def _finite(value: float) -> float | None:
 
 
 def _writer(hint: Any) -> _Convert | None:
-    """Return the function that makes a value of a type plain; None if it is plain already."""
+    """Return the function that converts values of a type to JSON data; None if they need no conversion."""
     kind, inner = _kind_of(hint)
     of_item = _writer(inner[-1 if issubclass(kind, Mapping) else 0]) if inner else None
     if issubclass(kind, Mapping):
@@ -261,7 +261,7 @@ def _optional(convert: _Convert, *, falsy: bool) -> _Convert:
 
 
 def _reader(hint: Any) -> _Convert | None:
-    """Return the function that makes a value of a type from a plain one; None if that is the same."""
+    """Return the function that converts JSON data to values of a type; None if they need no conversion."""
     kind, inner = _kind_of(hint)
     if issubclass(kind, Serializable):
         return lambda held: kind.from_json(held or {})
@@ -276,7 +276,7 @@ def _reader(hint: Any) -> _Convert | None:
 
 
 def _kind_of(hint: Any) -> tuple[type, tuple[Any, ...]]:
-    """Return the class of a type hint and what is in its brackets; `object` where it may be of several classes."""
+    """Return the class of a type hint and the types in its brackets; `object` if several classes are possible."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         choices = [choice for choice in inner if choice is not type(None)]
@@ -293,21 +293,21 @@ crosses to that version would mean something else."""
 
 
 def known_values(kind: type, data: Plain) -> dict[str, Any]:
-    """Return the values for which a dataclass has fields, without those that a later version has added.
+    """Return the values for which a dataclass has fields, without values that a later version has added.
 
     Args:
         kind: the dataclass.
-        data: keys and values as they were read.
+        data: keys and values from a file.
     """
     known = {item.name for item in fields(kind)}
     return {name: value for name, value in data.items() if name in known}
 
 
 def known_part(kind: Any, data: object) -> tuple[Any, Any]:
-    """Split plain data into the part for which a dataclass has fields, at any depth, and the rest with the same layout.
+    """Split JSON data into the part for which a dataclass has fields, at any depth, and the rest in the same layout.
 
-    Unknown keys of items of a list are dropped; every other unknown key is in the rest. The rest is an empty dict if
-    everything is known.
+    Unknown keys of items in a list are dropped; every other unknown key is part of the rest. The rest is an empty dict
+    if all keys are known.
     """
     if is_dataclass(kind) and isinstance(data, dict):
         hints = _hints_of(cast(Any, kind))
@@ -342,7 +342,7 @@ def _split(kinds: Plain, data: Plain) -> tuple[dict[str, object], dict[str, obje
 
 
 def merged(data: Plain, rest: Plain) -> dict[str, object]:
-    """Return plain data with its unknown keys added again, unless the data have a new value for such a key."""
+    """Return JSON data with its unknown keys added again, except keys for which the data have a new value."""
     found = dict(data)
     for name, value in rest.items():
         if name not in found:
@@ -353,11 +353,11 @@ def merged(data: Plain, rest: Plain) -> dict[str, object]:
 
 
 def slip(rest: Plain, known: Plain, kind: type) -> str:
-    """Return an unknown key that resembles a missing one (a typing error or damage); otherwise an empty string.
+    """Return an unknown key that resembles a missing key (a typing error or damage); empty if there is none.
 
     Args:
-        rest: the unknown part, of `known_part`.
-        known: the known part.
+        rest: the unknown part, from `known_part`.
+        known: the known part, from `known_part`.
         kind: the dataclass.
     """
     missing = [item.name for item in fields(kind) if item.name not in known]
@@ -365,16 +365,16 @@ def slip(rest: Plain, known: Plain, kind: type) -> str:
 
 
 def typed_where_there(data: Plain, types: Plain) -> None:
-    """Check the types of the values of some keys; a key may be missing.
+    """Check the types of the values of some keys; keys may be missing.
 
     Raises:
-        ValueError: with the key, its value and the type.
+        ValueError: a value has the wrong type; the message names the key, its value and the type.
     """
     typed(data, {key: kind for key, kind in types.items() if key in data})
 
 
 def essentials(*kinds: Any) -> frozenset[str]:
-    """Return the names of all essential fields of some dataclasses, and of those inside them."""
+    """Return the names of all essential fields of some dataclasses, and of the dataclasses inside them."""
     found: set[str] = set()
     for kind in kinds:
         if is_dataclass(kind):
@@ -385,7 +385,7 @@ def essentials(*kinds: Any) -> frozenset[str]:
 
 
 def not_understood(needed: Iterable[str], *kinds: object) -> list[str]:
-    """Return the names under ``requires`` in plain data that are fields of none of some dataclasses."""
+    """Return the names under ``requires`` in JSON data that are not fields of any of some dataclasses."""
     return sorted(set(needed) - essentials(*kinds)) if needed else []
 
 

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 def one_of(weights: Mapping[T, float], rng: np.random.Generator) -> T:
-    """Return one of some values, drawn with probability proportional to its weight; weights are positive."""
+    """Return a random value; its probability is proportional to its weight, which must be positive."""
     place = rng.random() * sum(weights.values())
     for value, weight in weights.items():
         place -= weight

@@ -64,11 +64,11 @@ DISK = FULL | {errno.EIO, errno.EROFS}
 
 
 class CrashhuntError(Exception):
-    """An error with the mistake, the fix, and where it is.
+    """An error: a message, the fix, and the place of the problem.
 
     Args:
-        message: what is wrong, with the offending value; or an error to copy.
-        fix: what to do about it, as an imperative.
+        message: description of the problem, with the offending value; or an error to copy.
+        fix: the fix, as an instruction to the user.
         where: the file, key or option with the problem.
     """
 
@@ -84,7 +84,7 @@ class CrashhuntError(Exception):
         self.where = where
 
     def __str__(self) -> str:
-        """Return the whole error in one line: ``where: message; fix``."""
+        """Return the whole error as one line: ``where: message; fix``."""
         text = f"{self.where}: {self.message}" if self.where else self.message
         return f"{text}; {self.fix}" if self.fix else text
 
@@ -93,12 +93,12 @@ class CrashhuntError(Exception):
         return _rebuild, (type(self), self.message, self.fix, self.where)
 
     def to_json(self) -> ErrorData:
-        """Return the shape that every command prints under ``--json``."""
+        """Return the error in the form that every command prints with ``--json``."""
         return {"error": {"message": self.message, "fix": self.fix, "where": self.where}}
 
     @classmethod
     def from_json(cls, data: ErrorData) -> CrashhuntError:
-        """Rebuild the error that `to_json` of any version returned."""
+        """Rebuild an error from the data of `to_json` of any version."""
         said = data["error"]
         parts = {"fix": str(said.get("fix", "")), "where": str(said.get("where", ""))}
         if said.get("traceback"):
@@ -143,7 +143,7 @@ class PluginError(CrashhuntError):
 
 
 class HuntDirectoryError(CrashhuntError):
-    """The directory of a hunt is busy, foreign, unwritable or full."""
+    """The directory of a hunt is in use, belongs to something else, or cannot be written, or the disk is full."""
 
 
 class BusyError(HuntDirectoryError):
@@ -167,16 +167,16 @@ class WorkerError(CrashhuntError):
 
 
 class InternalError(CrashhuntError):
-    """crashhunt itself failed: a fault to report, which ends a hunt.
+    """crashhunt itself failed. This is a defect to report, and it ends a hunt.
 
     Attributes:
-        traceback: The traceback, for the report.
+        traceback: The traceback, for the bug report.
     """
 
     traceback = ""
 
     def to_json(self) -> ErrorData:
-        """Return the shape of every error, with the traceback."""
+        """Return the JSON form of every error, with the traceback added."""
         data = super().to_json()
         data["error"]["traceback"] = self.traceback
         return data
@@ -203,9 +203,9 @@ class SimulatorError(EpisodeError):
 
 
 def remedy(error: OSError) -> str:
-    """Return what to do about an error of the operating system, as an imperative.
+    """Return the fix for an error of the operating system, as an instruction to the user.
 
-    Empty where the user can do nothing, as for a broken pipe between two processes of crashhunt.
+    The result is empty if the user can do nothing, for example for a broken pipe between two processes of crashhunt.
     """
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return "raise the limit on open files (ulimit -n), and run the same command again"

@@ -1,4 +1,4 @@
-"""Text of exceptions of any class and size, made in bounded time and memory."""
+"""Texts of exceptions of any class and size, created in bounded time and memory."""
 
 from __future__ import annotations
 
@@ -54,27 +54,27 @@ _CONTEXT_LINE = "\nDuring handling of the above exception, another exception occ
 
 
 def class_name(error: BaseException) -> str:
-    """Return the name of the class of an exception, of at most 200 characters."""
+    """Return the name of an exception's class, in at most 200 characters."""
     # A metaclass may define its own ``__name__``, so ask the descriptor of ``type``.
     name: str = type.__dict__["__name__"].__get__(type(error))
     return name[:_MAX_NAME_CHARACTERS]
 
 
 def message_of(error: BaseException, limit: int = MAX_MESSAGE_CHARACTERS) -> str:
-    """Return the message of an exception, cut after ``limit`` characters with a remark on how many follow.
+    """Return the message of an exception; after ``limit`` characters, it is cut with a note on the remaining number.
 
-    An exception whose ``__str__`` fails has a message that says so.
+    If an exception's ``__str__`` fails, the message says so.
     """
     text = _whole_message(error)
     return text if len(text) <= limit else f"{text[:limit]}… ({len(text) - limit} more characters are left out)"
 
 
 def format_error(error: BaseException) -> str:
-    """Return traceback and message of an exception and of its causes, as Python prints them.
+    """Return traceback and message of an exception and its causes, in Python's format.
 
-    The text has at most `MAX_TRACEBACK_CHARACTERS` characters and a line for each cut. Long tracebacks, messages,
-    chains and groups of exceptions are cut before they are formatted: Python needs 13 s for a million frames. The text
-    is empty if it cannot be made.
+    The text has at most `MAX_TRACEBACK_CHARACTERS` characters, and a line for each cut. Long tracebacks, messages,
+    chains and groups of exceptions are cut before they are formatted, because Python needs 13 s for a million frames.
+    The text is empty if formatting fails.
     """
     try:
         text = "".join(traceback.format_exception(error)) if _is_small(error) else "".join(_formatted_chain(error))
@@ -96,7 +96,7 @@ def _whole_message(error: BaseException) -> str:
 
 
 def _large_argument(error: BaseException) -> str:
-    """Return a short description in place of a message that only shows a large container; otherwise an empty string."""
+    """Return a short description that replaces a message which only shows a large container; else empty."""
     if type(error).__str__ not in (BaseException.__str__, KeyError.__str__):
         return ""
     for argument in error.args[:_MAX_GROUP_MEMBERS]:
@@ -106,7 +106,7 @@ def _large_argument(error: BaseException) -> str:
 
 
 def _is_small(error: BaseException) -> bool:
-    """Whether Python can format an exception in milliseconds."""
+    """Return whether Python can format an exception within milliseconds."""
     seen: set[int] = set()
     left: list[BaseException | None] = [error]
     frames = 0
@@ -152,9 +152,9 @@ def _links(first: TracebackType | None) -> Iterator[TracebackType]:
 
 
 def _skip_large_sources(files: Iterable[str]) -> None:
-    """Prevent that Python reads source lines from files without an end, such as ``/dev/zero``.
+    """Return a context in which Python reads no source lines from endless files, such as ``/dev/zero``.
 
-    The name of a file is whatever a program passes to `compile`.
+    Such file names can occur because a program may pass any name to `compile`.
     """
     for name in files:
         try:
@@ -166,7 +166,7 @@ def _skip_large_sources(files: Iterable[str]) -> None:
 
 
 def _formatted_chain(error: BaseException) -> Iterator[str]:
-    """Yield the texts of an exception and of the exceptions that led to it, the oldest first."""
+    """Yield the texts of an exception and of the exceptions that caused it, the oldest first."""
     newest: list[tuple[BaseException, str]] = []
     oldest: deque[tuple[BaseException, str]] = deque(maxlen=_EXCEPTIONS_PER_END)
     seen, count = {id(error)}, 0
@@ -193,7 +193,7 @@ def _formatted_chain(error: BaseException) -> Iterator[str]:
 
 
 def _formatted(error: BaseException) -> Iterator[str]:
-    """Yield the text of a single exception, each part of bounded length."""
+    """Yield the text of a single exception in parts of bounded length."""
     if error.__traceback__ is not None:
         yield "Traceback (most recent call last):\n"
         yield from _formatted_frames(error.__traceback__)
@@ -235,7 +235,7 @@ def _qualified_name(error: BaseException) -> str:
 
 
 def _without_middle(text: str, limit: int) -> str:
-    """Return the beginning and the end of a long text; a traceback begins with the place and ends with the error."""
+    """Return the beginning and the end of a long text: a traceback begins with the place and ends with the error."""
     if len(text) <= limit:
         return text
     half = limit // 2
@@ -252,30 +252,30 @@ _LIBRARY_FOLDERS = tuple({sysconfig.get_path(name) for name in ("stdlib", "plats
 
 
 def in_words(error: BaseException) -> str:
-    """Return type and message of an exception in one line of at most 1,200 characters or so."""
+    """Return type and message of an exception as one line of about 1,200 characters at most."""
     return " ".join(f"{class_name(error)}: {message_of(error, _MAX_LINE_CHARACTERS)}".split())
 
 
 def is_users(filename: str) -> bool:
-    """Whether a source file belongs to a user: not to crashhunt, nor to what is installed, nor to Python itself."""
+    """Return whether a source file belongs to the user, and not to crashhunt, an installed package or Python."""
     return not filename.startswith((_CRASHHUNT_FOLDER, *_LIBRARY_FOLDERS, *_IMPORT_SYSTEM_FILES))
 
 
 def blamed(what: str, error: BaseException, *, fix: str = "correct the code") -> PluginError:
-    """Return the error for user code that fails: the failed action, the reason and the place.
+    """Return the error for a failure of user code: the failed action, the reason and the place.
 
     Args:
         what: the failed action, such as ``the sampler 'mine' cannot be made``.
-        error: the exception that the user code has raised.
-        fix: what to do about it, as an imperative.
+        error: the exception that the user code raised.
+        fix: the fix, as an instruction to the user.
     """
     return PluginError(f"{what}: {in_words(error)}", fix=fix, where=place_of(error))
 
 
 def place_of(error: BaseException) -> str:
-    """Return ``FILE, line N``; empty if no line of a file is to blame.
+    """Return the origin of an exception as ``FILE, line N``; empty if no line of a file is known.
 
-    The place is the last traceback line in user code. If there is none, it is the last line in an installed library.
+    The origin is the last traceback line in user code, or else the last line in an installed library.
     """
     if isinstance(error, SyntaxError) and error.filename:
         # Nothing of the file has run, so that it is in no traceback; and there may be no line, as with null bytes.

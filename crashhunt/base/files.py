@@ -1,4 +1,4 @@
-"""Files that are complete or absent, even after a power failure."""
+"""Writing of files that are complete or absent, even after a power failure."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # of <fcntl.h> and <linux/fs.h>
 
 @contextmanager
 def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Iterator[Path]:
-    """Yield a temporary name in the folder of a file; the result replaces the file at the end, or is removed on error.
+    """Yield a temporary name in a file's folder. At the end, this file replaces the original; on error, it is deleted.
 
     Args:
-        path: path of the file.
-        lasting: whether content and name are synced to the disk before this returns. Set it to False for files that
-            are useless after a crash of the process or a power failure.
+        path: path of the final file.
+        lasting: whether content and name are synced to the disk at the end. Set it to False for files that are useless
+            after a crash of the process or a power failure.
         noted: whether the next command removes the temporary file if this process is killed. Set it to False inside
             a folder that is itself temporary.
 
     Raises:
-        HuntDirectoryError: it cannot be written.
+        HuntDirectoryError: the file cannot be written.
     """
     _refuse_device(path)
     name = temporary_name(path)
@@ -51,7 +51,7 @@ def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Itera
 
 
 def _refuse_device(path: Path) -> None:
-    """Raise an error where a file would replace a device or a pipe, or a link to one: root could replace /dev/null."""
+    """Raise an error if a file would replace a device or a pipe, or a link to one: root could replace /dev/null."""
     try:
         is_special = path.exists() and not (path.is_file() or path.is_dir())
     except OSError as error:  # such as a name that is too long
@@ -65,9 +65,9 @@ def _refuse_device(path: Path) -> None:
 
 
 def put_in_place(made: Path, final: Path) -> None:
-    """Rename a folder to its final name; a folder that has this name already is replaced.
+    """Rename a folder to its final name; an existing folder with this name is replaced.
 
-    Both are renamed at once where the system can do that. Elsewhere the old folder is removed first.
+    Both folders are renamed at once if the system supports that. Otherwise, the old folder is removed first.
 
     Raises:
         OSError: the folder cannot be renamed.
@@ -89,7 +89,7 @@ def exchange(first: Path, second: Path) -> bool:
 
 
 def sync_tree(folder: Path) -> None:
-    """Sync a folder and everything in it to the disk, so that its final name implies complete content.
+    """Sync a folder and all its contents to the disk, so that its final name implies complete contents.
 
     Raises:
         OSError: the disk is full, or broken.
@@ -107,16 +107,16 @@ def sync_tree(folder: Path) -> None:
 
 
 def is_empty_folder(path: Path) -> bool:
-    """Return whether a path is a folder that has nothing in it.
+    """Return whether a path is an empty folder.
 
     Raises:
-        OSError: it may not be read.
+        OSError: the folder may not be read.
     """
     return path.is_dir() and not any(path.iterdir())
 
 
 def sync_folder(*folders: str | Path) -> None:
-    """Sync the directory entries of folders to the disk, where the file system supports that."""
+    """Sync the directory entries of folders to the disk, if the file system supports that."""
     with suppress(OSError):  # some network file systems cannot
         for folder in folders:
             _sync(folder)

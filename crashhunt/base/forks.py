@@ -1,21 +1,22 @@
 """Forks of this process that continue at its current step, cannot change its files, and end with it.
 
-A fork gets a copy of the memory for free. This module separates everything else that fork(2) leaves shared.
+The kernel copies the memory for a fork. This module handles all other resources, which fork(2) leaves shared.
 
 Invariant: a fork changes no file or pipe through a descriptor that it has inherited, and does not outlive its parent.
 Every open descriptor is therefore handled in one of four ways before the work begins (`_replacement`):
 
 - A file that is read is opened again at the same position. Parent and fork otherwise share one position, and SUMO
   reads long route files in parts.
-- A file that is written is replaced by ``/dev/null``, and one that is also read by a private copy in memory.
-- A descriptor of crashhunt itself is closed.
+- A file that is written is replaced by ``/dev/null``. A file that is both written and read is replaced by a private
+  copy in memory.
+- A file descriptor of crashhunt itself is closed.
 - Threads, devices, connections and shared memory cannot be copied, so the fork is refused (`CannotForkError`).
 
-Why fork, and not a saved state of the simulator: SUMO's `loadState` does not continue as the original run did, even
-with saved random generators. A fork copies the whole memory, including that of libraries and of the agent.
+Reason for forks instead of saved states of the simulator: after SUMO's `loadState`, a run differs from the original
+run, even with saved random generators. A fork copies the whole memory, including that of libraries and of the agent.
 
-Cost: the kernel copies page tables, and later every page that parent or fork writes; ``gc.freeze`` keeps Python's
-garbage collector from touching the rest. Sources: fork(2), prctl(2), proc(5).
+Cost: the kernel copies page tables, and later every page that parent or fork writes. ``gc.freeze`` prevents Python's
+garbage collector from writing to all other pages. Sources: fork(2), prctl(2), proc(5).
 """
 
 from __future__ import annotations
@@ -84,11 +85,12 @@ _CHECK_EVERY_S = 0.2  # the same, of one whose answer is awaited
 
 @dataclass(frozen=True, slots=True)
 class NoAnswer:
-    """The reason why a copy did not answer.
+    """The reason why a fork returned no answer.
 
     Args:
-        why: a clause without a subject: "was killed by SIGKILL", "raised ValueError: …".
-        is_from_outside: whether another process or the system may be the cause, so that another copy may answer.
+        why: the reason as a clause without a subject, such as "was killed by SIGKILL".
+        is_from_outside: whether another process or the system may be the cause, so that another fork may return an
+            answer.
     """
 
     why: str
@@ -96,9 +98,9 @@ class NoAnswer:
 
 
 def parse_answer(received: bytes | bytearray) -> tuple[Plain | None, str, NoAnswer | None]:
-    """Parse what a fork has sent: return its answer, the text of its exception, and the reason for a missing answer.
+    """Parse the data that a fork has sent: return its answer, the text of its exception, and why an answer is missing.
 
-    Code of the agent may have written to the same pipe, so the data may be anything.
+    Code of the agent may have written to the same pipe, so the data may contain anything.
     """
     try:
         said = json.loads(received)
@@ -116,7 +118,7 @@ def took_longer(timeout_s: float) -> NoAnswer:
 
 
 def explain_silence(pid: int) -> NoAnswer:
-    """Return why a fork with a closed pipe has not answered; the caller still has to end its process."""
+    """Return why a fork with a closed pipe has sent no answer; the caller still has to end its process."""
     deadline = time.monotonic() + _ENDS_S
     try:
         while (end := os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG)) is None:
@@ -147,19 +149,19 @@ _fork, _leave, _dumps = os.fork, os._exit, json.dumps
 
 
 class CannotForkError(CrashhuntError):
-    """This process cannot be copied."""
+    """This process cannot be forked."""
 
 
 class NoProcessError(CannotForkError):
-    """The system does not start another process now: too many, or too little memory. It may do so later."""
+    """The system cannot start another process at present: there are too many, or too little memory."""
 
 
 class Watchdog:
-    """Writes the traceback of a process after a time limit. The thread of the watchdog is paused during a fork.
+    """Writes the traceback of a process after a time limit. The thread of the watchdog is stopped during a fork.
 
     Attributes:
-        file: the file that receives the traceback; None while the watchdog is not armed.
-        threads: ids of its own threads.
+        file: the file to which the traceback is written; None while no time limit is set.
+        threads: ids of the watchdog's own threads.
     """
 
     def __init__(self) -> None:
@@ -189,7 +191,7 @@ class Watchdog:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Pause the time limit inside the context; it resumes in this process only, not in a fork."""
+        """Return a context in which the time limit is paused. It resumes only in this process, not in a fork."""
         if self.file is None:
             yield
             return
@@ -216,12 +218,12 @@ watchdog = Watchdog()
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Resources that this process held before user code ran in it; forks need no copy of them.
+    """Resources that this process held before user code ran in it. Forks need no private copy of these.
 
     Args:
-        files: descriptor to its target.
-        children: process ids.
-        shared: names of memory that is shared with other processes; None to skip this check, which takes milliseconds.
+        files: target of each open file descriptor.
+        children: process ids of child processes.
+        shared: names of memory shared with other processes; None to skip this check, which takes milliseconds.
         threads: ids of threads.
     """
 
@@ -232,10 +234,10 @@ class Held:
 
 
 def held(shared: frozenset[str] | None = None) -> Held:
-    """Return the resources that this process holds now.
+    """Return the resources that this process currently holds.
 
     Args:
-        shared: names of shared memory, if the caller knows them already; see `Held`.
+        shared: names of shared memory, if the caller already knows them; see `Held`.
     """
     if sys.platform != "linux":
         return Held()
@@ -252,25 +254,25 @@ def shared_memory() -> frozenset[str]:
 
 
 def copying() -> bool:
-    """Return whether this module is forking now; fork handlers use that to ignore forks other than an agent's."""
+    """Return whether this module is currently forking; fork handlers then ignore the fork."""
     return _copying
 
 
 class Copy:
-    """A fork that does one piece of work and returns its answer.
+    """A fork that runs one function and returns its result.
 
     Args:
-        work: the work; its return value must be expressible as JSON.
-        known: resources that were open before user code ran.
-        keeps: descriptors that the work needs.
+        work: the function; its return value must be expressible as JSON.
+        known: resources that were held before user code ran.
+        keeps: file descriptors that the function needs.
 
     Raises:
-        CannotForkError: this process cannot be copied.
+        CannotForkError: this process cannot be forked.
 
     Attributes:
         pid: process id of the fork.
-        raised: text of the exception that ended the work; empty if there was none.
-        no_answer: why `answer` has returned None.
+        raised: text of the exception that ended the function; empty if there was none.
+        no_answer: reason why `answer` returned None.
     """
 
     def __init__(self, work: Callable[[], Plain], known: Held | None = None, *, keeps: Collection[int] = ()) -> None:
@@ -298,10 +300,10 @@ class Copy:
             os.close(theirs)
 
     def answer(self, timeout_s: float = math.inf) -> Plain | None:
-        """Wait for the answer, then end the fork; return None if the work raised, died or exceeded the time limit.
+        """Wait for the answer, then end the fork; return None if the work failed, died or exceeded the time limit.
 
         Args:
-            timeout_s: time limit in s of wall time.
+            timeout_s: maximum wall time, in s.
         """
         received, deadline = bytearray(), time.monotonic() + timeout_s
         try:
@@ -326,7 +328,7 @@ class Copy:
                 end_orphans(self._children)
 
     def end(self) -> None:
-        """Kill the fork; may be called twice."""
+        """Kill the fork; a second call does nothing."""
         if self._end >= 0:
             kill(self.pid)
             ended(self.pid)
@@ -346,15 +348,15 @@ def _has_ended(pid: int) -> bool:
 
 
 def end_orphans(children: frozenset[int]) -> None:
-    """End the children that this process has inherited from a killed fork, because they would prevent further forks.
+    """End the child processes that this process inherited from a killed fork, because they would prevent further forks.
 
-    Children that are older than the fork are not ended.
+    Child processes that are older than the fork are not ended.
     """
     end_descendants(children | _alive)
 
 
 def ended(pid: int) -> int:
-    """Wait for the end of a fork; return its exit code, negative for a signal."""
+    """Wait for the end of a fork; return its exit code, which is negative for a signal."""
     _alive.discard(pid)
     with suppress(ChildProcessError):
         return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
@@ -362,18 +364,19 @@ def ended(pid: int) -> int:
 
 
 def fork(work: Callable[[], object], known: Held | None = None, *, keeps: Collection[int] = ()) -> int:
-    """Fork this process; the fork does its work and exits.
+    """Fork this process; the fork runs a function and exits.
 
     Args:
-        work: the work. Its output is discarded, and so are its exceptions.
-        known: resources that were open before user code ran; None if unknown: then every resource may be the user's.
-        keeps: descriptors that the work needs, such as an end of a pipe.
+        work: the function to run. Its output and its exceptions are discarded.
+        known: resources that were held before user code ran; None if they are unknown, so that every resource may be
+            the user's.
+        keeps: file descriptors that the function needs, such as an end of a pipe.
 
     Returns:
         The process id of the fork; the caller has to wait for it.
 
     Raises:
-        CannotForkError: this process cannot be copied.
+        CannotForkError: this process cannot be forked.
     """
     global _copying
     if sys.platform != "linux":
@@ -420,10 +423,10 @@ _CLOSE, _NOTHING, _READ, _OWN = range(4)  # what a fork does with a descriptor: 
 
 
 def _replacements(known: Held, keeps: Collection[int]) -> list[tuple[int, int, int]]:
-    """Return for each descriptor what a fork does with it, and the position of this process in it.
+    """Return for each file descriptor what a fork does with it, and the current file position.
 
     Raises:
-        CannotForkError: a descriptor, a thread, a child or shared memory cannot be copied.
+        CannotForkError: a file descriptor, a thread, a child process or shared memory cannot be copied.
     """
     own = {str(threading.get_native_id())}
     others = len(threads() - watchdog.threads - known.threads - own)
@@ -490,7 +493,7 @@ def _replace(replaced: list[tuple[int, int, int]]) -> None:
 
 
 def children_now() -> frozenset[int]:
-    """Return the children of this process."""
+    """Return the process ids of this process's children."""
     return frozenset(children_of(os.getpid())) if has_child() else frozenset()
 
 
@@ -511,20 +514,20 @@ _loads, _write = json.loads, os.write
 
 
 class SuspendedFork:
-    """A suspended fork; it runs each job in its own fork, so its state never changes.
+    """A suspended fork, which runs each job in a fork of its own, so that its state never changes.
 
     Args:
-        work: computes the answer to a job; both must be expressible as JSON.
-        known: resources that were open before user code ran.
+        work: function that computes the answer to a job; both must be expressible as JSON.
+        known: resources that were held before user code ran.
 
     Raises:
-        CannotForkError: this process cannot be copied.
+        CannotForkError: this process cannot be forked.
 
     Attributes:
         pid: process id of the suspended fork.
         raised: text of the exception that ended the last job; empty if there was none.
-        no_answer: why `ask` has returned None.
-        is_usable: whether it accepts another job.
+        no_answer: reason why `ask` returned None.
+        is_usable: whether the suspended fork accepts another job.
     """
 
     def __init__(self, work: Callable[[Plain], Plain], known: Held | None = None) -> None:
@@ -544,11 +547,11 @@ class SuspendedFork:
             os.close(answers)
 
     def ask(self, job: Plain, timeout_s: float) -> Plain | None:
-        """Return the answer to a job; None if the work raised, died or exceeded the time limit (see `no_answer`).
+        """Return the answer to a job; None if the work failed, died or exceeded the time limit (see `no_answer`).
 
         Args:
-            job: the input of the work.
-            timeout_s: time limit in s of wall time.
+            job: the input of the function.
+            timeout_s: maximum wall time, in s.
         """
         if not self.is_usable:
             return None
@@ -592,7 +595,7 @@ class SuspendedFork:
         self.no_answer, self.is_usable = why, False
 
     def end(self) -> None:
-        """Kill the suspended fork and the forks that it has made; may be called twice."""
+        """Kill the suspended fork and its own forks; a second call does nothing."""
         if self._jobs >= 0:
             kill(self.pid)
             ended(self.pid)

@@ -1,4 +1,4 @@
-"""Git: queries about a folder, independent of the repository whose hook runs this process; temporary work trees."""
+"""Git: queries about a folder that ignore a hook's repository, and temporary work trees."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ def environment_of_git() -> dict[str, str]:
 
 
 def work_tree(folder: Path) -> Path | None:
-    """Return the top of the git work tree of a folder, without symbolic links; None if there is none.
+    """Return the root of a folder's git work tree, with symbolic links resolved; None if there is none.
 
-    Git refuses a work tree that belongs to another user; the result is None for it too.
+    Git refuses a work tree that belongs to another user. The result is then None as well.
     """
     found = _run_git(folder, "rev-parse", "--show-toplevel")
     return Path(os.path.realpath(os.fsdecode(found.rstrip(b"\n")))) if found else None
 
 
 def tracked_files(top: Path) -> frozenset[str]:
-    """Return the names of all files that git tracks in a work tree, relative to its top, with ``/``."""
+    """Return the names of all files that git tracks in a work tree, relative to its root, with ``/``."""
     found = _run_git(top, "rev-parse", "--absolute-git-dir")
     if not found:
         return frozenset()
@@ -95,35 +95,35 @@ def _run_git(folder: Path, *words: str) -> bytes | None:
 
 
 def top_of(folder: Path) -> Path:
-    """Return the top of the work tree of a folder.
+    """Return the root of the work tree that contains a folder.
 
     Raises:
-        CrashhuntError: it is in no work tree, or git cannot be run.
+        CrashhuntError: no work tree contains the folder, or git cannot be run.
     """
     return Path(git(folder, "rev-parse", "--show-toplevel"))
 
 
 def commit_of(folder: Path, revision: str) -> str:
-    """Return the commit that a revision names, as 40 or 64 digits.
+    """Return the commit that a revision names, as 40 or 64 hexadecimal digits.
 
     Raises:
-        UsageError: there is no such commit.
+        UsageError: the revision does not exist.
     """
     return git(folder, "rev-parse", "--verify", "--quiet", f"{revision}^{{commit}}", what=revision)
 
 
 @contextmanager
 def checked_out(top: Path, commit: str, *, purpose: str, name: str = "") -> Iterator[Path]:
-    """Yield a temporary work tree of a repository with a commit, and remove it at the end.
+    """Yield a temporary work tree with a commit of a repository, and remove it at the end.
 
     Args:
-        top: top of the user's work tree.
-        commit: as `commit_of` returns it.
-        purpose: first part of the name of the temporary folder, such as ``bisect``.
-        name: last part of the name of the work tree, where this process has several at a time.
+        top: root of the user's work tree.
+        commit: digits of the commit, as `commit_of` returns them.
+        purpose: first part of the temporary folder's name, such as ``bisect``.
+        name: last part of the work tree's name, if this process has several work trees at a time.
 
     Raises:
-        CrashhuntError: git fails.
+        CrashhuntError: git reports an error.
     """
     # Git gives the name of the work tree to what it writes about it.
     token = f"crashhunt-{this_process().token}{f'-{name}' if name else ''}"
@@ -138,11 +138,11 @@ def checked_out(top: Path, commit: str, *, purpose: str, name: str = "") -> Iter
 
 
 def import_environment(folder: Path, tree: Path) -> dict[str, str]:
-    """Return the environment variables with which code is imported from a work tree.
+    """Return the environment variables with which modules are imported from a work tree.
 
     Args:
-        folder: folder in the work tree, from which modules are imported.
-        tree: its top; modules in it and in its ``src`` are found as well.
+        folder: folder inside the work tree from which modules are imported.
+        tree: root of the work tree; modules in this folder and in its ``src`` are found as well.
     """
     places = dict.fromkeys(map(str, (folder, tree, tree / "src")))
     paths = [*places, *filter(None, [os.environ.get("PYTHONPATH")])]
@@ -160,17 +160,17 @@ def run_to_end(
 
 
 def git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str:
-    """Return git's output.
+    """Run a git command in a folder, and return its output.
 
     Args:
         folder: folder of the repository.
-        words: words of the command.
-        what: revision that the command resolves; the error names it.
-        skipped: whether to return the output also if git ends with an error.
+        words: words of the git command.
+        what: revision that the command resolves, for the error message.
+        skipped: whether to return the output even if git reports an error.
 
     Raises:
-        UsageError: there is no such revision.
-        CrashhuntError: git fails, or is not installed.
+        UsageError: the revision does not exist.
+        CrashhuntError: git reports an error, or is not installed.
     """
     command: Sequence[str] = ["git", "-C", str(folder), *words]
     try:

@@ -61,7 +61,7 @@ class FileEntry(TypedDict):
 
 
 def digest_of_row(values: tuple[object, ...]) -> int:
-    """Return the digest of a row of a table: 64 bits with a sign, the most compact form in SQLite."""
+    """Return the digest of a row of a table: a signed 64-bit number, the most compact form in SQLite."""
     text = "\0".join(map(str, values))  # a trial's cost is counted in microseconds, and JSON would take twice as long
     digest = hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=8).digest()
     return int.from_bytes(digest, "little", signed=True)
@@ -82,7 +82,7 @@ def digest_of_file(path: Path) -> str:
     """Return the digest of a file's content, in hexadecimal.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     with open(path, "rb", buffering=0) as file:  # hundreds at a time, and a Path takes twice as long
         if os.fstat(file.fileno()).st_size < _SMALL_FILE_BYTES:
@@ -94,7 +94,7 @@ def describe_files(folder: Path) -> dict[str, FileEntry]:
     """Return the size and digest of every file in a folder, by file name.
 
     Raises:
-        OSError: one cannot be read.
+        OSError: a file cannot be read.
     """
     return {
         path.name: {"size": path.stat().st_size, "blake2b": digest_of_file(path)}
@@ -104,7 +104,7 @@ def describe_files(folder: Path) -> dict[str, FileEntry]:
 
 
 def changed_file(path: Path, entry: FileEntry) -> str:
-    """Return how a file differs from its recorded size and digest; an empty string if it is unchanged."""
+    """Return how a file differs from its recorded size and digest; empty if it is unchanged."""
     try:
         status = path.lstat()
         if not stat.S_ISREG(status.st_mode):
@@ -118,15 +118,15 @@ def changed_file(path: Path, entry: FileEntry) -> str:
 
 
 def read_object(path: Path, shape: type[T]) -> T:
-    """Read a JSON object.
+    """Read a JSON object from a file.
 
     Args:
         path: path of the file.
-        shape: the `TypedDict` that the caller expects; the caller checks the keys it needs with `typed`.
+        shape: the expected `TypedDict`; the caller checks the keys that it needs with `typed`.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file contains no JSON object; the reason is in one line.
+        ValueError: the file contains no JSON object; the message is one line.
     """
     return parse_object(path.read_bytes(), shape)
 
@@ -136,10 +136,10 @@ def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the ty
 
     Args:
         text: text in UTF-8.
-        shape: as for `read_object`.
+        shape: the expected `TypedDict`, as for `read_object`.
 
     Raises:
-        ValueError: the text is not a JSON object; the reason is in one line.
+        ValueError: the text is not a JSON object; the message is one line.
     """
     try:
         found = json.loads(text)
@@ -155,11 +155,12 @@ FILES = dict[str, dict[str, int | str]]
 
 
 def typed(data: Plain, types: Plain) -> None:
-    """Check that an object has some keys, and that their values have the given types.
+    """Check that a JSON object has some keys whose values have the given types.
 
     Args:
-        data: the object.
-        types: key to type: a class, a union of classes, ``list[...]`` or ``dict[str, ...]``. An int is a float too.
+        data: the JSON object.
+        types: type of each required key: a class, a union of classes, ``list[...]`` or ``dict[str, ...]``. An int is
+            accepted as a float.
 
     Raises:
         ValueError: a key is missing or has a value of another type; the message names key, value and type.
@@ -205,11 +206,11 @@ _KEY_OF_THIS_PROCESS = secrets.token_bytes(_KEY_BYTES)
 
 
 def authentication_code(purpose: str, statement: Mapping[str, object]) -> str:
-    """Return the code of a statement, in hexadecimal.
+    """Return the authentication code of a statement, in hexadecimal.
 
     Args:
-        purpose: what the code is for, such as ``crash bundle``.
-        statement: plain data; their order makes no difference.
+        purpose: purpose of the code, such as ``crash bundle``.
+        statement: JSON-compatible data; the order of keys makes no difference.
     """
     text = json.dumps(statement, sort_keys=True, separators=(",", ":"))
     return hmac.new(user_key(), f"crashhunt {purpose}\0{text}".encode(), "sha256").hexdigest()
@@ -225,8 +226,8 @@ def is_authentic(purpose: str, statement: Mapping[str, object], code: object) ->
 def user_key() -> bytes:
     """Return the secret key of this user on this machine; the first call creates it.
 
-    If no folder can store the key, each process has its own key, and later processes do not recognize its crashes as
-    made here.
+    If the key cannot be stored in any folder, each process has its own key. Later processes then do not recognize the
+    crashes of this process as made here.
     """
     for folder in state_folders():
         key = _kept_key(folder / layout.ARCHIVE_KEY)
@@ -236,10 +237,10 @@ def user_key() -> bytes:
 
 
 def state_folders() -> Iterator[Path]:
-    """Yield the folders in which the state of this user may be kept, the usual one first; not all can be written.
+    """Yield the folders that may store the state of this user, the usual folder first; some may not be writable.
 
-    ``$XDG_STATE_HOME/crashhunt`` or ``~/.local/state/crashhunt``. A container may run a user without a writable home,
-    so a private folder among the temporary files comes last.
+    The usual folder is ``$XDG_STATE_HOME/crashhunt`` or ``~/.local/state/crashhunt``. A container may run a user
+    without a writable home, so a private folder among the temporary files comes last.
     """
     home = os.environ.get("XDG_STATE_HOME", "")
     if not Path(home).is_absolute():  # which the XDG specification says to ignore
@@ -259,7 +260,7 @@ def state_folders() -> Iterator[Path]:
 
 
 def _kept_key(file: Path) -> bytes | None:
-    """Return the key in a file; create a missing file. None if the file can be neither read nor created."""
+    """Return the key in a file, which is created if missing; None if it can be neither read nor created."""
     with suppress(OSError):
         key = file.read_bytes()
         # Everybody can compute codes with a key that is cut off: replace the file.

@@ -1,7 +1,7 @@
-"""The types of plain data of unknown shape: everything that a JSON file may hold.
+"""The types of JSON data of unknown structure: everything that a JSON file may contain.
 
-Data of a known shape have a `TypedDict` in the module that writes them, so the type checker finds misspelt keys.
-At run time all of them are dicts: nothing is converted or checked.
+Data of a known structure have a `TypedDict` in the module that writes them, so the type checker finds misspelt keys. At
+run time, all of these are dicts, and nothing is converted or checked.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ class ErrorWords(TypedDict):
 
 @final
 class ErrorData(TypedDict):
-    """The shape that every command prints under ``--json``."""
+    """The form in which every command prints an error with ``--json``."""
 
     error: ErrorWords
 
 
 def finite(value: float) -> float | None:
-    """Return a number for JSON, which has no infinity and no NaN: null instead."""
+    """Return a number for JSON: null replaces infinity and NaN, which JSON lacks."""
     return value if math.isfinite(value) else None
 
 
 def finite_values(data: Plain) -> dict[str, object]:
-    """Return plain data in which null replaces every number that is not finite."""
+    """Return JSON data in which null replaces every number that is not finite."""
     return {name: finite(value) if isinstance(value, float) else value for name, value in data.items()}

@@ -1,4 +1,4 @@
-"""The names of all files and folders that crashhunt writes, and the folder of its own code."""
+"""The names of all files and folders that crashhunt writes, and the folder of crashhunt's code."""
 
 from __future__ import annotations
 
@@ -119,11 +119,11 @@ REPLACED: Final = ".replaced-"
 
 
 def crash_folder(number: int, outcome: str) -> str:
-    """Return the name of the folder of a crash, which is its id, such as ``000012-collision``."""
+    """Return the name of a crash's folder, which is the id of the crash, such as ``000012-collision``."""
     return f"{number:06d}-{outcome}"
 
 
 def numbered(number: int, name: str) -> str:
-    """Return the file name of one trial among those of other trials, such as ``job-000012.json``."""
+    """Return the name of a file that belongs to a trial, such as ``job-000012.json``."""
     stem, dot, ending = name.partition(".")
     return f"{stem}-{number:06d}{dot}{ending}"

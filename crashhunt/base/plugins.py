@@ -1,4 +1,4 @@
-"""Finds the object for a name: an entry point of an installed package, or ``module:attribute``."""
+"""Lookup of an object by name: an entry point of an installed package, or ``module:attribute``."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Group = Literal["agents", "backends", "disturbances", "executors", "oracles", "s
 
 
 def registered(group: Group) -> dict[str, EntryPoint]:
-    """Return the entry points of a group, by name; nothing is imported."""
+    """Return the entry points of a group, by name, without imports."""
     found: dict[str, EntryPoint] = {}
     seen: set[str] = set()
     for distribution in distributions():
@@ -52,7 +52,7 @@ def registered(group: Group) -> dict[str, EntryPoint]:
 
 
 def distributions() -> Iterator[Distribution]:
-    """Yield the installed distributions as `importlib.metadata` does, but cached until a distribution changes."""
+    """Yield the installed distributions like `importlib.metadata`, but cached until a distribution changes."""
     # To look through all that is installed takes milliseconds, and a hunt asks some twenty times.
     for place in sys.path:
         yield from _distributions_in(place, _changed_at(place))
@@ -65,7 +65,7 @@ def _distributions_in(place: str, changed_at: int) -> list[Distribution]:  # noq
 
 @lru_cache(maxsize=1024)
 def _entry_points_of(distribution: Distribution) -> tuple[str, dict[str, dict[str, EntryPoint]]]:
-    """Return the name of a distribution, and its entry points of crashhunt's groups: group to name to entry point."""
+    """Return the name of a distribution, and its entry points by group and name, for crashhunt's groups."""
     found: dict[str, dict[str, EntryPoint]] = {}
     for point in distribution.entry_points:
         package, _, group = point.group.partition(".")
@@ -75,7 +75,7 @@ def _entry_points_of(distribution: Distribution) -> tuple[str, dict[str, dict[st
 
 
 def _changed_at(place: str) -> int:
-    """Return the time of the last installation or removal in a folder, in ns."""
+    """Return the time of the last installation or removal of a package in a folder, in ns."""
     try:
         return Path(place).stat().st_mtime_ns
     except OSError:
@@ -83,9 +83,9 @@ def _changed_at(place: str) -> int:
 
 
 def locate(group: Group, name: str) -> Any:
-    """Return the object that a registered name or a ``module:attribute`` names.
+    """Return the object with a registered name or a ``module:attribute``.
 
-    Modules are looked for in the current directory as well, as with ``python -m``.
+    Modules are also searched for in the current directory, as with ``python -m``.
 
     Raises:
         PluginError: the object does not exist, or its import failed.
@@ -100,27 +100,27 @@ def locate(group: Group, name: str) -> Any:
 
 
 def is_foreign(group: Group, name: str) -> bool:
-    """Whether `locate` would run code that is not crashhunt's, and that this process has not run yet."""
+    """Return whether `locate` would run code that is not crashhunt's and has not yet run in this process."""
     points = registered(group)
     target = points[name].value if name in points else name
     return ":" in target and is_foreign_module(target.partition(":")[0])
 
 
 def is_foreign_module(name: str) -> bool:
-    """Whether importing a module would run code that is not crashhunt's, and that this process has not run yet."""
+    """Return whether importing a module would run code that is not crashhunt's and has not yet run in this process."""
     return name.partition(".")[0] != "crashhunt" and name not in sys.modules
 
 
 @dataclass(frozen=True, slots=True)
 class ImportedModules:
-    """The modules that a process has imported, of which a snapshot takes the files.
+    """The modules that a process has imported, whose files a snapshot contains.
 
     Args:
-        places: file, and folders if it is a package, of each top-level module.
+        places: file of each top-level module, and its folders if it is a package.
         path: the folders from which modules are imported.
-        named: the top-level modules that were imported by name.
-        agents: the files of the agents' modules.
-        variables: the environment variables, which modules may set.
+        named: the top-level modules that were imported explicitly by name.
+        agents: the files of the modules that contain agents.
+        variables: the environment variables, which modules may have changed.
     """
 
     places: Mapping[str, tuple[str | None, tuple[str, ...]]]
@@ -131,14 +131,14 @@ class ImportedModules:
 
     @classmethod
     def here(cls, locators: Iterable[str] = (), modules: Iterable[str] = ()) -> ImportedModules:
-        """Import agents and modules in this process, and return what it has imported then.
+        """Import agents and modules in this process, and return all modules that the process has then imported.
 
         Args:
-            locators: locators of agents.
+            locators: locators of the agents.
             modules: names of further modules.
 
         Raises:
-            PluginError: one cannot be imported.
+            PluginError: an agent or a module cannot be imported.
         """
         driving = list(locators)
         named = {locate("agents", locator).__module__ for locator in driving}
@@ -163,7 +163,7 @@ class ImportedModules:
         return cls(places, tuple(data["path"]), frozenset(data["named"]), tuple(data["agents"]), data["variables"])
 
     def to_json(self) -> dict[str, object]:
-        """Return a description that can be written as JSON."""
+        """Return a description of the modules as JSON-compatible data."""
         return {
             "places": dict(self.places), "path": self.path, "named": sorted(self.named), "agents": self.agents,
             "variables": dict(self.variables),
@@ -171,11 +171,11 @@ class ImportedModules:
 
 
 def load_object(target: str, *, shown: str = "") -> Any:
-    """Import the class or function that a ``module:attribute`` names.
+    """Import the class or function that a ``module:attribute`` names, and return it.
 
     Args:
-        target: the module and what in it can be called.
-        shown: how errors name it.
+        target: the module and the class or function in it.
+        shown: name of the value in error messages.
 
     Raises:
         PluginError: the object does not exist, or its import failed.
@@ -189,11 +189,11 @@ def load_object(target: str, *, shown: str = "") -> Any:
 
 
 def load_attribute(target: str, *, shown: str = "") -> Any:
-    """Import the object of any kind that a ``module:attribute`` names.
+    """Import the object of any kind that a ``module:attribute`` names, and return it.
 
     Args:
         target: the module and the attribute.
-        shown: how errors name it.
+        shown: name of the value in error messages.
 
     Raises:
         PluginError: the object does not exist, or its import failed.
@@ -214,14 +214,14 @@ def load_attribute(target: str, *, shown: str = "") -> Any:
 
 
 def import_module(name: str, *, shown: str = "") -> types.ModuleType:
-    """Import a module, which may lie in the current directory.
+    """Import a module, which may lie in the current directory, and return it.
 
     Args:
         name: name of the module.
-        shown: name of the value in errors.
+        shown: name of the value in error messages.
 
     Raises:
-        PluginError: importing it failed.
+        PluginError: the import of the module failed.
     """
     if os.getcwd() not in sys.path and "" not in sys.path:  # noqa: PTH109 - sys.path holds strings
         sys.path.insert(0, os.getcwd())  # noqa: PTH109
@@ -234,7 +234,7 @@ def import_module(name: str, *, shown: str = "") -> types.ModuleType:
 
 
 def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
-    """Return the error for a failed import: either the module does not exist, or the module raises an exception."""
+    """Return the error for a failed import: either the module does not exist, or its code raised an exception."""
     said = in_words(error)
     if isinstance(error, SyntaxError):  # whose message repeats the place
         said = " ".join(f"{type(error).__name__}: {error.msg}"[:_MAX_LINE_CHARACTERS].split())

@@ -1,8 +1,8 @@
-"""Process trees that never outlive their owner.
+"""Process trees that end together with the process that owns them.
 
-An agent may start programs, and these may leave their session, their group and their parent. On Linux, orphans below a
-process can be made its children (*subreaper*, prctl(2)), so `end_descendants` finds and ends the whole tree. On
-other systems, processes that an agent has started may remain.
+An agent may start programs, and these may leave their session, their group and their parent. On Linux, a process can
+adopt all orphans below it (*subreaper*, prctl(2)), so `end_descendants` finds and ends the whole tree. On other
+systems, processes that an agent has started may remain.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ _PATIENCE_S = 2.0  # for processes that do not die at once; processes of another
 
 
 def adopt_orphans() -> None:
-    """Make this process the new parent of every process below it whose own parent ends."""
+    """Make this process the new parent of every process below it whose parent ends."""
     _prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
 def die_with(parent: int, number: int = signal.SIGKILL) -> None:
-    """Have the kernel end this process when its parent ends; exit at once if the parent has ended already.
+    """Make the kernel end this process when its parent ends; exit at once if the parent has already ended.
 
-    The kernel watches the *thread* that started this process, so that thread must stay alive.
+    The kernel watches the *thread* that started this process, so this thread must stay alive.
 
     Args:
-        parent: process id of the parent.
+        parent: process id of the parent process.
         number: signal that the kernel sends.
     """
     _prctl(_PR_SET_PDEATHSIG, number)
@@ -58,9 +58,9 @@ def die_with(parent: int, number: int = signal.SIGKILL) -> None:
 
 @contextmanager
 def exits_refused() -> Iterator[None]:
-    """Have `os._exit` raise `SystemExit` in this process meanwhile.
+    """Return a context in which `os._exit` raises `SystemExit` in this process.
 
-    A command that foreign code ends looks as if it were done. A fork of this process may end itself.
+    If foreign code could end a command, the command would look complete. A fork of this process may still end itself.
     """
     leave, owner = os._exit, os.getpid()
 
@@ -82,7 +82,7 @@ def outlive_parent() -> None:
 
 
 def children_of(pid: int) -> list[int]:
-    """Return the process ids of the children of a process; an empty list where the system does not report them."""
+    """Return the process ids of the children of a process; empty if the system does not report them."""
     found: list[int] = []
     try:
         for thread in Path(f"/proc/{pid}/task").iterdir():
@@ -96,13 +96,13 @@ def children_of(pid: int) -> list[int]:
 
 
 def end_descendants(spared: frozenset[int] = frozenset()) -> bool:
-    """Kill and reap every process below this one, which must have called `adopt_orphans`.
+    """Kill and reap every process below this process, which must have called `adopt_orphans`.
 
     Args:
-        spared: process ids of children to keep, with everything below them.
+        spared: process ids of children that are not killed, nor the processes below them.
 
     Returns:
-        Whether there was a process to kill.
+        Whether at least one process was killed.
     """
     found = False
     deadline = time.monotonic() + _PATIENCE_S
@@ -128,14 +128,14 @@ def kill(pid: int) -> None:
 
 
 def resume(pid: int) -> None:
-    """Resume a process that was stopped, as by SIGSTOP; a running process is not affected."""
+    """Resume a stopped process, for example after SIGSTOP; a running process is not affected."""
     with suppress(OSError, IndexError):
         if Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[0] == b"T":
             os.kill(pid, signal.SIGCONT)
 
 
 def is_alive(pid: int) -> bool:
-    """Return whether a process exists; a zombie counts."""
+    """Return whether a process exists; a zombie counts as existing."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -146,7 +146,7 @@ def is_alive(pid: int) -> bool:
 
 
 def _kill_below(pid: int) -> None:
-    """Kill a process and all below it; processes forked in the meantime become orphans for the next round."""
+    """Kill a process and all processes below it; those forked in the meantime become orphans for the next round."""
     below = children_of(pid)
     kill(pid)
     for child in below:
@@ -154,7 +154,7 @@ def _kill_below(pid: int) -> None:
 
 
 def has_child() -> bool:
-    """Return whether this process has a child; a zombie counts."""
+    """Return whether this process has a child process; a zombie counts."""
     try:
         os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     except ChildProcessError:

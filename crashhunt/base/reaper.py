@@ -1,4 +1,4 @@
-"""The keeper of a process: ends the process and all its descendants when it is done or its owner has ended.
+"""The keeper of a process: ends the process and all its descendants when it is done, or when its owner has ended.
 
 ``python -P …/reaper.py LIFELINE MODULE ARGUMENT…`` calls ``main()`` of a module in a child. The lifeline is one end of
 a pipe, and the owner holds the other end. The kernel closes that end whenever the owner dies, even before the keeper
@@ -36,17 +36,17 @@ class Kept:
     """A Python module that runs in a separate process with a keeper.
 
     Args:
-        module: its ``main()`` is called.
+        module: module whose function ``main()`` is called.
         arguments: command-line arguments of the module.
         environment: environment variables of the process.
         inherited: file descriptors that the process receives.
-        apart: whether the process has its own session, without signals of this terminal and group.
-        stdin: as for `subprocess.Popen`.
-        stdout: the same.
-        stderr: the same.
+        apart: whether the process has its own session, and thus gets no signals of this terminal and process group.
+        stdin: standard input, as for `subprocess.Popen`.
+        stdout: standard output, as for `subprocess.Popen`.
+        stderr: standard error, as for `subprocess.Popen`.
 
     Raises:
-        OSError: the system has no more processes or files.
+        OSError: the system cannot start further processes or open further files.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Kept:
             os.close(theirs)
 
     def end(self) -> None:
-        """Kill the process and everything below it; return when no process is left."""
+        """Kill the process and all processes below it; return when no process is left."""
         if self._lifeline >= 0:
             os.close(self._lifeline)
             self._lifeline = -1
@@ -123,7 +123,7 @@ def _main() -> None:
 
 
 def _imported(name: str) -> ModuleType:
-    """Import a module of a snapshot."""
+    """Import a module of a snapshot, and return it."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
@@ -136,7 +136,7 @@ def _imported(name: str) -> ModuleType:
 
 
 def _import_sibling(name: str) -> ModuleType:
-    """Import a module of this folder by its file, even where another package of that name is importable."""
+    """Import a module of this folder by its file, even if another package with this name is importable."""
     spec = importlib.util.spec_from_file_location(f"_crashhunt_{name}", Path(__file__).with_name(f"{name}.py"))
     assert spec is not None
     assert spec.loader is not None
@@ -146,9 +146,9 @@ def _import_sibling(name: str) -> ModuleType:
 
 
 def _wait(child: int, lifeline: int, resume: Callable[[int], None]) -> int | None:
-    """Wait until the child has ended or the owner has closed the lifeline; return the child's status, else None.
+    """Wait until the child has ended or the owner has closed the lifeline; return the child's status, or None.
 
-    A child that is stopped alone, for example by an agent, is resumed. A batch system stops the keeper as well, so
+    A child that is stopped alone, for example by an agent, is resumed. A batch system stops the keeper as well, so that
     the whole job stays suspended.
     """
     ended = None

@@ -1,4 +1,4 @@
-"""Resource limits of this process (``ulimit``): which one an error came from, and how to raise it."""
+"""Resource limits of this process (``ulimit``): which limit caused an error, and how to raise it."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _NO_MEMORY_MESSAGES = (
 
 
 def limit_behind(error: BaseException) -> str:
-    """Return the limit that an error came from and how to raise it, in words; empty if no limit is set.
+    """Return as text the limit that caused an error, and how to raise the limit; empty if no limit is set.
 
-    A limit on memory (``RLIMIT_AS``) shows as one of many errors: of Python, of a thread or of a library that does not
-    load. A limit on the size of files (``RLIMIT_FSIZE``) is an `OSError`, since Python ignores its signal.
+    A limit on memory (``RLIMIT_AS``) can cause many errors: in Python, in a thread, or in a library that does not load.
+    A limit on the size of files (``RLIMIT_FSIZE``) causes an `OSError`, because Python ignores its signal.
     """
     if _is_no_memory(error) and (limit := _soft_limit(resource.RLIMIT_AS)) is not None:
         return f"the limit on memory is {limit / _MEBIBYTE:.4g} MiB: raise it with ulimit -v"
@@ -62,10 +62,10 @@ _MAX_STATUS_LINES = 30  # what is looked for stands further up
 
 
 def free_memory(root: Path = Path("/")) -> float:
-    """Return the share of the memory that is free or can be reclaimed at once; 1 where the system does not report it.
+    """Return the share of the memory that is free or can be reclaimed at once; 1 if the system does not report it.
 
     Args:
-        root: where the kernel's own files are.
+        root: folder of the kernel's files.
     """
     with suppress(OSError, ValueError, KeyError, ZeroDivisionError):
         found = _status_values(root / "proc" / "meminfo")
@@ -82,6 +82,6 @@ def free_memory(root: Path = Path("/")) -> float:
 
 
 def _status_values(path: Path) -> dict[str, int]:
-    """Return the numbers after the names in the first lines of a file."""
+    """Return the numbers that follow the names in the first lines of a file."""
     lines = path.read_text(encoding="ascii").splitlines()[:_MAX_STATUS_LINES]
     return {name.rstrip(":"): int(number) for name, number, *_ in map(str.split, lines)}

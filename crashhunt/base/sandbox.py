@@ -1,4 +1,4 @@
-"""Landlock: the kernel prevents this process from writing outside its own folder."""
+"""Landlock: the kernel prevents this process from writing outside of its own folder."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ _SYSTEM_PATHS = """
 
 
 def landlock_version() -> int:
-    """Return the version of the kernel's interface; 0 if there is none."""
+    """Return the version of the kernel's Landlock interface; 0 if there is none."""
     if sys.platform != "linux":
         return 0
     return max(0, int(ctypes.CDLL(None, use_errno=True).syscall(_CREATE_RULESET, None, 0, _VERSION_ONLY)))
 
 
 def confine(folder: Path, readable: Iterable[Path | str] = ()) -> bool:
-    """Restrict this process and its children to write below one folder only. This cannot be undone.
+    """Restrict this process and its children to writing below one folder. This cannot be undone.
 
     The process can still read installed packages, this folder and the named files. If the kernel's version of Landlock
     supports it, the process can open no port and send no signal to other processes.
 
     Args:
-        folder: where it may write.
-        readable: further files and folders that it may read.
+        folder: folder below which the process may write.
+        readable: further files and folders that the process may read.
 
     Returns:
-        Whether the kernel restricts the process; False if it cannot.
+        Whether the kernel restricts the process; False if the kernel does not support it.
     """
     version = landlock_version()
     if not version:

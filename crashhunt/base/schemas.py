@@ -1,6 +1,6 @@
-"""JSON Schema (draft 2020-12) of typed dictionaries and of the dataclasses that `crashhunt.base.codec` writes.
+"""JSON Schema (draft 2020-12) for typed dictionaries and for the dataclasses that `crashhunt.base.codec` writes.
 
-Additional keys are allowed everywhere, because later versions may add some.
+Additional keys are allowed everywhere, because later versions may add keys.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ _ABSTRACT_TYPES: Mapping[str, Any] = {
 
 
 def json_schema(kind: Any, title: str, names: Mapping[str, Any] = _ABSTRACT_TYPES) -> JsonObject:
-    """Return the schema of a type, with its title and the dialect.
+    """Return the JSON schema of a type, with its title and the schema dialect.
 
     Args:
         kind: a `TypedDict`, a `Serializable` dataclass, or a type made of these.
         title: title of the schema.
-        names: objects that annotations use but that their modules import only for the type checker.
+        names: objects that annotations use, but that their modules import only for the type checker.
 
     Raises:
-        NameError: an annotation has a name that neither its module nor ``names`` has.
+        NameError: an annotation uses a name that neither its module nor ``names`` contains.
     """
     described = describe_type(kind, {**_ABSTRACT_TYPES, **names})
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, **described}
 
 
 def describe_type(hint: Any, names: Mapping[str, Any] = _ABSTRACT_TYPES) -> JsonObject:
-    """Return the schema of a type; ``{}``, which allows everything, if the type has several shapes in JSON."""
+    """Return the JSON schema of a type; ``{}``, which allows everything, if the type has several forms in JSON."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Required, NotRequired):
         return describe_type(inner[0], names)

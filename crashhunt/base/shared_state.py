@@ -1,13 +1,13 @@
-"""Detects open files and memory that a process shares with its forks, and gives a fork private ones.
+"""Detects open files and memory that a process shares with its forks, and gives a fork private copies.
 
-A fork shares three things with its parent:
+A fork shares three resources with its parent:
 
 - the position and flags of every open file,
-- the content of files without a name,
+- the content of unnamed files,
 - memory that is mapped as shared (`mmap.mmap(-1, …)`, `multiprocessing.Value`).
 
-A change of any of these by one fork is visible to all others. So is what a fork reads from a pipe or a socket, and
-these have no copies: they are reported.
+A change of any of these resources by one fork is visible to all others. The same is true for data that a fork reads
+from a pipe or a socket. Pipes and sockets cannot be copied, so they are reported.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class SharedState:
     """The files and memory that this process shares with its forks. Each fork first calls `separate`.
 
     Args:
-        known: descriptors that stay open.
+        known: file descriptors that stay open.
 
     Attributes:
         remaining: description of a file that is too large to copy, or of a pipe or socket; empty if there is none.
@@ -80,7 +80,7 @@ class SharedState:
                 self._add_mapping(line)
 
     def separate(self) -> None:
-        """Give this process, which is a fork, files and memory of its own."""
+        """Give this process, which is a fork, private files and memory."""
         copies: dict[tuple[int, int], int] = {}
         for file in self._files:
             try:
@@ -148,7 +148,7 @@ class SharedState:
 
 
 def _map_own(mapping: _Mapping, copy: int | None) -> None:
-    """Replace a mapping by private memory with the same content."""
+    """Replace a memory mapping by private memory with the same contents."""
     libc = ctypes.CDLL(None, use_errno=True)
     libc.mmap.restype = ctypes.c_void_p
     types = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long)

@@ -1,4 +1,4 @@
-"""Signals: requests to stop, deaths that may come from outside a process, code that no handler may interrupt."""
+"""Signals: requests to stop, deaths by external signals, and code that signal handlers cannot interrupt."""
 
 from __future__ import annotations
 
@@ -39,9 +39,10 @@ _interrupts: Final[list[int]] = []
 
 
 def remember_interrupts() -> None:
-    """Report a Ctrl-C to the next `stop_requests` if Python has dropped its `KeyboardInterrupt`.
+    """Pass a Ctrl-C on to the next `stop_requests` if Python has dropped its `KeyboardInterrupt`.
 
-    Python drops what is raised in a callback of a weak reference, and importing a module runs one of these each time.
+    Python drops exceptions that are raised in a callback of a weak reference, and importing a module runs such a
+    callback each time.
     """
 
     def interrupt(number: int, _frame: object) -> None:
@@ -53,12 +54,12 @@ def remember_interrupts() -> None:
 
 
 class _EndedError(BaseException):
-    """A signal asked this process to end."""
+    """A signal requested the end of this process."""
 
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Remove all temporary files before SIGTERM or a hang-up ends this process."""
+    """Return a context that removes all temporary files before SIGTERM or a hang-up ends this process."""
     asked: list[int] = []
 
     def end(number: int, _frame: object) -> None:
@@ -85,10 +86,10 @@ def ended_by_signals() -> Iterator[None]:
 
 
 def block_signals() -> None:
-    """Prevent that signal handlers of Python run in this thread from now on.
+    """Prevent signal handlers of Python from running in this thread from now on.
 
-    If there are other threads, the kernel may deliver a signal of the process to one of them, and then a handler runs.
-    The handler of an earlier signal may still run once, and its exceptions are dropped.
+    If there are other threads, the kernel may deliver a signal to one of these, and then a handler runs. The handler of
+    an earlier signal may still run once, and its exceptions are dropped.
     """
     for _ in range(2):
         try:
@@ -99,7 +100,7 @@ def block_signals() -> None:
 
 @contextmanager
 def blocked_signals() -> Iterator[None]:
-    """Prevent that signal handlers of Python run in this thread inside the context; signals are handled afterwards."""
+    """Return a context in which signal handlers of Python do not run in this thread; signals are handled afterwards."""
     before = _set_mask(signal.SIG_BLOCK, ())
     try:
         block_signals()
@@ -112,9 +113,9 @@ def blocked_signals() -> Iterator[None]:
 def stop_requests() -> Iterator[list[int]]:
     """Collect requests to stop as signal numbers instead of ending the process; a second request ends it at once.
 
-    An interrupt that `remember_interrupts` has seen is collected at once, because Python has dropped it. Hang-ups stay
-    ignored where they are ignored already, as under nohup. In a thread other than the main one nothing is collected,
-    because the embedding program handles signals there.
+    An interrupt that `remember_interrupts` has seen is collected at once, because Python has dropped it. Hang-ups that
+    are already ignored, as under nohup, stay ignored. Outside of the main thread nothing is collected, because the
+    embedding program handles signals there.
     """
     asked = [*_interrupts[:1]]
     first_at: list[float] = []
@@ -144,7 +145,7 @@ def is_sent_from_outside(exit_code: int) -> bool:
     """Return whether a process died of a signal that another process or the kernel may have sent.
 
     Args:
-        exit_code: as `subprocess` has it: negative for a signal.
+        exit_code: exit code in the form of `subprocess`, negative for a signal.
     """
     return -exit_code in _SENT_FROM_OUTSIDE
 
@@ -153,7 +154,7 @@ def describe_death(exit_code: int) -> str:
     """Return how a process ended: "was killed by SIGKILL", "exited with 3".
 
     Args:
-        exit_code: as `subprocess` has it: negative for a signal.
+        exit_code: exit code in the form of `subprocess`, negative for a signal.
     """
     if exit_code >= 0:
         return f"exited with {exit_code}"

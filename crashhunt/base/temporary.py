@@ -1,21 +1,21 @@
-"""Temporary files and folders of a process. All are removed, however the process ends.
+"""Temporary files and folders of a process, which are removed however the process ends.
 
 Each process has one folder for temporary files, ``crashhunt-temporary-UID/TOKEN`` in the system's folder for temporary
-files (``TMPDIR``, else ``/tmp``). `OwnerProcess` says what the token is. The folder holds
+files (``TMPDIR``, else ``/tmp``). `OwnerProcess` defines the token. The folder contains
 
-* the folders that only this process needs (`temporary_folder`), and
+* folders that only this process needs (`temporary_folder`), and
 * a symbolic link for each temporary file or folder in another place (`temporary_beside`). Such files become permanent
 by a rename, or the user has chosen their disk. The link is made before the file, and removed after it.
 
-`remove_leftovers` removes what killed processes left. Each command calls it when it starts, and each process calls it
-before it makes its first temporary file. It removes a leftover only if all of this holds:
+`remove_leftovers` removes files that killed processes left. Each command calls it when it starts, and each process
+calls it before it creates its first temporary file. A leftover is removed only if all of these conditions hold:
 
 * its process has certainly ended (`has_ended`), and no process holds the lock of its folder,
-* the leftover belongs to this user, and its name has the token of that process,
-* it is a folder or a regular file. A symbolic link that looks like a leftover stays, and so does its target.
+* the leftover belongs to this user, and its name contains the token of that process,
+* it is a folder or a regular file. A symbolic link that looks like a leftover is not removed, nor is its target.
 
 After a crash of the machine, no process can distinguish its temporary files from those of other hosts. The next hunt in
-a directory removes the scratch there, and the system clears its folder for temporary files.
+a directory removes the scratch folder of this directory, and the system clears its folder for temporary files.
 
 The page `reference/files.md` of the guide lists every temporary file.
 """
@@ -82,13 +82,13 @@ _TOKEN = re.compile(r"(?<![0-9])([0-9]{1,10})-([0-9]{1,20})-([0-9a-f]{12})-([0-9
 
 @dataclass(frozen=True, slots=True)
 class OwnerProcess:
-    """A process, as identified by the names of its temporary files.
+    """The process to which temporary files belong; their names contain its token.
 
     Args:
         pid: process id in its own PID namespace.
-        started: start time in clock ticks since the boot of the machine.
+        started: start time of the process, in clock ticks since the machine booted.
         boot: first 12 hexadecimal digits of the kernel's boot id.
-        namespace: checksum of its PID and time namespaces, 8 hexadecimal digits.
+        namespace: checksum of the process's PID and time namespaces, 8 hexadecimal digits.
     """
 
     pid: int
@@ -98,12 +98,12 @@ class OwnerProcess:
 
     @property
     def token(self) -> str:
-        """The part of a file name that names this process."""
+        """The part of a file name that identifies the process."""
         return f"{self.pid}-{self.started}-{self.boot}-{self.namespace}"
 
 
 def this_process() -> OwnerProcess:
-    """Return the owner that this process is."""
+    """Return the owner that represents this process."""
     return _owner(os.getpid())
 
 
@@ -129,7 +129,7 @@ def _namespace(kind: str) -> str:
 
 
 def owner_in(name: str) -> OwnerProcess | None:
-    """Return the owner that a file name gives; None if the name gives none, or several."""
+    """Return the owner that a file name identifies; None if it identifies no owner, or several."""
     found = set(_TOKEN.findall(name))
     if len(found) != 1:  # a user's file name may have such a token as well
         return None
@@ -138,9 +138,9 @@ def owner_in(name: str) -> OwnerProcess | None:
 
 
 def has_ended(owner: OwnerProcess) -> bool:
-    """Return whether it is certain that an owner has ended.
+    """Return whether an owner has certainly ended.
 
-    An owner of another boot, of another host or of another container counts as alive, because this process cannot know.
+    An owner from another boot, host or container counts as running, because this process cannot check it.
     """
     here = this_process()
     if here.boot == _UNKNOWN_BOOT or (owner.boot, owner.namespace) != (here.boot, here.namespace):
@@ -152,7 +152,7 @@ def start_time(pid: int) -> int:
     """Return when a process started, in clock ticks since the machine booted.
 
     Returns:
-        0 if there is no such process, or only a zombie is left of it; -1 where the system does not report it.
+        The start time; 0 if the process does not exist or only a zombie is left, -1 if the system does not report it.
     """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
@@ -187,10 +187,11 @@ _CREATE_FLAGS = os.O_CREAT | os.O_EXCL  # with both, shm_open has made the segme
 
 
 def record_shared_memory(scratch: Path) -> None:
-    """Record every segment that this process creates from now on.
+    """Record every shared-memory segment that this process creates from now on.
 
     Args:
-        scratch: a folder that is given to `release_shared_memory` later, directly or inside of another one.
+        scratch: folder for the records, which is later passed to `release_shared_memory`, directly or inside of another
+            folder.
     """
     try:
         module = importlib.import_module("_posixshmem")
@@ -215,10 +216,10 @@ def record_shared_memory(scratch: Path) -> None:
 
 
 def release_shared_memory(scratch: Path, *, of_ended: bool = False) -> None:
-    """Remove the segments that are recorded in a folder.
+    """Remove the shared-memory segments that are recorded in a folder.
 
     Args:
-        scratch: the folder.
+        scratch: the folder with the records.
         of_ended: whether to remove only segments of processes that have ended.
     """
     name = _SHARED_MEMORY_RECORD.format("*")
@@ -236,7 +237,7 @@ def release_shared_memory(scratch: Path, *, of_ended: bool = False) -> None:
 
 
 def _remove(name: str, device: int, number: int) -> None:
-    """Remove a segment, if it is still the one that was recorded."""
+    """Remove a shared-memory segment, if it is still the one that was recorded."""
     path = _SHARED_MEMORY_FOLDER / name
     if path.parent != _SHARED_MEMORY_FOLDER or not name.strip("."):
         return
@@ -257,7 +258,7 @@ class TemporaryFolder:
     """A new folder that only this process and its children use.
 
     Args:
-        purpose: first part of its name, such as ``replay``.
+        purpose: first part of the folder's name, such as ``replay``.
 
     Raises:
         OSError: the disk is full, or no folder for temporary files can be written.
@@ -269,7 +270,7 @@ class TemporaryFolder:
         self._remove = weakref.finalize(self, _remove_of_owner, self.path, os.getpid())
 
     def remove(self) -> None:
-        """Remove the folder and everything in it. A second call does nothing."""
+        """Remove the folder and all its contents. A second call does nothing."""
         self._remove()
 
 
@@ -278,7 +279,7 @@ def temporary_folder(purpose: str) -> Iterator[Path]:
     """Yield a new folder that only this process and its children use, and remove it at the end.
 
     Args:
-        purpose: first part of its name, such as ``replay``.
+        purpose: first part of the folder's name, such as ``replay``.
 
     Raises:
         OSError: the disk is full, or no folder for temporary files can be written.
@@ -294,7 +295,7 @@ def temporary_folder(purpose: str) -> Iterator[Path]:
 def temporary_beside(path: Path, *, name: str = "") -> Iterator[Path]:
     """Yield a temporary path in the same folder, and remove it at the end.
 
-    The caller makes a file or a folder under this path, and renames it to its final path.
+    The caller creates a file or a folder under this path, and renames it to its final path.
 
     Args:
         path: the final path; the temporary path has a similar name in the same folder.
@@ -319,8 +320,8 @@ def temporary_name(path: Path, suffix: str = "") -> str:
     """Return a hidden name with the token of this process, for a temporary file in the folder of a path.
 
     Args:
-        path: path of what is being made.
-        suffix: end of the name; by default that of the path, because some libraries choose the format by it.
+        path: final path of the file or folder.
+        suffix: end of the name; by default the ending of the path, because some libraries choose the format by it.
     """
     stem, suffix = (path.name, suffix) if suffix else (path.stem, path.suffix)
     rest = f".{this_process().token}{suffix}"
@@ -331,7 +332,7 @@ def temporary_name(path: Path, suffix: str = "") -> str:
 
 
 def remove_leftovers() -> None:
-    """Remove the temporary files of processes that have ended; this lists one folder."""
+    """Remove the temporary files of processes that have ended; only one folder is listed."""
     _things.swept = True
     place, prefix = _base_folder()
     try:
@@ -358,21 +359,21 @@ def remove_ended(folder: Path) -> None:
 
 
 def remove_at_once(path: Path) -> None:
-    """Remove a folder so that no other process ever sees a part of it; errors are ignored."""
+    """Remove a folder so that no other process ever sees a part of its contents; errors are ignored."""
     with temporary_beside(path) as hidden, suppress(OSError):
         path.rename(hidden)
 
 
 def remove_scratch(path: Path) -> None:
-    """Remove a folder in which trials ran, and the shared memory that they left."""
+    """Remove a folder in which trials ran, and the shared memory of these trials."""
     release_shared_memory(path)
     remove_tree(path)
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a file or a folder with everything in it, also if its permissions forbid that.
+    """Remove a file or a folder with all its contents, even if their permissions forbid it.
 
-    Errors are ignored. A symbolic link is removed, not its target.
+    Errors are ignored. For a symbolic link, the link is removed and not its target.
     """
     with suppress(OSError):
         if not stat.S_ISDIR(path.lstat().st_mode):
@@ -389,7 +390,7 @@ def remove_tree(path: Path) -> None:
 
 
 class _TemporaryFiles:
-    """The temporary files of this process: its folder exists while it has content."""
+    """The temporary files of this process. Their folder exists only while it has contents."""
 
     def __init__(self) -> None:
         self.swept = False
@@ -397,7 +398,7 @@ class _TemporaryFiles:
         os.register_at_fork(after_in_child=self._forget)
 
     def _forget(self) -> None:
-        """Forget the temporary files of the parent process, because a fork does not own them."""
+        """Ignore the temporary files of the parent process, because a fork does not own them."""
         self._lock = threading.Lock()
         self._folder: Path | None = None
         self._is_shared = False
@@ -431,7 +432,7 @@ class _TemporaryFiles:
         """Remove a temporary file; with the last file, also remove the folder.
 
         Args:
-            path: path of it.
+            path: path of the temporary file.
             removed: whether the file or folder is gone; otherwise it stays, and the next command tries again.
         """
         with self._lock:
@@ -441,7 +442,7 @@ class _TemporaryFiles:
             self._remove_folder()
 
     def next_name(self, purpose: str) -> str:
-        """Return a name that is not used in the folder."""
+        """Return a name that is not yet used in the folder."""
         self._serial += 1
         return f"{purpose}-{self._serial}"
 
@@ -494,7 +495,7 @@ def _remove_of_owner(path: Path, pid: int) -> None:
 
 
 def _base_folder() -> tuple[Path, str]:
-    """Return the folder with the temporary folders of all processes of this user, and the prefix of their names."""
+    """Return the folder that contains the temporary folders of all processes of this user, and their name prefix."""
     usual = _temporary_files()
     place = usual / f"crashhunt-temporary-{os.getuid()}"
     try:
@@ -517,7 +518,7 @@ def _temporary_files() -> Path:
 
 
 def _remove_left(folder: Path, token: str) -> None:
-    """Remove everything of a process that has ended."""
+    """Remove all temporary files of a process that has ended."""
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         if os.fstat(opened).st_uid != os.getuid():
@@ -537,7 +538,7 @@ def _remove_left(folder: Path, token: str) -> None:
 
 
 def _remove_if_ours(path: Path, token: str) -> bool:
-    """Remove a path if it carries a token; return whether it is absent or no longer exists."""
+    """Remove a path if its name contains a token; return whether the path is gone."""
     owner = owner_in(path.name)
     try:
         found = path.lstat()
@@ -553,7 +554,7 @@ def _remove_if_ours(path: Path, token: str) -> bool:
 
 
 def _exists(path: Path) -> bool:
-    """Return whether a path exists; a broken symbolic link counts."""
+    """Return whether a path exists; a broken symbolic link counts as existing."""
     try:
         path.lstat()
     except OSError:

@@ -1,4 +1,4 @@
-"""Text from outside: agents, simulators, networks, the operating system, and senders of crashes.
+"""Text from outside: from agents, simulators, networks, the operating system, and senders of crashes.
 
 A name may contain control characters that move the cursor of a terminal, clear lines, retitle its window, or reorder
 letters. Files keep the original text. Printed text is made visible first.
@@ -28,7 +28,7 @@ _LINE_BREAKS = re.compile(r"[^\S\n]*(?:\r\n|[\n\r\v\f\x1c-\x1e\x85\u2028\u2029])
 
 
 def encodable(text: str) -> str:
-    """Return a text that can be written as UTF-8: single surrogates, as in names of files, become escapes."""
+    """Return a text that can be written as UTF-8: lone surrogates, as in names of files, become escapes."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
@@ -46,7 +46,7 @@ def _visible_character(character: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Return a text as one line that is visible."""
+    """Return a text as one line without control characters."""
     return visible(_LINE_BREAKS.sub(" ", text.rstrip())).replace("\t", " ")
 
 
@@ -68,11 +68,11 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def near_path(path: Path, *endings: str) -> str:
-    """Return ``did you mean 'PATH'? `` for a missing path: a folder with a similar name, or a file with an ending.
+    """Return ``did you mean 'PATH'? `` for a missing path, with a similar name or an allowed ending.
 
     Args:
         path: the missing path.
-        endings: the endings of files that are also accepted.
+        endings: the endings of files that are suggested in addition.
     """
     try:
         siblings = sorted(path.parent.iterdir())
@@ -88,7 +88,7 @@ def near_path(path: Path, *endings: str) -> str:
 
 
 def listed(known: Iterable[str], *, none: str = "none") -> str:
-    """Return names in one line; a long list is cut."""
+    """Return names as one line; a long list is cut."""
     names = list(known)
     more = f", … ({len(names)} in all)" if len(names) > _MAX_LISTED_NAMES else ""
     return f"{', '.join(names[:_MAX_LISTED_NAMES])}{more}" or none

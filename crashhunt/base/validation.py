@@ -1,6 +1,7 @@
-"""Validates dataclasses with pydantic, and reports its first error as one line of crashhunt.
+"""Validates dataclasses with pydantic, and reports the first error as one line in crashhunt's form.
 
-Data that match exactly are built without pydantic, because its import and schemas take a third of a worker's start.
+Data that match exactly are built without pydantic, because importing pydantic and its schemas takes a third of a
+worker's start.
 """
 
 from __future__ import annotations
@@ -45,11 +46,11 @@ def validate(
     Args:
         kind: the dataclass.
         data: the data that were read from TOML or JSON.
-        where: the file, for the error.
-        error: the class of the error; its message has key and value, and its fix says which values are valid.
-        under: the key of the table in its file; empty for the whole file.
-        keys: returns the keys that are allowed at the top of the file, if these differ from the fields of the
-            dataclass.
+        where: path of the file, for the error message.
+        error: class of the error to raise; its message contains key and value, and its fix lists the valid values.
+        under: key of the table in the file; empty for the whole file.
+        keys: function that returns the keys that are allowed at the top of the file, if these differ from the
+            dataclass's fields.
     """
     try:
         return cast(T, _built(kind, data))
@@ -103,7 +104,7 @@ def _dataclass_built(kind: type, data: object) -> Any:
 
 
 def _member_built(kinds: tuple[object, ...], data: object) -> Any:
-    """Build the member of a union that has the type of the data; for an optional type, build that type."""
+    """Build the member of a union that has the type of the data; for an optional type, build this type."""
     if type(data) in kinds:
         return _built(type(data), data)
     others = [kind for kind in kinds if kind is not type(None)]
@@ -114,7 +115,7 @@ def _member_built(kinds: tuple[object, ...], data: object) -> Any:
 
 @cache
 def _hints_of(kind: type) -> tuple[dict[str, object], frozenset[str]]:
-    """Return the types of a dataclass's fields, and the names of those without a default."""
+    """Return the types of a dataclass's fields, and the names of the fields without a default."""
     items = fields(kind)
     hints = get_type_hints(kind)
     needed = (item.name for item in items if item.default is MISSING and item.default_factory is MISSING)
@@ -142,7 +143,7 @@ def _validated(kind: type[T], data: object, place: _Place) -> T:
 
 
 def _telling(errors: Sequence[ErrorDetails]) -> ErrorDetails:
-    """Return the error to report; a misspelt key is preferred to the missing key that it causes."""
+    """Return the error to report: a misspelt key is more informative than the missing key that it causes."""
     first = errors[0]
     if first["type"] in _MISSING_KEY_ERRORS:
         for other in errors[1:]:

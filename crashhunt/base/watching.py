@@ -1,4 +1,4 @@
-"""Progress of slow loops."""
+"""Progress reports of slow loops."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Watch = Callable[[int, int], None]
 
 
 def watched(items: Iterable[T], total: int, watch: Watch | None) -> Iterator[T]:
-    """Yield items, and report the number of finished ones after each.
+    """Yield items, and report the number of finished items after each.
 
     Args:
         items: the items to process.
         total: the number of items.
-        watch: receives the progress; None for no reports.
+        watch: function that receives the progress; None for no reports.
     """
     for done, item in enumerate(items, 1):
         yield item
