@@ -1,4 +1,4 @@
-"""Trials: the spaces that arguments are drawn from, what a trial is asked, how it can end, and the result."""
+"""Trials: the spaces of their arguments, their specifications, their possible outcomes, and their results."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Checks the plain data of trials, which processes exchange and which ledgers and bundles contain.
+"""Checks the JSON data of trials, which processes exchange and which ledgers and bundles contain.
 
 Keys that an earlier version did not write may be missing. Keys that a later version has added are accepted.
 """
@@ -34,10 +34,10 @@ _SPECIFICATION_TYPES = {
 
 
 def check_plain(data: JsonObject) -> None:
-    """Check that plain data has the types that `TrialResult.from_json` needs.
+    """Check that JSON data has the types that `TrialResult.from_json` needs.
 
     Raises:
-        ValueError: A value has a wrong type or range; the message says which.
+        ValueError: A value has a wrong type or range; the message names the value.
     """
     typed(data, {"outcome": str, "steps": int, "spec": dict})
     typed_where_there(data, {"sim_time_s": float, "digest": str, "wall_s": float})
@@ -62,7 +62,7 @@ def check_disturbances(disturbances: Sequence[JsonObject] | None) -> None:
     """Check the types and ranges of a list of disturbances; None is valid.
 
     Raises:
-        ValueError: A value has a wrong type or range; the message says which.
+        ValueError: A value has a wrong type or range; the message names the value.
     """
     typed({"disturbances": disturbances}, {"disturbances": list | None})
     for one in disturbances or ():
@@ -75,10 +75,10 @@ def check_disturbances(disturbances: Sequence[JsonObject] | None) -> None:
 def check_parts(
     closest: object, collision: object, failure: object, escape: object = None, event: object = None
 ) -> None:
-    """Check the types of the evidence with which a trial ended; None is valid.
+    """Check the types of the evidence on the end of a trial; None is valid.
 
     Raises:
-        ValueError: A value has a wrong type; the message says which.
+        ValueError: A value has a wrong type; the message names the value.
     """
     for name, part, kind in (
         ("closest", closest, ClosestApproach), ("collision", collision, Collision), ("failure", failure, Failure),

@@ -1,4 +1,4 @@
-"""Disturbances: an actor near the agent misbehaves, or the agent's observations or actions are late or wrong."""
+"""Disturbances: an actor near the agent misbehaves, or the agent's observations or actions are delayed or wrong."""
 
 from __future__ import annotations
 
@@ -36,13 +36,14 @@ CELLS = tuple(_CELL_BY_PLACE)
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """Properties of a type of disturbance.
+    """Properties of a kind of disturbance.
 
     Args:
         unit: The unit of `Disturbance.how_strong`; empty for a share.
         words: A sentence that describes the disturbance. ``share`` is the strength in per cent. The part after ``|`` is
             used only if the strength is above 0.
-        of_agent: Whether it affects the agent's own observations or actions, so that every simulator supports it.
+        of_agent: Whether the disturbance affects the agent's own observations or actions, so that every simulator
+            supports it.
         most: The largest meaningful strength, such as 1 for a share of a speed.
         less_is_worse: Whether a smaller number is a stronger disturbance.
     """
@@ -96,24 +97,25 @@ def steps_of(seconds: float, step_length_s: float) -> int:
 
 
 def _in_steps(seconds: float, step_length_s: float) -> float:
-    """Return a duration in s, rounded to whole steps, but at least one step; 0 stays 0."""
+    """Return a duration in s, rounded to whole steps but at least one step; 0 stays 0."""
     found = steps_of(seconds, step_length_s) * step_length_s if seconds > 0 else 0.0
     return seconds if math.isclose(found, seconds) else round(found, _DURATION_DIGITS)
 
 
 @dataclass(frozen=True, slots=True)
 class Disturbance(Serializable):
-    """A disturbance: planned, as part of a trial's specification, or as it took place.
+    """A disturbance: either planned in a trial's specification, or as it really took place.
 
     Args:
-        step: The step in which the disturbance begins, from 1.
-        who: The place of the vehicle in the grid around the agent when the disturbance begins, one of `CELLS`.
-        what: The type: one of `KINDS` or `HOLD_KINDS`, or a type that another simulator adds.
-        how_strong: The strength in the unit of the type: m/s² of braking, s of delay, a share of a speed or of a value.
+        step: The step in which the disturbance begins, counted from 1.
+        who: The place of the vehicle around the agent when the disturbance begins, one of `CELLS`.
+        what: The kind of the disturbance: one of `KINDS` or `HOLD_KINDS`, or a kind that another simulator adds.
+        how_strong: The strength in the unit of the kind: m/s² of braking, s of delay, or a share of a speed or of a
+            value.
         how_long: The duration in s of simulation time.
-        agent: The controlled vehicle around which the grid lies.
-        vehicle: The vehicle that was at the place. It is empty if the disturbance is planned, or if no vehicle was at
-            the place. A hold (`HOLD_KINDS`) names its vehicle from the beginning.
+        agent: The controlled vehicle around which the place is chosen.
+        vehicle: The vehicle that was at the place. It is empty if the disturbance is only planned, or if no vehicle was
+            at the place. A hold (`HOLD_KINDS`) names its vehicle from the beginning.
     """
 
     step: int
@@ -140,7 +142,7 @@ class Disturbance(Serializable):
 
     @property
     def words(self) -> str:
-        """A sentence that describes the disturbance, such as ``main.35 brakes with 4 m/s² for 2 s``."""
+        """Return a sentence that describes the disturbance, such as ``main.35 brakes with 4 m/s² for 2 s``."""
         agent = self.agent or "the agent"
         vehicle = self.vehicle or (agent if self.who == "itself" else f"the actor {self.place}")
         kind = KINDS.get(self.what) or HOLD_KINDS.get(self.what)
@@ -159,15 +161,15 @@ class Disturbance(Serializable):
         return _CELL_BY_PLACE[self.who].format(agent) if self.who in _CELL_BY_PLACE else f"{self.who} of {agent}"
 
     def is_active(self, step: int, step_length_s: float) -> bool:
-        """Whether the disturbance is active in a step."""
+        """Return whether the disturbance is active in a step."""
         return self.step <= step < self.step + steps_of(self.how_long, step_length_s)
 
 
 def why_not(one: Disturbance) -> tuple[str, str] | None:
-    """Return why a disturbance is invalid, and the fix; None if it is valid.
+    """Return the reason why a disturbance is invalid, and the fix; None if it is valid.
 
     Args:
-        one: A planned disturbance of any type; its step is not checked.
+        one: A planned disturbance of any kind; its step is not checked.
     """
     kind = KINDS.get(one.what)
     if not 0 <= one.how_strong < math.inf:
@@ -185,5 +187,5 @@ def why_not(one: Disturbance) -> tuple[str, str] | None:
 
 
 def in_turn(disturbances: Iterable[Disturbance]) -> tuple[Disturbance, ...]:
-    """Return disturbances in the order that a specification needs."""
+    """Return disturbances in the order that a specification requires."""
     return tuple(sorted(disturbances, key=lambda one: (one.step, one.agent, one.what)))

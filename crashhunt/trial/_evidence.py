@@ -20,22 +20,22 @@ class Collision(Serializable):
     """A collision, or a departure from the road.
 
     Args:
-        agent: The controlled vehicle of the collision.
+        agent: The controlled vehicle that collided or left the road.
         role: The agent's role: ``collider`` (it drove into the other actor), ``victim``, or ``alone``.
-        collider: The actor that drove into the other actor.
-        victim: The actor that was hit; empty if there was none.
-        seen_by: The oracles that detected the collision, sorted by name. If the simulator's report or the overlap of
-            outlines is missing, these two disagree.
+        collider: Identifier of the actor that drove into the other actor.
+        victim: Identifier of the actor that was hit; empty if there was none.
+        seen_by: The oracles that detected the collision, sorted by name. If one of them is missing (the simulator's
+            report, or the overlap of outlines), the two disagree.
         kind: The simulator's type of the collision, such as ``collision`` or ``junction``.
-        x: Position of the controlled vehicle's front bumper, in m.
-        y: Position of the controlled vehicle's front bumper, in m.
+        x: x of the controlled vehicle's front bumper, in m.
+        y: y of the controlled vehicle's front bumper, in m.
         lane: The lane of the controlled vehicle.
         collider_speed: Speed of the collider at the first contact, in m/s.
         victim_speed: Speed of the victim at the first contact, in m/s.
         time_s: Simulation time of the first contact, which lies within the step, in s; NaN if it is unknown.
-        cell: Of a simulator without scenes, the flags and short texts that describe the state after the collision.
-            Samplers search for crashes with other cells. It is no part of the crash type, because one fault may end in
-            several cells.
+        cell: For a simulator without scenes, the flags and short texts that describe the state after the collision.
+            Samplers search for crashes with different cells. The cell does not belong to the crash type, because one
+            fault may end in several cells.
     """
 
     agent: str
@@ -66,11 +66,12 @@ class Escape(Serializable):
 
     Args:
         step: Full braking after this step avoids the collision; None if no such step was found.
-        too_late: Full braking after this step does not avoid the collision; the next step, if ``step`` exists.
-        braking: The greatest deceleration of these runs, in m/s²; None if the vehicle never slowed down.
+        too_late: Full braking after this step does not avoid the collision. If ``step`` exists, this is the next step.
+        braking: The greatest deceleration in these runs, in m/s²; None if the vehicle never slowed down.
         how: A description of the braking, as in `FullBraking`.
-        why_not: Why there is no such step, and no step after which braking does not help; empty if there is one.
-        changed: Further differences of the run that avoids the collision, such as ``ego does not change lanes``.
+        why_not: The reason why neither `step` nor `too_late` is known; empty if one of them is known.
+        changed: Further differences of the agent in the run that avoids the collision, such as ``ego does not change
+            lanes``.
     """
 
     step: int | None = None
@@ -87,11 +88,13 @@ class Failure(Serializable):
 
     Args:
         kind: The exception's type, ``exit code``, ``signal``, ``timeout`` or ``killed from outside``.
-        message: The message in one line.
+        message: The message of the exception or failure, in one line.
         traceback: The traceback of the exception, or the stack of the stuck thread.
-        agent: The agent whose code failed; empty if it was no agent's code.
-        party: Whose code failed: ``agent``, ``environment``, ``simulator`` or ``oracle``; empty if it is not known.
-        place: Task of that code, such as ``act``, ``step`` or ``space conversion``; empty if unknown.
+        agent: The agent whose code failed; empty if the code was not an agent's.
+        party: The owner of the code that failed: ``agent``, ``environment``, ``simulator`` or ``oracle``; empty if it
+            is unknown.
+        place: The purpose for which this code was called, such as ``act``, ``step`` or ``space conversion``; empty if
+            unknown.
         exit_code: The exit code of a process that died; negative for a signal, as in `subprocess`.
         last_output: The last output of the process.
     """

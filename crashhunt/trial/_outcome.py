@@ -20,9 +20,9 @@ _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 
 
 class Outcome(StrEnum):
-    """How a trial ended.
+    """How a trial ended, as an enumeration.
 
-    Oracles may add outcomes (`Outcome.own`). Iterating over the class yields only the outcomes that every hunt has.
+    Oracles may add outcomes (`Outcome.own`). Iterating over the class yields only the built-in outcomes.
     """
 
     SURVIVED = "survived"
@@ -44,14 +44,14 @@ class Outcome(StrEnum):
 
     @classmethod
     def own(cls, name: str, category: Category) -> Self:
-        """Return the outcome that an oracle adds, or the existing outcome of that name.
+        """Return the outcome that an oracle adds, or an existing outcome with this name.
 
         Args:
             name: Lower-case letters, digits and underscores, such as ``too_close``.
             category: The category in reports, ``traffic crash`` or ``traffic event``.
 
         Raises:
-            ValueError: The name is invalid, or the outcome of that name has another category.
+            ValueError: The name is invalid, or an outcome with this name has another category.
         """
         if category not in get_args(Category):
             raise ValueError(f"{category!r} is not a category of outcomes")
@@ -74,27 +74,27 @@ class Outcome(StrEnum):
         return cls._value2member_map_.setdefault(value, member)  # type: ignore[return-value]
 
     def __reduce_ex__(self, protocol: object) -> tuple[object, ...]:
-        """Keep the category of an oracle's own outcome when it is sent to another process."""
+        """Keep the category of an oracle's own outcome when the outcome is sent to another process."""
         return (Outcome.own, (self.value, self.category)) if self.is_own else (Outcome, (self.value,))
 
     @property
     def is_own(self) -> bool:
-        """Whether an oracle has added the outcome."""
+        """Whether the outcome was added by an oracle."""
         return self.name not in Outcome.__members__
 
     @property
     def is_traffic_crash(self) -> bool:
-        """Whether the vehicle did harm on the road."""
+        """Whether the outcome is a traffic crash, in which the vehicle did harm on the road."""
         return self.category == "traffic crash"
 
     @property
     def is_traffic_event(self) -> bool:
-        """Whether it is a traffic event, which ends a trial only if ``--crash-on`` names it."""
+        """Whether the outcome is a traffic event, which ends a trial only if ``--crash-on`` names it."""
         return self.category == "traffic event"
 
     @property
     def is_software_fault(self) -> bool:
-        """Whether a program failed, not the driving."""
+        """Whether the outcome is a software fault, in which a program failed and not the driving."""
         return self.category == "software fault"
 
     @property
@@ -113,10 +113,10 @@ _CATEGORIES: dict[str, Category] = {
 
 
 def outcome_of(data: Mapping[str, Any]) -> Outcome:
-    """Return the outcome in plain data, with the category that the data give for an oracle's own outcome.
+    """Return the outcome from JSON data, with the category in the data for an oracle's own outcome.
 
     Raises:
-        ValueError: The outcome is invalid.
+        ValueError: The data contain no valid outcome.
     """
     outcome = Outcome(data["outcome"])
     if outcome.is_own and "category" in data:
@@ -125,7 +125,7 @@ def outcome_of(data: Mapping[str, Any]) -> Outcome:
 
 
 def in_order(outcomes: Iterable[str]) -> list[Outcome]:
-    """Return outcomes, each once: those that every hunt has in their order, then those of oracles by name."""
+    """Return outcomes without duplicates: built-in outcomes in their order, then those of oracles by name."""
     found = {Outcome(name) for name in outcomes}
     return [*(outcome for outcome in Outcome if outcome in found), *sorted(found - set(Outcome))]
 

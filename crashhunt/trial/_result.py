@@ -1,4 +1,4 @@
-"""The result of a trial, which the ledger keeps for every trial: immutable, small, convertible to JSON."""
+"""The result of a trial, which the ledger stores for every trial: immutable, small, convertible to JSON."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _NOT_ALL_ASKED = written_if(lambda stress: stress.margin is None)
 
 @dataclass(frozen=True, slots=True)
 class Branch(Serializable):
-    """A branch that crashed, as a specification from the start.
+    """A branch that crashed, as a specification that repeats the crash from the start.
 
     Args:
-        disturbances: The trial's disturbances up to the branching step, and those of the branch.
-        branched: The step after which the branch leaves the trial.
+        disturbances: The trial's disturbances up to the step of the branch, and the disturbances of the branch.
+        branched: The step after which the branch differs from the trial.
         outcome: The outcome of the branch.
-        step: The last step of the branch.
+        step: The number of the branch's last step.
         log_likelihood: Natural logarithm of the probability that exactly these disturbances begin in these steps; None
             if the hunt's models cannot draw them.
     """
@@ -48,14 +48,14 @@ class Branches(Serializable):
     """The results of the branches of a trial.
 
     Args:
-        moments: Number of moments from which branches were started.
+        moments: Number of steps after which branches were started.
         asked: Number of completed branches.
-        steps: Number of steps that the branches took.
+        steps: Number of simulated steps of the branches.
         left_out: Number of branches that were skipped because the budget of steps was used up.
         crashes: The branches that crashed, in the order in which they were found.
-        unanswered: Number of planned branches without a result.
-        why_unanswered: The reason for the first of them; empty if there is none.
-        may_be_asked_again: Whether a reason lies outside the trial, so that another run may complete all branches.
+        unanswered: Number of planned branches that have no result.
+        why_unanswered: The reason for the first missing result; empty if no result is missing.
+        may_be_asked_again: Whether a reason lies outside of the trial, so that another run may complete all branches.
     """
 
     moments: int = 0
@@ -69,7 +69,7 @@ class Branches(Serializable):
 
     @property
     def extent(self) -> str:
-        """The number of completed branches as text: "asked 12 of 13"."""
+        """Return the number of completed branches as text, such as "asked 12 of 13"."""
         return f"asked {self.asked} of {self.asked + self.unanswered}"
 
 
@@ -78,21 +78,24 @@ class Branches(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class ForcedCopy(Serializable):
-    """The result of a copy with a forced first onset.
+    """The result of a copy with a forced first disturbance.
 
     Args:
-        cell: the model and strength of the first onset, as in `Forcing.ratios`.
-        onset: step of the first onset; of the second onset if that is forced.
-        weight: probability of the onsets that this copy represents, given the root.
-        branched: the step after which it left the root, or the copy that it is a copy of.
+        cell: the model and strength of the first disturbance, as in `Forcing.ratios`.
+        onset: step in which the first disturbance begins; with a forced second disturbance, the step in which that
+            begins.
+        weight: probability of the disturbances that this copy represents, given the root trial.
+        branched: the step after which the copy was forked from the root trial, or from another copy.
         crash: the outcome if it counts as a crash in the hunt, else empty.
         step: the step at which the copy ended.
-        disturbed: whether any disturbance had an effect on the copy.
+        disturbed: whether any disturbance had an effect in the copy.
         disturbances: if the copy crashed, all disturbances that were planned from the start of the trial.
-        within: conditional probability of this copy, given its first onset. It is 1 if later disturbances are drawn as
-            usual. With forced second onsets, it is the probability of the forced second onset, or of no second onset.
-        second: the cell of its forced second onset; empty for none.
-        reseeding: with splitting, when its simulator's generators got other seeds; None without splitting.
+        within: conditional probability of this copy, given its first disturbance. It is 1 if later disturbances are
+            drawn as usual. With forced second disturbances, it is the probability of the forced second disturbance, or
+            of none.
+        second: the cell (model and strength) of the forced second disturbance; empty if there is none.
+        reseeding: with splitting, the steps after which the simulator got other seeds, with these seeds; None without
+            splitting.
     """
 
     cell: str
@@ -110,17 +113,20 @@ class ForcedCopy(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Forced(Serializable):
-    """The results of the copies of a root.
+    """The results of the copies of a root trial.
 
     Args:
-        survival: probability that no first onset begins before the root ends; with splitting, weight of the root.
-        masses: masses by cell, the probability that the first onset is of this cell and begins before the root ends.
-        copies: copies in the order of their onsets; after each copy its own copies, with a second onset.
-        steps: number of steps of the copies.
+        survival: probability that no first disturbance begins before the root trial ends; with splitting, weight of the
+            root trial.
+        masses: probability, by cell, that the first disturbance belongs to the cell and begins before the root trial
+            ends.
+        copies: copies in the order of their first disturbances; each copy is followed by its own copies, with a second
+            disturbance.
+        steps: number of simulated steps of the copies.
         unanswered: number of planned copies without a result.
-        why_unanswered: the reason for the first of them; empty if there is none.
-        may_be_asked_again: whether a reason lies outside of the trial, so that another run may get all answers.
-        peak: with splitting, the greatest measure of the root, to which the levels are compared.
+        why_unanswered: the reason for the first missing result; empty if no result is missing.
+        may_be_asked_again: whether a reason lies outside of the trial, so that another run may return all results.
+        peak: with splitting, the greatest measure of the root trial, which is compared with the levels.
     """
 
     survival: float
@@ -133,7 +139,7 @@ class Forced(Serializable):
     peak: float = field(default=0.0, metadata=OMIT_DEFAULT)
 
     def by_first_onset(self) -> list[tuple[ForcedCopy, ...]]:
-        """Return the copies of each first onset: the copy of the root, then the copies of that with a second onset."""
+        """Return the copies of each first disturbance: the copy of the root trial, then its own copies."""
         groups: list[tuple[ForcedCopy, ...]] = []
         for copy in self.copies:
             if copy.second:
@@ -155,16 +161,16 @@ class Stress(Serializable):
             strongest plausible one. It is 1 if no probe crashed, and 0 if the trial crashed without a disturbance. None
             if a probe has no result.
         probes: Number of probes.
-        steps: Number of steps that the probes took.
+        steps: Number of simulated steps of the probes.
         left_out: Number of probes that were skipped because the budget of steps was used up.
         disturbance: The minimal disturbance that made a probe crash; None if no probe crashed.
-        outcome: The outcome of that probe.
-        step: The last step of that probe.
-        moments: Number of moments at which probes were planned; 0 in results of earlier versions.
-        moments_asked: Number of these moments at which all probes have a result.
-        margin_upper_bound: If a probe has no result, an upper bound of the margin, from the other probes.
-        why_unasked: Why a probe has no result; empty if all have.
-        may_be_asked_again: Whether the reason lies outside the trial, so that another run may complete all probes.
+        outcome: The outcome of the probe with the minimal disturbance.
+        step: The last step of the probe with the minimal disturbance.
+        moments: Number of steps after which probes were planned; 0 in results of earlier versions.
+        moments_asked: Number of these steps for which all probes have a result.
+        margin_upper_bound: If a probe has no result, an upper bound of the margin from the other probes.
+        why_unasked: The reason why a probe has no result; empty if all probes have a result.
+        may_be_asked_again: Whether the reason lies outside of the trial, so that another run may complete all probes.
     """
 
     margin: float | None
@@ -188,7 +194,7 @@ class Stress(Serializable):
 
     @property
     def extent(self) -> str:
-        """The number of completed moments as text: "asked 1 of 9"."""
+        """Return the number of steps with completed probes as text, such as "asked 1 of 9"."""
         return f"asked {self.moments_asked} of {self.moments}"
 
 
@@ -223,20 +229,20 @@ class TrialResult(Serializable):
 
     Args:
         spec: The specification of the trial.
-        outcome: The outcome.
-        steps: Number of completed steps; for a crash, the step of the crash.
+        outcome: How the trial ended.
+        steps: Number of completed steps; if the trial crashed, the step of the crash.
         sim_time_s: Simulation time at the end, in s.
         digest: BLAKE2b over the whole recording, in hexadecimal; equal digests mean bit-identical runs.
         closest: The closest approach to another actor.
         collision: The evidence of a traffic crash.
         event: The evidence of a traffic event that ``--crash-on`` names.
-        failure: The evidence of a software fault, or the reason why the episode is invalid.
+        failure: The evidence of a software fault, or the reason why the episode could not be set up.
         wall_s: Wall time of the trial, in s.
         setup_s: Wall time before the first step, which is part of ``wall_s``.
         worker: The process id of the worker.
         kept: Whether the worker left its scratch folder for the hunt to collect.
         escape: The last step at which braking avoids the crash; None if the search was not run or found no answer.
-        why_no_escape: Why that search did not end, if its process was killed from outside; otherwise empty.
+        why_no_escape: The reason why this search did not end, if its process was killed from outside; otherwise empty.
         events: Number of traffic events by type; None if they were not counted.
         disturbances: The disturbances that took place, with their vehicles.
         log_likelihood: Natural logarithm of the probability, under the hunt's models, that exactly these disturbances
@@ -244,12 +250,12 @@ class TrialResult(Serializable):
         danger: The criticality, from 0 (nothing near) to 1 (contact); None if it was not measured.
         stress: The results of robustness probes; None if there were none.
         branches: The results of branches; None if there were none.
-        setup_steps: Number of steps before the first step, such as a warm-up of traffic; None if they were not counted.
-            If trials share a warm-up, the first of them counts it.
-        driven_m: Distance that the agents drove after the warm-up, all together, in m; None if it is not known.
-        driven_s: Time that the agents drove, all together, in s of simulation time; None if it is not known.
-        step_length_s: Step length of the simulator, in s; None if it is not known.
-        forced: The results of forks with a forced first onset; None if there were none.
+        setup_steps: Number of simulated steps before the first step of the trial, such as a warm-up of traffic; None if
+            they were not counted. If several trials share a warm-up, only the first trial counts it.
+        driven_m: Distance that all agents together drove after the warm-up, in m; None if it is unknown.
+        driven_s: Time that all agents together drove, in s of simulation time; None if it is unknown.
+        step_length_s: Step length of the simulator, in s; None if it is unknown.
+        forced: The results of forks with a forced first disturbance; None if there were none.
     """
 
     spec: TrialSpec
@@ -294,7 +300,7 @@ class TrialResult(Serializable):
 
     @property
     def category(self) -> str | None:
-        """The category of an outcome that an oracle has added; None for the outcomes that every hunt has."""
+        """The category of an outcome that an oracle has added; None for built-in outcomes."""
         return self.outcome.category if self.outcome.is_own else None
 
     def is_identical_run(self, other: TrialResult) -> bool:
@@ -321,12 +327,12 @@ class TrialResult(Serializable):
 
     @property
     def steps_begun(self) -> int:
-        """Number of begun steps: one more than the completed steps if a software fault ended the trial."""
+        """Number of steps that were begun: one more than the completed steps if a software fault ended the trial."""
         return self.steps + (self.failure is not None)
 
     @property
     def other_steps(self) -> int:
-        """Number of steps simulated in addition to the trial's own: before the first step, and in its forks."""
+        """Number of further simulated steps: before the first step of the trial, and in its forks."""
         return (self.setup_steps or 0) + sum(
             one.steps for one in (self.stress, self.branches, self.forced) if one is not None
         )
@@ -346,11 +352,11 @@ class TrialResult(Serializable):
 
     @property
     def summary(self) -> str:
-        """A sentence about the outcome, in one line."""
+        """A sentence that describes the outcome, in one line."""
         return summarize(self)
 
 
 def in_effect(result: TrialResult, reported: Iterable[Disturbance]) -> TrialResult:
-    """Return a result without the reported disturbances that had no effect before the end of the trial."""
+    """Return a result without those reported disturbances that had no effect before the end of the trial."""
     found = tuple(one for one in reported if one.vehicle and one.step <= result.steps_begun)
     return replace(result, disturbances=found) if found else result

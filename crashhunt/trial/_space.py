@@ -1,6 +1,6 @@
 """Argument spaces: the values of an argument, their notation, and how a value is drawn.
 
-A specification is a short text, as in ``--arg speed=5:40``::
+A specification is a short text, such as ``5:40`` in ``--arg speed=5:40``::
 
     ``20``             always this value
     ``5:40``           uniform between both ends (whole numbers for an integer argument)
@@ -52,20 +52,20 @@ Kind = Literal["float", "int", "bool", "str"]
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """One value, always."""
+    """A distribution with only one value."""
 
     value: Value
 
     def sample(self, rng: np.random.Generator) -> Value:
-        """Return the value."""
+        """Return the value of the constant."""
         return self.value
 
     def grid(self, points: int) -> tuple[Value, ...]:
-        """Return the one value."""
+        """Return the only value of the constant."""
         return (self.value,)
 
     def quantile(self, share: float) -> Value:
-        """Return the value."""
+        """Return the value of the constant."""
         return self.value
 
     def share_of(self, value: Value) -> float:
@@ -82,7 +82,7 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One of several values, all equally likely."""
+    """A choice between several values, all equally likely."""
 
     options: tuple[Value, ...]
 
@@ -91,15 +91,15 @@ class Choice:
         return self.options[int(rng.integers(len(self.options)))]
 
     def grid(self, points: int) -> tuple[Value, ...]:
-        """Return the options."""
+        """Return all options of the choice."""
         return self.options
 
     def quantile(self, share: float) -> Value:
-        """Return the option below which this share of the options lies, from 0 to 1."""
+        """Return the option at a share, from 0 to 1, of the options in their order."""
         return self.options[min(int(share * len(self.options)), len(self.options) - 1)]
 
     def share_of(self, value: Value) -> float:
-        """Return the middle of the shares whose quantile is this option.
+        """Return the middle of those shares whose quantile is the given option.
 
         Raises:
             ValueError: the value is not an option.
@@ -107,7 +107,7 @@ class Choice:
         return (self.options.index(value) + 0.5) / len(self.options)
 
     def contains(self, value: Value) -> bool:
-        """Whether ``value`` is among the options."""
+        """Return whether ``value`` is one of the options."""
         return value in self.options
 
     def __str__(self) -> str:
@@ -116,14 +116,14 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """A number between ``low`` and ``high``, both included.
+    """A number between ``low`` and ``high``, including both.
 
     Args:
         low: the lower end.
         high: the upper end.
-        step: distance of the values ``low``, ``low + step``, …; None for a continuous range.
-        log: uniform in the logarithm; needs ``low > 0``.
-        integer: whole numbers only.
+        step: distance between the values ``low``, ``low + step``, …; None for a continuous range.
+        log: whether the logarithm is uniformly distributed; this needs ``low > 0``.
+        integer: whether only whole numbers are drawn.
     """
 
     low: float
@@ -173,7 +173,7 @@ class Range:
         return math.log(self.low - room), math.log(self.high + room)
 
     def sample(self, rng: np.random.Generator) -> Value:
-        """Draw a value."""
+        """Draw a value from the range."""
         if self.log:
             return self._exp(rng.uniform(*self._logarithms))
         if self.step is not None or self.integer:
@@ -186,7 +186,7 @@ class Range:
         return round(value) if self.integer else value
 
     def quantile(self, share: float) -> Value:
-        """Return the value below which this share of all draws lies, from 0 to 1."""
+        """Return the value below which the given share of all draws lies, from 0 to 1."""
         if self.log:
             low, high = self._logarithms
             return self._exp(low + (high - low) * share)
@@ -195,7 +195,7 @@ class Range:
         return min(float(self.low + (self.high - self.low) * share), float(self.high))
 
     def share_of(self, value: Value) -> float:
-        """Return a share whose quantile is this value: 0 to 1, in the middle of those of a stepped range.
+        """Return a share, from 0 to 1, whose quantile is the value; for a stepped range, the middle of the shares.
 
         Raises:
             ValueError: the value is not a number.
@@ -212,7 +212,7 @@ class Range:
         return min(max((value - self.low) / (self.high - self.low), 0.0), 1.0)
 
     def grid(self, points: int) -> tuple[Value, ...]:
-        """Return all values of a stepped range, else at most ``points`` evenly spaced ones, ends included."""
+        """Return all values of a stepped range, else at most ``points`` evenly spaced values with both ends."""
         if self.step is not None or (self.integer and not self.log and self.steps <= points):
             return tuple(self._at(index) for index in range(self.steps))
         if points == 1 or self.low == self.high:
@@ -224,7 +224,7 @@ class Range:
         return tuple(dict.fromkeys(round(value) if self.integer else float(value) for value in clipped))
 
     def contains(self, value: Value) -> bool:
-        """Whether ``value`` is a number within the range (steps are not checked)."""
+        """Return whether ``value`` is a number within the range; steps are not checked."""
         return isinstance(value, int | float) and not isinstance(value, bool) and self.low <= value <= self.high
 
     def __str__(self) -> str:
@@ -240,7 +240,7 @@ class Argument:
     """An argument of an agent or a scenario, with its type, default, distribution and unit.
 
     Args:
-        name: name, as in ``--arg NAME=SPEC``.
+        name: name of the argument, as in ``--arg NAME=SPEC``.
         kind: type of the values; None if it is unknown.
         default: The default value; None if there is none.
         distribution: The distribution from which a hunt draws by default; None if the argument keeps its default.
@@ -263,7 +263,7 @@ def without_folder(value: object) -> str:
 
 
 def kind_of(value: Value) -> Kind:
-    """Return the kind of a value."""
+    """Return the type of a value."""
     if isinstance(value, bool):
         return "bool"
     if isinstance(value, int):
@@ -272,7 +272,7 @@ def kind_of(value: Value) -> Kind:
 
 
 def parse_spec(text: str, kind: Kind | None = None, *, where: str = "") -> Distribution:
-    """Read a specification (see the module's text).
+    """Parse the specification of an argument's values, whose notation is described in the docstring of the module.
 
     >>> parse_spec("log:1:100")
     Range(low=1, high=100, step=None, log=True, integer=True)
@@ -280,7 +280,7 @@ def parse_spec(text: str, kind: Kind | None = None, *, where: str = "") -> Distr
     Args:
         text: the specification.
         kind: the type of the argument; None to derive it from the text.
-        where: option or key that an error names, such as ``--arg speed``.
+        where: option or key that an error message names, such as ``--arg speed``.
 
     Raises:
         ArgumentError: the text is not a specification.
@@ -375,7 +375,7 @@ def _format(value: Value) -> str:
 
 
 def describe(space: Mapping[str, Distribution]) -> str:
-    """Return ``name=spec`` pairs in one line, for people."""
+    """Return ``name=spec`` pairs as one line of text for users."""
     return " ".join(f"{name}={distribution}" for name, distribution in sorted(space.items())) or "(nothing)"
 
 
@@ -387,14 +387,14 @@ _KINDS: dict[object, Kind] = {float: "float", int: "int", bool: "bool", str: "st
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """The arguments that a factory accepts.
+    """The signature of a factory: the arguments that it accepts.
 
     Args:
         arguments: arguments by name, in order.
         open: whether the factory accepts any other keyword (``**kwargs``).
-        given: those of ``observation_space``, ``action_space`` and ``step_length_s`` that the factory has as
-            parameters.
-        required: names of the arguments that have no default of any type.
+        given: those of the parameters ``observation_space``, ``action_space`` and ``step_length_s`` that the factory
+            has.
+        required: names of the arguments without a default.
     """
 
     arguments: dict[str, Argument]
@@ -404,10 +404,10 @@ class Signature:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Signature:
-        """Return the signature that `to_json` has described.
+        """Rebuild a signature from the data of `to_json`.
 
         Raises:
-            ArgumentError: a distribution cannot be parsed.
+            ArgumentError: the specification of a distribution is invalid.
             KeyError, TypeError: the data do not describe a signature.
         """
         found = [Argument(**{**facts, "distribution": None}) for facts in data["arguments"]]
@@ -421,7 +421,7 @@ class Signature:
         return cls(names, open=bool(data["open"]), given=given, required=required)
 
     def to_json(self) -> dict[str, Any]:
-        """Return a description that can be written as JSON."""
+        """Return the signature as JSON-compatible data."""
         arguments = [
             {
                 "name": one.name, "kind": one.kind, "default": one.default, "unit": one.unit, "help": one.help,
@@ -435,7 +435,7 @@ class Signature:
         """Refuse arguments that the factory does not accept.
 
         Raises:
-            ArgumentError: an argument is not accepted; the fix names those that are.
+            ArgumentError: an argument is not accepted; the fix names the accepted arguments.
         """
         for name in names:
             if name not in self.arguments and not self.open:
@@ -446,9 +446,9 @@ class Signature:
 def signature_of(factory: Callable[..., object]) -> Signature:
     """Return the arguments of a factory, read from its signature.
 
-    A parameter may be annotated ``Annotated[float, Argument(...)]`` to say what a hunt should try. Parameters named
-    ``observation_space`` and ``action_space`` are not arguments: they receive the spaces of the vehicle.
-    ``step_length_s`` is not an argument either: it receives the step length of the simulation.
+    A parameter may be annotated ``Annotated[float, Argument(...)]`` to define which values a hunt tries. Parameters
+    named ``observation_space`` and ``action_space`` are not arguments, because they receive the spaces of the vehicle.
+    ``step_length_s`` is not an argument either, because it receives the step length of the simulation.
     """
     if _takes_nothing(factory):
         return Signature({}, open=False, given=())
@@ -477,13 +477,13 @@ def signature_of(factory: Callable[..., object]) -> Signature:
 
 
 def _takes_nothing(factory: Callable[..., object]) -> bool:
-    """Return whether a class has no constructor of its own; `inspect` would need milliseconds for this answer."""
+    """Return whether a class has no constructor of its own; `inspect` would need milliseconds to determine this."""
     plain = type(factory) is type and inspect.getattr_static(factory, "__signature__", None) is None
     return plain and all(inspect.getattr_static(factory, name) is vars(object)[name] for name in _CONSTRUCTORS)
 
 
 def _annotation(parameter: inspect.Parameter, names: dict[str, object]) -> object:
-    """Return an annotation as an object; None if it cannot be evaluated, such as names imported for type checkers."""
+    """Return an annotation as an object; None if it cannot be evaluated, as with imports for type checkers only."""
     if not isinstance(parameter.annotation, str):
         return parameter.annotation
     try:

@@ -1,4 +1,4 @@
-"""The specification of a trial: everything that determines it."""
+"""The specification of a trial, which determines the trial completely."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class Overruled(Serializable):
 
     Args:
         agent: Identifier of the agent.
-        after: The last step without the override; the next step is the first with an overridden action.
-        manoeuvre: ``brake``; ``left`` or ``right`` also changes to the lane on that side in the first step.
-        keeps: ``lane`` or ``speed``: the agent still acts, but the vehicle keeps its lane or its current speed. Then
-            the manoeuvre has no effect.
+        after: The last step without the override; in the next step, an action is overridden for the first time.
+        manoeuvre: ``brake``; or ``left`` or ``right``, which also changes to the lane on that side in the first step.
+        keeps: ``lane`` or ``speed``: the agent still acts, but the vehicle keeps its lane or its current speed. In this
+            case, the manoeuvre has no effect.
         reference: ``longitudinal``, ``lateral`` or ``both``: the agent still acts, and a reference driver corrects its
             speeds, its lane changes, or both, where they are not safe. ``none``: the reference driver only reports
-            where it would have. Then manoeuvre and ``keeps`` have no effect.
+            where it would correct the agent. In these cases, the manoeuvre and ``keeps`` have no effect.
     """
 
     agent: str
@@ -55,12 +55,12 @@ class Overruled(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Handover(Serializable):
-    """A trial in which a recording drives a vehicle up to a step, and the vehicle's agent from that step on.
+    """A hand-over: a vehicle repeats recorded actions up to a step, and its agent acts after that.
 
     Args:
-        agent: the id of the vehicle.
-        after: number of recorded actions to play; the agent makes its first decision in the next step.
-        log: the path of the ``log.mcap`` with the recorded actions.
+        agent: id of the controlled vehicle.
+        after: number of recorded actions to repeat; the agent makes its first decision in the next step.
+        log: path of the ``log.mcap`` that contains the recorded actions.
     """
 
     agent: str
@@ -70,11 +70,11 @@ class Handover(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Reseeding(Serializable):
-    """A trial whose simulator gets other seeds for its random generators after a step.
+    """A re-seeding: the simulator's random generators get other seeds after a step.
 
     Args:
-        after: the step; the next step is the first that draws from the new seeds.
-        seed: seed of all generators of the simulator; 0 to 2**31 - 1.
+        after: the step after which the seeds change; the next step is the first that uses the new seeds.
+        seed: seed of all random generators of the simulator, from 0 to 2**31 - 1.
         earlier: further re-seedings at earlier steps, each as its step and its seed.
     """
 
@@ -83,22 +83,22 @@ class Reseeding(Serializable):
     earlier: tuple[tuple[int, int], ...] = field(default=(), metadata=_ESSENTIAL_METADATA)
 
     def seed_after(self, step: int) -> int | None:
-        """Return the seed that the generators get after a step; None if they continue."""
+        """Return the seed that the random generators get after a step; None if they are not re-seeded then."""
         return self.seed if step == self.after else dict(self.earlier).get(step)
 
 
 @dataclass(frozen=True, slots=True)
 class Forcing(Serializable):
-    """How copies of a root are given their first onset: a root is a trial without disturbances after its first step.
+    """How first disturbances are forced on copies of a root, a trial without disturbances after its first step.
 
     Args:
-        spacing: proposed probability per copy. One copy is made in each interval of this length.
-        ratios: ratios by cell, how many times more often than by its own law a first onset is proposed; 1 where it is
-            missing. A cell is a model with one strength, such as ``brake=4.0``.
-        second: cells of first onsets whose copies have forced second onsets.
-        second_spacing: probability per forced second onset; 0 for none.
-        levels: with splitting, the levels at which a path of the root continues as several; copies then get other
-            random numbers, and no onset is forced. None without splitting.
+        spacing: proposed probability per copy: one copy is made for each interval of this length.
+        ratios: for each cell, how many times more often a first disturbance is proposed than it occurs by its own
+            probability law; 1 if the cell is missing. A cell is a model with one strength, such as ``brake=4.0``.
+        second: cells of first disturbances whose copies also get forced second disturbances.
+        second_spacing: probability per forced second disturbance; 0 for none.
+        levels: with splitting, the levels at which a path of the root is copied; the copies then get other random
+            numbers, and no disturbance is forced. None without splitting.
     """
 
     spacing: float
@@ -110,24 +110,27 @@ class Forcing(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class TrialSpec(Serializable):
-    """Everything that determines one trial.
+    """The specification of one trial, which determines the trial completely.
 
     Args:
-        number: number of the trial in the hunt, from 0.
-        seed: seed for the simulator, the agents and the global generators; 0 to 2**31 - 1.
-        arguments: agent id to a mapping from argument name to value.
-        scenario_arguments: argument name to value.
+        number: number of the trial in the hunt, counted from 0.
+        seed: seed of the simulator, of the agents and of the process's random generators, from 0 to 2**31 - 1.
+        arguments: values of the agents' arguments, by agent id and argument name.
+        scenario_arguments: values of the scenario's arguments, by name.
         max_steps: maximum number of steps of the trial.
         overruled: The override of an agent's actions; None if all agents act to the end.
         parent: The trial from which the sampler derived this trial, or None. It does not affect the trial.
         origin: The sampler's label, such as the name of a strategy. It does not affect the trial.
         disturbances: The planned disturbances, sorted by step.
-        only: The other actors that take part; None for all. Minimized crashes have it.
-        script: Recorded paths along which all other actors are moved; the agents begin at the start of their paths, and
-            the scenario's traffic takes no part. None if the other actors drive.
-        handover: The agent that takes over from recorded actions, and when; None if all agents act from the start.
-        reseeding: When the simulator's generators are re-seeded, and the seed; None if they keep the trial's seed.
-        forcing: How forks of the trial are disturbed; None for no such forks. It does not affect the trial itself.
+        only: The other actors that take part; None for all actors. Minimized crashes use this field.
+        script: Recorded paths along which all other actors are moved. The agents begin at the start of their paths, and
+            the scenario's traffic is excluded. None if the other actors drive themselves.
+        handover: The agent that takes control after recorded actions, and the step; None if all agents act from the
+            start.
+        reseeding: The steps after which the simulator's random generators are re-seeded, and the seeds; None if they
+            keep the trial's seed.
+        forcing: How disturbances are forced on forks of the trial; None for no such forks. It does not affect the trial
+            itself.
     """
 
     number: int
@@ -146,7 +149,7 @@ class TrialSpec(Serializable):
     forcing: Forcing | None = field(default=None, metadata=OMIT_DEFAULT)
 
     def to_json(self) -> JsonObject:
-        """Return plain dicts and numbers; ``requires`` names what another version must know."""
+        """Return the specification as plain data; ``requires`` lists features that another version must know."""
         data = to_plain(self)
         inner = [one for one in (self.overruled, self.reseeding) if one is not None]
         if requires := [name for one in (self, *inner) for name in required_of(one)]:

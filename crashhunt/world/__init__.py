@@ -1,4 +1,4 @@
-"""The road at one step and the distances on it: scenes, outlines, contacts, the closest approach, criticality."""
+"""The road at one step and the distances on it: scenes, outlines, contacts, closest approach and criticality."""
 
 import lazy_loader
 

@@ -1,10 +1,11 @@
 """The closest approach of an episode to a crash: time to collision, gap, required deceleration.
 
-Computes for each scene the three measures between a controlled vehicle and every other actor, and keeps the best ones.
+The module computes three measures between a controlled vehicle and every other actor in each scene, and keeps the most
+critical values.
 
-Invariant: the result is that of all pairs of rectangles. A pair is skipped only where circles around and within the
-outlines prove that it cannot improve on the best value. Many scenes are computed in one NumPy call, because the
-overhead of a call exceeds the arithmetic of one scene tenfold. Sources are cited at `ApproachMeter`.
+Invariant: the result is the same as for all pairs of rectangles. A pair is skipped only if circles around and inside
+the outlines prove that it cannot be more critical. Many scenes are computed in one NumPy call, because the overhead of
+a call exceeds the arithmetic of one scene tenfold. Sources are cited at `ApproachMeter`.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ __all__ = ["ApproachMeter", "ClosestApproach", "approaches", "closest_approach",
 
 @dataclass(frozen=True, slots=True)
 class ClosestApproach(Serializable):
-    """The closest approach of a trial to a crash: each value over all steps, controlled vehicles and other actors.
+    """The closest approach of a trial to a crash: the most critical values over all steps, agents and other actors.
 
     Args:
-        time_to_collision_s: the minimum, at constant velocities; infinite if no courses crossed.
-        gap_m: the minimum distance between outlines; 0 at a touch.
-        required_deceleration: the maximum that was needed to avoid a collision, in m/s².
+        time_to_collision_s: the minimum time to collision at constant velocities, in s; infinite if no paths crossed.
+        gap_m: the minimum distance between outlines, in m; 0 if they touch.
+        required_deceleration: the maximum deceleration that was needed to avoid a collision, in m/s².
     """
 
     time_to_collision_s: float = field(default=math.inf, metadata=null_is(math.inf))
@@ -60,12 +61,12 @@ _LEAST_GAP_M = 0.01
 class ApproachMeter:
     """Measures the closest approach over the scenes of an episode, many scenes at a time.
 
-    Time to collision: J. C. Hayward, Near-miss determination through use of a scale of danger (1972), here of
-    outlines at constant velocity. Required deceleration (DRAC): D. F. Cooper and N. Ferguson, Traffic studies at
-    T-junctions (1976): v² / (2 gap) = v / (2 TTC), v being the closing speed.
+    Time to collision: J. C. Hayward, Near-miss determination through use of a scale of danger (1972); here for outlines
+    at constant velocity. Required deceleration (DRAC): D. F. Cooper and N. Ferguson, Traffic studies at T-junctions
+    (1976): v² / (2 gap) = v / (2 TTC), v being the closing speed.
 
     Args:
-        agents: the controlled vehicles.
+        agents: identifiers of the controlled vehicles.
     """
 
     def __init__(self, agents: Sequence[str]) -> None:
@@ -73,7 +74,7 @@ class ApproachMeter:
         self.closest = ClosestApproach()
 
     def measure(self, frames: Sequence[Frame]) -> None:
-        """Measure more scenes and update the closest approach."""
+        """Measure further scenes, and update the closest approach."""
         for agent in self._agents:
             closest = self.closest
             times, gaps, brakes = approaches(frames, agent, closest, only_best=True)
@@ -85,10 +86,11 @@ class ApproachMeter:
 
 
 def closing_rate(frame: Frame, agent: str) -> float:
-    """Return the greatest closing speed by gap of the vehicles ahead of an agent in the last scene, in 1/s.
+    """Return the greatest ratio of closing speed to gap over the vehicles ahead of an agent in the last scene, in 1/s.
 
-    It is the inverse of the time to collision, of vehicles that drive the same way in the same lane, and 0 where there
-    is none. Oncoming traffic and crossing traffic do not count: in a bend, constant velocities collide everywhere.
+    The ratio is the inverse of the time to collision with vehicles that drive in the same direction in the same lane;
+    it is 0 without such a vehicle. Oncoming and crossing traffic does not count, because in a bend constant velocities
+    lead to collisions everywhere.
     """
     roster, columns = frame.roster, frame.columns[-1]
     count, own = len(roster.actors), roster.index.get(agent)
@@ -107,7 +109,7 @@ def closing_rate(frame: Frame, agent: str) -> float:
 
 
 def closest_approach(scenes: Sequence[Scene], agents: Sequence[str]) -> ClosestApproach:
-    """Return the closest approach over some scenes."""
+    """Return the closest approach over the given scenes."""
     meter = ApproachMeter(agents)
     for first in range(0, len(scenes), _SCENES_PER_CALL):
         meter.measure([scene.frame for scene in scenes[first : first + _SCENES_PER_CALL]])
@@ -120,10 +122,10 @@ def approaches(
     """Return the closest approach of an agent in each scene.
 
     Args:
-        frames: frames in order.
-        agent: the controlled vehicle; scenes without it have no approach.
-        closest: the closest approach so far; approaches that are not closer in any measure may be skipped.
-        only_best: whether an approach may also be skipped if another scene has a closer one.
+        frames: frames of the scenes, in order.
+        agent: identifier of the controlled vehicle; scenes without it have no approach.
+        closest: the closest approach before these scenes; approaches that are not closer in any measure may be skipped.
+        only_best: whether an approach may also be skipped if another of the scenes has a closer approach.
 
     Returns:
         Time to collision (s), gap (m), required deceleration (m/s²), each of shape (scenes,). Gaps of more than 50 m
@@ -147,7 +149,7 @@ def approaches(
         others &= _on_one_level(whole, forward)
 
     def pairs(rows: NDArray[np.intp]) -> tuple[NDArray[np.float64], ...]:
-        """Offsets, velocities and turns in the agent's frame, and both half sizes."""
+        """Return offsets, velocities and turns in the agent's frame, and the half sizes of both rectangles."""
         c, s = forward[own[rows], 0], forward[own[rows], 1]
         turned = [np.stack((v[rows, 0] * c + v[rows, 1] * s, v[rows, 1] * c - v[rows, 0] * s), axis=1)
                   for v in (offset, relative)]  # fmt: skip
@@ -184,7 +186,7 @@ def approaches(
 
 
 class _Block(NamedTuple):
-    """Rectangles of scenes with an agent: front, motion, and the agent rectangle that each is measured against."""
+    """The rectangles of several scenes with an agent: fronts, motions, and the agent rectangle to compare each with."""
 
     x: NDArray[np.float64]
     y: NDArray[np.float64]
@@ -198,7 +200,7 @@ class _Block(NamedTuple):
     tall: NDArray[np.float64]
 
     def moved(self, step: int, first: int) -> _Block:
-        """Return the same rectangles with an offset added to the numbers of scenes and agents."""
+        """Return the same rectangles, with an offset added to the numbers of scenes and of agent rectangles."""
         return self._replace(step=self.step + step, own=self.own + first)
 
 
@@ -219,7 +221,7 @@ def _whole_block(frames: Sequence[Frame], agent: str, closest: ClosestApproach) 
 def _near_block(
     frames: Sequence[Frame], agent: str, closest: ClosestApproach, only_best: bool = False
 ) -> _Block | None:
-    """Return only the rectangles that may be near, found by the core; None if the core cannot do that."""
+    """Return only the rectangles that may be near, as found by the core; None if the core cannot do this."""
     core = core_of(frames)
     if core is None:
         return None
@@ -268,7 +270,7 @@ def _block(frame: Frame, row: int) -> _Block:
 
 
 def _bent_blocks(frame: Frame, row: int) -> list[_Block]:
-    """Return one block per scene and part of the agent; each part is measured against all parts of the others."""
+    """Return one block for each part of the agent; each part is compared with all parts of the other actors."""
     blocks = []
     for step in range(len(frame.columns)):
         scene = frame.scene(step)
@@ -299,7 +301,7 @@ def _bent_blocks(frame: Frame, row: int) -> list[_Block]:
 
 
 def _on_one_level(whole: _Block, forward: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for each rectangle whether `same_level` holds between it and the agent."""
+    """Return for each rectangle whether it is on the same level as the agent, as defined by `same_level`."""
     own = whole.own
     dx, dy = whole.x - whole.x[own], whole.y - whole.y[own]
     ahead = whole.grade[own] * (dx * forward[own, 0] + dy * forward[own, 1])

@@ -1,12 +1,12 @@
-"""The first contact of two actors between two scenes: when, with which sides, and which one drives into the other.
+"""The first contact of two actors between two scenes: its time, the touched sides, and the collider.
 
-Computes when two moving rectangles first overlap. Scenes are one step apart (0.1 s to 1 s). A test of the scenes alone
-would miss contacts between them, and report other contacts too late.
+The module computes when two moving rectangles first overlap. Scenes are one step apart (0.1 s to 1 s). A test of only
+the scenes would miss contacts between two scenes, and would report other contacts too late.
 
-Each rectangle follows a cubic between its poses (`_Way`). Conservative advancement then moves forward in time by the
-gap divided by a bound of the approach speed, so no contact is skipped (B. Mirtich, Impulse-based dynamic simulation of
-rigid body systems, 1996). A fixed small time step would be slower and could miss a short overlap. Bisection finds the
-time of the overlap to within 1e-9 of a step.
+Each rectangle follows a cubic curve between its poses (`_Way`). Conservative advancement repeatedly moves forward in
+time by the gap divided by a bound of the approach speed, so no contact is skipped (B. Mirtich, Impulse-based dynamic
+simulation of rigid body systems, 1996). A fixed small time step would be slower and could miss a short overlap.
+Bisection finds the time of the overlap to within 1e-9 of a step.
 """
 
 from __future__ import annotations
@@ -62,18 +62,18 @@ class Touch:
     """The first contact of two actors.
 
     Args:
-        time_s: simulation time, in s.
-        share: share of the step, from 0 to 1; 1 is the present scene.
+        time_s: simulation time of the contact, in s.
+        share: time of the contact as a share of the step, from 0 to 1; 1 is the present scene.
         drives_into: whether the first actor drives into the second; otherwise the second drives into the first.
         x: x of the first actor's front bumper, in m.
-        y: y of the front bumper of the controlled vehicle, in m.
+        y: y of the first actor's front bumper, in m.
         speed: speed of the first actor, in m/s.
         other_speed: speed of the second actor, in m/s.
         face: the side of the first actor that is touched.
         other_face: the side of the second actor that is touched.
-        turn: the heading of the second actor less that of the first, in rad, within -pi and pi.
-        jumps: whether the first actor makes the contact by an instantaneous lane change.
-        other_jumps: whether the second actor does.
+        turn: heading of the second actor minus heading of the first actor, in rad, from -pi to pi.
+        jumps: whether the first actor causes the contact by an instantaneous lane change.
+        other_jumps: whether the second actor causes the contact by an instantaneous lane change.
         gap_m: a lower bound of the distance between their outlines; 0 if they touch.
     """
 
@@ -93,19 +93,19 @@ class Touch:
 
     @property
     def is_sideways(self) -> bool:
-        """Whether an instantaneous lane change makes the contact."""
+        """Whether an instantaneous lane change causes the contact."""
         return self.jumps or self.other_jumps
 
 
 @dataclass(frozen=True, slots=True)
 class _Party:
-    """An actor at the contact.
+    """An actor at the time of the contact.
 
     Args:
         rectangle: the part of the actor that is touched.
         leads: whether this is the front part of the actor.
         trails: whether this is the back part of the actor.
-        velocity: velocity of this part, without a jump, in m/s.
+        velocity: velocity of this part, without a jump sideways, in m/s.
         jump: sideways jump of the actor at the contact, in m.
     """
 
@@ -120,7 +120,7 @@ class _Party:
         return math.hypot(*self.velocity) < STANDS_MPS
 
     def face(self, x: float, y: float) -> Face:
-        """Return the side of the rectangle that faces a direction."""
+        """Return the side of the rectangle that faces the given direction."""
         c, s = math.cos(self.rectangle[2]), math.sin(self.rectangle[2])
         ahead, left = x * c + y * s, y * c - x * s
         if abs(ahead) > _FRONT_COSINE and (self.leads if ahead > 0 else self.trails):
@@ -131,10 +131,10 @@ class _Party:
 class _Way:
     """The motion of one rectangle from one scene to the next.
 
-    Its centre follows a cubic with the headings at both ends as tangents. The heading of a vehicle is the direction of
-    the lane below its centre rather than below its bumper. Where the end is further to the side than any bend
-    explains, the vehicle has changed lanes instantaneously. As in SUMO, it then moves in its old lane first, and jumps
-    to the new one at the end.
+    The centre of the rectangle follows a cubic curve whose tangents are the headings at both ends. The heading of a
+    vehicle is the direction of the lane below its centre rather than below its bumper. If the end is further to the
+    side than any bend explains, the vehicle has changed lanes instantaneously. As in SUMO, the vehicle then moves in
+    its old lane first, and jumps to the new lane at the end.
     """
 
     __slots__ = ("_heading", "_size", "end", "jump", "legs", "points", "reach", "slack", "turn")
@@ -168,7 +168,7 @@ class _Way:
         self.legs = tuple((b[0] - a[0], b[1] - a[1]) for a, b in pairwise(self.points))
 
     def at(self, share: float) -> Rectangle:
-        """Return the rectangle at a share of the step; at 1, after the jump."""
+        """Return the rectangle at a share of the step; for a share of 1, after the jump."""
         if share >= 1.0:
             return self.end
         rest = 1 - share
@@ -180,7 +180,7 @@ class _Way:
         return x, y, heading, length, width
 
     def moving(self, share: float) -> tuple[float, float]:
-        """Return direction and speed of the centre, in m per step, without a jump."""
+        """Return the direction and the speed of the centre, in m per step, without a jump."""
         rest = 1 - share
         a, b, c = 3 * rest * rest, 6 * rest * share, 3 * share * share
         (x0, y0), (x1, y1), (x2, y2) = self.legs
@@ -188,12 +188,12 @@ class _Way:
 
 
 def poses_between(start: Rectangle, end: Rectangle, shares: Sequence[float], *, bends: bool = True) -> list[Rectangle]:
-    """Return the rectangles of an actor at some shares of a step, on the way that contacts are computed with.
+    """Return the rectangles of an actor at some shares of a step, on the path that contacts are computed with.
 
     Args:
-        start: start at the beginning of the step: x and y of the front in m, heading in rad, length and width in m.
-        end: pose at the end of the step, likewise.
-        shares: share of the step, 0 to 1; an instantaneous lane change takes place at 1.
+        start: pose at the beginning of the step: x and y of the front in m, heading in rad, length and width in m.
+        end: pose at the end of the step, in the same form.
+        shares: shares of the step, from 0 to 1; an instantaneous lane change takes place at 1.
         bends: whether the actor drives along a curve; persons do not.
     """
     way = _Way(start, end, bends=bends)
@@ -201,16 +201,16 @@ def poses_between(start: Rectangle, end: Rectangle, shares: Sequence[float], *, 
 
 
 def first_contact(previous: Scene | None, present: Scene, row: int, other: int) -> Touch | None:
-    """Return when two actors first touch, after the previous scene and up to the present one.
+    """Return the first contact of two actors after the previous scene and up to the present scene.
 
     Args:
-        previous: the scene one step before; None looks at the present one only.
-        present: the scene.
-        row: one actor.
-        other: another.
+        previous: the scene one step before; if None, only the present scene is examined.
+        present: the present scene.
+        row: row of the first actor in the present scene.
+        other: row of the second actor in the present scene.
 
     Returns:
-        The first contact; None if they do not touch, or pass on different levels.
+        The first contact; None if the actors do not touch, or pass each other on different levels.
     """
     pair = (row, other)
     before = _rows_before(previous, present, pair)
@@ -219,18 +219,19 @@ def first_contact(previous: Scene | None, present: Scene, row: int, other: int) 
 
 
 def contact_at(previous: Scene | None, present: Scene, row: int, other: int, *, swept: bool = True) -> Touch:
-    """Return the contact of two actors that are known to have collided, in the same way as `first_contact`.
+    """Return the contact of two actors that are known to have collided, computed as in `first_contact`.
 
     Args:
-        previous: the scene one step before; None examines the present one only.
+        previous: the scene one step before; if None, only the present scene is examined.
         present: the scene of the contact.
-        row: one actor.
-        other: another.
-        swept: as in `Scene`. If not, actors move in straight lines and jump nowhere, and the time is an estimate.
+        row: row of the first actor in the present scene.
+        other: row of the second actor in the present scene.
+        swept: whether actors drive along curves, as in `Scene`. If not, they move in straight lines without jumps, and
+            the time is an estimate.
 
     Returns:
-        The contact. If the outlines do not touch, as in some collisions that a simulator reports, the positions at the
-        end of the step.
+        The contact. If the outlines do not touch, as in some collisions reported by simulators, the positions at the
+        end of the step are used.
     """
     pair = (row, other)
     before = _rows_before(previous, present, pair)
@@ -247,7 +248,7 @@ def _ways(
     *,
     bends: bool = True,
 ) -> list[list[_Way]]:
-    """Return the ways of the parts of both actors."""
+    """Return the motions of the parts of both actors."""
     ways: list[list[_Way]] = []
     for place, who in enumerate(pair):
         if previous is None or before is None:
@@ -295,7 +296,7 @@ def _touch(
     ways: list[list[_Way]],
     best: tuple[float, int, int],
 ) -> Touch:
-    """Describe the contact at a share of the step, of a part of each actor."""
+    """Return the contact at a share of the step, between one part of each actor."""
     share, *parts = best
     time_s, step_s, speeds = present.time_s, 0.0, [present.speeds[who] for who in pair]
     if previous is not None and before is not None:
@@ -338,10 +339,11 @@ def _touch(
 
 
 def _speed_at(share: float, was: float, now: float, way: _Way, step_s: float) -> float:
-    """Return the speed at a share of a step, in m/s.
+    """Return the speed of an actor at a share of a step, in m/s.
 
-    Simulators integrate differently: SUMO's default drives the whole step at the new speed, others with a constant
-    acceleration. The distance of the step decides which of the two, or which mixture, it was.
+    Simulators integrate differently. By default, a vehicle of SUMO drives the whole step at the new speed; in other
+    simulators, the acceleration is constant. The distance driven in the step shows which of the two methods, or which
+    mixture, was used.
     """
     (x0, y0), *_, (x1, y1) = way.points
     mean, driven = (was + now) / 2, math.hypot(x1 - x0, y1 - y0) / step_s
@@ -352,12 +354,12 @@ def _speed_at(share: float, was: float, now: float, way: _Way, step_s: float) ->
 def lane_jump(previous: Scene, present: Scene, actor: str) -> float:
     """Return how far an actor jumped sideways between two scenes, in m to its left; 0 if it did not jump.
 
-    SUMO changes lanes in an instant. A movement that a bend explains is no jump, nor is a teleport.
+    SUMO changes lanes in an instant. A movement that a bend explains is not a jump, and neither is a teleport.
 
     Args:
         previous: the scene one step before.
-        present: the scene.
-        actor: its identifier.
+        present: the present scene.
+        actor: identifier of the actor.
     """
     was, row = previous.roster.index.get(actor), present.roster.index.get(actor)
     if was is None or row is None or is_person(actor) or _rows_before(previous, present, (row, row)) is None:
@@ -369,12 +371,12 @@ def lane_jump(previous: Scene, present: Scene, actor: str) -> float:
 
 
 def reachable_m(speed: float, time_s: float) -> float:
-    """Return the greatest distance that an actor of this speed can drive in a step; a larger one is a teleport."""
+    """Return the maximum distance that an actor with a speed can drive in a step; a longer movement is a teleport."""
     return 1.5 * speed * time_s + 1.0
 
 
 def _rows_before(previous: Scene | None, present: Scene, pair: tuple[int, int]) -> tuple[int, int] | None:
-    """Return both rows in the previous scene; None if an actor was absent, or was moved instead of driving."""
+    """Return the rows of both actors in the previous scene; None if an actor was absent, or did not drive there."""
     if previous is None:
         return None
     found = []
@@ -398,7 +400,7 @@ def _pieces(scene: Scene, row: int) -> int:
 
 
 def _sideways_excess(dx: float, dy: float, heading: float, turn: float) -> float:
-    """Return how far to the left, in m, a displacement exceeds what a bend with this change of heading can explain."""
+    """Return the distance to the left, in m, by which a movement exceeds what a bend with this turn explains."""
     across = dy * math.cos(heading) - dx * math.sin(heading)
     end = heading + turn
     across_end = dy * math.cos(end) - dx * math.sin(end)
@@ -413,9 +415,10 @@ def _same_level(scene: Scene, pair: tuple[int, int], ways: tuple[_Way, _Way], on
 
 
 def _first_share(way: _Way, other: _Way, *, until: float, still: bool) -> float | None:
-    """Return the share of the step at which two rectangles first overlap; None if they do not.
+    """Return the share of the step at which two rectangles first overlap; None if they do not overlap.
 
-    Conservative advancement: during the gap divided by a bound of the approach speed, no contact is possible.
+    The method is conservative advancement: no contact is possible during the gap divided by a bound of the approach
+    speed.
     """
     touching = separation(way.end, other.end)[0] < -_MIN_OVERLAP_M
     if still:
@@ -451,7 +454,7 @@ def _bisect(way: _Way, other: _Way, apart: float, together: float) -> float:
 
 
 def _direction(first: _Party, second: _Party) -> tuple[float, float, bool]:
-    """Return the unit vector from the first to the second at their contact, and whether a jump makes the contact."""
+    """Return the unit vector from the first to the second rectangle, and whether a jump causes the contact."""
     jump_x, jump_y = first.jump[0] - second.jump[0], first.jump[1] - second.jump[1]
     length = math.hypot(jump_x, jump_y)
     if length > _JUMP_M:
@@ -471,11 +474,11 @@ def _drives_into(first: _Party, second: _Party, x: float, y: float, *, jumps: bo
     """Return whether the first actor drives into the second.
 
     Args:
-        first: one actor.
-        second: another.
-        x: of the unit vector from the first to the second.
-        y: y of the front bumper of the controlled vehicle, in m.
-        jumps: whether an instantaneous lane change makes the contact.
+        first: the first actor.
+        second: the second actor.
+        x: x of the unit vector from the first to the second actor.
+        y: y of the unit vector from the first to the second actor.
+        jumps: whether an instantaneous lane change causes the contact.
     """
     if jumps:  # the actor that moves into the other's lane
         own, its = first.jump[0] * x + first.jump[1] * y, -second.jump[0] * x - second.jump[1] * y

@@ -1,29 +1,28 @@
-"""Criticality of steps and trials, from 0 (nothing near) to 1 (touched), measured along the ways really driven.
+"""Criticality of steps and trials, from 0 (nothing near) to 1 (contact), measured along real paths.
 
 The criticality of a step is the greater of two measures:
 
 - Post-encroachment time (PET; B. L. Allen, B. T. Shin and P. J. Cooper, Analysis of traffic conflicts and collisions,
-  1978): the time between the agent and another actor at the same place. It is taken along the way that the agent
-  really drove, so oncoming traffic in a bend does not count. For the vehicle ahead in a queue it is the time gap. For
-  t s the criticality is exp(-t / 1.2 s): 0.92 for 0.1 s, 0.43 for 1 s, 0.19 for 2 s.
+  1978): the time between the agent's and another actor's presence at the same place. It is measured along the path that
+  the agent really drove, so oncoming traffic in a bend does not count. For the vehicle ahead in a queue, this is the
+  time gap. For a PET of t s, the criticality is exp(-t / 1.2 s): 0.92 for 0.1 s, 0.43 for 1 s, 0.19 for 2 s.
 - Deceleration rate to avoid a crash (DRAC; D. F. Cooper and N. Ferguson, Traffic studies at T-junctions, 1976): the
-  least constant deceleration with which the agent, otherwise at constant speed on its way, touches no actor within
-  4 s. Actors move along their real ways, not at constant velocities. The criticality is its share of 12 m/s², which
-  exceeds the braking of any vehicle.
-  As in responsibility-sensitive safety (RSS; S. Shalev-Shwartz, S. Shammah and
-  A. Shashua, On a formal model of safe and scalable self-driving cars, 2017), the agent is assumed to respond late.
+  least constant deceleration with which the agent, on the path that it drove, touches no actor within 4 s. Actors move along their real paths, not at constant velocities. The criticality is the ratio of this
+  deceleration to 12 m/s², which exceeds the braking of any vehicle. As in responsibility-sensitive safety (RSS; S.
+  Shalev-Shwartz, S. Shammah and A. Shashua, On a formal model of safe and scalable self-driving cars, 2017), the agent
+  is assumed to respond late.
 
 The criticality of a trial grows with the time integral over its steps, in s, like the time integrated time to collision
-(TIT; M. M. Minderhoud and P. H. L. Bovy, Extended time-to-collision measures for road traffic safety assessment,
-2001): integral / (integral + 10 s), and 1 after a touch. The maximum over agents counts.
+(TIT; M. M. Minderhoud and P. H. L. Bovy, Extended time-to-collision measures for road traffic safety assessment, 2001):
+integral / (integral + 10 s), and 1 after a touch. If there are several agents, the maximum over the agents counts.
 
-Why the integral: it ranks trials better than the maximum over steps, as `scripts/danger` measures. Why real ways:
-constant velocities report a collision course with every oncoming vehicle in a bend.
+Reason for the integral: it ranks trials better than the maximum over steps, as measured by `scripts/danger`. Reason for
+real paths: with constant velocities, every oncoming vehicle in a bend would be on a collision course.
 
-Invariant: actors that approach from behind on the same way do not count. That is rear criticality, a separate number
-(`followers_danger`).
+Invariant: actors that approach from behind on the same path do not count. Their criticality is the rear criticality, a
+separate number (`followers_danger`).
 
-Cost: only actors within reach of the way are tested, at places 1 m to 4 m apart (0.8 of the agent's length). Each
+Cost: only actors within reach of the path are tested, at positions 1 m to 4 m apart (0.8 of the agent's length). Each
 first touch is refined by bisection. Long episodes are summed in windows of 4096 scenes, so memory stays bounded.
 """
 
@@ -78,9 +77,9 @@ class DangerousMoment(NamedTuple):
 
     Args:
         danger: criticality, from 0 to 1.
-        step: its step.
-        agent: the controlled vehicle.
-        other: the other actor; empty if none was near.
+        step: number of the step.
+        agent: identifier of the controlled vehicle.
+        other: identifier of the other actor; empty if no actor was near.
     """
 
     danger: float
@@ -90,10 +89,10 @@ class DangerousMoment(NamedTuple):
 
 
 class DangerMeter:
-    """Measures the criticality of an episode, after the fact, many scenes at a time.
+    """Measures the criticality of an episode after it has been recorded, many scenes at a time.
 
     Args:
-        agents: the controlled vehicles.
+        agents: identifiers of the controlled vehicles.
         step_length_s: step length in s.
     """
 
@@ -105,7 +104,7 @@ class DangerMeter:
         self._sums: dict[str, float | None] = dict.fromkeys(agents)
 
     def add(self, frames: Sequence[Frame]) -> None:
-        """Add scenes, and sum up complete windows."""
+        """Add scenes, and sum up windows of scenes that are complete."""
         self._frames += frames
         self._count += sum(len(frame.columns) for frame in frames)
         if self._count >= _WINDOW:
@@ -117,7 +116,7 @@ class DangerMeter:
 
     @property
     def danger(self) -> float | None:
-        """Return the criticality of all scenes so far; None if no agent was in any of them."""
+        """Return the criticality of all added scenes; None if no scene contains an agent."""
         found = [total for total in self._summed(self._count).values() if total is not None]
         return summed_danger(max(found)) if found else None
 
@@ -138,7 +137,7 @@ def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float
 
     Args:
         frames: frames of the whole episode, in order; later scenes determine the criticality of earlier ones.
-        agents: the controlled vehicles.
+        agents: identifiers of the controlled vehicles.
         step_length_s: step length in s.
     """
     count = sum(len(frame.columns) for frame in frames)
@@ -191,12 +190,12 @@ def _measured(
 
 
 def measured_along(track: Track, others: Others, *, same_way: bool = False) -> tuple[Array, NDArray[np.intp]]:
-    """Return the criticality of each sample of a track, and the number of the other actor (-1 for none).
+    """Return the criticality of each sample of a path, and the number of the other actor (-1 for none).
 
     Args:
-        track: the way of the agent.
-        others: the actors near it.
-        same_way: whether only actors count that the agent would hit from behind, driving in the same direction.
+        track: the path of the agent.
+        others: the paths of the actors near the agent.
+        same_way: whether only those actors count that the agent would hit from behind, driving in the same direction.
     """
     gaps, brakes, who = np.full(len(track.time), np.inf), np.zeros(len(track.time)), np.full(len(track.time), -1)
     if len(others.sample):
@@ -217,7 +216,7 @@ def measured_along(track: Track, others: Others, *, same_way: bool = False) -> t
 
 
 class _Way:
-    """The way that an agent drove, by distance along it, extended straight beyond its end."""
+    """The path that an agent drove, as a function of the distance along it, continued in a straight line."""
 
     def __init__(self, track: Track, *, flat: bool) -> None:
         self._track = track
@@ -234,12 +233,12 @@ class _Way:
         self._time = np.append(track.time, track.time[-1] + on / max(float(self.speed[-1]), 0.1))
 
     def reached(self, along: Array) -> Array:
-        """Return when the agent is at a distance along its way, in s."""
+        """Return the time at which the agent reaches a distance along its path, in s."""
         found: Array = np.interp(along, self._at, self._time)
         return found
 
     def first_contacts(self, others: Others) -> tuple[Array, Array]:
-        """Return how far ahead of and behind the agent its outline first touches each actor; infinite for no touch.
+        """Return the distances ahead and behind at which the agent's outline first touches each actor, or infinity.
 
         Behind the agent, only actors that drive in another direction count.
         """
@@ -255,7 +254,7 @@ class _Way:
         return ahead, behind
 
     def reaches_from_behind(self, others: Others) -> tuple[Array, Array]:
-        """Return the contacts ahead as `first_contacts` does, but only with actors that drive in the same direction."""
+        """Return the distances ahead as `first_contacts` does, but only for actors that drive in the same direction."""
         ahead, _ = self.first_contacts(others)
         there = np.isfinite(ahead)
         heading = np.interp(self.along[others.sample[there]] + ahead[there], self._at, self._heading)
@@ -263,7 +262,7 @@ class _Way:
         return ahead, np.full(len(ahead), np.inf)
 
     def _first(self, others: Others, spacing: float, far: float) -> Array:
-        """Return the first place of contact with each actor, by a search at fixed distances and then bisection."""
+        """Return the first position of contact with each actor, found by a search at fixed distances and bisection."""
         found = np.full(len(others.sample), np.inf)
         base = self.along[others.sample]
         reach = (
@@ -300,9 +299,9 @@ class _Way:
         return found
 
     def _apart(self, others: Others, pair: NDArray[np.intp], along: Array, reach: Array | None = None) -> Array:
-        """Return the distance between the agent at places along its way and other actors; negative where they overlap.
+        """Return the distance between the agent at positions on its path and other actors; negative if they overlap.
 
-        If a reach is given, larger distances are infinite.
+        If `reach` is given, larger distances are returned as infinite.
         """
         x, y = np.interp(along, self._at, self._x), np.interp(along, self._at, self._y)
         dx, dy = others.x[pair] - x, others.y[pair] - y
@@ -340,7 +339,7 @@ class _Way:
 
 
 def _forwards(track: Track) -> float:
-    """Return for each sample 1, or -1 if the agent last moved backwards; lane changes do not count."""
+    """Return for each sample 1, or -1 if the agent last moved backwards; lane changes do not count as movements."""
     moved = np.hypot(np.diff(track.x), np.diff(track.y))
     if not len(last := np.flatnonzero(moved > _MOVES_M)[-1:]):
         return 1.0
@@ -391,13 +390,13 @@ _SIDEWAYS_M = 10.0  # from the line through the agent: an actor never within it 
 
 
 def followers_danger(frames: Sequence[Frame], agent: str, step_length_s: float) -> tuple[Array, DangerousMoment, float]:
-    """Return the rear criticality of an agent: that of the actors that close in on it from behind.
+    """Return the rear criticality of an agent, caused by actors that approach the agent from behind.
 
-    It is computed from a recording. Of articulated vehicles, only the first part counts.
+    The rear criticality is computed from a recording. For articulated vehicles, only the first part counts.
 
     Args:
         frames: frames of the whole episode, in order.
-        agent: the controlled vehicle.
+        agent: identifier of the controlled vehicle.
         step_length_s: step length in s.
 
     Returns:
@@ -431,7 +430,7 @@ def followers_danger(frames: Sequence[Frame], agent: str, step_length_s: float) 
 
 
 def _behind(track: Track, others: Others) -> list[int]:
-    """Return the numbers of actors that were behind the agent at any time, near its line and in its direction."""
+    """Return the numbers of actors that were behind the agent at any time, near its path and in its direction."""
     at = others.sample
     c, s = np.cos(track.heading[at]), np.sin(track.heading[at])
     x, y = others.x - track.x[at], others.y - track.y[at]
@@ -442,7 +441,7 @@ def _behind(track: Track, others: Others) -> list[int]:
 
 
 def _pieces(track: Track, others: Others, number: int) -> Iterator[tuple[NDArray[np.intp], Track, Others]]:
-    """Yield the ways of an actor while it was near, with the samples of the agent as the only actor to reach."""
+    """Yield the paths of an actor while it was near, with the samples of the agent as the only other actor."""
     rows = np.flatnonzero(others.who == number)
     samples, first = np.unique(others.sample[rows], return_index=True)
     rows = rows[first]

@@ -1,15 +1,15 @@
-"""Distance and time that the controlled vehicles drive, from the recorded scenes.
+"""Distance and time that the controlled vehicles drive, computed from the recorded scenes.
 
-Computes for each agent the integral of its speed over the steps in which the agent is in the scene (trapezoidal rule),
-and the number of these steps. Warm-up steps are not recorded, so they do not count.
+For each agent, the module computes the integral of its speed over the steps in which the agent is in the scene
+(trapezoidal rule), and the number of these steps. Warm-up steps are not recorded, so they do not count.
 
 Invariant: the sums depend on the scenes only, not on how the scenes are grouped into frames. Therefore the compiled
-core, which records many steps at once, gives the bits of the Python path. This holds because `numpy.cumsum` adds in
-order. `numpy.sum` adds in pairs, and its rounding depends on the grouping.
+core, which records many steps at once, gives bit-identical sums. The reason is that `numpy.cumsum` adds in order.
+`numpy.sum` adds in pairs, and its rounding depends on the grouping.
 
-Why speeds, not positions: a lane change or a teleport moves a vehicle in one step. The trapezoidal rule is exact where
-the acceleration is constant within a step. SUMO's Euler integration uses the speed at the end of the step, so the two
-differ by at most half a step at the difference of first and last speed.
+Reason for speeds instead of positions: a lane change or a teleport moves a vehicle within one step. The trapezoidal
+rule is exact if the acceleration is constant within a step. SUMO's Euler integration uses the speed at the end of the
+step, so the two distances differ by at most half a step at the difference between first and last speed.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _ROUNDING_DIGITS = 3  # mm and ms
 
 
 class DrivenMeter:
-    """Measures how far and how long agents drive, many scenes at a time.
+    """Measures the distance and the time that agents drive, many scenes at a time.
 
     Args:
-        agents: the controlled vehicles.
+        agents: identifiers of the controlled vehicles.
         step_length_s: step length in s.
     """
 
@@ -46,7 +46,7 @@ class DrivenMeter:
         self._speeds, self._steps, self._seen = 0.0, 0, False
 
     def add(self, frames: Sequence[Frame]) -> None:
-        """Add scenes, in order; scene 0 is the one before the first step."""
+        """Add scenes, in order; scene 0 is the scene before the first step."""
         for agent in self._last:
             run: list[NDArray[np.float64]] = []
             for frame in frames:
@@ -72,11 +72,11 @@ class DrivenMeter:
 
     @property
     def driven_m(self) -> float | None:
-        """The distance of all agents together, in m; None if no scene has an agent, or a speed is not a number."""
+        """The distance driven by all agents together, in m; None if no scene has an agent, or if a speed is unknown."""
         meters = self._speeds * self._dt
         return round(meters, _ROUNDING_DIGITS) if self._seen and math.isfinite(meters) else None
 
     @property
     def driven_s(self) -> float | None:
-        """The time of all agents together, in s of simulation time; None if no scene has an agent."""
+        """The time driven by all agents together, in s of simulation time; None if no scene has an agent."""
         return round(self._steps * self._dt, _ROUNDING_DIGITS) if self._seen else None

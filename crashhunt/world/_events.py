@@ -1,4 +1,4 @@
-"""Traffic events that matter to a traffic engineer even without a crash."""
+"""Traffic events that are relevant to a traffic engineer even without a crash."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ braking vehicle's own type."""
 
 @dataclass(frozen=True, slots=True)
 class Event(Serializable):
-    """Something that happened in the traffic around a controlled vehicle.
+    """An event in the traffic around a controlled vehicle.
 
     Args:
         kind: one of `EVENT_WORDS`.
-        agent: the controlled vehicle that did it, or to which it was nearest.
-        what: description, a clause such as ``ego ran the red light 'c'``.
+        agent: the controlled vehicle that caused the event, or that was nearest to it.
+        what: description of the event, as a clause such as ``ego ran the red light 'c'``.
         others: the other vehicles that took part.
         lane: lane of the controlled vehicle.
         x: x of the front bumper of the controlled vehicle, in m.
@@ -56,7 +56,7 @@ class Event(Serializable):
 
 
 def event_counts(counts: Mapping[str, int]) -> str:
-    """Return the number of events of each kind in words, such as ``2 red lights run, 1 teleport``."""
+    """Return the number of events of each kind as text, such as ``2 red lights run, 1 teleport``."""
     return ", ".join(
         f"{count} {EVENT_WORDS.get(kind, (kind, kind))[count != 1]}" for kind, count in counts.items() if count
     )
@@ -98,23 +98,23 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class RightOfWay:
-    """The paths across all junctions of a map, and which path has to give way.
+    """The paths across all junctions of a map, and which path must yield to which.
 
     Args:
-        links: all paths.
-        gives_way: pairs of indices of ``links``; the first path has to give way to the second.
+        links: all paths across junctions.
+        gives_way: pairs of indices of ``links``; the first path has to yield to the second path.
     """
 
     links: tuple[Link, ...]
     gives_way: frozenset[tuple[int, int]]
 
     def places(self, lanes: tuple[str, ...], x: float, y: float) -> tuple[int, ...]:
-        """Return the indices of the links that an actor may be on, or has just left.
+        """Return the indices of the links on which an actor may be, or which it may just have left.
 
         Args:
-            lanes: the lanes of the actor in order; a lane may occur again.
+            lanes: the lanes of the actor in order; a lane may occur several times.
             x: x of the actor's front bumper, in m.
-            y: y of the front bumper of the controlled vehicle, in m.
+            y: y of the actor's front bumper, in m.
         """
         for back in range(len(lanes) - 1, -1, -1):
             lane, later = lanes[back], lanes[back + 1 :]

@@ -1,4 +1,4 @@
-"""Outlines: oriented rectangles, whether they overlap, how far apart they are, and when they will touch."""
+"""Outlines of actors: oriented rectangles, whether they overlap, their distance, and when they will touch."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ _MIN_OVERLAP_M = 1e-9  # m; less is rounding, not overlap
 
 
 def outlines_overlap(one: Rectangle, two: Rectangle, *, margin: float = 0.0) -> bool:
-    """Whether two outlines overlap, by the separating axis theorem.
+    """Return whether two outlines overlap, by the separating axis theorem.
 
     Args:
-        one: an outline.
-        two: another.
-        margin: distance in m below which two outlines count as overlapping; some pairs slightly beyond it count, too.
+        one: the first outline.
+        two: the second outline.
+        margin: distance in m below which two outlines count as overlapping; some pairs slightly above it also count.
     """
     x1, y1, h1, l1, w1 = one
     x2, y2, h2, l2, w2 = two
@@ -57,11 +57,11 @@ def outlines_overlap(one: Rectangle, two: Rectangle, *, margin: float = 0.0) -> 
 
 
 def separation(one: Rectangle, two: Rectangle) -> tuple[float, float, float]:
-    """Return how far apart two rectangles are along the axis on which they are furthest apart, and that axis.
+    """Return the distance of two rectangles along the axis on which it is greatest, and this axis.
 
     Returns:
-        The distance in m, negative where they overlap, never more than the real gap; and x and y of the unit vector
-        from the first to the second.
+        The distance in m, negative if the rectangles overlap, and never more than the real gap; then x and y of the
+        unit vector from the first to the second rectangle.
     """
     x1, y1, h1, l1, w1 = one
     x2, y2, h2, l2, w2 = two
@@ -92,13 +92,14 @@ def rectangle_gap(
     """Return the distance between pairs of rectangles; 0 if they overlap.
 
     Args:
-        offset: shape (n, 2), from the centre of the first to that of the second, in the frame of the first, in m.
-        turn: shape (n,), heading of the second in the frame of the first, in rad.
-        half_one: shape (n, 2), half length and half width of the first, in m.
-        half_two: half length and half width of the second.
+        offset: shape (n, 2), from the centre of the first rectangle to the centre of the second, in the frame of the
+            first, in m.
+        turn: shape (n,), heading of the second rectangle in the frame of the first, in rad.
+        half_one: shape (n, 2), half length and half width of the first rectangle, in m.
+        half_two: shape (n, 2), half length and half width of the second rectangle, in m.
 
     Returns:
-        Shape (n,), in m.
+        The distances, shape (n,), in m.
     """
     cosine, sine = np.cos(turn), np.sin(turn)
     # Between two convex outlines that do not overlap, a corner of one of them is nearest to the other.
@@ -123,20 +124,22 @@ def time_to_contact(
     half_one: NDArray[np.float64],
     half_two: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return when pairs of rectangles first touch, both at constant velocity; infinite if never.
+    """Return when pairs of rectangles first touch if both move at constant velocity; infinite for never.
 
-    On every separating axis the projections overlap during one interval of time; the outlines touch when all four do.
-    Source: the swept separating axis test, D. Eberly: Intersection of convex objects, the method of separating axes.
+    On every separating axis, the projections overlap during one interval of time. The outlines touch while all four
+    projections overlap. Source: the swept separating axis test, D. Eberly: Intersection of convex objects, the method
+    of separating axes.
 
     Args:
         offset: as in `rectangle_gap`.
-        velocity: shape (n, 2), of the second relative to the first, in the frame of the first, in m/s.
+        velocity: shape (n, 2), velocity of the second rectangle relative to the first, in the frame of the first, in
+            m/s.
         turn: as in `rectangle_gap`.
         half_one: as in `rectangle_gap`.
         half_two: as in `rectangle_gap`.
 
     Returns:
-        Shape (n,), in s; 0 if they overlap already.
+        The times, shape (n,), in s; 0 if the rectangles overlap already.
     """
     cosine, sine = np.cos(turn), np.sin(turn)
     along, across = np.abs(cosine), np.abs(sine)
@@ -162,7 +165,7 @@ def time_to_contact(
 
 
 def _outside(x: NDArray[np.float64], y: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distance of points from rectangles around the origin."""
+    """Return the distances of points from rectangles around the origin."""
     distance: NDArray[np.float64] = np.hypot(
         np.maximum(np.abs(x) - half[:, 0], 0.0), np.maximum(np.abs(y) - half[:, 1], 0.0)
     )
@@ -176,7 +179,7 @@ def _separations(
     half_one: NDArray[np.float64],
     half_two: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the gaps of the projections on the four axes, shape (4, n); if one is positive, there is no overlap."""
+    """Return the gaps of the projections on the four axes, shape (4, n); a positive gap means no overlap."""
     along, across = np.abs(cosine), np.abs(sine)
     x, y = offset[:, 0], offset[:, 1]
     return np.stack(
@@ -202,12 +205,13 @@ Level = tuple[float, float]
 
 
 def outlines(scene: Scene, row: int, *, parts: int = 0) -> list[Rectangle]:
-    """Return what an actor covers: one rectangle, or for a long vehicle in a bend several, from front to back.
+    """Return the outline of an actor: one rectangle, or several from front to back for a long vehicle in a bend.
 
     Args:
-        scene: where.
-        row: the actor.
-        parts: into how many pieces one that is straight is cut; 0 leaves it whole. One that is bent has its own number.
+        scene: the scene that contains the actor.
+        row: row of the actor in the scene.
+        parts: number of pieces into which a straight actor is cut; 0 to leave it whole. A bent actor has its own number
+            of pieces.
     """
     actor = scene.roster.actors[row]
     spine = scene.spines.get(row)
@@ -225,7 +229,7 @@ def outlines(scene: Scene, row: int, *, parts: int = 0) -> list[Rectangle]:
 
 
 def levels(scene: Scene, row: int, *, parts: int = 0) -> list[Level]:
-    """Return the height of each rectangle of `outlines`; equal heights on a flat map."""
+    """Return the height of each rectangle of `outlines`; all heights are equal on a flat map."""
     spine = scene.spines.get(row)
     if not scene.heights:
         return [(0.0, 0.0)] * (len(spine) - 1 if spine is not None else max(1, parts))
@@ -245,9 +249,9 @@ def same_level(one: Rectangle, level: Level, two: Rectangle, other_level: Level,
     On the same road, the grades at both rectangles explain the difference of their heights.
 
     Args:
-        one: a rectangle.
-        level: its height.
-        two: another.
+        one: the first rectangle.
+        level: height of the first rectangle, in m.
+        two: the second rectangle.
         other_level: height of the second rectangle, in m.
         lower_m: height of the lower actor itself, in m.
     """
@@ -258,7 +262,7 @@ def same_level(one: Rectangle, level: Level, two: Rectangle, other_level: Level,
 
 
 def on_one_level(scene: Scene, row: int, other: int) -> bool:
-    """Whether any part of two actors is on the level of a part of the other."""
+    """Return whether any part of an actor is on the same level as any part of another actor."""
     if not scene.heights:
         return True
     actors = scene.roster.actors

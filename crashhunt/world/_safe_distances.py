@@ -1,8 +1,8 @@
 """Safe distances of Responsibility-Sensitive Safety (RSS), and the surroundings for which they are computed.
 
 Source: Shalev-Shwartz, Shammah, Shashua: On a Formal Model of Safe and Scalable Self-driving Cars (2017),
-arXiv:1708.06374. The safe longitudinal distance is definition 1 and lemma 2 there. The same distance to the followers
-and leaders of the target lane decides about a lane change, because a change takes a single step in SUMO.
+arXiv:1708.06374. The safe longitudinal distance comes from definition 1 and lemma 2 of this paper. The same distance to
+the followers and leaders of the target lane decides about a lane change, because a change takes a single step in SUMO.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ def safe_distance(
     braking_mps2: float,
     front_braking_mps2: float,
 ) -> float:
-    """Return the smallest gap from which the rear vehicle can avoid the front one, in m.
+    """Return the smallest gap at which the rear vehicle can avoid hitting the front vehicle, in m.
 
-    During the response time the rear vehicle accelerates as hard as it can, and then brakes. The front vehicle brakes
+    During the response time, the rear vehicle accelerates as hard as it can; then it brakes. The front vehicle brakes
     from the beginning.
 
     >>> round(safe_distance(20, 20, response_s=0.5, acceleration_mps2=2, braking_mps2=4, front_braking_mps2=8), 3)
@@ -58,17 +58,17 @@ def safe_speed(
     braking_mps2: float,
     front_braking_mps2: float,
 ) -> float:
-    """Return the greatest speed of the rear vehicle for which a gap is safe, in m/s; 0 if none is.
+    """Return the greatest speed of the rear vehicle for which a gap is safe, in m/s; 0 if no speed is safe.
 
-    This is the inverse of `safe_distance`, with the same arguments: the positive root of a quadratic equation.
+    This function is the inverse of `safe_distance`, with the same arguments: the positive root of a quadratic equation.
 
     Args:
         gap_m: gap between the vehicles, in m.
-        front_mps: as in `safe_distance`.
-        response_s: as in `safe_distance`.
-        acceleration_mps2: as in `safe_distance`.
-        braking_mps2: as in `safe_distance`.
-        front_braking_mps2: as in `safe_distance`.
+        front_mps: speed of the front vehicle, as in `safe_distance`.
+        response_s: response time, as in `safe_distance`.
+        acceleration_mps2: acceleration of the rear vehicle, as in `safe_distance`.
+        braking_mps2: deceleration of the rear vehicle, as in `safe_distance`.
+        front_braking_mps2: deceleration of the front vehicle, as in `safe_distance`.
     """
     # With the response time t: later² / (2 b) + later t - a t² / 2 = gap + front² / (2 b_front), later = v + a t.
     room = gap_m + front_mps * front_mps / (2 * front_braking_mps2) + acceleration_mps2 * response_s * response_s / 2
@@ -86,7 +86,7 @@ def time_to_drive(distance_m: float, speed_mps: float, acceleration_mps2: float,
         distance_m: distance in m; 0 or less takes no time.
         speed_mps: speed at the beginning, in m/s.
         acceleration_mps2: acceleration until the top speed, in m/s²; at least 0.
-        top_mps: top in m/s; a vehicle that is faster keeps its speed.
+        top_mps: top speed in m/s; a vehicle that is faster keeps its speed.
     """
     if distance_m <= 0:
         return 0.0
@@ -102,15 +102,16 @@ def time_to_drive(distance_m: float, speed_mps: float, acceleration_mps2: float,
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Neighbor:
-    """An actor or a stop line ahead or behind, on one lane.
+    """An actor or a stop line ahead of or behind the agent, on one lane.
 
     Args:
-        actor: its identifier; empty for a red light.
-        gap_m: gap between the bumpers, in m; negative where the vehicles are alongside each other.
-        speed_mps: its speed along the lane, in m/s.
-        braking_mps2: its greatest deceleration, in m/s²; the usual one of its type.
-        acceleration_mps2: its greatest acceleration, in m/s².
-        kind: ``vehicle``, ``red light`` or ``crossing`` (an actor that crosses, at whose path the agent must stop).
+        actor: identifier of the actor; empty for a red light.
+        gap_m: gap between the bumpers, in m; negative if the vehicles are side by side.
+        speed_mps: speed of the actor along the lane, in m/s.
+        braking_mps2: greatest deceleration of the actor, in m/s²; the usual one of its type.
+        acceleration_mps2: greatest acceleration of the actor, in m/s².
+        kind: ``vehicle``, ``red light`` or ``crossing`` (an actor with a crossing path, before which the agent must
+            stop).
     """
 
     actor: str
@@ -123,17 +124,17 @@ class Neighbor:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Crossing:
-    """An actor whose path crosses or joins that of the agent in a junction.
+    """An actor whose path crosses or joins the agent's path in a junction.
 
     Args:
-        actor: its identifier.
-        distance_m: distance of the agent to the conflict area, in m; negative inside and after it.
-        exit_m: exit of the agent until its rear has left the area, in m.
-        actor_distance_m: actor distance of the actor to the area, in m.
-        actor_exit_m: actor exit of the actor until its rear has left the area, in m.
+        actor: identifier of the actor.
+        distance_m: distance of the agent to the conflict area, in m; negative inside and after the area.
+        exit_m: distance that the agent drives until its rear has left the conflict area, in m.
+        actor_distance_m: distance of the actor to the conflict area, in m.
+        actor_exit_m: distance that the actor drives until its rear has left the conflict area, in m.
         speed_mps: speed of the actor, in m/s.
-        braking_mps2: its greatest deceleration, in m/s².
-        has_right_of_way: whether the agent must yield to it.
+        braking_mps2: greatest deceleration of the actor, in m/s².
+        has_right_of_way: whether the agent must yield to the actor.
     """
 
     actor: str
@@ -151,9 +152,9 @@ class Side:
     """The neighbouring lane of an agent on one side.
 
     Args:
-        exists: whether there is a lane that the agent may use.
-        ahead: the nearest vehicle ahead of the agent in this lane.
-        behind: the nearest vehicle behind on it.
+        exists: whether the lane exists and the agent may use it.
+        ahead: the nearest vehicle ahead of the agent in this lane; None if there is none.
+        behind: the nearest vehicle behind the agent in this lane; None if there is none.
     """
 
     exists: bool
@@ -163,15 +164,16 @@ class Side:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surroundings:
-    """What a careful driver would consider in one step.
+    """What a careful driver of the agent's vehicle would consider in one step.
 
     Args:
         speed_mps: speed of the agent, in m/s.
-        acceleration_mps2: its greatest acceleration, in m/s².
-        braking_mps2: its deceleration at full braking, in m/s².
-        ahead: vehicles and red lights on its path.
-        crossing: actors whose paths cross its path.
-        sides: sides by lane change, 1 to the left and -1 to the right; a missing side is unknown, as inside a junction.
+        acceleration_mps2: greatest acceleration of the agent, in m/s².
+        braking_mps2: deceleration of the agent at full braking, in m/s².
+        ahead: vehicles and red lights on the agent's path.
+        crossing: actors whose paths cross the agent's path.
+        sides: the neighbouring lanes by direction, 1 for left and -1 for right; a missing side is unknown, as inside a
+            junction.
     """
 
     speed_mps: float

@@ -1,4 +1,4 @@
-"""The state of the actors at one step, and the collisions that the simulator reports."""
+"""The state of the actors at one step, and the collisions that the simulator reports for it."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ Spine = tuple[tuple[float, float, float], ...]
 
 @dataclass(frozen=True, slots=True)
 class Actor:
-    """The constant properties of an actor.
+    """The properties of an actor that do not change.
 
     Args:
-        id: identifier, unique within the episode; for a person, ``person``, a blank and the person's name.
-        kind: the simulator's class, such as SUMO's ``passenger``, ``truck``, ``pedestrian``.
-        length: length in m.
-        width: width in m.
-        height: height in m; 0 if the map is flat.
+        id: identifier, unique within the episode; for a person, ``person``, a space and the person's name.
+        kind: class of the actor in the simulator, such as SUMO's ``passenger``, ``truck`` or ``pedestrian``.
+        length: length of the actor, in m.
+        width: width of the actor, in m.
+        height: height of the actor, in m; 0 if the map is flat.
     """
 
     id: str
@@ -63,12 +63,12 @@ class Contact:
     """A collision that the simulator itself reports.
 
     Args:
-        collider: the actor that drove into the other.
-        victim: the actor that was hit.
+        collider: identifier of the actor that drove into the other actor.
+        victim: identifier of the actor that was hit.
         kind: the simulator's name of the type.
         lane: lane of the collision.
         collider_speed: speed of the collider, in m/s.
-        victim_speed: speed of the other actor, in m/s.
+        victim_speed: speed of the victim, in m/s.
     """
 
     collider: str
@@ -84,9 +84,9 @@ class Lane:
     """A lane of the map.
 
     Args:
-        id: the simulator's name of it.
-        width: width in m.
-        shape: its centre line, as (x, y) pairs in m.
+        id: name of the lane in the simulator.
+        width: width of the lane, in m.
+        shape: centre line of the lane, as (x, y) pairs in m.
     """
 
     id: str
@@ -98,7 +98,7 @@ class Roster:
     """The actors of a scene, in the order of its rows. A roster is shared by all steps between two changes of actors.
 
     Args:
-        actors: all actors.
+        actors: all actors of the scene.
     """
 
     def __init__(self, actors: tuple[Actor, ...]) -> None:
@@ -106,7 +106,7 @@ class Roster:
 
     @cached_property
     def index(self) -> dict[str, int]:
-        """Actor id to row."""
+        """The row of each actor, by the actor's identifier."""
         return {actor.id: row for row, actor in enumerate(self.actors)}
 
     @cached_property
@@ -141,7 +141,7 @@ class Roster:
 
     @cached_property
     def touch_distance(self) -> float:
-        """The distance of front bumpers beyond which no two outlines touch, in m."""
+        """The distance between front bumpers beyond which no two outlines touch, in m."""
         return 2 * max(self.reaches, default=0.0)
 
     def __len__(self) -> int:
@@ -153,10 +153,10 @@ _NOT_COMPUTED: Any = None  # in place of what is made of the core's columns when
 
 
 class Frame(NamedTuple):
-    """Successive scenes of the same actors, as bare columns.
+    """Consecutive scenes with the same actors, as plain columns.
 
     Args:
-        roster: the actors.
+        roster: the actors of all scenes.
         columns: float64, shape (scenes, 4 n): x and y alternating, then all headings, then all speeds.
         heights: float64, shape (scenes, 2 n): all heights, then all grades; None if the map is flat.
         spines: spines of each scene; None if no long vehicle is in a bend.
@@ -170,7 +170,7 @@ class Frame(NamedTuple):
     core: Core | None = None
 
     def scene(self, number: int) -> Scene:
-        """Return one of the scenes, without its time."""
+        """Return one of the scenes as a frame, without its time."""
         count, row = len(self.roster), self.columns[number].tolist()
         points = list(zip(row[: 2 * count : 2], row[1 : 2 * count : 2], strict=True))
         heights = self.heights[number].tolist() if self.heights is not None else []
@@ -188,7 +188,7 @@ class Frame(NamedTuple):
 
 
 def core_of(frames: Sequence[Frame]) -> Core | None:
-    """Return the compiled core that all of some frames have; None if a frame has none."""
+    """Return the compiled core that all given frames have; None if a frame has no core."""
     core = frames[0].core if frames else None
     if any(frame.core is None or frame.heights is not None or frame.spines is not None for frame in frames):
         return None
@@ -208,8 +208,8 @@ def joined_frame(
 
     Args:
         roster: the roster of all scenes.
-        columns: as in `Frame`.
-        scenes: each one; None if no actor has a height or bends.
+        columns: positions, headings and speeds of all scenes, as in `Frame`.
+        scenes: the scenes; None if no actor has a height or is bent.
         core: the compiled core for this frame.
     """
     heights = spines = None
@@ -223,11 +223,11 @@ def joined_frame(
 
 
 class Scene:
-    """The actors at one instant.
+    """The state of the actors at one time.
 
     Args:
         time_s: simulation time, in s.
-        roster: the actors of the rows.
+        roster: the actors, in the order of the rows.
         points: x and y of the centre of each front bumper, in m.
         headings: headings in rad, counter-clockwise from the x axis.
         speeds: speeds in m/s.
@@ -236,9 +236,10 @@ class Scene:
         lanes: the lane of each actor; empty if the step did not read them.
         heights: z of each front bumper, in m; empty if the map is flat.
         grades: slope of the road at each actor, in m per m, positive if it rises ahead; empty if the map is flat.
-        spines: row to centre line, for long vehicles in a bend.
-        swept: whether all actors have driven here from the previous scene along the way that the headings describe.
-            Contacts between the two scenes can then be found. A lane change of SUMO, a jump sideways, is at the end.
+        spines: centre lines of long vehicles in a bend, by row.
+        swept: whether all actors have driven from the previous scene to their positions along the path that the
+            headings describe. Contacts between the two scenes can then be found. A lane change of SUMO, a jump
+            sideways, is at the end of the path.
         core: compiled core that computes with the scene, if there is one; results are bit-identical.
         columns: points, headings and speeds as arrays of the core; they replace the three arguments.
 
@@ -310,21 +311,21 @@ class Scene:
     # Most steps do without these lists. No `__getattr__`: with one, every attribute of a scene takes longer.
     @property
     def points(self) -> Sequence[tuple[float, float]]:
-        """The centre of each front bumper: x and y, in m."""
+        """The centre of each front bumper, as x and y, in m."""
         if self._points is _NOT_COMPUTED and self.columns is not None:
             self._points = self.columns.points
         return self._points
 
     @property
     def headings(self) -> Sequence[float]:
-        """In rad, counter-clockwise from the x axis."""
+        """The heading of each actor, in rad, counter-clockwise from the x axis."""
         if self._headings is _NOT_COMPUTED and self.columns is not None:
             self._headings = self.columns.headings
         return self._headings
 
     @property
     def speeds(self) -> Sequence[float]:
-        """In m/s."""
+        """The speed of each actor, in m/s."""
         if self._speeds is _NOT_COMPUTED and self.columns is not None:
             self._speeds = self.columns.speeds
         return self._speeds
@@ -343,13 +344,13 @@ class Scene:
 
     @property
     def frame(self) -> Frame:
-        """The scene as bare columns."""
+        """The scene as plain columns."""
         flat = [value for point in self.points for value in point]
         return joined_frame(self.roster, np.array([[*flat, *self.headings, *self.speeds]]), [self])
 
     @property
     def data(self) -> NDArray[np.float64]:
-        """Shape (n, 4): x, y, heading, speed of every actor."""
+        """The x, y, heading and speed of every actor, shape (n, 4)."""
         columns = np.empty((len(self.points), 4))
         columns[:, :2] = np.reshape(self.points, (-1, 2))
         columns[:, 2] = self.headings
@@ -365,7 +366,7 @@ class Scene:
         return centers
 
     def neighbors(self, row: int) -> list[tuple[float, int]]:
-        """Return (squared distance of front bumpers in m², row) of all other actors, nearest first."""
+        """Return (squared distance of front bumpers in m², row) of all other actors, the nearest first."""
         found = self._neighbors.get(row)
         if found is None:
             x, y = self.points[row]
@@ -377,5 +378,5 @@ class Scene:
 
 
 def is_person(actor: str) -> bool:
-    """Whether an actor's id is that of a person."""
+    """Return whether an actor's id is the id of a person."""
     return actor.startswith(PERSON)

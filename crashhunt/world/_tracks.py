@@ -1,4 +1,4 @@
-"""Positions over time as arrays: the way of one agent, and of every actor that came near it."""
+"""Positions over time as arrays: the path of one agent, and the paths of all actors that came near it."""
 
 from __future__ import annotations
 
@@ -50,27 +50,27 @@ def spacing_s(step_length_s: float) -> float:
 
 
 def _every(step_length_s: float) -> int:
-    """Return the stride of sampled steps, more than 1 where steps are short."""
+    """Return the stride between sampled steps; it is above 1 if steps are short."""
     return max(1, round(_APART_S / step_length_s))
 
 
 def _between_steps(step_length_s: float) -> int:
-    """Return the number of samples per step, more than 1 where steps are long."""
+    """Return the number of samples per step; it is above 1 if steps are long."""
     return max(1, math.ceil(step_length_s / _AT_MOST_S - 1e-9))
 
 
 class Track(NamedTuple):
-    """The way of an agent, each of shape (samples,).
+    """The path of an agent as arrays, each of shape (samples,).
 
     Args:
         time: time in s since the first scene.
-        x: of the centre of its outline, in m.
-        y: y of the front bumper of the controlled vehicle, in m.
+        x: x of the centre of the outline, in m.
+        y: y of the centre of the outline, in m.
         heading: heading in rad, without jumps by whole turns.
-        z: of its front, in m.
-        half_length: half length in m.
-        half_width: half width in m.
-        height: height in m.
+        z: z of the front bumper, in m.
+        half_length: half the length of the agent, in m.
+        half_width: half the width of the agent, in m.
+        height: height of the agent, in m.
     """
 
     time: Array
@@ -84,11 +84,11 @@ class Track(NamedTuple):
 
 
 class Others(NamedTuple):
-    """The actors near an agent, each of shape (pairs,): fields as in `Track`.
+    """The actors near an agent as arrays, each of shape (pairs,); all further fields are as in `Track`.
 
     Args:
-        sample: index in the track.
-        who: the number of the actor, as `tracks` numbers them.
+        sample: index of the sample in the track.
+        who: number of the actor, as assigned by `tracks`.
     """
 
     sample: NDArray[np.intp]
@@ -103,7 +103,7 @@ class Others(NamedTuple):
 
 
 def sampled(frames: Sequence[Frame], step_length_s: float) -> Iterator[tuple[Frame, Array]]:
-    """Yield the sampled scenes and the times of their rows, in s; where steps are short, not all scenes are sampled."""
+    """Yield the sampled scenes and the times of their rows, in s; if steps are short, some scenes are skipped."""
     every, step = _every(step_length_s), 0
     for frame in frames:
         steps = np.arange(step, step + len(frame.columns))
@@ -118,12 +118,12 @@ def sampled(frames: Sequence[Frame], step_length_s: float) -> Iterator[tuple[Fra
 
 
 class Reach(NamedTuple):
-    """The part of an agent's way in which other actors matter; actors that do not touch it are irrelevant.
+    """The part of an agent's path in which other actors matter; actors that do not touch this part are irrelevant.
 
     Args:
-        ahead: how far along the way, in m; 0 if all actors matter.
-        behind: how far back, in m.
-        unknown: how far straight on the way is extended at its end, in m.
+        ahead: length of this part ahead along the path, in m; 0 if all actors matter.
+        behind: length of this part backwards along the path, in m.
+        unknown: length by which the path is continued straight at its end, in m.
     """
 
     ahead: float = 0.0
@@ -134,16 +134,17 @@ class Reach(NamedTuple):
 def ways(
     frames: Sequence[Frame], agent: str, within_m: float, step_length_s: float, reach: Reach | None = None
 ) -> tuple[Track, Others, list[str]] | None:
-    """Return the result of `tracks` for instants that are `spacing_s` apart, computed by the core where possible.
+    """Return the result of `tracks` for times that are `spacing_s` apart, computed by the core if possible.
 
-    Where steps are long, samples between two scenes are interpolated along straight lines.
+    If steps are long, samples between two scenes are interpolated along straight lines.
 
     Args:
         frames: frames of an episode.
-        agent: the controlled vehicle.
-        within_m: as for `tracks`.
+        agent: identifier of the controlled vehicle.
+        within_m: maximum distance, as for `tracks`.
         step_length_s: step length in s.
-        reach: if given, the core may skip irrelevant actors, and returns no numbers of actors.
+        reach: part of the path that matters; if given, the core may skip irrelevant actors, and returns no numbers of
+            actors.
     """
     between = _between_steps(step_length_s)
     if between > 1:
@@ -161,24 +162,24 @@ def tracks(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) ->
     """Return the path of an agent, the paths of the actors that came within a distance of it, and their names.
 
     Args:
-        parts: as `sampled` yields them.
-        agent: the controlled vehicle.
-        within_m: greatest distance between centres, in m; actors slightly further away may be included.
+        parts: the sampled scenes, as yielded by `sampled`.
+        agent: identifier of the controlled vehicle.
+        within_m: maximum distance between centres, in m; actors slightly further away may be included.
 
     Returns:
-        None if the agent is in no scene.
+        The paths and the names; None if no scene contains the agent.
     """
     seen = _fronts(parts, agent, within_m)
     return (_track(seen.time, seen.own), _others(seen.theirs), seen.names) if len(seen.time) else None
 
 
 class _Fronts(NamedTuple):
-    """The data of tracks, with fronts in place of centres.
+    """The data of tracks, with front bumpers instead of centres.
 
     Args:
         time: time in s, shape (samples,).
         own: shape (7, samples): x, y, heading, z, half the length and the width, and height of the agent.
-        theirs: sample and actor number, and the same seven of each near actor, each of shape (pairs,).
+        theirs: sample, actor number, and the same seven values of each near actor, each of shape (pairs,).
         names: names of the numbered actors.
     """
 
@@ -253,7 +254,7 @@ _NO_FRONTS = _Fronts(time=np.zeros(0), own=np.zeros((7, 0)), theirs=[np.zeros(0)
 
 
 def _filled(seen: _Fronts, between: int, step_length_s: float) -> _Fronts:
-    """Return fronts with samples between two scenes added, on straight lines for each actor that is in both."""
+    """Return fronts with further samples between two scenes, on a straight line for each actor in both scenes."""
     time, own, theirs, names = seen
     joined = np.diff(time) < 1.5 * step_length_s  # the agent may have been absent for some steps
     size = np.append(np.where(joined, between, 1), 1)
@@ -333,7 +334,7 @@ def _straight(frame: Frame, row: int, names: NDArray[np.intp], within_m: float) 
 
 
 def _bent(frame: Frame, row: int, names: NDArray[np.intp], within_m: float) -> tuple[Array, tuple[Any, ...]]:
-    """Return the same for long vehicles in bends: each part counts as an actor, but only the agent's first part."""
+    """Return the same for articulated vehicles in bends: each part counts as an actor, of the agent only the first."""
     own: list[tuple[float, ...]] = []
     theirs: list[tuple[float, ...]] = []
     for sample in range(len(frame.columns)):
@@ -361,11 +362,11 @@ class ActorState(NamedTuple):
     """The state of an actor after a step.
 
     Args:
-        x: of the centre of the front bumper, in m.
-        y: y of the front bumper of the controlled vehicle, in m.
+        x: x of the centre of the front bumper, in m.
+        y: y of the centre of the front bumper, in m.
         heading: heading in rad, counter-clockwise from the x axis.
         speed: speed in m/s.
-        z: of the front bumper, in m; 0 if the map is flat.
+        z: z of the front bumper, in m; 0 if the map is flat.
         grade: rise of the road per metre.
     """
 
@@ -379,13 +380,13 @@ class ActorState(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """The way of an actor while it was visible; an actor that returns has several.
+    """The path of an actor while it was visible; an actor that returns has several paths.
 
     Args:
-        actor: its id, kind and size.
-        first: the step after which it was first visible; 0 is before the first step.
-        states: states after that step and each that followed.
-        lanes: its lanes as (step, lane), after the steps for which they were recorded.
+        actor: id, kind and size of the actor.
+        first: the step after which the actor was first visible; 0 is before the first step.
+        states: states after this step and after each following step.
+        lanes: lanes of the actor as (step, lane), after the steps for which they were recorded.
         spines: the centre lines of a long vehicle in bends, as (step, centre line).
     """
 
@@ -397,11 +398,11 @@ class Path:
 
     @property
     def last(self) -> int:
-        """The step after which it was last visible."""
+        """The step after which the actor was last visible."""
         return self.first + len(self.states) - 1
 
     def at(self, step: int, step_length_s: float) -> ActorState:
-        """Return the state of the actor after a step; after its last one, it continues straight at constant speed."""
+        """Return the state of the actor after a step; after the last step, it continues straight at constant speed."""
         state = self.states[min(step, self.last) - self.first]
         if step <= self.last:
             return state
@@ -428,13 +429,13 @@ class Path:
 
 @dataclass(frozen=True, slots=True)
 class Paths(Serializable):
-    """The recorded ways of several actors.
+    """The recorded paths of several actors.
 
     Args:
         time_s: simulation time before the first step, in s.
-        steps: number of steps; there is one more state, before the first step.
+        steps: number of steps; there is one more state, the state before the first step.
         agents: paths of the controlled vehicles.
-        others: paths of all other actors, in order of appearance.
+        others: paths of all other actors, in the order of their appearance.
     """
 
     time_s: float
@@ -444,32 +445,32 @@ class Paths(Serializable):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the other actors, each once."""
+        """The names of the other actors, each name once."""
         return tuple(dict.fromkeys(path.actor.id for path in self.others))
 
     def only(self, names: Collection[str]) -> Paths:
-        """Return the paths with only those other actors that are named."""
+        """Return the paths reduced to the named other actors."""
         return replace(self, others=tuple(path for path in self.others if path.actor.id in names))
 
     def driven_by(self, agents: Collection[str]) -> Paths:
-        """Return the paths with only the named agents as agents; the rest are among the others."""
+        """Return the paths with only the named agents as agents; all other agents count as other actors."""
         more = tuple(path for path in self.agents if path.actor.id not in agents)
         left = tuple(path for path in self.agents if path.actor.id in agents)
         return replace(self, agents=left, others=(*more, *self.others))
 
     def cut(self, begin: int, end: int, step_length_s: float) -> Paths:
-        """Return the part from after step ``begin`` to after step ``end``, counted from ``begin``."""
+        """Return the part of the paths from after step ``begin`` to after step ``end``, counted from ``begin``."""
         parts = [[part for path in some if (part := path.cut(begin, end))] for some in (self.agents, self.others)]
         time_s = self.time_s + begin * step_length_s
         return Paths(time_s=time_s, steps=min(end, self.steps) - begin, agents=tuple(parts[0]), others=tuple(parts[1]))
 
     def placing(self) -> Paths:
-        """Return the paths with only the first states of the agents."""
+        """Return the paths, reduced to the first states of the agents."""
         starts = (replace(path, states=path.states[:1], lanes=path.lanes[:1], spines=()) for path in self.agents)
         return replace(self, agents=tuple(starts))
 
     def to_json(self) -> JsonObject:
-        """Return plain data: a readable summary, and the paths as compressed JSON; numbers stay exact."""
+        """Return the paths as data for JSON: a readable summary, and exact numbers in compressed form."""
         plain = [[_plain(path) for path in some] for some in (self.agents, self.others)]
         text = json.dumps(plain, separators=(",", ":"))
         return {
@@ -482,7 +483,7 @@ class Paths(Serializable):
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:
-        """Rebuild what `to_json` returned.
+        """Rebuild paths from the data of `to_json`.
 
         Raises:
             ValueError: the data are damaged.
@@ -497,10 +498,10 @@ class Paths(Serializable):
 
 
 def paths_of(scenes: Sequence[Scene], agents: Collection[str]) -> Paths:
-    """Return the ways of all actors in successive scenes.
+    """Return the paths of all actors in consecutive scenes.
 
     Args:
-        scenes: scenes before the first step and after each.
+        scenes: the scenes before the first step and after each step.
         agents: the ids of the controlled vehicles.
     """
     found: list[_Open] = []
@@ -527,7 +528,7 @@ def paths_of(scenes: Sequence[Scene], agents: Collection[str]) -> Paths:
 
 
 class _Open:
-    """The way of an actor that is still visible."""
+    """The path of an actor that is still visible."""
 
     def __init__(self, actor: Actor, first: int) -> None:
         self._actor, self._first = actor, first
