@@ -1,4 +1,4 @@
-"""Samplers: which arguments the next trial gets."""
+"""Samplers: they choose the arguments of the next trial."""
 
 import lazy_loader
 

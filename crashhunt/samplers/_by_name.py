@@ -1,4 +1,4 @@
-"""Samplers by name: creates them, calls them, and turns each failure of a user's sampler into one clear line."""
+"""Samplers by name: creates and calls them, and reports each failure of a user's sampler as one clear line."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ _SEEDS = 2**31
 
 
 class NamedSampler:
-    """A sampler by its name, of which everything that it answers is checked.
+    """A sampler that was created by name, and whose proposals are all checked.
 
     Args:
         name: a registered name, ``optuna:NAME``, or ``module:attribute``.
-        space: what to sample.
-        points: how many values to try of a range without a step.
-        hunt: what one that wants it may know of the hunt.
+        space: the space of the arguments to sample.
+        points: number of values to try for a range without a step.
+        hunt: facts about the hunt, for samplers that request them.
 
     Raises:
-        PluginError: there is no such sampler, it cannot be made, or it is none.
-        CrashhuntError: it refuses the space.
+        PluginError: the sampler does not exist, cannot be created, or is not a sampler.
+        CrashhuntError: the sampler refuses the space.
     """
 
     def __init__(self, name: str, space: Space, *, points: int, hunt: HuntFacts = HuntFacts()) -> None:  # noqa: B008
@@ -70,29 +70,29 @@ class NamedSampler:
 
     @property
     def learns(self) -> bool:
-        """Whether it receives results."""
+        """Whether the sampler receives results."""
         return self._sampler.learns
 
     @property
     def independent(self) -> bool:
-        """Whether it draws every trial independently of the others; one that does not say so does not."""
+        """Whether the sampler declares that it draws every trial independently of the others."""
         return isinstance(self._sampler, Independent) and self._sampler.independent
 
     @property
     def plain_origin(self) -> str:
-        """The origin of the trials that it draws independently of all others; empty if it keeps none apart."""
+        """The origin of the trials that the sampler draws independently of all results; empty if there are none."""
         return self._sampler.plain_origin if isinstance(self._sampler, PlainStream) else ""
 
     @property
     def version(self) -> int:
-        """The version of its proposals, 1 if it has none: another one proposes other trials for the same results."""
+        """The version of the sampler's proposals, by default 1; another version may propose other trials."""
         return self._sampler.version if isinstance(self._sampler, Versioned) else 1
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
-        """Return its proposal.
+        """Return the sampler's proposal for a trial.
 
         Raises:
-            PluginError: it fails, or what it answers is none.
+            PluginError: the sampler failed, or did not return a valid proposal.
         """
         try:
             with exits_refused():
@@ -110,10 +110,10 @@ class NamedSampler:
         return proposal
 
     def tell(self, result: TrialResult) -> None:
-        """Tell it how a trial ended.
+        """Report to the sampler how a trial ended.
 
         Raises:
-            PluginError: it fails.
+            PluginError: the sampler failed.
         """
         try:
             with exits_refused():
@@ -149,10 +149,10 @@ class NamedSampler:
 
 
 def varies_only_asked(name: str) -> bool:
-    """Return whether a sampler varies only the arguments that the user asks for by name.
+    """Return whether a sampler varies only the arguments that the user requests by name.
 
     Raises:
-        PluginError: there is no such sampler.
+        PluginError: the sampler does not exist.
     """
     kind = _maker(name)
     return isinstance(kind, OnlyAsked) and kind.only_asked

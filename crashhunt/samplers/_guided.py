@@ -193,7 +193,7 @@ class KnownCrashes:
         return seed in self._seeds or bool(self._covered(point[None])[0])
 
     def is_new(self, trial: ScoredTrial) -> bool:
-        """Return whether a crash has an unknown type; without a type, whether no known crash is near it."""
+        """Return whether the type of a crash is unknown; for a crash without a type, whether no known crash is near."""
         return trial.kind not in self._kinds if trial.kind else not self.cover(trial.point)
 
     def outside(self, trials: Sequence[ScoredTrial]) -> list[ScoredTrial]:
@@ -320,8 +320,8 @@ class Portfolio:
 
     Args:
         cube: cube of the arguments.
-        space: the same as distributions.
-        hunt: its seed scrambles the sequence.
+        space: the space of the arguments, as distributions.
+        hunt: facts about the hunt, whose seed scrambles the sequence.
     """
 
     def __init__(self, cube: Cube, space: Space, hunt: HuntFacts) -> None:
@@ -388,7 +388,7 @@ class Portfolio:
         return Draft(self._even.point(place), origin=_EVEN)
 
     def _drawn(self, rng: np.random.Generator) -> list[str]:
-        """Return the strategies in the order in which they are asked; none where it is the even search's turn."""
+        """Return the strategies in the order in which they are called; empty if it is the even search's turn."""
         names = []
         elsewhere = _CLIMBING_THERE if self._niches.climbs else _OTHER_PEAKS
         if self._is_stuck and rng.random() < elsewhere / _OF_OURS:

@@ -24,12 +24,12 @@ _PLAIN, _START = "random", "start"
 
 
 class Learning:
-    """The base of all samplers that learn: every fifth trial is random, the others come from a strategy.
+    """The base class of all samplers that learn: every fifth trial is random, and a strategy proposes the others.
 
     Args:
-        space: what to sample.
-        points: not used.
-        hunt: what counts as a crash in it, and its seed.
+        space: the space of the arguments to sample.
+        points: ignored; other samplers need this argument.
+        hunt: facts about the hunt: its seed, and what counts as a crash.
     """
 
     learns = True
@@ -61,7 +61,7 @@ class Learning:
         return Proposal(arguments, seed=draft.seed, parent=draft.parent, origin=draft.origin or self.origin)
 
     def tell(self, result: TrialResult) -> None:
-        """Learn how a trial ended."""
+        """Learn from the result of a trial."""
         trial = scored_trial(result, self._cube, self._hunt)
         if trial is not None and self._cube.dimensions:
             self._strategy.tell(trial)

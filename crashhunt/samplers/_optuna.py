@@ -46,7 +46,7 @@ _NEEDS = {
 
 @dataclass(frozen=True, slots=True)
 class OptunaMaker:
-    """Makes samplers of one kind.
+    """Creates samplers of one class of Optuna.
 
     Args:
         kind: the class in ``optuna.samplers``.
@@ -62,10 +62,10 @@ class OptunaMaker:
 
 
 def optuna_maker(name: str) -> OptunaMaker:
-    """Return what makes the sampler with a name, such as ``optuna:TPESampler`` or ``optuna:tpe``.
+    """Return an object that creates samplers of the given name, such as ``optuna:TPESampler`` or ``optuna:tpe``.
 
     Raises:
-        UsageError: Optuna is not installed, or the sampler is not for hunts, or needs a package more.
+        UsageError: Optuna is not installed, or the sampler is not suitable for hunts, or needs a further package.
         PluginError: Optuna has no such sampler.
     """
     asked = name[len(PREFIX) :]
@@ -95,13 +95,13 @@ def optuna_maker(name: str) -> OptunaMaker:
 
 
 def _short(name: str) -> str:
-    """``tpe`` for TPESampler, tpe-sampler and TPE."""
+    """Return a short name: ``tpe`` for TPESampler, tpe-sampler and TPE."""
     plain = "".join(letter for letter in name.lower() if letter.isalnum())
     return plain.removesuffix("sampler")
 
 
 class _OptunaSampler(Learning):
-    """Asks a study of Optuna."""
+    """A sampler whose proposals come from a study of Optuna."""
 
     origin = ORIGIN
 
@@ -116,8 +116,8 @@ class _OptunaSampler(Learning):
 class _Study:
     """A study that maximizes criticality: a number from 0 to 1 for each numeric argument, a category for each choice.
 
-    Its proposals depend only on the reported results, as crashhunt's samplers promise, so a hunt resumes exactly. Each
-    request and each report therefore uses a new Optuna sampler on the same study, seeded by that trial. A request
+    The proposals depend only on the reported results, as the sampler protocol requires, so a hunt can resume exactly.
+    Each request and each report therefore uses a new Optuna sampler on the same study, seeded by that trial. A request
     leaves no trace in the study (`Storage`). A trial is added to the study when its result is reported.
 
     Args:
@@ -156,7 +156,7 @@ class _Study:
         self._add(scored.point.tolist(), scored.score, scored.number)
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
-        """Return what the study suggests."""
+        """Return the proposal of the study."""
         if self._kind == "QMCSampler":
             self._storage.count_from(place % _LONGEST)
         with self._seeded(int(rng.integers(2**31))), self._storage.asking():
@@ -187,7 +187,7 @@ class _Study:
 
     @contextmanager
     def _seeded(self, seed: int) -> Iterator[None]:
-        """Have a new sampler with a seed, and say nothing of what is experimental or logged."""
+        """Return a context with a new sampler that has the given seed, without warnings and log messages of Optuna."""
         logging, known = self._optuna.logging, self._optuna.logging.get_verbosity()
         logging.set_verbosity(logging.ERROR)
         try:
@@ -220,7 +220,7 @@ class Storage(InMemoryStorage):  # type: ignore[misc] # whose types are not look
 
     @contextmanager
     def asking(self) -> Iterator[None]:
-        """Discard everything that is written inside the context."""
+        """Return a context in which everything that is written is discarded at the end."""
         self._asked = FrozenTrial(
             number=self.count, trial_id=_ASKED, state=TrialState.RUNNING, value=None, datetime_start=None,
             datetime_complete=None, params={}, distributions={}, user_attrs={}, system_attrs={}, intermediate_values={},
@@ -265,7 +265,7 @@ class Storage(InMemoryStorage):  # type: ignore[misc] # whose types are not look
             super().set_study_system_attr(study_id, key, value)
 
     def count_from(self, drawn: int) -> None:
-        """Set the draw counters that samplers keep in attributes of the study, as if they had made so many draws."""
+        """Set the draw counters that samplers keep in attributes of the study, as after that number of draws."""
         for study in self.get_all_studies():
             for key in study.system_attrs:
                 self.set_study_system_attr(study._study_id, key, drawn - 1)

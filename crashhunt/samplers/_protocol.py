@@ -1,4 +1,4 @@
-"""The sampler protocol: what the next trial is to be."""
+"""The sampler protocol: the interface of objects that propose the next trial."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ Space = Mapping[Key, Distribution]
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """What a sampler asks for.
+    """The proposal of a sampler for a trial.
 
     Args:
         arguments: a value for every key of the space.
-        seed: seed of the trial, 0 to 2**31 - 1; None for the one that its number has in the hunt.
-        parent: the number of the trial that it was made from; None if there is none.
-        origin: a word on where it came from, such as the name of a strategy; empty for nothing.
+        seed: seed of the trial, from 0 to 2**31 - 1; None for the seed that follows from the trial's number.
+        parent: number of the trial from which the proposal was derived; None if there is none.
+        origin: a word for the origin of the proposal, such as the name of a strategy; may be empty.
     """
 
     arguments: Mapping[Key, Value]
@@ -51,7 +51,7 @@ class Proposal:
 
 @dataclass(frozen=True, slots=True)
 class HuntFacts:
-    """What a sampler may know of the hunt that it is made for.
+    """The facts about a hunt that its sampler may use.
 
     Args:
         seed: seed of the hunt.
@@ -65,8 +65,8 @@ class HuntFacts:
 class Sampler(Protocol):
     """Proposes trials, and may learn from their results.
 
-    It is created with the space and, as a keyword, ``points``: the number of values to try of a range without a step.
-    It also receives ``hunt`` if it asks for that (`ReceivesHuntFacts`).
+    A sampler is created with the space and, as a keyword, ``points``: the number of values to try for a range without a
+    step. It also receives ``hunt`` if it requests this (`ReceivesHuntFacts`).
 
     Contract: a proposal depends on the constructor's arguments, the trial's number, its generator, and the reported
     results in their order. It never depends on time, on earlier requests or on anything else. A new sampler that
@@ -93,20 +93,20 @@ class Sampler(Protocol):
         """Return a proposal, or only its arguments.
 
         Args:
-            number: number of the trial, from 0.
-            rng: the trial's own generator, the same for the same hunt seed and number.
+            number: number of the trial, counted from 0.
+            rng: the trial's own random generator, the same for the same hunt seed and number.
         """
 
     def tell(self, result: TrialResult) -> None:
-        """Learn how a trial ended; its ``spec`` says what was proposed."""
+        """Learn from the result of a trial; its ``spec`` contains the proposal."""
 
 
 @runtime_checkable
 class OnlyAsked(Protocol):
-    """A sampler that may vary only the arguments that the user asks for by name.
+    """A sampler that may be restricted to varying the arguments that the user requests by name.
 
-    Where ``only_asked`` is true, every other argument is a constant in its space. ``only_asked`` is a class attribute,
-    because it is read before a sampler is created.
+    If ``only_asked`` is true, every other argument is a constant in the sampler's space. ``only_asked`` is a class
+    attribute, because it is read before a sampler is created.
     """
 
     only_asked: bool
@@ -114,9 +114,10 @@ class OnlyAsked(Protocol):
 
 @runtime_checkable
 class ReceivesHuntFacts(Protocol):
-    """A sampler that may be made with one keyword more: ``hunt``, the `HuntFacts`.
+    """A sampler that may be created with a further keyword: ``hunt``, the `HuntFacts`.
 
-    Where ``wants_hunt`` is true, it is. The class says so, for it is asked before a sampler is made.
+    The keyword is passed if ``wants_hunt`` is true. ``wants_hunt`` is a class attribute, because it is read before a
+    sampler is created.
     """
 
     wants_hunt: bool
@@ -124,7 +125,7 @@ class ReceivesHuntFacts(Protocol):
 
 @runtime_checkable
 class Versioned(Protocol):
-    """A sampler whose proposals have a version, from 1: another version proposes other trials for the same results.
+    """A sampler whose proposals have a version, counted from 1; another version may propose other trials.
 
     A hunt cannot resume with another version than it began with. A sampler without a version has version 1.
     """
@@ -134,11 +135,11 @@ class Versioned(Protocol):
 
 @runtime_checkable
 class Independent(Protocol):
-    """A sampler that may draw every trial from the distributions of its space, independently of all others.
+    """A sampler that may draw every trial from the distributions of its space, independently of all other trials.
 
-    Where ``independent`` is true, the share of trials that crash estimates the crash rate of the agent, so the rate
-    gets a confidence interval. Such a sampler draws the scenario's arguments first, in order of their names. Two
-    hunts with one seed therefore have the same traffic for any agent.
+    If ``independent`` is true, the share of trials that crash estimates the crash rate of the agent, so the rate gets a
+    confidence interval. Such a sampler draws the scenario's arguments first, in order of their names. Two hunts with
+    the same seed therefore have the same traffic for any agent.
     """
 
     independent: bool
@@ -146,10 +147,10 @@ class Independent(Protocol):
 
 @runtime_checkable
 class PlainStream(Protocol):
-    """A sampler that learns, and draws some trials as `RandomSampler` does, independently of all results.
+    """A sampler that learns, but draws some trials as `RandomSampler` does, independently of all results.
 
-    Their numbers are fixed beforehand, and ``plain_origin`` is the origin of all of them and of no other trial. The
-    share of them that crash estimates the crash rate of the agent. The other trials are biased towards crashes.
+    The numbers of these trials are fixed in advance. ``plain_origin`` is the origin of exactly these trials. The share
+    of these trials that crash estimates the crash rate of the agent. The other trials are biased towards crashes.
     """
 
     plain_origin: str

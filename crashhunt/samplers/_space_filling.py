@@ -1,4 +1,4 @@
-"""Independent draws."""
+"""Samplers without learning: random draws, grids, sweeps and evenly distributed sequences."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class RandomSampler:
     """Draws every argument independently in every trial.
 
     Args:
-        space: what to draw from.
-        points: not used.
+        space: the space of the arguments to draw.
+        points: ignored; other samplers need this argument.
     """
 
     learns = False
@@ -37,26 +37,26 @@ class RandomSampler:
 
     @property
     def independent(self) -> bool:
-        """Whether draws are independent; a class made of this one that draws in another way says so for itself."""
+        """Whether draws are independent; a subclass that draws in another way overrides this property."""
         return type(self).ask is RandomSampler.ask
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
-        """Return a draw."""
+        """Return a random draw from the space."""
         return Proposal({key: distribution.sample(rng) for key, distribution in self._space})
 
     def tell(self, result: TrialResult) -> None:
-        """Nothing to learn."""
+        """Do nothing, because this sampler does not learn."""
 
 
 # Every combination in turn, and one argument in steps.
 
 
 class GridSampler:
-    """Tries every combination of values in turn; after the last one it begins again, with other seeds.
+    """Tries every combination of values in turn; after the last combination it starts again, with other seeds.
 
     Args:
-        space: the axes; the last one in order of its name varies fastest.
-        points: how many values to try of a range that has no step of its own.
+        space: the axes of the grid; the axis whose name is last in alphabetical order varies fastest.
+        points: number of values to try for a range without a step.
 
     Raises:
         UsageError: ``points`` is below 1.
@@ -73,11 +73,11 @@ class GridSampler:
 
     @property
     def size(self) -> int:
-        """How many combinations there are."""
+        """The number of combinations."""
         return math.prod(len(values) for _, values in self._axes)
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
-        """Return the combination whose turn it is."""
+        """Return the combination for the number of the trial."""
         chosen: dict[Key, Value] = {}
         for key, values in reversed(self._axes):
             number, index = divmod(number, len(values))
@@ -85,18 +85,18 @@ class GridSampler:
         return Proposal(chosen)
 
     def tell(self, result: TrialResult) -> None:
-        """Nothing to learn."""
+        """Do nothing, because this sampler does not learn."""
 
 
 class SweepSampler(GridSampler):
     """Steps through one argument from its start to its end.
 
     Args:
-        space: exactly one argument that varies; the others are constants.
-        points: number of steps, where the range has no step of its own.
+        space: the space; exactly one argument must vary, the others are constants.
+        points: number of values to try if the range has no step.
 
     Raises:
-        UsageError: none or several arguments vary.
+        UsageError: no argument varies, or several arguments vary.
     """
 
     def __init__(self, space: Space, *, points: int = 10) -> None:
@@ -116,7 +116,7 @@ class Cube:
     """The unit cube whose points represent arguments.
 
     Args:
-        space: space of the arguments; those with one value have no dimension.
+        space: space of the arguments; arguments with only one value have no dimension.
     """
 
     def __init__(self, space: Space) -> None:
@@ -130,7 +130,7 @@ class Cube:
 
     @property
     def dimensions(self) -> int:
-        """How many arguments vary."""
+        """The number of arguments that vary."""
         return len(self._axes)
 
     def arguments(self, point: NDArray[np.float64]) -> dict[Key, Value]:
@@ -141,7 +141,7 @@ class Cube:
         return {key: chosen[key] if key in chosen else self._fixed[key] for key in self._space}
 
     def values(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return points with the place of the value that is meant, instead of a share, where that is a choice."""
+        """Return points in which the coordinate of each choice is replaced by the index of its value."""
         if not self.categorical.any():
             return points
         options = np.array(self.options)
@@ -167,12 +167,12 @@ _LONGEST = 2**30  # points that SciPy's Sobol sequence has; the next one is the 
 
 
 class HaltonSampler:
-    """The sequence of Halton (1960), scrambled by the hunt's seed as Owen (2017) does.
+    """Draws the sequence of Halton (1960), scrambled by the hunt's seed as in Owen (2017).
 
     Args:
-        space: what to fill.
-        points: not used.
-        hunt: whose seed scrambles it.
+        space: the space of the arguments.
+        points: ignored; other samplers need this argument.
+        hunt: facts about the hunt, whose seed scrambles the sequence.
     """
 
     learns = False
@@ -187,14 +187,14 @@ class HaltonSampler:
         self._points: Any = None
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
-        """Return the arguments whose turn it is."""
+        """Return the arguments for the number of the trial."""
         return Proposal(self._cube.arguments(self.point(number)))
 
     def tell(self, result: TrialResult) -> None:
-        """Nothing to learn."""
+        """Do nothing, because this sampler does not learn."""
 
     def point(self, number: int) -> NDArray[np.float64]:
-        """Return the point whose turn it is, in the cube of the arguments that vary."""
+        """Return the point of the sequence for the given number, in the cube of the varying arguments."""
         number %= _LONGEST
         if not self._cube.dimensions:
             return np.empty(0)
@@ -213,14 +213,14 @@ class HaltonSampler:
 
 
 class SobolSampler(HaltonSampler):
-    """The sequence of Sobol' (1967), scrambled by the hunt's seed as Matoušek (1998) does.
+    """Draws the sequence of Sobol' (1967), scrambled by the hunt's seed as in Matoušek (1998).
 
-    The most even after 2, 4, 8 … trials.
+    The sequence is most evenly distributed after 2, 4, 8 … trials.
 
     Args:
-        space: what to fill; at most 21201 arguments that vary.
-        points: not used.
-        hunt: whose seed scrambles it.
+        space: the space of the arguments; at most 21201 arguments may vary.
+        points: ignored; other samplers need this argument.
+        hunt: facts about the hunt, whose seed scrambles the sequence.
     """
 
     sequence = "Sobol"

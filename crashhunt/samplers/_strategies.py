@@ -2,8 +2,8 @@
 
 All of them see a trial as a point in the unit cube with a score from 0 to 1, the criticality, or 1 for a crash. Each
 section says what its strategy computes and where it comes from. All use ranks of scores, because criticality is not
-linear in the distance to a crash; CMA-ES alone also ends a run where scores are nearly equal. None depends on anything
-but the reported results and the generator.
+linear in the distance to a crash; CMA-ES alone also ends a run where scores are nearly equal. All strategies depend
+only on the reported results and the random generator.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _SIGMA = 0.2  # initial standard deviation, in widths of the cube: a fifth cover
 class CmaEs:
     """CMA-ES (Hansen 2001), of the package ``cmaes``: learns the directions in which criticality rises.
 
-    Successive runs, each from the most critical of the last ten trials before it. The first run starts after ten
-    trials; the ten before a later run may include proposals of the run before.
+    Successive runs start from the most critical of the last ten trials before each run. The first run starts after ten
+    trials; the ten trials before a later run may include proposals of the previous run.
 
     Args:
         cube: cube of the arguments.
@@ -115,7 +115,7 @@ class CrossEntropy:
         self._points: np.ndarray[tuple[int, int], np.dtype[np.float64]] | None = None
 
     def tell(self, trial: ScoredTrial) -> None:
-        """Count a trial, and add it to the elites if it is good enough."""
+        """Count a trial, and add it to the elites if its score is high enough."""
         self._count += 1
         self._elites.add(trial)
         self._points = None
@@ -186,7 +186,7 @@ class Mutation:
         self._energy = None
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
-        """Return a mutant."""
+        """Return a mutant of a trial in the corpus."""
         if len(self._corpus) < _MIN_CORPUS:
             return None
         if self._energy is None:

@@ -27,10 +27,10 @@ class Draft:
     """A proposed point.
 
     Args:
-        point: point in the cube.
-        seed: seed of the trial; None for the one that its number has.
+        point: point in the unit cube.
+        seed: seed of the trial; None for the seed that follows from the trial's number.
         parent: the number of the trial that it is derived from; None if there is none.
-        origin: the strategy that proposes it, where there are several.
+        origin: the strategy that proposes the point, if there are several strategies.
     """
 
     point: NDArray[np.float64]
@@ -40,17 +40,17 @@ class Draft:
 
 
 class Strategy(Protocol):
-    """Learns from reported results, and proposes from these alone: earlier proposals change nothing."""
+    """Learns from reported results, and derives proposals only from these; earlier proposals have no influence."""
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
         """Return the draft at a place from 0 in the sequence of drafts; None while there are too few results."""
 
     def tell(self, trial: ScoredTrial) -> None:
-        """Learn how a trial ended, whatever its origin."""
+        """Learn from the result of a trial of any origin."""
 
 
 def reflected(point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a point inside the cube: a point outside is mirrored at the border."""
+    """Return a point inside the cube: a point outside of the cube is mirrored at the border."""
     inside: NDArray[np.float64] = np.abs(np.mod(point + 1.0, 2.0) - 1.0)
     return inside
 
@@ -64,16 +64,16 @@ _NUMBER_AT_END = re.compile(r"[\W_]*\d+\W*$")  # of a lane id: the lane's index 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredTrial:
-    """A trial that has ended.
+    """A finished trial, as samplers learn from it.
 
     Args:
         number: number of the trial.
-        point: where it was in the cube.
+        point: point of the trial in the unit cube.
         seed: seed of the trial.
-        score: 0 to 1, `CRASHED` for a crash.
-        origin: origin from which strategy it was.
-        parent: the number of the trial that it was made from; None if there is none.
-        kind: kind of a crash, its manner and its place as far as its result says so; empty if it does not.
+        score: criticality from 0 to 1; `CRASHED` for a crash.
+        origin: the strategy that proposed the trial.
+        parent: number of the trial from which it was derived; None if there is none.
+        kind: type of the crash, as far as the result shows it; empty if it does not.
     """
 
     number: int
@@ -86,12 +86,12 @@ class ScoredTrial:
 
     @property
     def crashed(self) -> bool:
-        """Whether it is what the hunt is after."""
+        """Whether the trial crashed in a way that the hunt searches for."""
         return self.score == CRASHED
 
 
 def scored_trial(result: TrialResult, cube: Cube, hunt: HuntFacts) -> ScoredTrial | None:
-    """Return a result as a sampler learns from it; None if it says nothing, as after a failed setup."""
+    """Convert a result to the form from which samplers learn; None if it has no information."""
     if result.outcome in hunt.crash_on:
         score = CRASHED
     elif result.danger is None or result.outcome.category != "no crash":
@@ -130,7 +130,7 @@ def _kind(result: TrialResult) -> str:
 
 
 class Elites:
-    """The trials with the greatest scores; of equal ones, those that were reported first.
+    """The trials with the greatest scores; of trials with equal scores, those that were reported first.
 
     Args:
         most: the maximum number of trials.
@@ -151,11 +151,11 @@ class Elites:
         return self._kept[place][2]
 
     def add(self, trial: ScoredTrial) -> ScoredTrial | None:
-        """Add a trial; return the one that is dropped for it, which is the trial itself if it is not good enough."""
+        """Add a trial; return the trial that is dropped for it, which is the new trial if its score is too low."""
         self._count += 1
         insort(self._kept, (-trial.score, self._count, trial))
         return self._kept.pop()[2] if len(self._kept) > self._most else None
 
     def best(self, many: int) -> list[ScoredTrial]:
-        """Return the best trials, at most so many."""
+        """Return the best trials, at most the given number."""
         return [trial for _, _, trial in self._kept[:many]]
