@@ -7,10 +7,11 @@ The criticality of a step is the greater of two measures:
   the agent really drove, so oncoming traffic in a bend does not count. For the vehicle ahead in a queue, this is the
   time gap. For a PET of t s, the criticality is exp(-t / 1.2 s): 0.92 for 0.1 s, 0.43 for 1 s, 0.19 for 2 s.
 - Deceleration rate to avoid a crash (DRAC; D. F. Cooper and N. Ferguson, Traffic studies at T-junctions, 1976): the
-  least constant deceleration with which the agent, on the path that it drove, touches no actor within 4 s. Actors move along their real paths, not at constant velocities. The criticality is the ratio of this
-  deceleration to 12 m/s², which exceeds the braking of any vehicle. As in responsibility-sensitive safety (RSS; S.
-  Shalev-Shwartz, S. Shammah and A. Shashua, On a formal model of safe and scalable self-driving cars, 2017), the agent
-  is assumed to respond late.
+  least constant deceleration with which the agent, on the path that it drove, touches no actor within 4 s. Actors
+  move along their real paths, not at constant velocities. The criticality is the ratio of this deceleration to
+  12 m/s², which exceeds the braking of any vehicle. As in responsibility-sensitive safety (RSS; S. Shalev-Shwartz, S.
+  Shammah and A. Shashua, On a formal model of safe and scalable self-driving cars, 2017), the agent is assumed to
+  respond late.
 
 The criticality of a trial grows with the time integral over its steps, in s, like the time integrated time to collision
 (TIT; M. M. Minderhoud and P. H. L. Bovy, Extended time-to-collision measures for road traffic safety assessment, 2001):

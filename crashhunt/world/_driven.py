@@ -9,7 +9,7 @@ core, which records many steps at once, gives bit-identical sums. The reason is 
 
 Reason for speeds instead of positions: a lane change or a teleport moves a vehicle within one step. The trapezoidal
 rule is exact if the acceleration is constant within a step. SUMO's Euler integration uses the speed at the end of the
-step, so the two distances differ by at most half a step at the difference between first and last speed.
+step. The two distances differ by at most half a step at the difference between first and last speed.
 """
 
 from __future__ import annotations

@@ -60,8 +60,8 @@ def separation(one: Rectangle, two: Rectangle) -> tuple[float, float, float]:
     """Return the distance of two rectangles along the axis on which it is greatest, and this axis.
 
     Returns:
-        The distance in m, negative if the rectangles overlap, and never more than the real gap; then x and y of the
-        unit vector from the first to the second rectangle.
+        The distance in m, which is negative if the rectangles overlap, and never more than the real gap. Then x and y
+        of the unit vector from the first to the second rectangle.
     """
     x1, y1, h1, l1, w1 = one
     x2, y2, h2, l2, w2 = two
