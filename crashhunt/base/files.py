@@ -1,4 +1,4 @@
-"""Writing of files that are complete or absent, even after a power failure."""
+"""Files that are complete or absent, even after a power failure."""
 
 from __future__ import annotations
 
