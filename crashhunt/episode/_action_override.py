@@ -11,10 +11,13 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.agents import Closes, Recorded
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.simulators import NamesMetaActions, ReportsSurroundings, SupportsFullBraking
+from crashhunt.simulators import NamesMetaActions, ReportsSurroundings, SupportsFullBraking, TranslatesMotion
 from crashhunt.world import Neighbor, safe_distance, safe_speed, time_to_drive
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from crashhunt.agents import Agent
     from crashhunt.base.codec import JsonObject
     from crashhunt.simulators import ActionForm, Simulator
@@ -259,7 +262,11 @@ class ReferenceDriver:
             )
         form = simulator.actions[overruled.agent]
         self._meanings = tuple(form.space.meanings) if supports(form.space, NamesMetaActions) else ()
-        if tuple(form.names) != ("target_speed", "lane_change") and not {"IDLE", "SLOWER"} <= {*self._meanings}:
+        has_speeds = tuple(form.names) == ("target_speed", "lane_change") or {"IDLE", "SLOWER"} <= {*self._meanings}
+        self._steers = (
+            simulator if supports(simulator, TranslatesMotion) and simulator.is_steered(overruled.agent) else None
+        )
+        if not has_speeds and self._steers is None:
             raise InvalidEpisodeError(
                 f"a reference driver cannot drive {overruled.agent}: the lanes and speeds that its actions mean are "
                 "unknown"
@@ -295,6 +302,8 @@ class ReferenceDriver:
         around = self._see(self._agent)
         if self._meanings:
             return self._meta(step, action, self._meanings[int(encoded[0])], around)
+        if self._steers is not None:
+            return self._steered(step, action, encoded, self._steers, around)
         target, change = encoded.tolist()
         allowed = self._allowed_change(step, int(change), around)
         limit = self._limit(step, float(target), self._reached(float(target), around), around)
@@ -322,6 +331,18 @@ class ReferenceDriver:
         if self._lane and not allowed:
             return self._meanings.index("IDLE")
         return action
+
+    def _steered(
+        self, step: int, action: object, encoded: NDArray[np.generic], steers: TranslatesMotion, around: Surroundings
+    ) -> object:
+        motion = steers.motion_of(self._agent, encoded)
+        allowed = self._allowed_change(step, motion.lane_change, around)
+        limit = self._limit(step, motion.speed_mps, motion.speed_mps, around)
+        speed = limit if self._speed else None
+        keeps_lane = self._lane and not allowed
+        if speed is None and not keeps_lane:
+            return action
+        return steers.action_with(self._agent, encoded, speed_mps=speed, keeps_lane=keeps_lane)
 
     def _reached(self, target: float, around: Surroundings) -> float:
         """Return the speed that the vehicle has one step after an action with this target speed, in m/s."""

@@ -40,4 +40,5 @@ from ._protocol import (
     SupportsHolds as SupportsHolds,
     SupportsReseeding as SupportsReseeding,
     SupportsScripts as SupportsScripts,
+    TranslatesMotion as TranslatesMotion,
 )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from crashhunt.base.boundaries import Party
     from crashhunt.native import UsualSteps, Vehicles
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Lane, Paths, Roster, Scene, Surroundings
+    from crashhunt.world import Lane, Motion, Paths, Roster, Scene, Surroundings
 
 __all__ = [
     "FACULTIES",
@@ -52,6 +52,7 @@ __all__ = [
     "SupportsHolds",
     "SupportsReseeding",
     "SupportsScripts",
+    "TranslatesMotion",
 ]
 
 
@@ -300,6 +301,31 @@ class ReportsSurroundings(Protocol):
 
         Args:
             agent: The identifier of an agent's vehicle that has not left the simulation.
+        """
+
+
+class TranslatesMotion(Protocol):
+    """A simulator that translates actions of acceleration and steering into speeds and lane changes.
+
+    Counterfactual runs with a reference driver need it for such actions. Contract: no method changes the simulation.
+    """
+
+    def is_steered(self, agent: str) -> bool:
+        """Whether the actions of a vehicle are an acceleration and a steering angle."""
+
+    def motion_of(self, agent: str, action: NDArray[np.generic]) -> Motion:
+        """Return what an encoded action does within the next step."""
+
+    def action_with(
+        self, agent: str, action: NDArray[np.generic], *, speed_mps: float | None, keeps_lane: bool
+    ) -> NDArray[np.generic]:
+        """Return an encoded action with another speed or with other steering.
+
+        Args:
+            agent: The identifier of an agent's vehicle that has not left the simulation.
+            action: The action that is corrected.
+            speed_mps: The speed after the step, in m/s; None leaves the acceleration.
+            keeps_lane: Whether the vehicle steers to the middle of its lane.
         """
 
 

@@ -43,6 +43,7 @@ from ._geometry import (
 )
 from ._safe_distances import (
     Crossing as Crossing,
+    Motion as Motion,
     Neighbor as Neighbor,
     Side as Side,
     Surroundings as Surroundings,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["Crossing", "Neighbor", "Side", "Surroundings", "safe_distance", "safe_speed", "time_to_drive"]
+__all__ = ["Crossing", "Motion", "Neighbor", "Side", "Surroundings", "safe_distance", "safe_speed", "time_to_drive"]
 
 NeighborKind = Literal["vehicle", "red light", "crossing"]
 
@@ -160,6 +160,19 @@ class Side:
     exists: bool
     ahead: Neighbor | None = None
     behind: Neighbor | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """What an action of acceleration and steering does to a vehicle.
+
+    Args:
+        speed_mps: speed after the step, in m/s.
+        lane_change: the side to which the vehicle leaves its lane; 1 left, -1 right, 0 neither.
+    """
+
+    speed_mps: float
+    lane_change: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -38,6 +38,7 @@ from crashhunt.simulators.highway._config import configured, mistake, restore_cl
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances
 from crashhunt.simulators.highway._scene import Hidden, HighwayEvents, VehicleFilter, contact_of, lanes_of
 from crashhunt.simulators.highway._scripted import Puppet, Puppets
+from crashhunt.simulators.highway._steering import action_with, is_steered, motion_of
 from crashhunt.simulators.highway._surroundings import surroundings_of
 from crashhunt.world import Actor, Lane, Roster, Scene
 
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.simulators._protocol import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Contact, Event, Paths, Surroundings
+    from crashhunt.world import Contact, Event, Motion, Paths, Surroundings
 
 __all__ = ["HighwaySimulator"]
 
@@ -204,7 +205,23 @@ class HighwaySimulator:
         """Return what a careful driver of an agent's vehicle would consider."""
         vehicle = self._controlled[agent]
         others = (thing for thing in self._objects() if thing is not vehicle)
-        return surroundings_of(self._env.road.network, vehicle, others, lambda thing: self._actor(thing).id)
+        limits = tuple(self._kinds[agent].acceleration_range) if self.is_steered(agent) else None
+        return surroundings_of(self._env.road.network, vehicle, others, lambda thing: self._actor(thing).id, limits)
+
+    def is_steered(self, agent: str) -> bool:
+        """Whether the actions of a vehicle are an acceleration and a steering angle."""
+        return is_steered(self._kinds[agent])
+
+    def motion_of(self, agent: str, action: NDArray[np.generic]) -> Motion:
+        """Return what an action does within the next step."""
+        return motion_of(self._kinds[agent], self._controlled[agent], action, self.step_length_s)
+
+    def action_with(
+        self, agent: str, action: NDArray[np.generic], *, speed_mps: float | None, keeps_lane: bool
+    ) -> NDArray[np.generic]:
+        """Return an action with another speed, or with the steering that keeps the lane."""
+        kind, vehicle = self._kinds[agent], self._controlled[agent]
+        return action_with(kind, vehicle, action, self.step_length_s, speed_mps=speed_mps, keeps_lane=keeps_lane)
 
     def resolve_target(self, disturbance: Disturbance) -> str:
         """Return the identifier of the vehicle at the disturbance's place around its agent; empty if none is there."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.simulators.highway._disturbances import lanes_ahead
+from crashhunt.simulators.highway._steering import OVER_M, lane_change_of
 from crashhunt.world import Neighbor, Side, Surroundings
 
 if TYPE_CHECKING:
@@ -20,43 +21,60 @@ if TYPE_CHECKING:
 __all__ = ["surroundings_of"]
 
 _MIN_LOOK_M, _LOOK_S = 60.0, 6.0  # further away, no safe distance of a road vehicle reaches
-_OVER_M = 1.0  # over the side of its lane, a vehicle is in the way of the next lane: as highway-env itself has it
 _OTHERS_MPS2 = 6.0  # IDMVehicle.ACC_MAX: the limit of the other vehicles in both directions
 _SPEED_STEP_MPS = 5.0  # ControlledVehicle.DELTA_SPEED, where a vehicle has no list of target speeds
 
 
 def surroundings_of(
-    network: RoadNetwork, vehicle: Any, others: Iterable[Any], name_of: Callable[[Any], str]
+    network: RoadNetwork,
+    vehicle: Any,
+    others: Iterable[Any],
+    name_of: Callable[[Any], str],
+    acceleration_range: tuple[float, float] | None = None,
 ) -> Surroundings:
-    """Return the surroundings of a vehicle with meta-actions. Reads positions only, and draws no random number.
+    """Return the surroundings of a vehicle. Reads positions only, and draws no random number.
 
     Args:
         network: network of roads.
         vehicle: vehicle of the agent.
         others: all other vehicles and obstacles.
         name_of: function that returns the identifier of an actor.
+        acceleration_range: accelerations of continuous actions, in m/s²; None for a vehicle with meta-actions.
     """
     things = list(others)
     ahead: dict[str, Neighbor] = {}
-    for index in dict.fromkeys((vehicle.lane_index, vehicle.target_lane_index)):  # two while it changes lanes
+    lanes = [vehicle.lane_index]  # two while it changes lanes
+    if acceleration_range is None:
+        lanes.append(vehicle.target_lane_index)
+    elif change := lane_change_of(vehicle, float(vehicle.lane.local_coordinates(vehicle.position)[1])):
+        lanes.append(_next_lane(network, vehicle.lane_index, change))
+    for index in dict.fromkeys(index for index in lanes if index is not None):
         leader = _side(network, vehicle, index, things, name_of).ahead
         if leader is not None:
             ahead[leader.actor] = leader
     sides = {}
-    start, end, own = vehicle.target_lane_index
-    for change, number in ((1, own - 1), (-1, own + 1)):  # highway-env numbers lanes from the left
-        # highway-env ignores a change to a lane that does not exist, or that is out of reach.
-        is_there = 0 <= number < len(network.graph[start][end])
-        if is_there and network.get_lane((start, end, number)).is_reachable_from(vehicle.position):
-            sides[change] = _side(network, vehicle, (start, end, number), things, name_of)
-    limit = _greatest_acceleration(vehicle)
+    for change in (1, -1):
+        index = _next_lane(network, vehicle.lane_index if acceleration_range else vehicle.target_lane_index, change)
+        if index is not None and network.get_lane(index).is_reachable_from(vehicle.position):
+            sides[change] = _side(network, vehicle, index, things, name_of)
+        elif acceleration_range is not None:
+            sides[change] = Side(exists=False)
+        # With meta-actions, highway-env ignores a change to a lane that does not exist, or that is out of reach.
+    limit = _greatest_acceleration(vehicle) if acceleration_range is None else 0.0
+    braking, acceleration = acceleration_range or (-limit, limit)
     return Surroundings(
         speed_mps=max(0.0, float(vehicle.speed)),
-        acceleration_mps2=limit,
-        braking_mps2=limit,
+        acceleration_mps2=acceleration,
+        braking_mps2=-braking,
         ahead=tuple(ahead.values()),
         sides=sides,
     )
+
+
+def _next_lane(network: RoadNetwork, index: _LaneIndex, change: int) -> _LaneIndex | None:
+    start, end, own = index
+    number = own - change  # highway-env numbers lanes from the left
+    return (start, end, number) if 0 <= number < len(network.graph[start][end]) else None
 
 
 def _greatest_acceleration(vehicle: Any) -> float:
@@ -75,7 +93,7 @@ def _side(
     for lane, offset_m in _connected(network, vehicle, index):
         for thing in things:
             there, aside = lane.local_coordinates(thing.position)
-            if not lane.on_lane(thing.position, there, aside, margin=_OVER_M):
+            if not lane.on_lane(thing.position, there, aside, margin=OVER_M):
                 continue
             away = float(there) + offset_m - along
             is_ahead, gap_m = away >= 0, abs(away) - (vehicle.LENGTH + thing.LENGTH) / 2
