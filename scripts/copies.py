@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import json
 import os
@@ -10,13 +11,9 @@ import shutil
 import signal
 import sys
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import CodeType, FrameType
+from typing import Any
 
 __all__ = ["ROOT", "Slot", "Watcher"]
 
@@ -40,20 +37,36 @@ class Watcher:
     """
 
     def __init__(self, files: list[str]) -> None:
-        self.test = ""
-        self.reached: dict[str, dict[str, set[int]]] = {file: {} for file in files}
         self.seconds: Counter[str] = Counter()
         self.forked: set[str] = set()  # tests that have started processes, of which no line is seen
-        self._known: dict[CodeType, bool] = {}
+        self._files = files
+        self._test = ""
 
     def start(self) -> None:
-        """Begin to trace."""
-        sys.settrace(self._call)
+        """Begin to trace, in C: a trace function in Python makes tests several times slower."""
+        import coverage
+
+        self._coverage = coverage.Coverage(data_file=None, config_file=False, include=self._files)
+        self._coverage.set_option("run:disable_warnings", ["trace-changed", "no-data-collected"])
+        self._coverage.start()
         sys.addaudithook(self._audit)
+
+    def reached(self) -> dict[str, dict[str, list[int]]]:
+        """Stop, and return of each file test to the lines that it runs; those that run at import have no test."""
+        self._coverage.stop()
+        data, reached = self._coverage.get_data(), {}
+        for file in self._files:
+            inside, lines = lines_in_functions(Path(file).read_text(encoding="utf-8")), defaultdict(set)
+            for line, tests in data.contexts_by_lineno(file).items():
+                for test in tests if line in inside else ("",):
+                    lines[test].add(line)
+            reached[file] = {test: sorted(found) for test, found in lines.items()}
+        return reached
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         """A test begins."""
-        self.test = nodeid
+        self._test = nodeid
+        self._coverage.switch_context(nodeid)
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """A part of a test is over."""
@@ -61,24 +74,21 @@ class Watcher:
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
         """A test is over."""
-        self.test = ""
+        self._test = ""
+        self._coverage.switch_context("")
 
     def _audit(self, event: str, _: object) -> None:
-        if event in _STARTS and self.test:
-            self.forked.add(self.test)
+        if event in _STARTS and self._test:
+            self.forked.add(self._test)
 
-    def _call(self, frame: FrameType, event: str, _: object) -> Callable[..., Any] | None:
-        code = frame.f_code
-        ours = self._known.get(code)
-        if ours is None:
-            ours = self._known[code] = code.co_filename in self.reached
-        return self._line if ours else None
 
-    def _line(self, frame: FrameType, event: str, _: object) -> Callable[..., Any]:
-        code = frame.f_code
-        function = code.co_flags & 0x1  # CO_OPTIMIZED, which modules and bodies of classes are not
-        self.reached[code.co_filename].setdefault(self.test if function else "", set()).add(frame.f_lineno)
-        return self._line
+def lines_in_functions(source: str) -> set[int]:
+    """Return the lines of the bodies of functions, which do not run at import."""
+    inside: set[int] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            inside.update(range(node.body[0].lineno, (node.end_lineno or node.lineno) + 1))
+    return inside
 
 
 class Slot:
@@ -171,11 +181,8 @@ class Slot:
         if watcher is not None:
             watcher.start()
         code = pytest.main([*PYTEST, f"--basetemp={self.tree}.tmp", *arguments], plugins=[watcher] if watcher else [])
-        sys.settrace(None)
         if watcher is not None:
-            reached = {
-                file: {test: sorted(lines) for test, lines in found.items()} for file, found in watcher.reached.items()
-            }
+            reached = watcher.reached()
             others = [name for name, module in [*sys.modules.items()] if self._is_installed(name, module)]
             facts = {"reached": reached, "seconds": watcher.seconds, "forked": [*watcher.forked], "modules": others}
             Path(".facts").write_text(json.dumps(facts), encoding="utf-8")

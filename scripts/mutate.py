@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 ENOUGH = 0.2  # the share of survivors that is tolerated
 EQUIVALENT = ROOT / "scripts" / "equivalent_slips.json"
-_SURVEY_S = 900  # of the processor, for all nearest tests of a package; tracing makes them several times slower
+_SURVEY_S = 900  # of the processor, for all nearest tests of a package
 _TESTS_ELSEWHERE = {
     # Tests of the accelerator compare it with highway-env through the simulator.
     "accelerator": ("simulators/test_accelerator*.py", "simulators/test_kernel.py", "simulators/test_dynamic_*.py"),
