@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import visible
@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
 
 __all__ = ["add_show"]
+
+
+_MIN_BRAKING_MPS2: Final = 0.1
 
 
 def add_show(commands: Commands) -> None:
@@ -49,9 +52,11 @@ def add_show(commands: Commands) -> None:
 def _show(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.report import Story
 
-    for name, value in (("--last-seconds", options.last_seconds), ("--braking", options.braking)):
-        if value is not None and not 0 < value < float("inf"):
-            raise UsageError(f"{name} is {value:g}", fix="give a number above 0")
+    if not 0 < options.last_seconds < float("inf"):
+        raise UsageError(f"--last-seconds is {options.last_seconds:g}", fix="give a number above 0")
+    # The calculation continues until the vehicle stands, which takes forever if it hardly brakes.
+    if options.braking is not None and not _MIN_BRAKING_MPS2 <= options.braking < float("inf"):
+        raise UsageError(f"--braking is {options.braking:g}", fix=f"give a number of at least {_MIN_BRAKING_MPS2}")
     with opened_crash(options.directory, options.crash) as (bundle, _):
         story = Story(bundle, last_s=options.last_seconds, braking=options.braking)
     print(json.dumps(story.to_json()) if options.json else visible(story.describe()))

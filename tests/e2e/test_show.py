@@ -49,7 +49,7 @@ def test_a_collision_is_reported_in_words_and_a_table(crash):
 
 
 def test_bad_numbers_are_refused(crash):
-    for words in (("--braking", "0"), ("--last-seconds", "-1"), ("--braking", "nan"), ("--crash", "999")):
+    for words in (("--braking", "1e-9"), ("--last-seconds", "-1"), ("--braking", "nan"), ("--crash", "999")):
         refused = crash.crashhunt("show", "h", *words, expect=2)
         assert len(refused.err.strip().splitlines()) == 1
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 from hypothesis import given, strategies as st
@@ -19,6 +20,7 @@ from crashhunt.trial import (
     check_plain,
     in_effect,
 )
+from crashhunt.trial._disturbance import in_turn, why_not
 
 texts = st.text(max_size=9)
 disturbances = st.builds(
@@ -91,3 +93,40 @@ def test_what_had_an_effect_began_by_the_end_with_an_actor_there():
 
 def test_the_eyes_and_hands_of_agents_are_no_business_of_simulators():
     assert {"late_observation", "noisy_observation", "late_action"} == SENSOR_KINDS
+
+
+def test_disturbances_are_in_the_order_of_step_agent_and_kind():
+    ordered = [
+        Disturbance(step=1, who="ahead", what="brake", how_strong=1.0, how_long=1.0, agent="b"),
+        Disturbance(step=2, who="ahead", what="brake", how_strong=1.0, how_long=1.0, agent="a"),
+        Disturbance(step=2, who="ahead", what="stop", how_strong=1.0, how_long=1.0, agent="a"),
+        Disturbance(step=2, who="ahead", what="brake", how_strong=1.0, how_long=1.0, agent="b"),
+    ]
+    assert in_turn(reversed(ordered)) == tuple(ordered)
+
+
+def test_disturbance_is_active_for_its_duration():
+    one = Disturbance(step=3, who="ahead", what="brake", how_strong=1.0, how_long=0.2)
+    assert [step for step in range(9) if one.is_active(step, 0.1)] == [3, 4]
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({}, ""),
+        ({"how_strong": -1.0}, "the strength is -1"),
+        ({"how_strong": math.inf}, "the strength is inf"),
+        ({"how_long": 0.0}, "the duration is 0"),
+        ({"how_long": math.inf}, "the duration is inf"),
+        ({"who": "itself"}, "brake is not about 'itself'"),
+        ({"what": "late_action"}, "late_action is not about 'ahead'"),
+        ({"what": "dawdle", "how_strong": 1.5}, "dawdle of 1.5 is more than all"),
+        ({"what": "of a later version", "who": "itself"}, ""),
+    ],
+    ids=str,
+)
+def test_invalid_disturbance_has_a_reason_and_a_fix(given, reason):
+    one = Disturbance(**{"step": 1, "who": "ahead", "what": "brake", "how_strong": 1.0, "how_long": 1.0} | given)
+    found = why_not(one)
+    assert (found is None) == (not reason)
+    assert found is None or (found[0] == reason and found[1].startswith(("give ", "it is about ")))

@@ -6,6 +6,7 @@ from hypothesis import given, strategies as st
 
 from crashhunt.errors import ArgumentError
 from crashhunt.space import Choice, Constant, Range, parse_spec
+from crashhunt.trial._space import kind_of
 
 finite = st.floats(allow_nan=False, allow_infinity=False, width=64).filter(lambda x: abs(x) < 1e300)
 
@@ -130,3 +131,90 @@ def test_every_whole_number_of_a_range_is_drawn():
     assert {Range(1, 6, integer=True).sample(rng) for _ in range(200)} == {1, 2, 3, 4, 5, 6}
     assert {Range(1, 6, step=2, integer=True).sample(rng) for _ in range(200)} == {1, 3, 5}
     assert {Choice(("a", "b")).sample(rng) for _ in range(50)} == {"a", "b"}
+
+
+@given(ranges(), st.floats(0, 1, exclude_max=True))
+def test_quantiles_rise_with_their_share(distribution, share):
+    value = distribution.quantile(share)
+    assert distribution.contains(value)
+    assert isinstance(value, int if distribution.integer else float)
+    assert distribution.quantile(0.0) == pytest.approx(distribution.low)
+    assert distribution.quantile(0.0) <= value <= distribution.quantile(1.0) <= distribution.high
+
+
+@pytest.mark.parametrize(
+    ("distribution", "values"),
+    [
+        (Choice(("a", "b", "c")), ["a", "a", "b", "c", "c"]),
+        (Range(0.0, 8.0), [0.0, 2.0, 4.0, 6.0, 8.0]),
+        (Range(1, 3, integer=True), [1, 1, 2, 3, 3]),
+        (Range(1.0, 2.2, step=0.5), [1.0, 1.0, 1.5, 2.0, 2.0]),
+        (Range(1.0, 16.0, log=True), [1.0, 2.0, 4.0, 8.0, 16.0]),
+        (Range(1, 6, step=2, integer=True), [1, 1, 3, 5, 5]),
+        (Constant("x"), ["x"] * 5),
+    ],
+    ids=str,
+)
+def test_quantiles_divide_the_draws_into_equal_shares(distribution, values):
+    assert [distribution.quantile(share) for share in (0.0, 0.25, 0.5, 0.75, 1.0)] == pytest.approx(values)
+    for value in dict.fromkeys(values):
+        assert 0.0 <= distribution.share_of(value) <= 1.0
+        assert distribution.quantile(distribution.share_of(value)) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("distribution", "shares"),
+    [
+        (Choice(("a", "b")), {"a": 0.25, "b": 0.75}),
+        (Range(0.0, 8.0), {-1: 0.0, 2: 0.25, 9: 1.0}),
+        (Range(1, 4, integer=True), {1: 0.125, 4: 0.875}),
+        (Range(0.0, 1.0, step=0.25), {0.0: 0.1, 0.3: 0.3, 1.0: 0.9}),
+        (Range(1.0, 16.0, log=True), {0.5: 0.0, 4.0: 0.5, 32.0: 1.0}),
+        (Range(3.0, 3.0), {3.0: 0.5}),
+    ],
+    ids=str,
+)
+def test_shares_of_values(distribution, shares):
+    assert {value: distribution.share_of(value) for value in shares} == pytest.approx(shares)
+
+
+def test_ends_of_log_ranges_of_whole_numbers_are_as_likely_as_the_others():
+    distribution = Range(1, 4, log=True, integer=True)
+    drawn = [distribution.quantile((share + 0.5) / 1000) for share in range(1000)]
+    counts = [drawn.count(number) for number in (1, 2, 3, 4)]
+    assert counts == pytest.approx([500, 232, 153.5, 114.5], abs=1)  # 1000 ln((n + 0.5) / (n - 0.5)) / ln(9)
+
+
+@pytest.mark.parametrize(
+    ("distribution", "points", "values"),
+    [
+        (Range(0.0, 8.0), 5, [0.0, 2.0, 4.0, 6.0, 8.0]),
+        (Range(0.0, 8.0), 1, [0.0]),
+        (Range(1.0, 16.0, log=True), 3, [1.0, 4.0, 16.0]),
+        (Range(0, 3, integer=True), 4, [0, 1, 2, 3]),
+        (Range(0, 10, integer=True), 3, [0, 5, 10]),
+        (Range(1, 100, log=True, integer=True), 3, [1, 10, 100]),
+        (Range(1, 4, log=True, integer=True), 9, [1, 2, 3, 4]),
+        (Range(0.0, 1.0, step=0.4), 2, [0.0, 0.4, 0.8]),
+        (Choice(("a", "b")), 1, ["a", "b"]),
+        (Constant(7), 3, [7]),
+    ],
+    ids=str,
+)
+def test_grids(distribution, points, values):
+    found = distribution.grid(points)
+    assert list(found) == pytest.approx(values)
+    assert [type(value) for value in found] == [type(value) for value in values]
+
+
+def test_kinds_of_values():
+    assert [kind_of(value) for value in (True, 3, 3.0, "3")] == ["bool", "int", "float", "str"]
+
+
+def test_value_is_contained_if_it_is_a_number_within_the_range():
+    distribution = Range(1.0, 2.0)
+    assert [distribution.contains(value) for value in (1, 2.0, 2.1, 0.9, True, "1")] == [True, True, *[False] * 4]
+    assert [Choice((1, 2)).contains(value) for value in (2, 3)] == [True, False]
+    assert [Constant("x").contains(value) for value in ("x", "y")] == [True, False]
+    with pytest.raises(ValueError, match="not in tuple"):
+        Choice(("a",)).share_of("b")

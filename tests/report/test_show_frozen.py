@@ -1,0 +1,130 @@
+"""What `show` reports of frozen crashes, in process: the table, the facts in the sentences, and the JSON shape."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from crashhunt.crashes import find_bundle, open_archive
+from crashhunt.report._show import Story, _steps_around, _thinned
+
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages"
+TABLE = """\
+                                                       braking
+     time  ego target_  lane_ leader  gap closing  TTC  needed          from
+step    s  m/s   speed change    m/s    m     m/s    s    m/s² danger behind
+  32  3.2 14.5   14.45      0    6.7 14.8    +7.8  1.9     2.0   0.39      -
+  45  4.5 14.5   14.45      0    6.7  4.7    +7.8  0.6     6.3   0.76      -
+  46  4.6 14.5   14.45      0    6.7  4.0    +7.8  0.5     7.6   0.76      - <- the last step after which braking helps
+  47  4.7 14.5   14.45      0    6.7  3.2    +7.8  0.4     9.4   0.76      -
+  51  5.1 14.5   14.45      0    6.7  0.1    +7.8  0.0   334.0   0.99      -
+  52  5.2 14.5   14.45      0    6.7  0.0    +7.8  0.0       -      -      -"""
+
+
+@pytest.fixture(scope="module")
+def rear_end():
+    """ego drove into the back of a slower leader."""
+    return find_bundle(FROZEN / "hunt", "")
+
+
+@pytest.fixture
+def exported():
+    """Open an exported crash; it is closed after the test."""
+    opened = []
+
+    def story(archive):
+        opened.append(open_archive(archive))
+        return Story(find_bundle(opened[-1].__enter__().directory, ""))
+
+    yield story
+    for archive in opened:
+        archive.__exit__(None, None, None)
+
+
+def numbers(text):
+    return re.findall(r"\d+(?:\.\d+)?", text)
+
+
+def test_table_has_the_last_steps_in_aligned_columns(rear_end):
+    rows = Story(rear_end).table()
+    assert len(rows) == 22  # a head of three lines, and of 51 steps the last ones and some earlier ones
+    assert [row for row in rows if row in TABLE.split("\n")] == TABLE.split("\n")
+    assert [row.split()[0] for row in rows[3:12]] == ["2", "7", "12", "17", "22", "27", "32", "37", "42"]
+    assert "19 of 51 steps shown" in Story(rear_end).describe()
+    assert [row.split()[0] for row in Story(rear_end, last_s=0.35).table()[3:]] == ["49", "50", "51", "52"]
+
+
+def test_sentences_have_the_distances_speeds_and_times_of_the_crash(rear_end):
+    words = Story(rear_end).words()
+    found = {sentence.partition(",")[0]: numbers(sentence) for sentence in words}
+    assert found["ego drove into leader at step 52"] == ["52", "5.1"]
+    assert found["4.9 s before"] == ["4.9", "29.9", "0.6", "7.3", "6.7"]
+    assert found["When they touched"] == ["14.5", "6.7"]
+    assert "1.0 s before, leader was ahead of ego, going the same way." in words
+    assert numbers(words[4])[:3] == ["8", "0.5", "46"]
+    assert words[5].startswith("At fault: ego, by the rule 'rear end': ")
+
+
+def test_calculated_braking_is_reported_as_a_calculation(rear_end):
+    ran, calculated = Story(rear_end).to_json(), Story(rear_end, braking=4.0).to_json()
+    assert (ran["last_escape_step"], calculated["last_escape_step"]) == (46, 41)
+    how = {"how": "at 8 m/s², all that it can do,", "too_late_step": 47}
+    assert ran["braking"] == {"by": "running it", "changed": [], "why_not": ""} | how
+    how = {"how": None, "too_late_step": None}
+    assert calculated["braking"] == {"by": "calculation", "changed": [], "why_not": ""} | how
+    assert (ran["full_braking"], calculated["full_braking"]) == pytest.approx((8.0, 4.0))
+    (sentence,) = (words for words in Story(rear_end, braking=4.0).words() if "calculation" in words)
+    assert numbers(sentence) == ["4", "1.0", "41"]
+    (harder,) = (words for words in Story(rear_end, braking=20.0).words() if "calculation" in words)
+    assert "with at most 8.0" in harder  # the run could not brake so hard
+
+
+def test_moments_of_the_json_are_those_of_the_table(rear_end):
+    facts = Story(rear_end).to_json()
+    moments = {moment["step"]: moment for moment in facts["moments"]}
+    assert list(moments) == list(range(2, 53))
+    assert (moments[46]["gap_to_other_m"], moments[46]["speed"]) == pytest.approx((3.96, 14.45), abs=0.05)
+    assert moments[46]["action"] == pytest.approx([14.45, 0.0], abs=0.005)
+    assert moments[2]["time_to_other_s"] == pytest.approx(49.9, abs=0.1)
+    assert (facts["agent"], facts["other"], facts["fault"]["verdict"]) == ("ego", "leader", "ego")
+
+
+def test_failure_shows_the_last_observation_and_the_innermost_frames(exported):
+    words = exported(FROZEN / "fault.zip").words()
+    (seen,) = (words for words in words if words.startswith("Its last observation"))
+    assert numbers(seen)[:2] == ["9", "1"]
+    assert "x 6.44, y 0, vx 9.1" in seen
+    assert len(words[words.index("") + 1 :]) == 6  # the innermost frames
+    assert words[-1].endswith("SimulatorError: the toy was told to fail")
+
+
+def test_run_that_braking_does_not_save_is_reported(exported):
+    story = exported(FROZEN / "highway.zip")
+    (sentence,) = (words for words in story.words() if words.startswith("Braking"))
+    assert numbers(sentence) == ["10.0", "11"]
+    assert (story.escape, story.to_json()["braking"]["too_late_step"]) == (None, 11)
+    assert "<-" not in "".join(story.table())
+
+
+def test_lane_change_of_the_agent_and_the_touch_are_reported(exported):
+    story = exported(FROZEN.parents[1] / "bundles" / "crashhunt-0.1.0.zip")
+    assert "ego decided to change lanes to the left at step 40." in story.words()
+    assert story.table()[-1].split()[:5] == ["40", "24.1", "13.9", "13.91", "1"]
+    assert story._speeds_at_contact() == pytest.approx((13.9, 18.2), abs=0.1)
+
+
+class Step:
+    def __init__(self, step):
+        self.step = step
+
+
+def test_selection_of_steps_keeps_the_last_and_the_marked_ones():
+    steps = [Step(number) for number in range(100)]
+    shown = [step.step for step in _thinned(steps, 20, always=13)]
+    assert shown[-10:] == [*range(90, 100)]
+    assert shown[:-10] == [8, 13, 17, 26, 35, 44, 53, 62, 71, 80, 89]
+    assert _thinned(steps[:20], 20, always=None) == steps[:20]
+    around = [step.step for step in _steps_around(steps, 20, 52)]
+    assert (52 in around, len(around), around[1] - around[0]) == (True, 20, 5)
