@@ -93,6 +93,7 @@ NAMED_ALL_THE_SAME = {
     "envs/": "is that environment, which is SUMO and nothing else",
     "cli/__init__.py": "has an example for people",
     "cli/_init.py": "says to people which maps it takes",
+    "cli/_replay.py": "says to people what an option is for",
     "guide/": "has the names of pages",
     "native/": "is compiled for libsumo, and finds its functions by name",
     "plans/_run_options.py": "says to people what an option is for",
