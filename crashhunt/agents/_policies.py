@@ -127,12 +127,12 @@ class _Network(ABC):
             values = np.asarray(self._answer(batch))
         except Exception as error:
             why = f"{type(error).__name__}: {_first_line(error)}"
-            raise ValueError(f"{path!r} does not take observations of the shape {batch.shape} ({why})") from error
+            raise ValueError(f"{path!r} does not accept observations of the shape {batch.shape} ({why})") from error
         wanted = _count(self._space)
         if values.shape[:1] != (1,) or (wanted and values[0].size != wanted):
             raise ValueError(
-                f"{path!r} answers one observation with the shape {values.shape}; (1, {wanted}) is needed for actions "
-                f"in {self._space}"
+                f"{path!r} returns values of the shape {values.shape} for one observation, but needs (1, {wanted}) for "
+                f"actions in {self._space}"
             )
         self._forget(path)
 
@@ -233,7 +233,7 @@ def _library(name: str, extra: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise ValueError(f"needs {name}: pip install 'crashhunt[{extra}]' ({error})") from error
+        raise ValueError(f"the agent needs the package {name}: pip install 'crashhunt[{extra}]' ({error})") from error
 
 
 def _existing(path: str) -> Path:
@@ -324,9 +324,9 @@ class NumpyPolicy:
             self._hold = max(1, round(float(data["period_s"]) / step_length_s))
             values = self.evaluate(np.zeros(self._rows * len(self._columns), np.float32))
             if values.shape != (len(_META_ACTIONS),):
-                raise ValueError(f"the weights give values of the shape {values.shape}, not ({len(_META_ACTIONS)},)")
+                raise ValueError(f"the weights compute values of the shape {values.shape}, not ({len(_META_ACTIONS)},)")
         except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
-            raise ValueError(f"{path!r} has no weights of a policy: {error}") from error
+            raise ValueError(f"{path!r} does not contain the weights of a policy: {error}") from error
         self.reset(0)
 
     def reset(self, seed: int) -> None:

@@ -99,7 +99,10 @@ def meta_actions(space: Space[object] | None) -> Mapping[str, int] | None:
         )
     numbers = {name: number for number, name in enumerate(meanings)}
     if "IDLE" not in numbers:
-        raise ValueError(f"the agent needs actions (target speed, lane change) or meta-actions, not the space {space}")
+        raise ValueError(
+            "the agent can only choose actions (target speed, lane change) or meta-actions, not actions of the space "
+            f"{space}"
+        )
     return {name: numbers.get(name, numbers["IDLE"]) for name in _META_ACTIONS}
 
 

@@ -460,9 +460,7 @@ def _replacement(descriptor: int, what: str, known: Held) -> tuple[int, int]:
         if flags == os.O_WRONLY or ours or MEMORY in what:
             return _NOTHING, 0
         if os.fstat(descriptor).st_size > _MAX_COPIED_FILE_BYTES:
-            raise CannotForkError(
-                f"a fork cannot copy a file that is open for writing and reading and is so large: {what}"
-            )
+            raise CannotForkError(f"a fork cannot copy a large file that is open for reading and writing: {what}")
         return _OWN, place
     if stat.S_ISDIR(mode) or what.startswith(_SHAREABLE_DEVICES):
         return _READ if stat.S_ISDIR(mode) else _NOTHING, 0

@@ -45,7 +45,9 @@ def _check(options: argparse.Namespace, _words: list[str]) -> int:
 
     found = check(options.directory)
     if options.salvage is not None and len(found) != 1:
-        raise UsageError(f"--salvage takes one hunt, but there are {len(found)}", fix="give the directory of one hunt")
+        raise UsageError(
+            f"--salvage takes one hunt, but {len(found)} hunts were found", fix="give the directory of one hunt"
+        )
     for each in found:
         say(_describe(each), as_json=options.json)
     saved = None

@@ -72,7 +72,8 @@ def _convert(options: argparse.Namespace) -> int:
     suffix = _FORMATS[options.form]
     if options.file.suffix != suffix:
         raise UsageError(
-            f"{options.file}: --as {options.form} writes a {suffix}", fix=f"call it {options.file.with_suffix(suffix)}"
+            f"{options.file}: --as {options.form} writes a {suffix} file",
+            fix=f"name it {options.file.with_suffix(suffix)}",
         )
     write: Callable[..., Any] = write_openscenario if options.form == "openscenario" else write_commonroad
     with opened_crash(options.directory, options.crash) as (bundle, _):

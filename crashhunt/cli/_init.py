@@ -160,7 +160,7 @@ def _check_agent(name: str) -> None:
     required = Signature.from_json(data).required
     if required:
         fix = "give it a default: the new scenario has no value for it"
-        raise UsageError(f"--agent {name}: it needs the argument {required[0]!r}", fix=fix)
+        raise UsageError(f"--agent {name}: the agent needs the argument {required[0]!r}", fix=fix)
 
 
 def _run_one_trial(folder: Path, steps: int) -> PlainTrial:

@@ -116,7 +116,7 @@ def film_options(options: argparse.Namespace) -> FilmOptions | None:
     check_places(video=options.video, gif=options.gif, folder=options.frames)
     width, _, height = options.size.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
-        raise UsageError(f"--size {options.size!r} is no size", fix="write 960x540")
+        raise UsageError(f"--size {options.size!r} is not a size", fix="write WIDTHxHEIGHT, such as 960x540")
     return FilmOptions(
         fps=options.fps,
         size=(int(width), int(height)),
@@ -323,7 +323,9 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
     film = film_options(options)
     crashes = options.crash.split(",")
     if len(crashes) > 1 and film is None:
-        raise UsageError(f"--crash {options.crash!r} names several", fix="give one, or make a film of them")
+        raise UsageError(
+            f"--crash {options.crash!r} names several crashes", fix="give one crash, or make a film of all"
+        )
     _refuse_what_would_be_ignored(options, film)
     answers, shots, good = [], [], True
     for crash in crashes:
@@ -428,11 +430,12 @@ def _last_step(options: argparse.Namespace, bundle: Bundle) -> int:
         from crashhunt.crashes import most_dangerous
 
         near = most_dangerous(bundle.recording())
-        crash, what = (near.step, "it was nearest") if near is not None and near.step else (crash, "it ended")
+        what = "the closest moment is" if near is not None and near.step else "the trial ended"
+        crash = near.step if near is not None and near.step else crash
     if options.before is not None:
         if not 0 <= options.before < crash:
             fix = f"give 0 to {crash - 1}" if crash else "omit the option"
-            raise UsageError(f"--before is {options.before}, and {what} at step {crash}", fix=fix)
+            raise UsageError(f"--before is {options.before}, but {what} at step {crash}", fix=fix)
         return crash - int(options.before)
     if options.until is not None:
         if options.until < 1:

@@ -141,7 +141,7 @@ def _read_index(archive: zipfile.ZipFile, path: Path) -> ArchiveIndex:
         if index["schema"] != SCHEMA:
             raise BundleError(
                 f"schema version {index['schema']} is not supported (supported: {SCHEMA})",
-                fix="use the version that wrote the trial",
+                fix="use the version of crashhunt that wrote the trial",
                 where=str(path),
             )
         typed(index, {"files": FILES})

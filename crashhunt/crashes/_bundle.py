@@ -438,7 +438,7 @@ def read_bundle(path: Path) -> Bundle:
         if not 1 <= data["schema"] <= SCHEMA:
             raise BundleError(
                 f"schema version {data['schema']} is not supported (supported: 1 to {SCHEMA})",
-                fix="use the version that wrote the trial",
+                fix="use the version of crashhunt that wrote the trial",
                 where=str(file),
             )
         if data["schema"] >= _FIRST_SCHEMA_WITH_DIGESTS or "integrity" in data:
@@ -446,7 +446,7 @@ def read_bundle(path: Path) -> Bundle:
         return _bundle(path, data)
     except OSError as error:
         raise BundleError(
-            f"no crash bundle here: {error.strerror}",
+            f"the folder contains no crash bundle: {error.strerror}",
             fix="give another folder, or run crashhunt check to see what can be recovered",
             where=str(file),
         ) from None

@@ -148,9 +148,13 @@ def remove_trusted(names: Sequence[str]) -> list[TrustedOrigin]:
         if not found and len(name) >= _MIN_FINGERPRINT_CHARACTERS:
             found = [origin for origin in known if origin.fingerprint.startswith(name.lower())]
             if len(found) > 1:
-                raise UsageError(f"--remove {name!r} matches {len(found)} origins", fix="give more of the fingerprint")
+                raise UsageError(
+                    f"--remove {name!r} matches {len(found)} origins", fix="give more characters of the fingerprint"
+                )
         if not found:
-            raise UsageError(f"--remove {name!r}: no such origin is trusted", fix="crashhunt trust lists them")
+            raise UsageError(
+                f"--remove {name!r}: no trusted origin has this name", fix="crashhunt trust lists the trusted origins"
+            )
         chosen |= {origin.fingerprint: origin for origin in found}
     for fingerprint in chosen:
         for folder in _folders():

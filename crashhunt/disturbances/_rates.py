@@ -263,7 +263,7 @@ def draw_checked(name: str, model: DisturbanceModel, rng: np.random.Generator) -
         raise blamed(f"the disturbance {name!r} cannot be drawn", error) from error
     if not fine:
         fix = f"draw one of {', '.join(CELLS)}, a finite strength, and a length above 0 s"
-        raise PluginError(f"the disturbance {name!r} has drawn {drawn}, which is not a disturbance", fix=fix)
+        raise PluginError(f"the disturbance {name!r} returned {drawn}, which is not a disturbance", fix=fix)
     return drawn
 
 
@@ -373,7 +373,7 @@ class DisturbanceSampler:
         )
         reason = why_not(one) if one.what in KINDS else None  # only built-in kinds can be checked
         if reason is not None:
-            raise PluginError(f"the disturbance {name!r} has drawn {drawn}: {reason[0]}", fix=reason[1])
+            raise PluginError(f"the disturbance {name!r} returned {drawn}: {reason[0]}", fix=reason[1])
         return one
 
     def log_likelihood(self, disturbances: Iterable[Disturbance], steps: int) -> float:

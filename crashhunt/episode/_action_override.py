@@ -109,7 +109,7 @@ class Keeping:
         self._idle = _idle(form)
         if self._idle is None and tuple(form.names) != ("target_speed", "lane_change"):
             raise InvalidEpisodeError(
-                f"the speed of {agent} cannot be held: the lanes and speeds that its actions mean are unknown"
+                f"the speed of {agent} cannot be held: it is unknown which lanes and speeds its actions choose"
             )
         self._driver, self._simulator, self._agent, self._form = driver, simulator, agent, form
         self._after, self._stays = after, keeps == "lane"

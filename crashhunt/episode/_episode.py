@@ -334,7 +334,7 @@ class Episode(Forkable, Ending):
             RuntimeError: the episode was not created with ``forks``.
         """
         if self._disturbed is None:
-            raise RuntimeError("only an episode that may be forked can get disturbances while it runs")
+            raise RuntimeError("disturbances can be added to a running episode only if it was made with forks")
         self._disturbed.add(disturbance)
 
     def replan(self, disturbances: Sequence[Disturbance]) -> None:
@@ -477,6 +477,6 @@ def _require_reseeding(simulator: Simulator) -> None:
         InvalidEpisodeError: the random generators cannot get another seed.
     """
     if not supports(simulator, SupportsReseeding):
-        raise InvalidEpisodeError("its simulator offers no way to re-seed its random generators")
+        raise InvalidEpisodeError("the simulator cannot re-seed its random generators")
     if simulator.why_no_reseeding:
         raise InvalidEpisodeError(simulator.why_no_reseeding)

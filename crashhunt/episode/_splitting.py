@@ -312,5 +312,5 @@ def _why_no_noise(episode: Episode) -> str:
     """Return why copies of an episode cannot get other random numbers; empty if they can get them."""
     simulator = episode.simulator
     if not supports(simulator, SupportsReseeding):
-        return "its simulator offers no way to re-seed its random generators"
+        return "the simulator cannot re-seed its random generators"
     return simulator.why_no_reseeding

@@ -226,7 +226,7 @@ def compare(*directories: Path | str) -> Comparison:
         HuntDirectoryError: a directory has no hunt, or its ledger is damaged.
     """
     if len(directories) < 2:
-        raise UsageError("there is nothing to compare with", fix="give the directories of two hunts or more")
+        raise UsageError("a single hunt cannot be compared", fix="give the directories of at least two hunts")
     hunts = [HuntResults(directory) for directory in directories]
     for hunt in hunts:
         if hunt.state.damaged:

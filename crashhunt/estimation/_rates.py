@@ -266,7 +266,7 @@ def _by_argument(by: str, settings: HuntSettings) -> _Division:
     short = {name: key for key, (_, name) in names.items() if sum(name == other for _, other in space) == 1}
     word, colon, count = by.partition(":")
     if word in _CRASH_PROPERTIES:
-        raise UsageError(f"--by {by}: {word} has no bins", fix=f"give --by {word}")
+        raise UsageError(f"--by {by}: {word} cannot be divided into bins", fix=f"give --by {word}")
     key = word if word in names else short.get(word, "")
     if not key:
         raise UsageError(f"--by: there is no argument {word!r}", fix=one_of(word, [*_CRASH_PROPERTIES, *short, *names]))

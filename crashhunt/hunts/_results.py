@@ -359,7 +359,8 @@ class HuntResults:
         if not trust and not is_hunt_trusted(self.directory, self._snapshot()):
             runs = describe_code(self._snapshot(), self.settings)
             raise UntrustedError(
-                f"nothing proves that you began this hunt on this machine, and this would import what it names: {runs}",
+                "nothing proves that you began this hunt on this machine, and this call would import the code that it "
+                f"names: {runs}",
                 fix="run crashhunt trust DIR once, or give trust=True, if you trust that code",
                 where=str(self.directory),
             )

@@ -148,11 +148,11 @@ def sums_of_branches(ledger: Ledger, facts: Facts) -> BranchSums | None:
     if BRANCHES not in (facts.get("copies") or ()):
         return None
     (row,) = ledger.summed(
-        "count(asked), total(moments), total(asked), total(steps), total(left_out), total(crashed), "
-        "total(crashed > 0), total(unanswered > 0)",
+        "count(asked), total(moments), total(asked), total(steps), total(left_out), total(crashed), total(crashed > "
+        "0), total(unanswered > 0)",
         "SELECT {branches.moments} AS moments, {branches.asked} AS asked, {branches.steps} AS steps, "
-        "{branches.left_out} AS left_out, {branches.unanswered} AS unanswered, "
-        "json_array_length(data, '$.branches.crashes') AS crashed",
+        "{branches.left_out} AS left_out, {branches.unanswered} AS unanswered, json_array_length(data, "
+        "'$.branches.crashes') AS crashed",
     )
     trials, moments, branches, steps, left_out, crashed, crashed_trials, not_fully_asked = map(int, row)
     again, confirmed = _verified_counts(facts, BRANCHES)
@@ -500,7 +500,7 @@ class HuntDirectory:
             except OSError:
                 lock.seek(0)
                 raise BusyError(
-                    f"another hunt is running there (process {lock.read().strip() or '?'})",
+                    f"another hunt is running in this directory (process {lock.read().strip() or '?'})",
                     fix="wait for it, stop it, or choose another directory",
                     where=str(self.path),
                 ) from None
@@ -558,7 +558,7 @@ class HuntDirectory:
                 more = len(differences) - _DIFFERENCES_SHOWN
                 shown = "; ".join(differences[:_DIFFERENCES_SHOWN]) + (f"; and {more} more" if more > 0 else "")
                 raise HuntDirectoryError(
-                    f"another hunt is there: {shown}",
+                    f"the directory contains another hunt: {shown}",
                     fix="give the same settings to resume it, another directory, or --overwrite to begin again",
                     where=str(self.path),
                 )

@@ -390,7 +390,7 @@ def painted(panel: Panel, width: int, height: int, label: str) -> NDArray[np.uin
 
 @singledispatch
 def _paint(panel: Panel, _canvas: Canvas) -> None:
-    raise TypeError(f"{type(panel).__name__} has no method that draws it")
+    raise TypeError(f"{type(panel).__name__} has no method that draws the panel")
 
 
 @_paint.register(Heatmap)
@@ -521,7 +521,7 @@ def _paint_distribution(panel: ActionDistribution, canvas: Canvas) -> None:
         _bars(canvas, [_name(panel.names, place) for place in range(len(values))], values, 0.0, 1.0)
         return
     if panel.mean is None or panel.std is None:
-        raise ValueError("give probabilities, or mean and std")
+        raise ValueError("the panel has no values: give probabilities, or mean and std")
     mean, std = _numbers(panel.mean).ravel(), np.maximum(_numbers(panel.std).ravel(), 1e-9)
     if len(mean) != len(std):
         raise ValueError(f"mean has {len(mean)} values, but std has {len(std)}")

@@ -381,7 +381,7 @@ def _agents_in(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
     for agent, action in actions.items():
         if action and not scenario.backend.actions:
             meant, fix = titles(lambda backend: bool(backend.actions)), "omit the option; the environment has its own"
-            raise UsageError(f"--action {action} is for {meant}, and {scenario.name} is not", fix=fix)
+            raise UsageError(f"--action {action} is for {meant}, but the scenario {scenario.name} is not", fix=fix)
         if action:
             scenario = with_action(scenario, agent, action)
     return scenario
@@ -481,7 +481,7 @@ def _check_branch(settings: HuntSettings) -> None:
         fix = "give rates, such as --disturb brake=0.02,cut_in=0.02"
         raise UsageError("--branch needs disturbances, but the hunt has none", fix=fix)
     if settings.branch and sys.platform != "linux":
-        raise UsageError("--branch forks processes, which needs Linux", fix="omit it")
+        raise UsageError("--branch forks processes, which needs Linux", fix="omit --branch")
 
 
 _MAX_RARE_CHANCE = 0.2  # per step: above that a first onset is no rare event, and plain trials are cheaper
@@ -533,7 +533,9 @@ def _with_defaults(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
     names = ",".join(never)
     if len(never) == len(crash_on):
         fix = f"it reports {', '.join(told)}" if told else "remove it"
-        raise UsageError(f"--crash-on {names}: the simulator {scenario.simulator!r} cannot report that", fix=fix)
+        raise UsageError(
+            f"--crash-on {names}: the simulator {scenario.simulator!r} cannot report these outcomes", fix=fix
+        )
     return replace(scenario, notes=(*scenario.notes, f"the simulator {scenario.simulator!r} never reports {names}"))
 
 
@@ -681,7 +683,9 @@ def _scenario_arguments(request: Request, scenario: Scenario, *, hunted: bool) -
             spec = str(Constant(argument.default))
         else:
             raise ScenarioError(
-                f"arguments.{name} has neither a default nor a range", fix="give it one", where=scenario.origin
+                f"arguments.{name} has neither a default nor a range",
+                fix="give it a default or a range",
+                where=scenario.origin,
             )
         specs[name] = ArgumentSpec(spec=spec, kind=argument.kind)
     return specs

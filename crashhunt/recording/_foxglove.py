@@ -384,7 +384,7 @@ def messages_of(
             kind, length = _RECORD_HEAD.unpack_from(chunk, at)
             start, at = at + _RECORD_HEAD.size, at + _RECORD_HEAD.size + length
             if at > size or (kind == _MESSAGE_RECORD and length < _MESSAGE_HEAD.size):
-                raise McapError(f"a record of {length} bytes does not fit")
+                raise McapError(f"a record of {length} bytes extends beyond the end of its chunk")
             if kind == _MESSAGE_RECORD:
                 number, sequence, _, _ = _MESSAGE_HEAD.unpack_from(chunk, start)
                 channel = summary.channels[number]

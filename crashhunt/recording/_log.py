@@ -205,7 +205,7 @@ def _unknown(message: _Message) -> _Channel:
     form = next((form for form in (TextForm(), BytesForm()) if name in form.messages), None)
     if form is None:
         raise BundleError(
-            f"there are records of a type that this version does not know ({message.topic})",
-            fix="use the version that wrote the trial",
+            f"the log contains records of a type that this version of crashhunt does not know ({message.topic})",
+            fix="use the version of crashhunt that wrote the trial",
         )
     return _Channel(tag=tag, aux=int(message.metadata.get("aux", 0)), topic=message.topic, form=form)

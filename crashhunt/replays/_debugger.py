@@ -176,7 +176,7 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
         KeyboardInterrupt: the user left the debugger or closed the window.
     """
     if look.window is not None and sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        raise UsageError("a window needs a display, and DISPLAY is not set", fix="log in with ssh -X, or give --video")
+        raise UsageError("a window needs a display, but DISPLAY is not set", fix="log in with ssh -X, or give --video")
     # A user who sits at the debugger or at a window may have killed it, and begins again on purpose only.
     attempts = 1 if look.stop_at or look.window is not None else _MAX_ATTEMPTS
     for _ in range(attempts - 1):

@@ -175,7 +175,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     if code == "log":
         if edits.all:
             raise UsageError(
-                f"recorded actions are valid only for the unchanged trial, and {edits.all[0]}",
+                f"recorded actions are valid only for the unchanged trial, but {edits.all[0]}",
                 fix="replay with --code snapshot",
             )
         if not trusted:

@@ -310,7 +310,7 @@ def with_action(scenario: Scenario, agent: str, action: str) -> Scenario:
         ScenarioError: the form of actions does not exist.
     """
     if action not in ("continuous", "meta"):
-        raise ScenarioError(f"{action!r} is not a form of action", fix="give continuous or meta")
+        raise ScenarioError(f"{action!r} is not a form of actions", fix="give continuous or meta")
     setup = replace(scenario.agents[agent], action=action)  # type: ignore[arg-type]
     return replace(scenario, agents={**scenario.agents, agent: setup})
 

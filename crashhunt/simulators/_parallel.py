@@ -80,7 +80,7 @@ class OneLearner(gymnasium.Env[Any, Any]):
         super().reset(seed=seed)
         self._seen, self._infos = self._parallel.reset(seed=seed, options=options)
         if self._learner not in self._seen:
-            raise RuntimeError(f"the learner {self._learner!r} is not in the environment from the first step")
+            raise RuntimeError(f"the learner {self._learner!r} is missing in the first step of the environment")
         return self._seen[self._learner], dict(self._infos.get(self._learner, {}))
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

@@ -96,7 +96,7 @@ class Snapshot:
             if not 1 <= found["schema"] <= SCHEMA:
                 raise BundleError(
                     f"schema version {found['schema']} is not supported (supported: 1 to {SCHEMA})",
-                    fix="use the version that wrote the trial",
+                    fix="use the version of crashhunt that wrote the trial",
                     where=str(file),
                 )
             if found["schema"] >= _FIRST_VERSION_WITH_DIGESTS or "integrity" in found:

@@ -195,7 +195,7 @@ class Gate:
             raise UsageError(f"--most is {self.most}", fix="give at least 1")
         if self.most < len(self.hunts):
             raise UsageError(
-                f"--most is {self.most} for {len(self.hunts)} hunts", fix="give at least one pair for each"
+                f"--most is {self.most} for {len(self.hunts)} hunts", fix="give at least one pair for each hunt"
             )
         if not 0 <= self.margin < 1:
             raise UsageError(f"--margin is {self.margin:g}", fix="give a share from 0 to below 1, such as 0.01")
@@ -223,7 +223,7 @@ def _locked(place: Path) -> Iterator[None]:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 fix = "wait for it, stop it, or give --keep another folder"
-                raise BusyError("another gate is running there", fix=fix, where=str(place)) from None
+                raise BusyError("another gate is running in this folder", fix=fix, where=str(place)) from None
             yield
     except OSError as error:
         fix = "choose one below a folder that exists and is writable"
@@ -353,7 +353,7 @@ class _Run:
                 same = replace(request, folder=before.folder, request=replace(request.request, trials=0))
                 if replace(before, request=replace(before.request, trials=0)).to_plain() != same.to_plain():
                     raise HuntDirectoryError(
-                        "the gate was begun there with other options",
+                        "the gate in this directory was begun with other options",
                         fix="give --keep another directory", where=str(place),
                     )  # fmt: skip
                 if not self._gate.trusted:
@@ -503,7 +503,7 @@ class _Run:
         where = f"{side.upper()} ({self._versions[side]})"
         if state == "no_valid_trial":
             raise NoValidTrialError(f"no trial can be set up: {why}", where=where)
-        raise HuntDirectoryError(f"cannot be hunted: {why}", where=where)
+        raise HuntDirectoryError(f"the hunt cannot run: {why}", where=where)
 
     def _why_undecided(self) -> str:
         invalid = next((f"{one.name}: {one.why_not}" for one in self._hunts if one.why_not), "")

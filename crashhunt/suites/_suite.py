@@ -120,7 +120,7 @@ class Suite:
         if whole.schema != 1:
             raise UsageError(f"schema = {whole.schema}", fix="this crashhunt reads schema 1", where=str(file))
         if not whole.hunts:
-            raise UsageError("there are no hunts", fix="add [[hunts]]", where=str(file))
+            raise UsageError("the file lists no hunts", fix="add [[hunts]]", where=str(file))
         entries = []
         for place, given in enumerate(whole.hunts):
             merged = _merged(whole.defaults, given)
@@ -140,7 +140,7 @@ class Suite:
         place = Path(directory)
         if is_hunt(place):
             raise HuntDirectoryError(
-                "the directory has a hunt, not a suite", fix="give another directory", where=str(place)
+                "the directory contains a hunt, not a suite", fix="give another directory", where=str(place)
             )
         planned: dict[Path, RunRequest] = {}
         for entry in self.entries:
@@ -223,7 +223,7 @@ class Suite:
             wanted = replace(wanted, request=replace(wanted.request, seed=before.request.seed))
         if before != replace(wanted, folder=before.folder):
             raise HuntDirectoryError(
-                f"the hunt {entry.id!r} was planned there with other settings",
+                f"the hunt {entry.id!r} was planned in this folder with other settings",
                 fix="give another directory, or run it again with crashhunt rerun",
                 where=str(folder),
             )

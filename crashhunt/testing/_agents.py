@@ -32,17 +32,17 @@ class AgentContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that makes an agent."""
-        raise NotImplementedError("give the suite a fixture named make")
+        raise NotImplementedError("the contract suite needs a fixture named make")
 
     @pytest.fixture
     def form(self) -> ActionForm:
         """Return the form of the agent's actions."""
-        raise NotImplementedError("give the suite a fixture named form")
+        raise NotImplementedError("the contract suite needs a fixture named form")
 
     @pytest.fixture
     def observations(self) -> list[NDArray[np.generic]]:
         """Return the observations of the agent, in order."""
-        raise NotImplementedError("give the suite a fixture named observations")
+        raise NotImplementedError("the contract suite needs a fixture named observations")
 
     def test_it_acts_inside_its_space_and_by_its_seed_alone(
         self, make: Make, form: ActionForm, observations: list[NDArray[np.generic]]

@@ -30,7 +30,7 @@ class DisturbanceContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that makes a disturbance model."""
-        raise NotImplementedError("give the suite a fixture named make")
+        raise NotImplementedError("the contract suite needs a fixture named make")
 
     def test_what_is_drawn_is_a_disturbance(self, make: Make) -> None:
         """A place in the grid around the agent, a finite strength, and a length above 0 s."""

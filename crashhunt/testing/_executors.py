@@ -38,7 +38,7 @@ class ExecutorContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that makes an executor."""
-        raise NotImplementedError("give the suite a fixture named make")
+        raise NotImplementedError("the contract suite needs a fixture named make")
 
     @pytest.fixture
     def executor(self, make: Make, tmp_path: Path) -> Iterator[Executor]:

@@ -30,7 +30,7 @@ class OracleContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that makes an oracle."""
-        raise NotImplementedError("give the suite a fixture named make")
+        raise NotImplementedError("the contract suite needs a fixture named make")
 
     def test_it_has_a_name_and_states_which_outcomes_it_brings(self, make: Make) -> None:
         """As names and categories that reports can print."""

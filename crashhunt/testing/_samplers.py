@@ -34,12 +34,12 @@ class SamplerContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that makes a sampler."""
-        raise NotImplementedError("give the suite a fixture named make")
+        raise NotImplementedError("the contract suite needs a fixture named make")
 
     @pytest.fixture
     def space(self) -> Space:
         """Return a space."""
-        raise NotImplementedError("give the suite a fixture named space")
+        raise NotImplementedError("the contract suite needs a fixture named space")
 
     def test_every_proposal_is_complete_and_inside_the_space(self, make: Make, space: Space) -> None:
         """A value for every key, and no other, as plain data; before it received results, and after."""

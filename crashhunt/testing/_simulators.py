@@ -55,7 +55,7 @@ class SimulatorContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that makes a simulator."""
-        raise NotImplementedError("give the suite a fixture named make")
+        raise NotImplementedError("the contract suite needs a fixture named make")
 
     def _drive(self, simulator: Simulator, seed: int, reseeded: tuple[int, int] | None = None) -> list[_Shown]:
         """Everything that an episode shows, as bytes and numbers."""

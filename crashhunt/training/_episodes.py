@@ -132,7 +132,10 @@ class CrashEpisodes:
         if episode.result is not None:
             failure = episode.result.failure
             why = failure.message if failure is not None else str(episode.result.outcome)
-            raise SimulatorError(f"no episode with seed {seed}: {why}", fix="check the scenario with crashhunt run")
+            raise SimulatorError(
+                f"the environment cannot begin an episode with seed {seed}: {why}",
+                fix="check the scenario with crashhunt run",
+            )
         return self._observation_and_info(episode)
 
     def step(self, action: object) -> tuple[object, float, bool, bool, dict[str, object]]:

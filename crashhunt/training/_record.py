@@ -104,7 +104,7 @@ def read_trained_on(path: Path) -> TrainedOn:
         typed(data, {"schema": int, "seeds": list[int], "hunt_seeds": list[int]})
         test = float(data["test"])
         if data["schema"] != _SCHEMA or not 0 <= test < 1:
-            raise ValueError(f"schema {data['schema']}, test {test:g}")
+            raise ValueError(f"schema is {data['schema']} and test is {test:g}")
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise HuntDirectoryError(

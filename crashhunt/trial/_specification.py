@@ -167,6 +167,6 @@ class TrialSpec(Serializable):
         if unknown:
             raise CrashhuntError(
                 f"trial {data['number']} has {', '.join(unknown)}, which crashhunt {__version__} does not support",
-                fix="use the version that wrote the trial",
+                fix="use the version of crashhunt that wrote the trial",
             )
         return from_plain(cls, {"arguments": {}, "scenario_arguments": {}, **data})

@@ -305,7 +305,7 @@ def _require_judgeable(bundle: Bundle, *, of_two: bool, why: int) -> None:
     if not of_two and why == 0:
         raise UsageError(
             f"{bundle.id} is not a collision with another actor, so only its causes can be analysed",
-            fix="omit --why, or give at least 1",
+            fix="omit --why, or give --why at least 1",
         )
 
 

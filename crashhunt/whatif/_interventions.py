@@ -346,7 +346,9 @@ def _handover_to_same(bundle: Bundle, step: int, changes: Mapping[str, str], opt
     agents = tuple(bundle.result.spec.arguments)
     vehicles = {agent_of(name, agents) for name in changes} - {""}
     if len(vehicles) > 1:
-        raise UsageError(f"--set names several agents: {', '.join(sorted(vehicles))}", fix="give one at a time")
+        raise UsageError(
+            f"--set names several agents: {', '.join(sorted(vehicles))}", fix="give values for one agent at a time"
+        )
     odd = next((name for name in changes if name in bundle.result.spec.scenario_arguments), "")
     if odd:
         message = f"--set {odd} is an argument of the scenario, which holds from the start"

@@ -170,4 +170,4 @@ def _require_same_trial(asked: TrialSpec, run: TrialSpec) -> None:
     """
     named = attrgetter("overruled", "disturbances", "only", "handover", "reseeding")
     if named(asked) != named(run):
-        raise NotUnderstoodError("the snapshot contains a version of crashhunt that is too old")
+        raise NotUnderstoodError("the snapshot contains a version of crashhunt that is too old for this command")

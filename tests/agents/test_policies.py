@@ -93,7 +93,12 @@ def test_by_target_speed_it_never_leaves_the_leftmost_lane_to_the_left():
 
 @pytest.mark.parametrize(
     ("path", "says"),
-    [("no/such.npz", "no weights"), ("text.npz", "no weights"), ("other.npz", "no weights"), ("cut.npz", "no weights")],
+    [
+        ("no/such.npz", "not contain the weights"),
+        ("text.npz", "not contain the weights"),
+        ("other.npz", "not contain the weights"),
+        ("cut.npz", "not contain the weights"),
+    ],
 )
 def test_a_file_without_weights_is_said_to_be_one(tmp_path, path, says):
     (tmp_path / "text.npz").write_text("hello")
@@ -151,9 +156,13 @@ class TestOnnxPolicy(_Policy):
 @pytest.mark.parametrize(
     ("shown", "actions", "says"),
     [
-        ((8, 7), spaces.Discrete(9), r"the shape \(1, 5\); \(1, 9\) is needed for actions in Discrete\(9\)"),
-        ((8, 7), BOX, r"\(1, 2\) is needed"),
-        ((5, 5), spaces.Discrete(5), r"does not take observations of the shape \(1, 25\)"),
+        (
+            (8, 7),
+            spaces.Discrete(9),
+            r"the shape \(1, 5\) for one observation, but needs \(1, 9\) for actions in Discrete\(9\)",
+        ),
+        ((8, 7), BOX, r"needs \(1, 2\) for"),
+        ((5, 5), spaces.Discrete(5), r"does not accept observations of the shape \(1, 25\)"),
     ],
 )
 def test_a_model_of_another_shape_is_refused(linear, shown, actions, says):
@@ -180,7 +189,7 @@ def test_weights_that_do_not_fit_together_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"values of the shape \(9,\), not \(5,\)"):
         NumpyPolicy(str(tmp_path / "nine.npz"))
     np.savez(tmp_path / "cut.npz", **{**data, "columns": data["columns"][:-1]})
-    with pytest.raises(ValueError, match="no weights of a policy"):
+    with pytest.raises(ValueError, match="does not contain the weights of a policy"):
         NumpyPolicy(str(tmp_path / "cut.npz"))
 
 

@@ -269,9 +269,9 @@ def test_a_damaged_crash_is_in_the_way_of_no_one_who_means_another(tmp_path):
     (broken.path / layout.CRASH).unlink()
     assert find_bundle(tmp_path, "1").result.spec.number == 1
     for word in ("20", "020", "000020", "000020-collision", "0000"):
-        with pytest.raises(BundleError, match="no crash bundle here"):
+        with pytest.raises(BundleError, match="the folder contains no crash bundle"):
             find_bundle(tmp_path, word)
-    with pytest.raises(BundleError, match="no crash bundle here"):
+    with pytest.raises(BundleError, match="the folder contains no crash bundle"):
         list_bundles(tmp_path)
     (tmp_path / "crashes" / "notes").mkdir()
     (tmp_path / "crashes" / ".000021-hang.part").mkdir()

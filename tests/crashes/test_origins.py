@@ -320,7 +320,7 @@ def test_origins_are_removed_by_fingerprint_or_path(place):
     first = add_trusted("ab" * 32, path=str(place / "one"), runs="x")
     add_trusted("abab" * 15 + "cdcd", path=str(place / "two"), runs="y")
     for name in ("abab", "ffffffff", str(place / "three"), ""):
-        with pytest.raises(UsageError, match="no such origin"):
+        with pytest.raises(UsageError, match="no trusted origin"):
             remove_trusted([first.fingerprint, name])
     with pytest.raises(UsageError, match="matches 2 origins"):
         remove_trusted(["ababab"])
@@ -408,7 +408,7 @@ def test_command_lists_and_removes(place, capsys):
         ((place / "thiers",), "does not exist"),
         ((place / "toy",), "has no code that could run"),
         ((place / "theirs", "--remove", "x"), "cannot be combined"),
-        (("--remove", "x"), "no such origin is trusted"),
+        (("--remove", "x"), "no trusted origin has this name"),
     ):
         code, _, err = crashhunt(*words)
         assert (code, says in err, len(err.splitlines())) == (2, True, 1), err

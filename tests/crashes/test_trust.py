@@ -69,7 +69,7 @@ def test_an_origin_is_removed_by_what_names_it_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(_trust, "_folders", lambda: [tmp_path])
     with pytest.raises(UsageError, match="--remove 'abcdef' matches 2 origins"):
         remove_trusted(["0123456", "abcdef"])
-    with pytest.raises(UsageError, match="--remove '01234': no such origin is trusted"):
+    with pytest.raises(UsageError, match="--remove '01234': no trusted origin has this name"):
         remove_trusted(["01234"])  # too short
     assert len(list(tmp_path.iterdir())) == 3
     assert remove_trusted(["ABCDEF2", "/c"]) == known[1:]

@@ -214,7 +214,7 @@ def test_a_model_that_draws_nonsense_is_named():
         def log_likelihood(self, drawn):
             return 0.0
 
-    with pytest.raises(PluginError, match="'odd' has drawn"):
+    with pytest.raises(PluginError, match="'odd' returned"):
         DisturbanceSampler({"odd": Odd()}, {"odd": 5.0}, ("ego",), DT).draw(1, 100)
 
 
@@ -229,7 +229,7 @@ def test_a_model_that_draws_nonsense_is_named():
 )
 def test_a_model_draws_only_what_its_kind_may_be(what, who, strong):
     model = Choices(what, {who: 1.0}, {strong: 1.0}, {1.0: 1.0})
-    with pytest.raises(PluginError, match=f"'odd' has drawn .*who='{who}'"):
+    with pytest.raises(PluginError, match=f"'odd' returned .*who='{who}'"):
         DisturbanceSampler({"odd": model}, {"odd": 5.0}, ("ego",), DT).draw(1, 100)
     own = Choices("lean", {who: 1.0}, {strong: 1.0}, {1.0: 1.0})  # a kind of a simulator's of somebody's own
     assert DisturbanceSampler({"own": own}, {"own": 5.0}, ("ego",), DT).draw(1, 100)

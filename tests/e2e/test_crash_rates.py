@@ -110,7 +110,7 @@ def test_bad_input_is_one_line(hunt):
         (("--confidence", "100"), "--confidence is 100; give percent from 50 to 99.9999"),
         (("--by", "sped"), "--by: there is no argument 'sped'"),
         (("--by", "speed:0"), "'0' bins; give 1 to 50 bins"),
-        (("--by", "kind:3"), "kind has no bins; give --by kind"),
+        (("--by", "kind:3"), "kind cannot be divided into bins; give --by kind"),
         (("h/hunt.toml",), "'h/hunt.toml' is a file; give the directory of a hunt or a suite"),
     ):
         done = toy.crashhunt("rate", "h", *words, expect=2)

@@ -103,7 +103,7 @@ def test_another_rate_is_another_hunt_and_a_rerun_keeps_its_own(toy):
     file = toy.folder / "toy" / "scenario.toml"
     hunt(toy, "--disturb", "brake=0.5", trials="1")
     done = toy.crashhunt("run", "h", "1", "2", "100", *WORDS, expect=2)
-    assert "another hunt is there: disturb was brake=0.5 and is now none" in done.err
+    assert "the directory contains another hunt: disturb was brake=0.5 and is now none" in done.err
     toy.crashhunt("rerun", "h", "--to", "again")
     assert crashhunt.load(toy.folder / "again").settings.disturb == ("brake=0.5",)
     hunt(toy, "--overwrite", trials="1")

@@ -147,13 +147,10 @@ def test_a_crash_that_kills_the_process_is_filmed_up_to_it(toy, agent, where):
 @pytest.mark.parametrize("number", [pytest.param("SIGINT", marks=pytest.mark.nightly), "SIGKILL"])
 def test_film_of_a_replay_that_is_killed_once_is_made(toy, number):
     (toy.folder / "killed.py").write_text(
-        "import os, signal\nfrom pathlib import Path\nfrom faulty import Raises\n"
-        "class Killed(Raises):\n"
-        "    def act(self, observation):\n"
-        "        if (place := os.environ.get('KILLED')) and not Path(place).exists():\n"
-        "            Path(place).touch()\n"
-        f"            os.kill(os.getpid(), signal.{number})\n"
-        "        return super().act(observation)\n"
+        "import os, signal\nfrom pathlib import Path\nfrom faulty import Raises\nclass Killed(Raises):\n    def "
+        "act(self, observation):\n        if (place := os.environ.get('KILLED')) and not "
+        "Path(place).exists():\n            Path(place).touch()\n            os.kill(os.getpid(), "
+        f"signal.{number})\n        return super().act(observation)\n"
     )
     toy.crashhunt("run", "h", "1", "1", "40", "--scenario", "toy", "--agent", "killed:Killed", "--arg", "at=5",
                   "--seed", "1")  # fmt: skip
@@ -169,7 +166,7 @@ def test_film_of_a_replay_that_is_killed_once_is_made(toy, number):
         (("--video", "out.avi"), "--video 'out.avi' does not end in .mp4"),
         (("--gif", "no/out.gif"), "there is no folder 'no'"),
         (("--frames", "faulty.py"), "--frames 'faulty.py' is not an empty folder"),
-        (("--video", "a.mp4", "--size", "huge"), "--size 'huge' is no size"),
+        (("--video", "a.mp4", "--size", "huge"), "--size 'huge' is not a size"),
         (("--video", "a.mp4", "--size", "10x10"), "--size is 10"),
         (("--video", "a.mp4", "--fps", "-1"), "--fps is -1"),
         (("--video", "a.mp4", "--last-seconds", "nan"), "--last-seconds is nan"),

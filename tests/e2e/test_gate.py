@@ -179,7 +179,10 @@ def test_crash_that_comes_back_in_the_corpus_of_head_is_worse_without_any_trial(
         (("drivers:Calm", "v9"), "'v9' is neither an agent nor a commit"),
         (("drivers:Calm", "HEAD"), "'drivers:Calm' is an agent and 'HEAD' is a commit; give two commits, or two"),
         (("HEAD", "HEAD", "--agent", "crashhunt.agents:RandomAgent"), "'crashhunt.agents' is imported from"),
-        (("drivers:Calm", "drivers:Nobody"), "HEAD (drivers:Nobody): cannot be hunted: 'drivers:Nobody': drivers has"),
+        (
+            ("drivers:Calm", "drivers:Nobody"),
+            "HEAD (drivers:Nobody): the hunt cannot run: 'drivers:Nobody': drivers has",
+        ),
         (("drivers:Calm", "drivers:Wild", "--most", "0"), "--most is 0; give at least 1"),
         (("drivers:Calm", "drivers:Wild", "--margin", "x"), "--margin is x; give a share from 0 to below 1"),
         (("drivers:Calm", "drivers:Wild", "--margin", "-1"), "--margin is -1; give a share from 0 to below 1"),
@@ -211,7 +214,7 @@ def test_gate_whose_time_is_up_is_undecided(drivers):
 def test_agent_whose_module_ends_its_process_is_refused(drivers):
     (drivers.folder / "gone.py").write_text("import os\n\nos._exit(7)\n")
     done = drivers.crashhunt("gate", CALM, "gone:Driver", *TOY, "--most", "3", expect=2)
-    assert "HEAD (gone:Driver): cannot be hunted: 'gone:Driver' cannot be imported" in done.err
+    assert "HEAD (gone:Driver): the hunt cannot run: 'gone:Driver' cannot be imported" in done.err
 
 
 def test_no_valid_trial_exits_with_3(drivers):
@@ -310,7 +313,8 @@ def test_two_gates_in_one_folder_exclude_each_other(drivers):
     process = begun(drivers, "--most", "5000")
     try:
         words = ("--set", "step_wall_s=0.002", "--keep", "kept")
-        assert "another gate is running there" in drivers.crashhunt("gate", CALM, TWIN, *TOY, *words, expect=2).err
+        refused = drivers.crashhunt("gate", CALM, TWIN, *TOY, *words, expect=2)
+        assert "another gate is running in this folder" in refused.err
     finally:
         process.send_signal(signal.SIGTERM)
         process.communicate(300)

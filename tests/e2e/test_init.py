@@ -28,7 +28,7 @@ needs_programs = pytest.mark.skipif(
         (("--grid", "2x2", "--agent="), "'' is not a registered name of agents"),
         (
             ("--grid", "2x2", "--agent", "json:loads"),
-            "--agent json:loads: it needs the argument 's'; give",
+            "--agent json:loads: the agent needs the argument 's'; give",
         ),
         (("--grid", "2x2", "--agent", "ending:Driver"), "'ending:Driver' cannot be imported: its process exited"),
         (("--net", "empty.osm", "--lefthand"), "--lefthand cannot be used with --net"),

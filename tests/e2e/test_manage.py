@@ -307,5 +307,5 @@ def test_an_interval_only_where_trials_are_independent(toy):
     assert "first: no crash rate: the hunt stops at its first crash" in found.out
     assert "grid: no interval: the sampler grid does not draw" in found.out
     assert "first and other have no seed in common" in found.out
-    assert "nothing to compare" in toy.crashhunt("compare", "first", expect=2).err
+    assert "a single hunt cannot be compared" in toy.crashhunt("compare", "first", expect=2).err
     assert "does not exist" in toy.crashhunt("compare", "first", "nowhere", expect=2).err

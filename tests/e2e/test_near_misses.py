@@ -75,7 +75,7 @@ def test_it_is_reported_around_the_moment_when_it_was_nearest(hunt):
     made = hunt.crashhunt("replay", *words, *film, "--last-seconds", "1", "--json").json
     assert made["written"] == {"f": len(around)}
     refused = hunt.crashhunt("replay", *words, "--before", "99", expect=2)
-    assert f"it was nearest at step {nearest['step']}" in refused.err
+    assert f"but the closest moment is at step {nearest['step']}" in refused.err
 
 
 def test_the_page_shows_them_after_the_crashes(hunt):

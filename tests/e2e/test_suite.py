@@ -233,7 +233,7 @@ def _results(shell, hunt: str) -> list[dict]:
     ("text", "says"),
     [
         ("", "the key 'hunts' is missing"),
-        ("hunts = []", "there are no hunts"),
+        ("hunts = []", "the file lists no hunts"),
         ("[[hunts]]\nid = 'a'\n[[hunts]]\nid = 'A'", "the id 'A' is used twice"),
         ("[[hunts]]\nscenario = 'toy'", "hunts[0].id = ''"),
         ("[[hunts]]\nid = '../a'", "'../a' is not a valid folder name"),
@@ -270,12 +270,12 @@ def test_a_suite_that_has_changed_is_refused(toy):
     toy.crashhunt("run", "single", "1", "1", "5", "--scenario", "toy")
     written(toy, SUITE.replace("speed = 4", "speed = 5"))
     refused = toy.crashhunt("suite", "run", "suite.toml", "out", expect=2)
-    assert "the hunt 'slow' was planned there with other settings" in refused.err
+    assert "the hunt 'slow' was planned in this folder with other settings" in refused.err
     # What cannot be planned leaves nothing behind.
     written(toy, SUITE.replace("speed = 4", "speed = 5").replace("runs = 2", "runs = 3"))
     toy.crashhunt("suite", "run", "suite.toml", "out", expect=2)
     assert not (toy.folder / "out/fast/2").exists()
-    assert "the directory has a hunt" in toy.crashhunt("suite", "run", "suite.toml", "single", expect=2).err
+    assert "the directory contains a hunt" in toy.crashhunt("suite", "run", "suite.toml", "single", expect=2).err
     written(toy, SUITE.replace("seed = 3", "seed = 3\nsnapshot_roots = ['toy']"))
     assert "other settings" in toy.crashhunt("suite", "run", "suite.toml", "out", expect=2).err
     assert "cannot be read" in toy.crashhunt("suite", "run", "nowhere.toml", "out", expect=2).err

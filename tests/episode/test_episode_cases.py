@@ -527,5 +527,5 @@ def test_an_agent_is_kept_from_one_thing_after_a_step(keeps, form, decided, done
 
 def test_what_no_one_understands_keeps_no_one_from_anything():
     car = SimpleNamespace(actions={"ego": SimpleNamespace(names=(), space=spaces.Discrete(5))})
-    with pytest.raises(InvalidEpisodeError, match="ego cannot be held: the lanes and speeds"):
+    with pytest.raises(InvalidEpisodeError, match="ego cannot be held: it is unknown which lanes"):
         overruled_agent(SimpleNamespace(), car, Overruled("ego", 2, keeps="lane"))

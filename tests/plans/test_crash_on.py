@@ -72,7 +72,7 @@ def test_limits_reach_the_simulator_and_the_file(tmp_path):
 
 def test_what_a_simulator_never_reports(tmp_path):
     with pytest.raises(
-        UsageError, match="the simulator 'highway' cannot report that; it reports wrong_way, not_moving"
+        UsageError, match="the simulator 'highway' cannot report these outcomes; it reports wrong_way, not_moving"
     ):
         plan(Request(trials=1, max_steps=10, scenario="highway", crash_on=("red_light",)))
     scenario, _ = plan(Request(trials=1, max_steps=10, scenario="highway", crash_on=("red_light", "collision")))

@@ -119,9 +119,9 @@ def test_a_type_that_cannot_be_read_is_refused(tmp_path, monkeypatch):
     with monkeypatch.context() as newer:
         newer.setitem(RECORD_TYPES, WIND, RecordType(WIND, "wind", "/weather/wind", Numbers(), _read))
         write_log(tmp_path / "log.mcap", recorded(tmp_path / "box"))
-    with pytest.raises(BundleError, match="a type that this version does not know") as refused:
+    with pytest.raises(BundleError, match="a type that this version of crashhunt does not know") as refused:
         read_log(tmp_path / "log.mcap")
-    assert refused.value.fix == "use the version that wrote the trial"
+    assert refused.value.fix == "use the version of crashhunt that wrote the trial"
 
 
 def test_a_prologue_of_a_later_version_is_read(tmp_path):

@@ -181,7 +181,7 @@ def test_a_panel_of_ones_own_draws_itself():
             return np.full((height, width, 3), (255, 0, 0), np.uint8)
 
     assert colors(Red().draw()) == {(255, 0, 0): 240 * 160}
-    with pytest.raises(TypeError, match="Panel has no method that draws it"):
+    with pytest.raises(TypeError, match="Panel has no method that draws the panel"):
         Panel().draw()
 
 

@@ -157,5 +157,5 @@ def test_learner_of_an_environment_with_one_agent_is_refused(tmp_path):
 
 def test_learner_that_comes_later_makes_the_trial_invalid(tmp_path):
     simulator = simulator_of(tmp_path, late=True)
-    with pytest.raises(Exception, match="the learner 'runner' is not in the environment from the first step"):
+    with pytest.raises(Exception, match="the learner 'runner' is missing in the first step of the environment"):
         simulator.reset(seed=1)

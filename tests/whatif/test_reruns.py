@@ -34,7 +34,10 @@ def test_another_trial_than_was_asked_for_is_refused(asked):
 def test_a_crash_of_the_first_version_is_judged_by_what_it_understands(request):
     with open_archive(request.path.parent.parent / "e2e" / "bundles" / "crashhunt-0.1.0.zip") as archive:
         found = judge(find_bundle(archive.directory), runs=2, why=10, parallel=2)
-    assert (found.attempts, found.why_not) == ((), "the snapshot contains a version of crashhunt that is too old")
+    assert (found.attempts, found.why_not) == (
+        (),
+        "the snapshot contains a version of crashhunt that is too old for this command",
+    )
     assert found.why is not None
     assert {factor.kind for factor in found.why.factors} <= {"argument", "seed"}
     assert found.why.why_not == found.why_not
