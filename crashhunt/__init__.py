@@ -1,8 +1,8 @@
 """A parallel crash-hunting fuzzer for traffic agents.
 
-``crashhunt.run``, ``prepare``, ``replay``, ``what_if``, ``load``, ``compare``, ``Hunt`` and ``Suite`` do what the
-command line does. ``accelerate`` speeds highway-env up in a process of your own. ``make_training_env`` returns an
-environment to train an agent on crashes.
+``crashhunt.run``, ``prepare``, ``replay``, ``what_if``, ``load``, ``compare``, ``Hunt`` and ``Suite`` provide the
+functions of the command line. ``accelerate`` speeds up highway-env in your own process. ``make_training_env`` returns
+an environment to train an agent on crashes.
 
 >>> import crashhunt
 >>> report = crashhunt.run(
@@ -47,7 +47,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import the functions when they are first asked for: a worker needs none of them."""
+    """Import a function of the package at its first use; workers need none of them."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_HOMES.get(name, "crashhunt.api")), name)
@@ -64,7 +64,7 @@ _ENVIRONMENTS = {
 
 
 def _register_environments() -> None:
-    """Register the environments with Gymnasium, without imports until one is made."""
+    """Register the environments with Gymnasium; their modules are imported when an environment is created."""
     from gymnasium.envs.registration import register, registry
 
     for name, entry_point in _ENVIRONMENTS.items():
@@ -73,13 +73,13 @@ def _register_environments() -> None:
 
 
 class _GymnasiumFinder:
-    """Registers the environments once Gymnasium is imported after crashhunt; imports nothing itself.
+    """Import finder that registers the environments if Gymnasium is imported after crashhunt; it finds no modules.
 
-    ``gymnasium.make("crashhunt:…")`` imports this module, which does nothing if it was imported before.
+    ``gymnasium.make("crashhunt:…")`` imports this module, which has no effect if the module was already imported.
     """
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
-        """Return the spec of Gymnasium's registry, with a loader that also registers; None for other modules."""
+        """Return the spec of Gymnasium's registry module, with a loader that also registers; None for other modules."""
         if name != _REGISTRY or self not in sys.meta_path:
             return None
         sys.meta_path.remove(self)

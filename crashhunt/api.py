@@ -1,4 +1,4 @@
-"""What the command line does, as functions: ``import crashhunt``."""
+"""The functions of the command line for Python: ``import crashhunt``."""
 
 from __future__ import annotations
 
@@ -26,17 +26,16 @@ __all__ = ["HuntCall", "RunCall", "prepare", "replay", "run", "what_if"]
 
 @dataclass(frozen=True)
 class HuntCall(HuntOptions):
-    """What `prepare` takes: the options of the list, and what only Python has.
+    """Arguments of `prepare`: all options of hunts, and arguments that only Python has.
 
     Args:
-        directory: directory of the hunt, created if it does not exist. A hunt that exists there with the same settings
-            resumes.
-        parallel: trials at a time; 0 for one per core.
+        directory: directory of the hunt, created if it does not exist. An existing hunt with the same settings resumes.
+        parallel: number of trials at a time; 0 for one per core.
         trials: maximum number of trials; 0 for no limit, which needs a ``duration``.
         max_steps: maximum number of steps of a trial.
-        snapshot: options of the snapshot, in place of the ``snapshot_…`` arguments.
+        snapshot: options of the snapshot, instead of the ``snapshot_…`` arguments.
         overwrite: whether a new hunt replaces an existing one.
-        command: the command line, as a comment in ``hunt.toml``.
+        command: the command line, which is written to ``hunt.toml`` as a comment.
     """
 
     directory: Path | str
@@ -51,18 +50,17 @@ class HuntCall(HuntOptions):
 
 @dataclass(frozen=True)
 class RunCall(HuntCall):
-    """What `run` takes: everything that `prepare` takes, and the observers.
+    """Arguments of `run`: all arguments of `prepare`, and a function that receives the progress.
 
     Args:
-        directory: directory of the hunt, created if it does not exist. A hunt that exists there with the same settings
-            resumes.
-        parallel: trials at a time; 0 for one per core.
+        directory: directory of the hunt, created if it does not exist. An existing hunt with the same settings resumes.
+        parallel: number of trials at a time; 0 for one per core.
         trials: maximum number of trials; 0 for no limit, which needs a ``duration``.
         max_steps: maximum number of steps of a trial.
-        watch: called about ten times a second.
-        snapshot: options of the snapshot, in place of the ``snapshot_…`` arguments.
+        watch: function called with the progress of the hunt about ten times a second.
+        snapshot: options of the snapshot, instead of the ``snapshot_…`` arguments.
         overwrite: whether a new hunt replaces an existing one.
-        command: the command line, as a comment in ``hunt.toml``.
+        command: the command line, which is written to ``hunt.toml`` as a comment.
     """
 
     _: KW_ONLY
@@ -74,7 +72,7 @@ def prepare(asked: HuntCall) -> Hunt:
     """Return a hunt that is ready to run.
 
     Raises:
-        CrashhuntError: the input is invalid; the message says why.
+        CrashhuntError: the input is invalid; the message gives the reason.
     """
     return _prepared(asked)
 
@@ -111,7 +109,7 @@ def run(asked: RunCall) -> HuntReport:
     """Hunt for a crash, as ``crashhunt run`` does, and return the result.
 
     Raises:
-        CrashhuntError: the input is invalid; the message says why.
+        CrashhuntError: the input is invalid; the message gives the reason.
     """
     return _prepared(asked).run(asked.watch)
 
@@ -132,19 +130,20 @@ def replay(
     """Run a saved crash again in a new process, as ``crashhunt replay`` does.
 
     Args:
-        crash: directory of a hunt or of one crash, or a crash of the hunt that `load` returned.
+        crash: directory of a hunt or of one crash, or a crash of a hunt that `load` returned.
         crash_id: id of a crash of the hunt; by default the crash with the fewest steps.
-        code: code that drives: that of the ``snapshot``, the ``current`` code, or the actions of the ``log``.
-        changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value.
+        code: the code that drives: the code of the ``snapshot``, the ``current`` code, or the recorded actions of the
+            ``log``.
+        changes: new value of each argument, by ``NAME`` or ``AGENT.NAME``.
         times: number of replays.
         force: whether to replay from a damaged snapshot.
-        scenario: the name or path of another scenario in which the same agents drive, on another simulator too.
-        accelerate: speed simulators up where that changes no bit.
-        trust: run its code even if it is neither made here nor trusted. With the actions of the ``log``, its scenario
-            may then do more than simulate.
+        scenario: name or path of another scenario in which the same agents drive; it may use another simulator.
+        accelerate: whether to speed up simulators if the results stay bit-identical.
+        trust: whether to run the crash's code even if it is neither made here nor trusted. With the actions of the
+            ``log``, the scenario may then have side effects.
 
     Returns:
-        The verdict with its evidence.
+        The verdict on the replay, with its evidence.
 
     Raises:
         UntrustedError: the code of the crash would run, but the crash is neither made on this machine nor trusted.
@@ -186,26 +185,29 @@ def what_if(
     """Run a saved crash again with changes and count the outcomes, as ``crashhunt whatif`` does.
 
     Args:
-        crash: directory of a hunt or of one crash, or a crash of the hunt that `load` returned.
+        crash: directory of a hunt or of one crash, or a crash of a hunt that `load` returned.
         crash_id: id of a crash of the hunt; by default the crash with the fewest steps.
-        changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value; with a step, of the agent from then on.
+        changes: new value of each argument, by ``NAME`` or ``AGENT.NAME``; with a step, arguments of the agent from
+            this step on.
         from_step: number of steps that stay as recorded.
         before_s: time before the crash at which the change begins, in s of simulation time; replaces ``from_step``.
-        agent: ``module:Name`` of an agent that takes over after that step.
-        arguments: arguments of that agent.
-        futures: give the simulator's random generators another seed after that step, a different one in each run.
+        agent: ``module:Name`` of an agent that takes control after the step.
+        arguments: arguments of the agent that takes control.
+        futures: whether to give the simulator's random generators another seed after the step, a different seed in each
+            run.
         overrule: ``brake``, ``left``, ``right``, ``keep_lane``, ``keep_speed``, ``reference_speed``,
-            ``reference_lanes`` or ``reference``, after that step.
+            ``reference_lanes`` or ``reference``; the manoeuvre that replaces the agent's actions after the step.
         leave_out: ids of actors to remove from the start.
         interventions: further interventions, from `crashhunt.whatif`.
-        code: which code drives: that of the ``snapshot``, or the ``current`` code, which is the default with ``agent``.
+        code: the code that drives: the code of the ``snapshot``, or the ``current`` code, which is the default with
+            ``agent``.
         times: number of runs; 0 for 50 with ``futures``, else 1.
-        parallel: runs at a time; 0 for one per core.
+        parallel: number of runs at a time; 0 for one per core.
         time_s: maximum wall time of all runs, in s.
-        trust: run its code even if it is neither made here nor trusted.
+        trust: whether to run the crash's code even if it is neither made here nor trusted.
 
     Returns:
-        The counts, with each run.
+        The counts of the outcomes, with each run.
 
     Raises:
         UntrustedError: the code of the crash would run, but the crash is neither made on this machine nor trusted.

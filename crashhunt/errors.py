@@ -1,4 +1,4 @@
-"""The errors of crashhunt, to catch or to raise."""
+"""The errors of crashhunt, which users may catch or raise."""
 
 from crashhunt.base import errors as _errors
 from crashhunt.base.errors import *  # noqa: F403 - every one of them

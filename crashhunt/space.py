@@ -1,4 +1,4 @@
-"""Spaces of arguments, to annotate the arguments of an agent: ``Annotated[float, Argument(...)]``."""
+"""Spaces of arguments, for annotations of an agent's arguments: ``Annotated[float, Argument(...)]``."""
 
 from crashhunt.trial import _space
 from crashhunt.trial._space import *  # noqa: F403 - all of them

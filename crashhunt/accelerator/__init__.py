@@ -1,4 +1,4 @@
-"""highway-env made fast without changing a bit of its results."""
+"""Acceleration of highway-env without changing a bit of its results."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The positions of all objects of a road at one instant, with their coordinates on the lanes."""
+"""The positions of all objects of a road at one time, with their coordinates on the lanes."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ __all__ = ["TrafficFrame", "are_plain"]
 
 
 class TrafficFrame:
-    """The positions of all objects at one instant, with lazily computed coordinates on the lanes.
+    """The positions of all objects at one time, with coordinates on the lanes that are computed when needed.
 
     Args:
         network: The lanes of the road.
         road: The road with its vehicles and objects.
 
     Attributes:
-        plain: Whether all positions have the usual type; otherwise the frame must not be used.
+        plain: Whether all positions have the usual data type; otherwise the frame must not be used.
         things: The vehicles, then the objects.
         row: The number of each object in `things`, by its ``id()``.
-        places: Their positions in m, of shape (things, 2).
+        places: The positions of the objects in m, of shape (things, 2).
     """
 
     def __init__(self, network: Network, road: Road) -> None:
@@ -53,7 +53,7 @@ class TrafficFrame:
         self._queues: dict[int, tuple[list[float], list[RoadObject]]] = {}
 
     def is_of(self, road: Road) -> bool:
-        """Whether the road still has the same objects at the same positions."""
+        """Return whether the road still has the same objects at the same positions."""
         things = road.vehicles + road.objects
         # Compare identities, because a user's class may define equality.
         return (
@@ -101,7 +101,7 @@ class TrafficFrame:
         )
 
     def _queue(self, lane: int) -> tuple[list[float], list[RoadObject]]:
-        """Return the places and objects on a lane, and on connected lanes if the road searches them, in order."""
+        """Return positions and objects on a lane, in order, and on connected lanes if the road searches these."""
         found: dict[int, float] = {}
         for other, offset in self.network.connected_lanes(lane) if self._looks_further else [(lane, 0.0)]:
             for row, (s, r) in enumerate(zip(*self.column(other), strict=True)):
@@ -129,7 +129,7 @@ def _places_of(things: list[RoadObject]) -> NDArray[np.float64]:
 
 
 def are_plain(things: list[RoadObject], kinds: list[VehicleClass] | None = None) -> bool:
-    """Whether all positions have the usual type, no two objects share a position array, and no object occurs twice."""
+    """Return whether all positions have the usual type, no objects share an array, and no object occurs twice."""
     if not all(map(_PLAIN, kinds or kinds_of(things))):
         return False
     positions = [thing.position for thing in things]

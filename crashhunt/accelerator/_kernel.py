@@ -1,9 +1,9 @@
-"""The compiled kernel: sub-steps of a road with the bits of highway-env, at the price of their arithmetic.
+"""The compiled kernel: runs sub-steps of a road with the bits of highway-env, at the cost of the arithmetic alone.
 
 The kernel computes what highway-env's methods compute, vehicle after vehicle and in the same order of operations. For
-sine, cosine and their like it calls the inner loops of NumPy's own functions. A self-test compares all functions with
-NumPy on random numbers, once per process. Where it fails, or where the kernel was not compiled, the accelerator is not
-used, and highway-env does the work.
+functions such as sine and cosine, it calls the inner loops of NumPy's own functions. A self-test compares all functions
+with NumPy on random numbers, once per process. If the self-test fails, or if the kernel was not compiled, the
+accelerator is not used, and highway-env's own code runs.
 """
 
 from __future__ import annotations
@@ -33,64 +33,64 @@ class Traffic(Protocol):
     """The vehicles and objects of a road in the kernel."""
 
     def is_current(self, road: Road, /) -> bool:
-        """Whether they are those of the road, with everything about them that must stay the same except their state."""
+        """Return whether the kernel still has the objects of the road, with unchanged properties except their state."""
 
     def read(self) -> bool:
-        """Read the state of all vehicles; return False if a value is unusual, and the kernel must not be used."""
+        """Read the state of all vehicles; return False if a value is unusual, so that the kernel must not be used."""
 
     def act(self) -> None:
-        """Do what `Road.act` does."""
+        """Compute the result of `Road.act` for all vehicles."""
 
     def step(self, dt: float, /) -> bool:
-        """Do what `Road.step` does; return False before the search for lanes if a number is no longer finite."""
+        """Compute `Road.step`; return False before the search for lanes if a number is no longer finite."""
 
     def run(self, count: int, dt: float, stops: bool, /) -> tuple[int, bool]:
-        """Do several sub-steps; return the number of complete ones, and whether `step` would have returned False.
+        """Run several sub-steps; return the number of complete ones, and whether `step` would have returned False.
 
-        If it stops at crashes, the sub-step in which a vehicle crashes is the last one.
+        If the kernel stops at crashes, the sub-step in which a vehicle crashes is the last one.
         """
 
     def collide(self, dt: float, /) -> None:
-        """Do what `Road.step` does after the movement: check all pairs for collisions."""
+        """Compute the last part of `Road.step`, after the movement: check all pairs for collisions."""
 
     def conflicts(self) -> list[tuple[int, int, bool]] | None:
         """Return the pairs of vehicles with a possible conflict, and for each pair whether the conflict is certain.
 
-        None if highway-env must decide.
+        The result is None if highway-env's own code must decide.
         """
 
     def fill_times(self, *given: object) -> None:
-        """Fill the grid of `compute_ttc_grid`."""
+        """Fill the grid that `compute_ttc_grid` returns."""
 
     def observe(self, *given: object) -> int | None:
-        """Fill the rows of a `KinematicObservation`; return their number, or None if highway-env must observe."""
+        """Fill the rows of a `KinematicObservation`; return their number, or None if highway-env's code must run."""
 
     def completed(self) -> int:
-        """Return the number of complete sub-steps of the last `run`, which may have raised an error."""
+        """Return the number of complete sub-steps of the last call of `run`, which may have raised an error."""
 
 
 class CompiledNetwork(Protocol):
     """The lanes of a road in the kernel."""
 
     def coordinates(self, lane: int, positions: bytes, /) -> tuple[list[float], list[float]]:
-        """Return longitudinal and lateral coordinates on a lane, in m, of positions ``x, y`` of float64."""
+        """Return the longitudinal and lateral coordinates on a lane, in m, of float64 positions ``x, y``."""
 
     def mark_cells(self, *grid: object) -> tuple[bytearray, list[tuple[int, float]]]:
-        """Return a byte for each cell with a point of a lane, and lanes with points near the border of a cell."""
+        """Return a byte for each cell that contains a point of a lane, and the lanes with points near a cell border."""
 
 
 class Snapshot(Protocol):
-    """The members that namespaces had at one time."""
+    """The members that some namespaces had at one time, for a later comparison."""
 
     def first_changed(self, sizes: list[int], /) -> int:
-        """Return the number of the first namespace with another size or member; -1 if there is none."""
+        """Return the number of the first namespace whose size or members have changed; -1 if there is none."""
 
 
 class Contents(Protocol):
-    """The contents of containers at one time."""
+    """The contents of some containers at one time, for a later comparison."""
 
     def is_same(self) -> bool:
-        """Whether all containers still have the same members in the same order, and all arrays the same bytes."""
+        """Return whether all containers still have the same members in order, and all arrays the same bytes."""
 
 
 Poses = tuple[list[tuple[float, float]], list[float], list[float]]
@@ -142,9 +142,9 @@ def _load_kernel() -> tuple[_Module | None, str]:
 
 
 def _bind_turn(module: _Module) -> None:
-    """Find out how NumPy rounds a product of a matrix and a vector.
+    """Determine how NumPy rounds a product of a matrix and a vector.
 
-    Where no known way has its bits, highway-env computes the dynamic bicycle model.
+    If no known way gives NumPy's bits, highway-env computes the dynamic bicycle model.
     """
     rng = np.random.default_rng(2)
     numbers = [(a, b, 20 * c, d) for a, b, c, d in rng.normal(size=(300, 4)).tolist()]
@@ -175,12 +175,12 @@ def kernel() -> _Module | None:
 
 
 def why_not() -> str:
-    """Return why the kernel is not used; empty if it is used."""
+    """Return the reason why the kernel is not used; empty if it is used."""
     return _load_kernel()[1]
 
 
 def _differs(module: _Module) -> str:
-    """Return the name of a function whose result is not bit-identical to NumPy's; empty if there is none."""
+    """Return the name of a function whose result differs from NumPy's in any bit; empty if there is none."""
     rng = np.random.default_rng(1)
     count = 600  # where two ways of rounding differ at all, they do so for about one number in twenty
     numbers = (rng.normal(size=count) * 10.0 ** rng.integers(-9, 4, count)).tolist()

@@ -32,8 +32,9 @@ class Network:
         lanes: All lanes, by number.
         index: The number of each lane, by its key.
         number: The number of each lane, by the ``id()`` of the lane.
-        keys: The keys of all lanes, by number.
-        compiled: The lanes in the kernel, by whether the road also searches connected lanes for neighbours.
+        keys: The keys of all lanes, ordered by number.
+        compiled: The lanes in the kernel, separately for roads that also search connected lanes for neighbours and for
+            others.
         plain: Whether all lanes have a known class; otherwise the object must not be used.
     """
 
@@ -48,11 +49,11 @@ class Network:
         self.plain = type(network) is RoadNetwork and all(map(_is_known, self.lanes)) and bool(self.lanes)
 
     def is_of(self, network: RoadNetwork) -> bool:
-        """Whether the network still has the same lane objects with unchanged keys and attributes."""
+        """Return whether the network still has the same lane objects, with unchanged keys and attributes."""
         return network is self.network and self._contents.is_same() and self._lane_extensions == _lane_extensions()
 
     def in_kernel(self, *, looks_further: bool) -> CompiledNetwork:
-        """Return the lanes in the kernel, which must exist.
+        """Return the lanes in the kernel, which must already exist.
 
         Args:
             looks_further: Whether the road also searches connected lanes for neighbours.
@@ -93,7 +94,7 @@ class Network:
         return self.in_kernel(looks_further=False).coordinates(number, places.tobytes())
 
     def is_on(self, number: int, s: float, r: float) -> bool:
-        """Whether highway-env's search for neighbours counts a position as on the lane."""
+        """Return whether highway-env's search for neighbours counts a position as on the lane."""
         lane = self.lanes[number]
         return bool(abs(r) <= lane.width / 2 + _ON_LANE_MARGIN_M and -5 <= s < lane.length + 5)
 
@@ -101,7 +102,7 @@ class Network:
 def _ordered_lanes(network: RoadNetwork) -> tuple[list[tuple[str, str, int]], list[AbstractLane]]:
     """Return all keys and lanes in highway-env's order of comparison; empty if the network is unusual.
 
-    An unusual network has its own methods, or its graph has containers of other types.
+    A network is unusual if it has methods of its own, or if its graph has containers of other types.
     """
     keys: list[tuple[str, str, int]] = []
     lanes: list[AbstractLane] = []
@@ -117,7 +118,7 @@ def _ordered_lanes(network: RoadNetwork) -> tuple[list[tuple[str, str, int]], li
 
 
 def _contents(network: RoadNetwork, lanes: list[AbstractLane]) -> Contents:
-    """Return everything about a network that must stay the same: its lanes in their order, and their attributes."""
+    """Return all properties of a network that must stay unchanged: its lanes in their order, and their attributes."""
     module = kernel()
     assert module is not None
     containers: list[object] = []
@@ -136,7 +137,7 @@ def _is_array(value: object) -> bool:
 
 
 def _lane_extensions() -> list[float]:
-    """Return for each class of lanes how far beyond its end highway-env counts vehicles as on the lane, in m."""
+    """Return for each class of lanes how far beyond its end a vehicle still counts as on the lane, in m."""
     return [kind.VEHICLE_LENGTH for kind in _KNOWN]
 
 
@@ -174,7 +175,7 @@ _DTYPES = (np.dtype(np.float64), np.dtype(np.int64))
 
 
 def _table(network: Network) -> bytes:
-    """Return the numbers of all lanes, in the order of the kernel's structure ``LaneRow``."""
+    """Return the numbers that describe all lanes, in the order of the kernel's structure ``LaneRow``."""
     roads: dict[tuple[str, str], int] = {}
     rows = []
     for number, ((start, end, of_road), lane) in enumerate(zip(network.keys, network.lanes, strict=True)):

@@ -1,4 +1,4 @@
-"""Observations: `KinematicObservation.observe` and its like without data frames, and the search for close objects."""
+"""Observations: `KinematicObservation.observe` and similar methods without data frames; search for close objects."""
 
 from __future__ import annotations
 
@@ -175,10 +175,10 @@ def _visible_rows(
     """Return the rows of the agent and of close objects; None if highway-env's own code must run.
 
     Args:
-        kinematic: The observation.
+        kinematic: The observation object.
         frame: The positions on the road.
-        close: The close objects, nearest first; the last ones count.
-        replaced: Features of the agent that differ from its own.
+        close: The close objects, nearest first; only the last ones are used.
+        replaced: Features of the agent that replace its own features.
     """
     vehicle, features = kinematic.observer_vehicle, kinematic.features
     close = close[-kinematic.vehicles_count + 1 :]
@@ -229,7 +229,7 @@ def observe_grid(grid: OccupancyGridObservation, frame: TrafficFrame | None) -> 
     """Return the result of `OccupancyGridObservation.observe`; None if highway-env's own code must run.
 
     The features of all vehicles are normalized in one array, without a data frame. highway-env writes the vehicles in
-    reverse order, so that the first one in a cell remains.
+    reverse order, so that the first vehicle in a cell remains.
     """
     observer, features = grid.observer_vehicle, grid.features
     shown = [name for name in features if name != "on_road"] if type(features) is list else None
@@ -284,18 +284,18 @@ def observe_grid(grid: OccupancyGridObservation, frame: TrafficFrame | None) -> 
 
 
 def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, reach: float) -> bool:
-    """Do what `OccupancyGridObservation.fill_road_layer_by_lanes` does, for all lanes together.
+    """Compute the result of `OccupancyGridObservation.fill_road_layer_by_lanes`, for all lanes together.
 
-    highway-env's own code decides about points so near to the border of a cell that rounding matters.
+    If a point is so near to a cell border that rounding matters, highway-env's own code decides.
 
     Args:
-        grid: The observation.
+        grid: The observation object.
         network: The lanes of the road.
         layer: The number of the layer to fill.
-        reach: How far lanes are followed in both directions, in m.
+        reach: The distance for which lanes are followed in both directions, in m.
 
     Returns:
-        False, with nothing changed, if the grid is too large or not finite.
+        Whether the layer was filled; False, with nothing changed, if the grid is too large or not finite.
     """
     observer, cells = grid.observer_vehicle, grid.grid.shape[-2:]
     spacing = float(np.amin(grid.grid_step))
@@ -328,8 +328,8 @@ def fill_times(
 
     Args:
         env: The environment.
-        state: The current state of its road.
-        vehicle: The observer.
+        state: The current state of the environment's road.
+        vehicle: The observing vehicle.
         quantum: The time between two cells, in s.
         horizon: The time of the last cell, in s.
     """
@@ -363,12 +363,12 @@ def _as_tuple(value: object) -> object:
 
 
 def _are_known(features: object) -> bool:
-    """Whether all features are known and each occurs once; a data frame repeats the column of a repeated feature."""
+    """Return whether all features are known and unique; a data frame repeats the column of a repeated feature."""
     return type(features) is list and _KNOWN_FEATURES.issuperset(features) and len(set(features)) == len(features)
 
 
 def _arrives(thing: RoadObject, network: Network) -> bool:
-    """Whether the end of a vehicle's route is on the road; otherwise highway-env's `to_dict` fails."""
+    """Return whether the end of a vehicle's route is on the road; otherwise highway-env's `to_dict` fails."""
     route = getattr(thing, "route", None)
     if not route:
         return True
@@ -387,11 +387,11 @@ def _is_plain(thing: RoadObject, features: list[str]) -> bool:
 
 
 def _vehicle_values(thing: RoadObject, late: Iterable[str] = ()) -> dict[str, float]:
-    """Return the part of highway-env's `to_dict` that observations use.
+    """Return those values of highway-env's `to_dict` that observations use.
 
     Args:
         thing: A vehicle or an object.
-        late: The features of its lane and its destination that are shown.
+        late: The features of the lane and the destination that are shown.
     """
     x, y = thing.position.tolist()
     c, s = float(np.cos(thing.heading)), float(np.sin(thing.heading))

@@ -1,4 +1,4 @@
-"""Caches for the roads in use: their lanes, and the state of their vehicles."""
+"""Caches for the roads in use: their lanes, and the states of their vehicles."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ watches: dict[str, Watch] = {}
 
 
 class Prepared:
-    """The cached data of a road: its network, and the state of its vehicles.
+    """The cached data of a road: its network, and the states of its vehicles.
 
     Attributes:
         network: The lanes of the road.
-        frame: The positions at the last access.
+        frame: The positions when they were last read.
         alone: Whether no foreign code runs between the sub-steps of the road, so that the state stays valid.
     """
 
@@ -70,17 +70,17 @@ class Prepared:
         self._kept = state if self.alone else None
 
     def trusted(self) -> RoadState | None:
-        """Return the kept state and discard it; None if no state has been kept since the last call."""
+        """Return the kept state and discard it; None if no state was kept after the last call."""
         kept, self._kept = self._kept, None
         return kept
 
     def distrust(self) -> None:
-        """Prepare for foreign code: discard the kept state."""
+        """Discard the kept state, because foreign code runs next."""
         self._kept = None
 
 
 class RoadState(NamedTuple):
-    """The current state of a road in the kernel."""
+    """The current state of a road's vehicles in the kernel."""
 
     owner: Prepared
     roster: KernelRoster
@@ -88,7 +88,7 @@ class RoadState(NamedTuple):
 
 
 def take(road: Road) -> RoadState | None:
-    """Return the kept state of a road; None if foreign code may have run since."""
+    """Return the kept state of a road; None if foreign code may have run in the meantime."""
     found = _roads.get(id(road))
     return found.trusted() if found is not None and found.road is road else None
 
@@ -103,13 +103,13 @@ def look(road: Road) -> RoadState | None:
 
 
 def forget() -> None:
-    """Forget all roads."""
+    """Discard the cached data of all roads."""
     _roads.clear()
     watches.clear()
 
 
 def prepared(road: Road) -> Prepared | None:
-    """Return the cached data of a road that is known, or seen; None if its lanes are unknown."""
+    """Return the cached data of a road whose vehicles may be searched; None if its lanes are unknown."""
     found = _roads.get(id(road))
     if found is None or not found.network.is_of(road.network):
         found = _roads[id(road)] = Prepared(road)
@@ -122,8 +122,8 @@ class _RoadKind:
     """Properties of a class of roads.
 
     Attributes:
-        is_seen: Whether the accelerator may search its vehicles and objects.
-        is_known: Whether, in addition, the class does not override a method that the accelerator bypasses.
+        is_seen: Whether the accelerator may search the road's vehicles and objects.
+        is_known: Whether, in addition, the class overrides no method that the accelerator bypasses.
     """
 
     def __init__(self, kind: type[Road]) -> None:
@@ -148,12 +148,12 @@ _road_kinds: dict[type, _RoadKind] = {}
 
 
 def is_known(road: Road) -> bool:
-    """Whether the kernel may decide for and move the vehicles of a road: its class and highway-env are unchanged."""
+    """Return whether the kernel may decide for and move a road's vehicles: class and highway-env are unchanged."""
     return _kind_of(road).is_known and _is_usual(road)
 
 
 def _is_seen(road: Road) -> bool:
-    """Whether the vehicles and objects of a road may be searched, maybe from a search of the road's own class."""
+    """Return whether the vehicles and objects of a road may be searched, possibly by the road class's own search."""
     return _kind_of(road).is_seen and _is_usual(road)
 
 
@@ -166,7 +166,7 @@ def _kind_of(road: Road) -> _RoadKind:
 
 
 def _is_usual(road: Road) -> bool:
-    """Whether no function of highway-env has been replaced, nor a method of this road."""
+    """Return whether no function of highway-env and no method of this road has been replaced."""
     return (
         bool(watches)
         and watches["roads"].intact

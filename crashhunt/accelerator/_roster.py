@@ -1,4 +1,4 @@
-"""The vehicles and objects of a road in the compiled kernel, with everything that must stay the same meanwhile."""
+"""The vehicles and objects of a road in the compiled kernel, and all their properties that must stay unchanged."""
 
 from __future__ import annotations
 
@@ -49,18 +49,18 @@ assert all(_PARAMETERS[: len(names)] == names for names in NUMBERS_OF.values())
 
 
 class KernelRoster:
-    """The vehicles and objects of a road in the kernel, with everything that must stay the same while they are there.
+    """The vehicles and objects of a road in the kernel, and their properties that must stay unchanged meanwhile.
 
     Args:
         road: The road.
         network: The lanes of the road.
 
     Attributes:
-        traffic: The vehicles in the kernel; None if it does not know them.
-        decides: Whether the kernel knows how all vehicles decide.
+        traffic: The vehicles in the kernel; None if the kernel does not know them.
+        decides: Whether the kernel knows how all vehicles make decisions.
         moves: Whether the kernel knows how all vehicles move.
-        predicts: Whether all vehicles predict their paths as highway-env's do.
-        describes: Whether all vehicles and objects describe themselves as highway-env's do.
+        predicts: Whether all vehicles predict their paths with highway-env's own methods.
+        describes: Whether all vehicles and objects describe themselves with highway-env's own methods.
         kinds: The properties of the class of each vehicle and object.
     """
 
@@ -78,7 +78,7 @@ class KernelRoster:
         self.traffic = self._in_kernel(road, things, network)
 
     def is_of(self, road: Road) -> bool:
-        """Whether the kernel still knows the vehicles and objects of a road, apart from their state."""
+        """Return whether the kernel still has the vehicles and objects of a road; their state is not compared."""
         if self._looks_further != road.neighbour_vehicles_connected_lanes:
             return False
         if self.traffic is not None:
@@ -106,7 +106,7 @@ class KernelRoster:
 
 
 def _examples(things: list[RoadObject], kinds: list[VehicleClass]) -> list[tuple[RoadObject, tuple[str, ...]]]:
-    """Return the objects with parameters of their own, and one of each class without, with the names of parameters."""
+    """Return the objects with own parameters and one object of each other class, with the names of the parameters."""
     found: list[tuple[RoadObject, tuple[str, ...]]] = []
     seen: set[int] = set()
     for thing, kind in zip(things, kinds, strict=True):
@@ -122,7 +122,7 @@ def _flags_of(thing: RoadObject, kind: VehicleClass) -> int:
 
 
 def _read_parameters(things: list[RoadObject], kinds: list[VehicleClass]) -> bytes | None:
-    """Return the kernel's row of parameters for each object; None if one is missing or unusual."""
+    """Return the kernel's row of parameters for each object; None if a parameter is missing or unusual."""
     shared: dict[int, Row] = {}  # of objects without parameters of their own, by class
     rows = []
     try:
@@ -155,7 +155,7 @@ def _read_parameters(things: list[RoadObject], kinds: list[VehicleClass]) -> byt
 
 
 def _is_tame(rows: NDArray[np.float64]) -> bool:
-    """Whether the parameters of drivers guarantee finite accelerations for finite velocities."""
+    """Return whether the parameters of drivers guarantee finite accelerations at finite velocities."""
     comfort, braking, wanted, time = (rows[:, _PARAMETERS.index(name)] for name in _GAP_PARAMETERS)
     return bool(
         np.isfinite([comfort, braking, wanted, time]).all()

@@ -17,7 +17,7 @@ __all__ = ["collide_one_by_one", "enforce", "finish"]
 
 
 def finish(road: Road, dt: float) -> None:
-    """Finish a sub-step after the kernel has moved the vehicles: with numbers that are not finite, in highway-env."""
+    """Finish a sub-step in which the kernel has moved the vehicles; if numbers are not finite, in highway-env."""
     for vehicle in road.vehicles:
         vehicle.on_state_update()
     collide_one_by_one(road, dt)
@@ -33,14 +33,14 @@ def collide_one_by_one(road: Road, dt: float) -> None:
 
 
 def enforce(road: RegulatedRoad, traffic: Traffic) -> bool:
-    """Do what `RegulatedRoad.enforce_road_rules` does, with one prediction per vehicle.
+    """Compute the result of `RegulatedRoad.enforce_road_rules`, with one prediction per vehicle.
 
     Args:
         road: The road.
-        traffic: Its vehicles in the kernel, with their current state.
+        traffic: The road's vehicles in the kernel, with their current state.
 
     Returns:
-        False, with nothing changed, if highway-env must predict a path.
+        Whether the rules were applied; False, with nothing changed, if highway-env must predict a path.
     """
     vehicles = road.vehicles
     conflicts = traffic.conflicts()

@@ -1,7 +1,7 @@
 """The loop over an environment's sub-steps, which keeps the vehicles' state in the kernel while no foreign code runs.
 
-Foreign code is code of the user or of a library other than highway-env. It may change a vehicle at any time, so the
-state is read again after it has run.
+Foreign code is the code of the user or of a library other than highway-env. It may change a vehicle at any time, so the
+state is read again after foreign code has run.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ __all__ = ["Onlooker", "SkippedObservation", "can_run_alone", "simulate"]
 
 
 class Onlooker:
-    """Replaces the ``step`` of a road object, and calls observers before and after it.
+    """Replaces the ``step`` of a road object by one that calls observers before and after each sub-step.
 
-    The kept state of the road stays valid while the observers do not interfere.
+    The kept state of the road stays valid as long as the observers do not change the road.
 
     Args:
-        advance: The road's own ``step``.
-        before: Called before each sub-step with its length, in s.
-        after: Called after each sub-step.
-        interferes: Returns whether the two observers may change the road; called before and after each sub-step. By
-            default they never do.
-        waits: Returns whether the observers do nothing until a vehicle crashes, apart from the sub-steps in which a
-            vehicle crashes. Then ``after`` is called only after these, and ``before`` is not called. By default they
-            are always called.
+        advance: The original ``step`` of the road.
+        before: Function called before each sub-step with the length of the sub-step, in s.
+        after: Function called after each sub-step.
+        interferes: Function that returns whether the two observers may change the road; called before and after each
+            sub-step. By default, they never do.
+        waits: Function that returns whether the observers act only in sub-steps in which a vehicle crashes. If so,
+            ``after`` is called only after these sub-steps, and ``before`` is never called. By default, both are always
+            called.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Onlooker:
         self.waits = waits
 
     def look(self) -> None:
-        """Call the observer after a sub-step."""
+        """Call the observer that follows a sub-step."""
         if self._after is not None:
             self._after()
 
@@ -94,19 +94,20 @@ _kinds: dict[type, Own] = {}
 
 
 def can_run_alone() -> bool:
-    """Whether the functions that highway-env calls between sub-steps are its own; stores them in `originals`."""
+    """Return whether the functions that highway-env calls between sub-steps are its own; store them in `originals`."""
     found = {f"AbstractEnv.{name}": getattr(AbstractEnv, name) for name in _CALLED_METHODS}
     originals.update(found)
     return all(is_genuine(name, function) for name, function in found.items())
 
 
 def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[object, str, object]]) -> None:
-    """Do what `AbstractEnv._simulate` does.
+    """Compute the result of `AbstractEnv._simulate`.
 
     Args:
         env: The environment.
-        action: The action of its agents, or None.
-        replaced: The replacements that must be in place: the owner of a method, its name and its replacement.
+        action: The action of the environment's agents, or None.
+        replaced: The replacements that must be in place: for each, the owner of the method, its name and the
+            replacement.
     """
     road = env.road
     found = prepared(road) if _runs_alone(env) and _are_in_place(replaced) and is_known(road) else None
@@ -145,7 +146,7 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[object, 
 
 
 def _run(env: AbstractEnv, found: Prepared, count: int) -> int:
-    """Let the kernel do several sub-steps; return how many it has done."""
+    """Let the kernel run several sub-steps; return the number of sub-steps that it has run."""
     road = env.road
     state = look(road)
     dt = 1 / env.config["simulation_frequency"]
@@ -172,7 +173,7 @@ def _frames(env: AbstractEnv) -> int:
 
 
 def _runs_alone(env: AbstractEnv) -> bool:
-    """Whether only the agents' actions and an `Onlooker` run between the sub-steps of an environment."""
+    """Return whether only the agents' actions and an `Onlooker` run between the sub-steps of an environment."""
     road, kind = env.road, type(env)
     if type(road) not in (Road, RegulatedRoad) or env.viewer is not None:
         return False
@@ -189,7 +190,7 @@ def _runs_alone(env: AbstractEnv) -> bool:
 
 
 def _are_in_place(replaced: Iterable[tuple[object, str, object]]) -> bool:
-    """Whether no method that highway-env calls in a sub-step has been wrapped or replaced."""
+    """Return whether no method that highway-env calls in a sub-step has been wrapped or replaced."""
     rendering = vars(AbstractEnv).get("_automatic_rendering")
     return rendering is originals["AbstractEnv._automatic_rendering"] and all(
         vars(owner).get(name) is faster for owner, name, faster in replaced
@@ -197,7 +198,7 @@ def _are_in_place(replaced: Iterable[tuple[object, str, object]]) -> bool:
 
 
 def _waits(road: Road) -> bool:
-    """Whether the observers of a road's sub-steps may be called at a crash only."""
+    """Return whether the observers of a road's sub-steps need to be called only at a crash."""
     onlooker = vars(road).get("step")
     return onlooker is None or (type(onlooker) is Onlooker and onlooker.waits())
 
@@ -265,7 +266,7 @@ def _observe_nothing() -> None:
 
 
 def _is_stateless(eye: ObservationType) -> bool:
-    """Whether making an observation has no effect except its return value."""
+    """Return whether making an observation has no effect except its return value."""
     if type(eye) not in _STATELESS_OBSERVATIONS:
         return False
     values = vars(eye)
@@ -287,7 +288,7 @@ class _Environments:
 
 
 def _is_own(kind: type) -> bool:
-    """Whether a class and all its functions are defined in highway-env or in the accelerator."""
+    """Return whether a class and all its functions are defined in highway-env or in the accelerator."""
     if not kind.__module__.startswith("highway_env."):
         return False
     functions = (getattr(found, "fget", None) or getattr(found, "__func__", found) for found in vars(kind).values())

@@ -58,7 +58,7 @@ def switch_on() -> str:
     """Accelerate highway-env in this process.
 
     Returns:
-        The reason if highway-env cannot be accelerated; otherwise empty.
+        The reason why highway-env cannot be accelerated; empty if it is accelerated.
     """
     if watches:
         return why_not()
@@ -79,7 +79,7 @@ def switch_on() -> str:
 
 
 def switch_off() -> None:
-    """Restore highway-env's methods; a method that other code has replaced meanwhile stays replaced."""
+    """Restore highway-env's methods; a method that other code has replaced in the meantime is not restored."""
     forget()
     _restore()
 
@@ -95,12 +95,12 @@ def _name(owner: type | ModuleType, name: str) -> str:
 
 
 def is_on() -> bool:
-    """Whether the accelerator is switched on."""
+    """Return whether the accelerator is switched on."""
     return bool(watches)
 
 
 def why_not() -> str:
-    """Return why the accelerator has no effect at the moment; empty if it has, or if it is switched off."""
+    """Return why the accelerator currently has no effect; empty if it has an effect or is switched off."""
     return next((watch.reason for watch in watches.values() if watch.reason), "")
 
 
@@ -135,13 +135,13 @@ def _step(self: Road, dt: float) -> None:
 
 
 def _slides(vehicle: Vehicle) -> bool:
-    """Whether the kernel computes the dynamic bicycle model of a vehicle, which is expensive in highway-env."""
+    """Return whether the kernel computes the dynamic bicycle model of a vehicle, which is slow in highway-env."""
     kind = kind_of(type(vehicle))
     return kind.slides and kind.moves
 
 
 def _step_one_by_one(road: Road, dt: float) -> None:
-    """Do what `Road.step` does; the kernel checks the pairs if it knows the vehicles then."""
+    """Compute the result of `Road.step`; the kernel checks pairs if it knows the vehicles afterwards."""
     for vehicle in road.vehicles:
         vehicle.step(dt)
     state = look(road) if type(dt) is float else None
@@ -253,7 +253,7 @@ def _compute_ttc_grid(
 
 
 def _is_plain(observation: KinematicObservation | OccupancyGridObservation, kind: Any) -> bool:
-    """Whether an observation has a known class, observes a road, and has no replaced method."""
+    """Return whether an observation has a known class, observes a road, and has no replaced method."""
     return bool(
         type(observation) is kind
         and watches
@@ -304,7 +304,7 @@ class Acceleration:
 
     @property
     def left_alone(self) -> dict[str, tuple[str, ...]]:
-        """Classes of vehicles that are not accelerated, or only in part, each with the members that it overrides."""
+        """Classes of vehicles that are not or only partly accelerated, each with the members that it overrides."""
         return {name: tuple(own) for name, own in left_alone.items()}
 
     def undo(self) -> None:
@@ -333,8 +333,8 @@ class Acceleration:
 def accelerate() -> Acceleration:
     """Accelerate highway-env in this process: bit-identical results in a fraction of the time.
 
-    Hunts call it by themselves. Call this function in your own process, such as a training. highway-env's own code runs
-    for everything that the accelerator does not know, and the accelerator checks that in every step:
+    Hunts call this function automatically. Call it in your own process, for example for training. highway-env's own
+    code runs in all cases that the accelerator does not know. The accelerator checks for these cases in every step:
 
     - another version of highway-env
     - an installation of crashhunt without the compiled kernel, which needs a C++ compiler
@@ -342,9 +342,9 @@ def accelerate() -> Acceleration:
     - functions and methods that other code has replaced, on a class, a module or an object
 
     Returns:
-        The state of the acceleration. Its truth value says whether highway-env is accelerated. ``reason`` says why not.
-        ``left_alone`` lists classes that are not accelerated. ``undo()``, or the end of a ``with`` block, switches the
-        accelerator off.
+        The state of the acceleration. Its truth value is whether highway-env is accelerated. ``reason`` is the reason
+        if not. ``left_alone`` lists classes that are not accelerated. ``undo()``, or the end of a ``with`` block,
+        switches the accelerator off.
 
     Example:
         >>> import crashhunt

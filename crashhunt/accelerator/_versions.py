@@ -59,13 +59,13 @@ _NUMPY = (
 
 
 class Watch:
-    """Detects replaced, added and removed members of namespaces, except numbers, which are read where they are used.
+    """Detects replaced, added and removed members of namespaces. Numbers are exempt, because they are read at each use.
 
     A check costs a few microseconds, so it can run in every sub-step.
 
     Args:
-        places: Namespaces, which are dictionaries of modules or classes, with their names in messages.
-        but: Members that do not matter, as ``Class.name``.
+        places: Namespaces, that is, dictionaries of modules or classes, with their names for messages.
+        but: Members that are not watched, as ``Class.name``.
     """
 
     def __init__(self, places: Iterable[tuple[str, Space]], but: Iterable[str] = ()) -> None:
@@ -76,7 +76,7 @@ class Watch:
 
     @classmethod
     def of_roads(cls, but: Iterable[str]) -> Watch:
-        """Watch roads, lanes and vehicles, and the functions of NumPy that they use."""
+        """Return a watch of roads, lanes and vehicles, and of the functions of NumPy that they use."""
         places: list[tuple[str, Space]] = [(module.__name__, vars(module)) for module in MODULES]
         for module in MODULES:
             places += _classes(module)
@@ -88,7 +88,7 @@ class Watch:
 
     @classmethod
     def of_observations(cls, but: Iterable[str]) -> Watch:
-        """Watch the classes of the accelerated observations."""
+        """Return a watch of the classes of the accelerated observations."""
         kinds = ("", "Kinematic", "KinematicsGoal", "OccupancyGrid", "Exit", "MultiAgent")
         wanted = ("ObservationType", *[f"{kind}Observation" for kind in kinds])
         places: list[tuple[str, Space]] = [(module.__name__, vars(module)) for module in (observation, finite_mdp)]
@@ -96,7 +96,7 @@ class Watch:
 
     @property
     def intact(self) -> bool:
-        """Whether no member has changed; logs each changed member once."""
+        """Return whether no member has changed; each changed member is logged once."""
         if self._snapshot is None:
             self._snapshot = snapshot_of([(place.owner, place.members) for place in self._places])
             self._sizes = [place.size for place in self._places]
@@ -114,7 +114,7 @@ class Watch:
 
     @property
     def reason(self) -> str:
-        """A sentence about the replaced member; empty if no member has changed."""
+        """A sentence about a replaced member; empty if no member has changed."""
         return f"{self._reported} has been replaced" if not self.intact else ""
 
 
@@ -141,7 +141,7 @@ class _Place:
         self.members = {key: space[key] for key in names}
 
     def changed(self) -> str:
-        """Return the first changed name that matters; empty if there is none."""
+        """Return the first changed name that is watched; empty if there is none."""
         missing = object()
         for name, value in self.members.items():
             if self.space.get(name, missing) is not value:
@@ -155,7 +155,7 @@ class _Place:
 
 
 def is_plain(value: object) -> bool:
-    """Whether a member of a class is a plain value: no function, property, other descriptor, or module."""
+    """Return whether a member of a class is a plain value: not a function, property, other descriptor or module."""
     return not callable(value) and not hasattr(type(value), "__get__") and not inspect.ismodule(value)
 
 
@@ -164,7 +164,7 @@ def _special(name: str) -> bool:
 
 
 def snapshot_of(spaces: Iterable[tuple[Space, Mapping[str, object]]]) -> Snapshot:
-    """Return the members of namespaces in the kernel, to find out in a few microseconds whether one has changed."""
+    """Return a snapshot of the members of namespaces in the kernel, with which changes are found in microseconds."""
     module = kernel()
     assert module is not None
     owners, members = zip(*spaces, strict=True)
@@ -178,7 +178,7 @@ def _classes(module: ModuleType) -> list[tuple[str, type]]:
 
 
 def _is_method(owner: str, name: str) -> bool:
-    """Whether a base class of a class has a method of this name, which a value would hide."""
+    """Return whether a base class has a method with this name, which a value of the class would hide."""
     kinds = [kind for module in (*MODULES, observation) for key, kind in vars(module).items() if key == owner]
     return any(not is_plain(inspect.getattr_static(base, name)) for kind in kinds if isinstance(kind, type)
                for base in kind.__mro__[1:] if name in vars(base))  # fmt: skip
@@ -303,7 +303,7 @@ class Own:
         self.plain = type(kind) is type(base) and not self.names
 
     def has(self, name: str) -> bool:
-        """Whether the class overrides this member of its base class."""
+        """Return whether the class overrides this member of its base class."""
         return self._member(name) is not inspect.getattr_static(self._base, name, None)
 
     def _member(self, name: str) -> object:
@@ -311,7 +311,7 @@ class Own:
 
     @property
     def current(self) -> bool:
-        """Whether the class has not changed since."""
+        """Return whether the class has not changed since this object was created."""
         return self._kind.__mro__ is self._mro and (
             self._snapshot is None or self._snapshot.first_changed(self._sizes) < 0
         )
@@ -327,15 +327,16 @@ class VehicleClass:
         plain: Whether all attributes that the accelerator reads are plain values.
         collides: Whether the collision check is inherited.
         moves: Whether the movement is inherited.
-        slides: Whether the class has the dynamic bicycle model, which highway-env's own code computes.
-        times: Whether its vehicles count the time since their last decision about a lane change.
-        drives: The model of decision, ``idm``, ``linear``, ``controlled`` or ``nothing``; empty if not inherited.
+        slides: Whether the class uses the dynamic bicycle model, which highway-env's own code computes.
+        times: Whether the vehicles of the class count the time since their last lane-change decision.
+        drives: The inherited decision model: ``idm``, ``linear``, ``controlled`` or ``nothing``; empty if it is not
+            inherited.
         predicts: Whether the prediction of trajectories is inherited.
-        describes: Whether ``to_dict`` and its parts are inherited.
+        describes: Whether ``to_dict`` and the methods that it calls are inherited.
         chooses: Whether the choice between target speeds is inherited.
-        base: The model of decision of the base class.
+        base: The decision model of the base class.
         methods: Names of methods, which an object of the class must not override.
-        fixed: These names, and the names of the parameters that objects of the class usually share.
+        fixed: The names of these methods, and of the parameters that objects of the class usually share.
     """
 
     def __init__(self, kind: type) -> None:
@@ -373,7 +374,7 @@ class VehicleClass:
                 logging.getLogger("crashhunt").info("not accelerated: %s has its own %s", name, ", ".join(own))
 
     def is_of(self, thing: object) -> bool:
-        """Whether an object overrides no method of its class."""
+        """Return whether an object overrides no method of its class."""
         return self.methods.isdisjoint(vars(thing))
 
 
@@ -400,7 +401,7 @@ _kinds: dict[type, VehicleClass] = {}
 
 
 def are_numbers(values: Iterable[object]) -> bool:
-    """Whether all values are of the types float, int or NumPy's float64, and not of a subclass."""
+    """Return whether all values are exactly of the types float, int or NumPy's float64, not of a subclass."""
     return _NUMBERS.issuperset(map(type, values))
 
 
@@ -430,7 +431,7 @@ _FILES = {str(module.__file__) for module in (*_MODULES, abstract, finite_mdp)}
 
 
 def is_genuine(name: str, function: Callable[..., object]) -> bool:
-    """Whether a function comes from highway-env's source and has this name, such as ``Class.method``."""
+    """Return whether a function comes from highway-env's source and has the given name, such as ``Class.method``."""
     found = inspect.unwrap(function)
     return getattr(getattr(found, "__code__", None), "co_filename", "") in _FILES and found.__qualname__ == name
 

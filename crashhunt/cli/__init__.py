@@ -1,4 +1,4 @@
-"""The command line: parses, calls, prints."""
+"""The command line: parses the arguments, calls the functions, and prints the results."""
 
 from __future__ import annotations
 
@@ -108,9 +108,10 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _open_standard_streams() -> None:
-    """Open the standard streams that were closed before the start, as null devices, also for child processes.
+    """Open standard streams that were closed at the start as null devices, for child processes as well.
 
-    Otherwise the next file that is opened takes the descriptor, and gets what libraries and child processes print.
+    Otherwise, the next opened file would get the descriptor of a standard stream, and everything that libraries and
+    child processes print.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):  # in the order of their descriptors
         if getattr(sys, name) is None:
@@ -150,7 +151,7 @@ def _report(error: CrashhuntError, *, as_json: bool) -> int:
 
 
 def _explained(error: Exception) -> CrashhuntError:
-    """Return an unexpected error as one line; print its traceback first if CRASHHUNT_TRACEBACK is set."""
+    """Return an unexpected error as one line; if CRASHHUNT_TRACEBACK is set, print its traceback first."""
     if os.environ.get("CRASHHUNT_TRACEBACK"):
         traceback.print_exc()
     if isinstance(error, OSError):
@@ -174,7 +175,7 @@ def _flush() -> None:
 
 
 def _is_output_closed() -> bool:
-    """Whether the reader of standard output or standard error has closed it."""
+    """Return whether the reader of standard output or standard error has closed the stream."""
     closed = select.poll()
     for descriptor in (1, 2):
         closed.register(descriptor, 0)  # which reports errors and hang-ups alone
@@ -182,7 +183,7 @@ def _is_output_closed() -> bool:
 
 
 def _discard_output() -> None:
-    """Send what is still to be written to nowhere, so that Python does not fail over it when it leaves."""
+    """Discard the output that has not been written, so that Python does not fail to write it at exit."""
     with suppress(OSError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
@@ -196,9 +197,9 @@ def _check_names(words: Sequence[str]) -> None:
 
 
 def _spell_out(words: Sequence[str]) -> list[str]:
-    """Return the command line with ``--splitting`` in place of the second word of ``--rare splitting``.
+    """Return the command line with ``--splitting`` instead of the second word of ``--rare splitting``.
 
-    An option with an optional value would take DIR for that value in ``run --rare DIR``.
+    If ``--rare`` had an optional value, ``run --rare DIR`` would take DIR for this value.
     """
     return ["--splitting" if pair == ("--rare", "splitting") else pair[1] for pair in pairwise(["", *words])]
 
@@ -221,7 +222,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 class _ByPurpose(argparse.RawDescriptionHelpFormatter):
-    """Omits argparse's own list of the commands, one long block; groups by purpose list them."""
+    """Omits argparse's own list of the commands, which is one long block; lists grouped by purpose replace it."""
 
     def _iter_indented_subactions(self, action: argparse.Action) -> Generator[argparse.Action, None, None]:
         yield from ()

@@ -57,13 +57,13 @@ Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 
 
 class Parser(argparse.ArgumentParser):
-    """Reports errors in one line, with the most similar name."""
+    """A parser that reports errors in one line, with the most similar name."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Refuse unknown options first: argparse would take the value of one for an argument, and complain of that.
+        """Refuse unknown options first. Otherwise, argparse would report an error about the option's value.
 
         Raises:
-            UsageError: there is no such option.
+            UsageError: an option does not exist.
         """
         known = [option for option in self._option_string_actions if option.startswith("--")]
         for word in takewhile(lambda word: word != "--", args or ()):
@@ -87,23 +87,23 @@ class Parser(argparse.ArgumentParser):
             file.write(message)  # argparse would hide that the disk is full
 
     def error(self, message: str) -> NoReturn:
-        """Refuse a command line.
+        """Raise an error that refuses the command line.
 
         Raises:
-            UsageError: always.
+            UsageError: in every case.
         """
         raise UsageError(message, fix=f"see {self.prog} --help")
 
 
 def add_json(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
-    """Add ``--json``, the same for every command."""
+    """Add the option ``--json``, which is the same for every command."""
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object to stdout; all other text goes to stderr"
     )
 
 
 def add_crash(parser: argparse.ArgumentParser) -> None:
-    """Add what chooses a crash."""
+    """Add the arguments that select a crash."""
     parser.add_argument(
         "directory",
         metavar="DIR",
@@ -120,10 +120,10 @@ def add_crash(parser: argparse.ArgumentParser) -> None:
 
 @contextmanager
 def opened_crash(directory: Path, crash: str) -> Iterator[tuple[Bundle, Archive | None]]:
-    """Yield the chosen crash; an exported crash is unpacked until the context ends.
+    """Yield the selected crash; an exported crash is unpacked until the end of the context.
 
     Raises:
-        BundleError: there is no such crash.
+        BundleError: the crash does not exist.
     """
     from crashhunt.crashes import find_bundle
 
@@ -138,10 +138,10 @@ def opened_crash(directory: Path, crash: str) -> Iterator[tuple[Bundle, Archive 
 
 @contextmanager
 def opened_hunt(directory: Path) -> Iterator[tuple[Path, bool]]:
-    """Yield the directory of a hunt, and whether it is an exported hunt that is unpacked until the context ends.
+    """Yield a hunt's directory, and whether it is an exported hunt that is unpacked until the end of the context.
 
     Raises:
-        HuntDirectoryError: it is not the directory of a hunt.
+        HuntDirectoryError: the directory contains no hunt.
     """
     if directory.is_file():
         from crashhunt.crashes import open_archive
@@ -157,15 +157,15 @@ def opened_hunt(directory: Path) -> Iterator[tuple[Path, bool]]:
 
 
 def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
-    """Return the hunts of a directory, with their names in it.
+    """Return the hunts in a directory, by their names in it.
 
     Args:
         directory: directory of a hunt or a suite.
-        runs: ``ID/N``, or ``ID`` for all runs of it; empty for every hunt.
+        runs: ``ID/N``, or ``ID`` for all runs of this hunt; empty for all hunts.
 
     Raises:
-        HuntDirectoryError: there is none.
-        UsageError: there is no such run.
+        HuntDirectoryError: the directory contains no hunt.
+        UsageError: the run does not exist.
     """
     from crashhunt.hunts import find_hunts
 
@@ -185,7 +185,7 @@ def pairs(words: list[str], option: str, *, named: bool = True) -> dict[str, str
     """Split repeated ``NAME=VALUE`` options.
 
     Raises:
-        UsageError: one has no name, or a name comes twice.
+        UsageError: an option has no name, or a name occurs twice.
     """
     found: dict[str, str] = {}
     for word in words:
@@ -201,7 +201,7 @@ def pairs(words: list[str], option: str, *, named: bool = True) -> dict[str, str
 
 
 def integer(text: str) -> int:
-    """Read a whole number."""
+    """Convert a text to a whole number."""
     try:
         return int(text)
     except ValueError:
@@ -209,7 +209,7 @@ def integer(text: str) -> int:
 
 
 def number(text: str) -> float:
-    """Read a number."""
+    """Convert a text to a number."""
     try:
         return float(text)
     except ValueError:
@@ -217,7 +217,7 @@ def number(text: str) -> float:
 
 
 def add_trust(parser: argparse.ArgumentParser) -> None:
-    """Add ``--trust``, the same for every command that runs code of a crash."""
+    """Add the option ``--trust``, which is the same for every command that runs code of a crash."""
     parser.add_argument(
         "--trust", action="store_true",
         help="run the code of a hunt or crash from another machine without asking; crashhunt trust DIR trusts this "
@@ -233,15 +233,15 @@ def run_trusted(
     *,
     path: Path | None = None,
 ) -> T:
-    """Call a function that runs the code of a crash; if the code is not trusted, ask the user once per origin.
+    """Call a function that runs the code of a crash; if the code is not trusted, ask the user once for each origin.
 
     Args:
-        run: called with True if the code is trusted; else with None, to find out. It raises `UntrustedError` before
-            anything runs.
-        bundle: the crash.
-        archive: which the crash was in, if any.
-        options: ``trust``, ``json`` and ``directory``.
-        path: what the user named; ``directory`` by default.
+        run: function called with True if the code is trusted, or with None to determine it. It raises `UntrustedError`
+            before any code runs.
+        bundle: the crash whose code runs.
+        archive: the archive that contained the crash; None if there was none.
+        options: the options ``trust``, ``json`` and ``directory`` of the command line.
+        path: path as the user named it; by default ``directory``.
 
     Raises:
         UntrustedError: the code is not trusted, and there is no terminal for a question, or the user declines.
@@ -261,7 +261,7 @@ def run_trusted(
 
 
 def check_trust(bundle: Bundle, trusted: bool | None) -> None:
-    """Refuse a crash that is not trusted; for `run_trusted`, before something runs that does not find out itself.
+    """Refuse a crash that is not trusted, for use in `run_trusted` before code that does not check the trust itself.
 
     Raises:
         UntrustedError: the crash is neither made here nor trusted.
@@ -273,7 +273,7 @@ def check_trust(bundle: Bundle, trusted: bool | None) -> None:
 
 
 def ask_to_trust(refusal: UntrustedError, *, as_json: bool) -> bool:
-    """Whether the user trusts code from now on; False without a terminal."""
+    """Ask whether the user trusts the code from now on; return False without a terminal."""
     if as_json or not (sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()):
         return False
     print(visible(f"{refusal.where}: {refusal.message}"), file=sys.stderr)
@@ -289,8 +289,8 @@ def shown_progress(what: str, *, as_json: bool) -> Iterator[Watch | None]:
     """Yield a function that shows progress in one line; the line is removed at the end, also after Ctrl-C.
 
     Args:
-        what: the work, such as ``writing crash.mp4``.
-        as_json: whether the output is JSON; then no progress is shown.
+        what: description of the work, such as ``writing crash.mp4``.
+        as_json: whether the output is JSON; in this case, no progress is shown.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -314,7 +314,7 @@ def shown_progress(what: str, *, as_json: bool) -> Iterator[Watch | None]:
 
 
 def add_ci_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--summary`` and ``--annotate``."""
+    """Add the options ``--summary`` and ``--annotate``."""
     parser.add_argument(
         "--summary", metavar="FILE", type=Path,
         help="add a summary in Markdown to the end of FILE, such as $GITHUB_STEP_SUMMARY",
@@ -327,10 +327,10 @@ def add_ci_options(parser: argparse.ArgumentParser) -> None:
 
 
 def tell(options: argparse.Namespace, summary: str, annotations: Sequence[str]) -> None:
-    """Write the summary and print the annotations, where they were asked for.
+    """Write the summary and print the annotations, if the user requested them.
 
     Raises:
-        HuntDirectoryError: the file cannot be written.
+        HuntDirectoryError: the summary file cannot be written.
     """
     if options.summary is not None:
         try:
@@ -347,21 +347,21 @@ def tell(options: argparse.Namespace, summary: str, annotations: Sequence[str]) 
 
 
 def add_options(groups: Mapping[str, argparse._ArgumentGroup], names: Collection[str] = ()) -> None:
-    """Add every option that has a flag to its group of the help.
+    """Add every option that the command line has to its group of the help.
 
     Args:
-        groups: groups of the help, by name.
-        names: names of the options, where not all are for this command.
+        groups: groups of the help by name.
+        names: names of the options to add; by default all options.
     """
     for option in _options(names):
         _add(groups[option.about.group], option)
 
 
 def chosen_options(given: argparse.Namespace, names: Collection[str] = ()) -> Given:
-    """Return the options that were given, as `crashhunt.prepare` takes them.
+    """Return the options that the user gave, in the form for `crashhunt.prepare`.
 
     Raises:
-        UsageError: a value has no name, or a name comes twice.
+        UsageError: a value has no name, or a name occurs twice.
     """
     return {option.name: _value(option, getattr(given, option.name)) for option in _options(names)}
 
@@ -379,7 +379,7 @@ def add_options_of_machine(parser: argparse.ArgumentParser) -> None:
 
 
 def chosen_of_machine(given: argparse.Namespace) -> Given:
-    """Return the given options of `add_options_of_machine`."""
+    """Return those options of `add_options_of_machine` that the user gave."""
     found = {option.name: getattr(given, option.name) for option in hunt_options() if option.about.anywhere}
     return {name: value for name, value in found.items() if value is not None}
 

@@ -1,4 +1,4 @@
-"""Shell completion: ``crashhunt completion SHELL``, and what there is to complete."""
+"""Shell completion: ``crashhunt completion SHELL``, and the possible completions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ put one of these lines where your shell starts:
 
 
 def add_completion(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     completion = commands.add_parser(
         "completion",
         help="print a shell script that adds tab completion",
@@ -51,7 +51,7 @@ def _completion(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
-    """Answer the shell, if it is the shell that has called, and end the process; else do nothing."""
+    """If a shell has called for completions, print them and end the process; otherwise do nothing."""
     if "_ARGCOMPLETE" not in os.environ:
         return
     from argcomplete import autocomplete
@@ -148,7 +148,7 @@ def _runs(parsed_args: argparse.Namespace, **_: object) -> list[str]:
 
 
 def _arguments(parsed_args: argparse.Namespace, *, of_agents: bool) -> list[str]:
-    """Return the arguments of the scenario, from its file alone, because a shell does not wait."""
+    """Return the arguments of the scenario, read only from its file, because a shell does not wait for long."""
     from crashhunt.scenario import configurations, shipped_folder
 
     name = vars(parsed_args).get("scenario") or "loop"
@@ -164,7 +164,7 @@ def _arguments(parsed_args: argparse.Namespace, *, of_agents: bool) -> list[str]
 
 
 def _several(one: Completer) -> Completer:
-    """Complete the last of several that commas part."""
+    """Complete the last of several values that are separated by commas."""
 
     def last(prefix: str, **given: object) -> list[str]:
         before = prefix.rpartition(",")[0]
@@ -175,7 +175,7 @@ def _several(one: Completer) -> Completer:
 
 
 def _paths(*endings: str) -> Completer:
-    """Complete folders, and files with one of some endings."""
+    """Complete folders, and files with one of the given endings."""
 
     def inside(prefix: str, **_: object) -> list[str]:
         folder, _slash, start = prefix.rpartition("/")

@@ -34,7 +34,7 @@ __all__ = ["add_corpus"]
 
 
 def add_corpus(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     corpus = commands.add_parser(
         "corpus",
         help="keep crashes in a repository, and check that they stay fixed",
@@ -151,7 +151,7 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _trust_cases(cases: list[Path], options: argparse.Namespace) -> None:
-    """See that every case is trusted before the first one runs; ask at the terminal once for each origin."""
+    """Check that every case is trusted before the first case runs; ask at the terminal once for each origin."""
     from crashhunt.corpus import untrusted_case
 
     for path in cases:

@@ -26,7 +26,7 @@ _DEFAULT_RUNS = 8  # `crashhunt.whatif.REPRESENTATIVES`, which takes longer to i
 
 
 def add_crashes(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     crashes = commands.add_parser(
         "crashes",
         help="list the different crash types",
@@ -86,7 +86,7 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _divide_types(options: argparse.Namespace, groups: Sequence[Group]) -> tuple[list[tuple[CauseGroup, ...]], bool]:
-    """Return the crashes of each type, divided by cause, and whether the user has stopped that."""
+    """Return the crashes of each type, divided by cause, and whether the user has interrupted the division."""
     from crashhunt.base.signals import stop_requests
     from crashhunt.replays import ReplayOptions
     from crashhunt.whatif import divide_by_cause
@@ -119,7 +119,7 @@ def _cases(corpus: Path | None) -> list[Case] | None:
 
 
 def _types_in_corpus(groups: Sequence[Group], cases: list[Case] | None) -> dict[Signature, str] | None:
-    """Return crash type to the case of the corpus; None if no corpus was given."""
+    """Return for each crash type the name of its corpus case; None if no corpus was given."""
     from crashhunt.corpus import known_kinds
 
     if cases is None:

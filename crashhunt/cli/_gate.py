@@ -45,7 +45,7 @@ _LINE_EVERY_S = 30.0  # where there is no terminal
 
 
 def add_gate(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     gate = commands.add_parser(
         "gate",
         help="give a verdict on a change: better, worse, no difference or undecided",
@@ -168,7 +168,7 @@ def _margin(text: str) -> float:
 
 
 def _of_options(options: argparse.Namespace, folder: Path) -> dict[str, RunRequest]:
-    """Return the one hunt that the options describe."""
+    """Return the only hunt, as the options describe it."""
     from dataclasses import replace
 
     from crashhunt.plans import HuntOptions, SnapshotChoices, fields_of, request_of
@@ -187,7 +187,7 @@ def _of_options(options: argparse.Namespace, folder: Path) -> dict[str, RunReque
 
 
 def _of_suite(options: argparse.Namespace, words: list[str]) -> dict[str, RunRequest]:
-    """Return every run of a suite by name."""
+    """Return all runs of a suite by name."""
     from dataclasses import replace
 
     from crashhunt.plans import hunt_options
@@ -210,13 +210,13 @@ def _of_suite(options: argparse.Namespace, words: list[str]) -> dict[str, RunReq
 
 
 def _flags(words: list[str]) -> set[str]:
-    """Return the options that the command line gives."""
+    """Return the options that the command line contains."""
     return {word.partition("=")[0] for word in words}
 
 
 @contextmanager
 def _watched(*, as_json: bool) -> Iterator[Callable[[GateProgress], None]]:
-    """Yield what shows how far a gate is: a line that changes on a terminal, a line every half minute elsewhere."""
+    """Yield a function that shows the progress of a gate: a changing line on a terminal, else a line each 30 s."""
     from rich.console import Console
     from rich.status import Status
 

@@ -19,7 +19,7 @@ __all__ = ["add_guide"]
 
 
 def add_guide(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     guide = commands.add_parser(
         "guide",
         help="read the guide: tutorials, how to, reference, troubleshooting",
@@ -66,7 +66,7 @@ def _listing(pages: list[Page]) -> str:
 
 
 def _show(text: str) -> None:
-    """Draw Markdown, in lines of a length that can be read."""
+    """Print Markdown in lines of readable length."""
     from rich.console import Console
     from rich.markdown import Markdown
 

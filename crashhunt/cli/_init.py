@@ -26,7 +26,7 @@ _KIND_BY_OPTION = {"osm": "osm", "opendrive": "opendrive", "net": "net"}
 
 
 def add_init(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     init = commands.add_parser(
         "init",
         help="make a scenario from a map",
@@ -118,10 +118,10 @@ def _source(options: argparse.Namespace) -> MapSource:
 
 
 def _demand(text: str) -> tuple[float, float]:
-    """Return the range.
+    """Return the range of traffic factors in a text.
 
     Raises:
-        UsageError: it is none.
+        UsageError: the text is not a range.
     """
     fix = "give two factors above 0, such as --demand 0.2:1.5"
     low, colon, high = text.partition(":")
@@ -141,11 +141,11 @@ _IMPORT_S = 60.0
 
 
 def _check_agent(name: str) -> None:
-    """Refuse an agent that no trial could make, before the map takes its time.
+    """Refuse an agent that no trial could create, before the time-consuming work on the map.
 
     Raises:
-        PluginError: there is no such agent, or its module cannot be imported.
-        UsageError: it needs an argument.
+        PluginError: the agent does not exist, or its module cannot be imported.
+        UsageError: the agent needs an argument.
     """
     from crashhunt.base.apart import work_apart
     from crashhunt.base.plugins import is_foreign, locate
@@ -164,7 +164,7 @@ def _check_agent(name: str) -> None:
 
 
 def _run_one_trial(folder: Path, steps: int) -> PlainTrial:
-    """Run one trial.
+    """Run one trial in the new scenario, and return its result.
 
     Raises:
         NoValidTrialError: the controlled vehicle does not enter.

@@ -21,7 +21,7 @@ __all__ = ["add_lists"]
 
 
 def add_lists(commands: Commands) -> None:
-    """Add the commands."""
+    """Add the commands to the parser."""
     for name, command, text in (
         ("agents", _agents, "list the agents that crashhunt includes or that are installed, with their arguments"),
         ("disturbances", _disturbances, "list the disturbances that crashhunt includes or that are installed"),

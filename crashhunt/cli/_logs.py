@@ -20,7 +20,7 @@ __all__ = ["add_logs"]
 
 
 def add_logs(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     logs = commands.add_parser(
         "logs",
         help="show the output and the errors of hunts and trials",
@@ -69,5 +69,5 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _split_progress_lines(text: str) -> str:
-    """Return the lines of a progress bar that has overwritten its own line."""
+    """Return the states of a progress bar, which has overwritten its own line, as separate lines."""
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -23,7 +23,7 @@ __all__ = ["add_rate", "exit_code_of"]
 
 
 def add_rate(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     rate = commands.add_parser(
         "rate",
         help="report how often an agent crashes, with a guarantee",
@@ -95,7 +95,7 @@ def _rate(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def exit_code_of(verdicts: Iterable[str]) -> int:
-    """Return 1 where a rate is above its bar, else 3 where a rate is undecided, else 0."""
+    """Return 1 if a rate is above its threshold, else 3 if a rate is undecided, else 0."""
     found = set(verdicts)
     if "above" in found:
         return THE_ANSWER_IS_NO

@@ -59,7 +59,7 @@ __all__ = [
 
 
 def add_film_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options."""
+    """Add the options for films to the parser."""
     film = parser.add_argument_group(
         "to watch it",
         "With --from-log no code is run, and nothing is simulated; otherwise what the replay does is shown, with the "
@@ -102,10 +102,10 @@ def add_film_options(parser: argparse.ArgumentParser) -> None:
 
 
 def film_options(options: argparse.Namespace) -> FilmOptions | None:
-    """Return what a film shall look like; None if none is wanted.
+    """Return the options of a film; None if the user wants no film.
 
     Raises:
-        UsageError: an option cannot be meant, or Pillow is not installed.
+        UsageError: an option is invalid, or Pillow is not installed.
     """
     if not (options.video or options.gif or options.frames):
         return None
@@ -128,7 +128,7 @@ def film_options(options: argparse.Namespace) -> FilmOptions | None:
 
 
 def look_at_all(bundle: Bundle, *, to_stderr: bool = False) -> Look | None:
-    """Return how to look at a whole crash; None if nothing of it can be looked at."""
+    """Return the options to examine a whole crash; None if no part of it can be examined."""
     from crashhunt.replays import Look
 
     # The process that is looked at is not watched over: it stops before what ended the one of the hunt.
@@ -141,7 +141,7 @@ def look_at_all(bundle: Bundle, *, to_stderr: bool = False) -> Look | None:
 def filmed(
     chosen: ReplayOptions, bundle: Bundle, film: FilmOptions | None, *, to_stderr: bool
 ) -> Iterator[ReplayOptions]:
-    """Yield how to replay so that the agent's panels are drawn, and where they then are."""
+    """Yield the replay options with which the agent's panels are drawn, and the folder of their pictures."""
     if film is None or not film.panels:
         yield chosen
         return
@@ -159,7 +159,7 @@ def filmed(
 
 
 def replayed_shot(report: ReplayReport, chosen: ReplayOptions) -> Shot:
-    """Return what a replay did, to be filmed."""
+    """Return a replay in the form from which films are made."""
     from crashhunt.render import load_meanings, load_panels
 
     folder = chosen.look.panels[1] if chosen.look is not None and chosen.look.panels is not None else None
@@ -170,15 +170,15 @@ def replayed_shot(report: ReplayReport, chosen: ReplayOptions) -> Shot:
 
 
 def recorded_shot(bundle: Bundle) -> Shot:
-    """Return the recording, for a film."""
+    """Return the recording of a crash in the form from which films are made."""
     return _shot(bundle, bundle.recording(), bundle.result, {}, crashed=not bundle.is_near_miss)
 
 
 def write_films(options: argparse.Namespace, shots: list[Shot], film: FilmOptions) -> dict[str, int]:
-    """Write the requested films; return file to number of pictures.
+    """Write the requested films; return the number of pictures of each file.
 
     Raises:
-        CrashhuntError: a file cannot be written, or what writes it is not installed.
+        CrashhuntError: a file cannot be written, or a required package is not installed.
     """
     from crashhunt.render import write_frames, write_gif, write_video
 
@@ -230,7 +230,7 @@ def _shot(
 
 
 def add_replay(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     replay = commands.add_parser(
         "replay",
         help="run a saved crash again, and report whether it is bit-identical",
@@ -354,7 +354,7 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions | None) -> None:
-    """Refuse options that contradict each other rather than omit one of them."""
+    """Refuse options that contradict each other, instead of ignoring one of them."""
     look = {
         "--gui": options.gui,
         "--pdb": options.pdb,

@@ -22,7 +22,7 @@ __all__ = ["add_report"]
 
 
 def add_report(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     report = commands.add_parser(
         "report",
         help="write one HTML file that shows a hunt and animates its crashes",
@@ -89,7 +89,7 @@ def _report(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _shown_crashes(found: FoundCrashes, shown: Sequence[Bundle]) -> str:
-    """Return in words which of the crashes are shown; empty if all are, or where the user has named one."""
+    """Return as text which crashes are shown; empty if all are shown, or if the user has named one."""
     if not found.shown:
         return ""
     chosen = ": the shortest of each type, then the shortest of all" if len(shown) < found.saved else ""

@@ -40,10 +40,10 @@ _GROUPS = {
 
 
 class _ShortHelp(argparse.Action):
-    """Prints the most used options, and the names of all others by their group."""
+    """Action that prints the most used options, and the names of all other options by group."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
-        """Print the help and leave."""
+        """Print the help and exit."""
         parser._print_message(short_help(parser), sys.stdout)
         parser.exit()
 
@@ -76,7 +76,7 @@ def short_help(parser: argparse.ArgumentParser) -> str:
 
 
 def add_run(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     run = commands.add_parser(
         "run",
         help="hunt for a crash",

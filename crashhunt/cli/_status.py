@@ -27,7 +27,7 @@ _STATE_COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "
 
 
 def add_status(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     status = commands.add_parser(
         "status",
         help="show the progress of hunts",
@@ -68,7 +68,7 @@ def _states(directories: list[Path]) -> list[HuntState]:
 
 
 def states_console(*, stderr: bool = False) -> Console:
-    """Return the console for the table; its width is 120 columns where it is not a terminal."""
+    """Return the console for the table of states; it has 120 columns if it is not a terminal."""
     from rich.console import Console
 
     console = Console(stderr=stderr, highlight=False)
@@ -76,7 +76,7 @@ def states_console(*, stderr: bool = False) -> Console:
 
 
 def states_table(states: list[HuntState]) -> Group:
-    """Return hunts as a table for a terminal, and below it the other facts of each hunt, one line each."""
+    """Return hunts as a table for a terminal, followed by the other facts of each hunt, one line each."""
     from rich import box
     from rich.console import Group
     from rich.table import Table
@@ -112,7 +112,7 @@ def states_table(states: list[HuntState]) -> Group:
 
 
 def _facts(state: HuntState) -> list[str]:
-    """Return the facts of a hunt that no column has, one line each."""
+    """Return the facts of a hunt that are not in a column, one line each."""
     from crashhunt.report import describe_running
 
     crashes = _crashes(state)
@@ -132,7 +132,7 @@ def _state(state: HuntState) -> str:
 
 
 def fork_lines(state: HuntState) -> list[str]:
-    """Return the results of the forks of a hunt's trials so far, one line each; an empty list where it has none."""
+    """Return the present results of the forks of a hunt's trials, one line each; empty if it has no forks."""
     lines = []
     if (probes := state.probes) is not None:
         least = "no stress margin yet"
@@ -158,7 +158,7 @@ def _confirmed(sums: ProbeSums | BranchSums) -> str:
 
 
 def _crashes(state: HuntState) -> str:
-    """Return how many crashes are saved and disturbed, the number of types, and the age of the last new type."""
+    """Return the numbers of saved and disturbed crashes, the number of types, and the age of the last new type."""
     from crashhunt.report import describe_types, format_seconds
 
     said = [] if state.crashes_saved is None else [f"{state.crashes_saved} saved"]
@@ -171,7 +171,7 @@ def _crashes(state: HuntState) -> str:
 
 
 def show_states(states: list[HuntState], console: Console) -> None:
-    """Print hunts as a table, and below it the errors of failed hunts."""
+    """Print hunts as a table, followed by the errors of failed hunts."""
     console.print(states_table(states))
     for state in states:
         if state.detail:

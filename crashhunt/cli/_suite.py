@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 
 def add_suite(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     suite = commands.add_parser(
         "suite",
         help="run many hunts from one file",
@@ -65,7 +65,7 @@ def add_suite(commands: Commands) -> None:
 
 
 def add_rerun(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     rerun = commands.add_parser(
         "rerun",
         help="run failed hunts again, or a hunt with other settings in another directory",
@@ -154,7 +154,7 @@ def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _run_with_trust(run: Callable[[bool], T], options: argparse.Namespace) -> T:
-    """Run hunts; ask at the terminal for each that is not trusted, before the first one runs.
+    """Run hunts; ask at the terminal for each hunt that is not trusted, before the first hunt runs.
 
     Raises:
         UntrustedError: a hunt is not trusted, and there is no terminal for a question, or the user declines.
@@ -173,7 +173,7 @@ def _run_with_trust(run: Callable[[bool], T], options: argparse.Namespace) -> T:
 
 
 def _watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Callable[[], None]]:
-    """What shows how it goes, and what ends the showing: a table on a terminal, a line per change elsewhere."""
+    """Return a function that shows the progress, and one that ends the display: a table on a terminal, else lines."""
     from rich.live import Live
 
     console = states_console(stderr=as_json)

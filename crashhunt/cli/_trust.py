@@ -22,7 +22,7 @@ __all__ = ["add_trust_command"]
 
 
 def add_trust_command(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command to the parser."""
     trust = commands.add_parser(
         "trust",
         help="trust the code of hunts and crashes that you did not make on this machine",
@@ -71,7 +71,7 @@ def _trust(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _trust_place(place: Path) -> list[TrustedOrigin]:
-    """Trust everything that a user has named.
+    """Trust all code at a place that the user has named.
 
     Raises:
         BundleError: the place has no code to run, or is damaged.

@@ -36,8 +36,8 @@ class Bisected(Serializable):
 
     Args:
         commit: The first commit with the crash; None if revisions that cannot run make it ambiguous.
-        subject: The subject of the commit message.
-        candidates: The commits among which the first one is, if it is ambiguous.
+        subject: The subject line of the commit's message.
+        candidates: The commits that may have introduced the crash, if the result is ambiguous.
         tried: The tried revisions, each with the status of the crash.
     """
 
@@ -68,7 +68,7 @@ def bisect(
 
     Raises:
         UsageError: A revision does not exist or has the wrong status, or the code does not come from the work tree.
-        CrashhuntError: git fails.
+        CrashhuntError: git reports an error.
     """
     folder = (folder or Path.cwd()).resolve()
     top = top_of(folder)

@@ -1,7 +1,7 @@
 """Cases of a corpus: folders with a crash and the expected result of the current code.
 
-A case has the layout of a hunt's directory with one crash, so that all commands that read crashes can read it. In
-addition it has the file ``crashhunt-case.toml``, which users edit.
+A case has the layout of a hunt's directory with one crash, so that all commands that read crashes can read it. It also
+contains the file ``crashhunt-case.toml``, which users edit.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _CASE_COMMENT = """\
 
 @dataclass(frozen=True, kw_only=True)
 class _File:
-    """The content of ``crashhunt-case.toml``."""
+    """The contents of ``crashhunt-case.toml``."""
 
     expect: Expectation
     note: str = ""
@@ -57,7 +57,7 @@ class _File:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A case on disk.
+    """A case of a corpus, stored on disk.
 
     Args:
         path: The folder of the case.
@@ -93,7 +93,7 @@ class Case:
         return found[0]
 
     def kind_of_log(self) -> Literal["whole", "compact", ""]:
-        """Return whether the log of the case has all actors; empty if there is no log, as in cases of early versions.
+        """Return whether the log of the case contains all actors; empty if there is no log, as in early cases.
 
         Raises:
             BundleError: The crash or its log is damaged.
@@ -104,7 +104,7 @@ class Case:
         return "whole" if bundle.recording().compact is None else "compact"
 
     def expecting(self, expect: Expectation | None, note: str | None) -> Case:
-        """Write another expectation or note into the case and return the changed case; None changes nothing.
+        """Store another expectation or note in the case, and return the changed case; None keeps the present value.
 
         Raises:
             HuntDirectoryError: The file cannot be written.
@@ -130,7 +130,7 @@ class Case:
             temporary.write_text(_CASE_COMMENT + tomli_w.dumps(said), encoding="utf-8")
 
     def to_json(self) -> JsonObject:
-        """Return the shape that ``corpus list --json`` prints."""
+        """Return the case in the form that ``corpus list --json`` prints."""
         files = [file for file in self.path.rglob("*") if file.is_file()]
         return {
             "path": str(self.path),
@@ -143,10 +143,10 @@ class Case:
 
 
 def read_case(path: Path) -> Case:
-    """Read the case of a folder.
+    """Read the case in a folder.
 
     Raises:
-        BundleError: The folder has no valid case; the message has the key, its value and the fix.
+        BundleError: The folder has no valid case; the message names the key, its value and the fix.
     """
     file = path / layout.CASE
     try:
@@ -163,7 +163,7 @@ def find_cases(places: list[Path]) -> list[Path]:
     """Return the folders of all cases in the given folders, sorted by name; a given folder may itself be a case.
 
     Raises:
-        BundleError: A folder has no case.
+        BundleError: A folder contains no case.
     """
     found: dict[Path, None] = {}
     for place in places:
@@ -192,11 +192,11 @@ _MAX_BYTES_OF_OBSERVATIONS = 50 * 1024  # raw; images have more, and only their 
 
 @dataclass(frozen=True, slots=True)
 class Added:
-    """The result of adding a crash.
+    """The result of adding a crash to a corpus.
 
     Args:
         case: The case in the corpus.
-        new: Whether the corpus did not have the case before.
+        new: Whether the case is new in the corpus.
     """
 
     case: Case
@@ -206,7 +206,7 @@ class Added:
 def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None, note: str | None = None) -> Added:
     """Add a crash to a corpus. If the corpus has the crash already, update only the expectation and the note.
 
-    The function runs no code. Afterwards the case counts as made by this user, so check first that the bundle is
+    The function runs no code. After the call, the case counts as made by this user, so check before that the bundle is
     trusted. Two processes may add to the same corpus at the same time.
 
     Args:
@@ -288,7 +288,7 @@ def _with_relative_paths(spec: TrialSpec, case: Path) -> TrialSpec:
     """Return a specification with relative paths for files below the current folder, such as weights.
 
     Paths from a scenario file are absolute, and another machine has the repository elsewhere. A case outside of the
-    current folder, such as that of `crashhunt bisect`, keeps absolute paths.
+    current folder, such as the case of `crashhunt bisect`, keeps absolute paths.
     """
     here = Path.cwd()
     if not case.resolve().is_relative_to(here):
@@ -317,10 +317,10 @@ def _copy(bundle: Bundle, case: Case, folder: Path) -> None:
 
 
 def _compact(bundle: Bundle, recording: Recording) -> Recording:
-    """Return the recording with the vehicles of the crash, and in each step the actors near an agent.
+    """Return the recording with the vehicles of the crash, and in each step also the actors near an agent.
 
-    The distance is so large that crash type and fault are those of all actors. Criticality and the closest approach
-    need actors that are farther away, so nothing reports them from a compact log.
+    The distance is so large that crash type and fault are the same as with all actors. Criticality and the closest
+    approach depend on actors that are farther away, so they are not reported from a compact log.
     """
     if recording.compact is not None:
         return recording
@@ -336,7 +336,7 @@ def _compact(bundle: Bundle, recording: Recording) -> Recording:
 
 
 def _facts(bundle: Bundle, recording: Recording) -> tuple[object, ...]:
-    """Return what commands derive from a recording, to compare two of them."""
+    """Return the facts that commands derive from a recording, so that two recordings can be compared."""
     return signature_of(bundle, recording), fault_of(bundle, recording).to_json()
 
 
@@ -344,9 +344,9 @@ def _facts(bundle: Bundle, recording: Recording) -> tuple[object, ...]:
 
 
 def known_kinds(signatures: Iterable[Signature], cases: Iterable[Case]) -> dict[Signature, Case]:
-    """Return a case of the same crash type for each signature that has one.
+    """Return for each signature a case of the same crash type, if there is one.
 
-    Cases with the status ``fixed`` are ignored, because their crashes must not occur any more.
+    Cases that expect ``fixed`` are ignored, because their crashes must not occur again.
 
     Args:
         signatures: The signatures of the crashes.

@@ -44,13 +44,13 @@ _HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)
 
 @dataclass(frozen=True, slots=True)
 class CaseReport(Serializable):
-    """The result of a case.
+    """The result of running a case.
 
     Args:
         path: The folder of the case.
         expected: The expected status.
-        got: The status: ``still`` (reproduces with the same crash type), ``fixed``, ``changed`` (another crash type) or
-            ``cannot_run``.
+        got: The actual status: ``still`` (reproduces with the same crash type), ``fixed``, ``changed`` (another crash
+            type) or ``cannot_run``.
         was: A description of the recorded crash.
         now: A description of the current result, or the reason why the case cannot run.
         note: The user's note.
@@ -71,21 +71,21 @@ class CaseReport(Serializable):
 
     @property
     def ok(self) -> bool:
-        """Whether the status is as expected, or better."""
+        """Whether the actual status is the expected one, or a better one."""
         return self.got == self.expected or self.got == "fixed"
 
     @property
     def may_be_tightened(self) -> bool:
-        """Whether the case is fixed although ``still`` is expected; false with warnings, because they raise doubt."""
+        """Whether the case is fixed although ``still`` is expected; false with warnings, which cast doubt on it."""
         return self.expected == "still" and self.got == "fixed" and not self.warnings
 
     @property
     def line(self) -> str:
-        """The current result and the note, in one line."""
+        """The current result and the note, as one line."""
         return one_line(f"{self.now} ({self.note})" if self.note else self.now)
 
     def describe(self) -> str:
-        """Return a text of several lines with the result and the command to show it."""
+        """Return a text of several lines with the result and the command that shows the crash."""
         lines = [
             f"{self.path.name}: {_RESULT_WORDS[self.got]}" + ("" if self.ok else f", and {self.expected} was expected")
         ]
@@ -123,10 +123,11 @@ def run_cases(
     Args:
         cases: The folders of the cases.
         parallel: Number of cases at a time; 0 for one per core.
-        keep: A folder for the crashes; each crash gets a hunt's directory with the name of the case.
-        watch: Called with the number of completed cases and the number of all cases.
-        stopped: Returns whether to stop; called repeatedly.
-        trusted: Whether to run the cases without a check; otherwise all cases must be trusted before the first runs.
+        keep: A folder for the crashes. For each crash, a hunt's directory with the name of the case is created.
+        watch: Function called with the number of completed cases and the number of all cases.
+        stopped: Function that returns whether to stop; called repeatedly.
+        trusted: Whether to run the cases without a check of trust; otherwise all cases must be trusted before the first
+            case runs.
 
     Returns:
         The reports of the completed cases, in the order of the cases.
@@ -160,7 +161,7 @@ def run_cases(
 
 
 def _refuse_untrusted_cases(cases: Sequence[Path]) -> None:
-    """Refuse cases that are neither this user's nor trusted; unreadable cases do not run anyway.
+    """Refuse cases that are neither made by this user nor trusted; unreadable cases cannot run anyway.
 
     Raises:
         UntrustedError: A case is not trusted; the message names the first such case.
@@ -172,7 +173,7 @@ def _refuse_untrusted_cases(cases: Sequence[Path]) -> None:
 
 
 def untrusted_case(path: Path) -> Bundle | None:
-    """Return the crash of a case that is not trusted; None if it is trusted, or damaged and so cannot run."""
+    """Return the crash of a case that is not trusted; None if it is trusted, or is damaged and thus cannot run."""
     try:
         bundle = read_case(path).bundle()
         snapshot_of(bundle).verify()
@@ -182,7 +183,7 @@ def untrusted_case(path: Path) -> Bundle | None:
 
 
 class _Running:
-    """A case that runs."""
+    """A case that is running."""
 
     def __init__(self, case: Case, bundle: Bundle, settings: HuntSettings, snapshot: Snapshot) -> None:
         self._case, self._bundle, self._settings = case, bundle, settings
@@ -258,7 +259,7 @@ class _Running:
         return replace(found, kept=kept.path if kept is not None and keep is not None else None)
 
     def _keep(self, result: TrialResult, directory: Path, *, whole: bool) -> Bundle:
-        """Write a bundle of the current crash; with ``whole``, also the other files of a hunt's directory."""
+        """Write a bundle of the present crash; if ``whole``, also the other files of a hunt's directory."""
         digest = self._bundle.snapshot
         if whole:
             directory.mkdir(parents=True, exist_ok=True)
@@ -289,7 +290,7 @@ def _begin(path: Path, stack: ExitStack) -> _Running | CaseReport:
 
 
 def _verified_snapshot(snapshot: Snapshot) -> Snapshot:
-    """Return the snapshot of a case.
+    """Return the snapshot of a case after checking it.
 
     Raises:
         BundleError: The snapshot is damaged; the fix names the repository, because a case has no other copy.
@@ -303,7 +304,7 @@ def _verified_snapshot(snapshot: Snapshot) -> Snapshot:
 
 
 def _warnings(snapshot: Snapshot) -> tuple[str, ...]:
-    """Return the differences of the environment because of which the same seed may draw other traffic."""
+    """Return the differences in the environment because of which the same seed may result in other traffic."""
     environment, scenario = snapshot.environment(), snapshot.scenario()
     changed = environment_changes(environment)
     names = (name for name in scenario.backend.versions if name in changed)

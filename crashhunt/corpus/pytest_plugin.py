@@ -1,4 +1,4 @@
-"""The pytest plugin: every case of a corpus is a test.
+"""The pytest plugin, in which every case of a corpus is a test.
 
 pytest imports this module at every start, so the module imports the rest of crashhunt only when a case runs.
 """
@@ -19,7 +19,7 @@ _CASE_FILE = "crashhunt-case.toml"  # as in crashhunt.base.layout
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
-    """Collect a case."""
+    """Collect a case as a test."""
     return _CaseFile.from_parent(parent, path=file_path) if file_path.name == _CASE_FILE else None
 
 
@@ -45,7 +45,7 @@ class _CaseItem(pytest.Item):
             pytest.xfail(report.line)
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: object = None) -> str:
-        """Return the report of a failed case, without a traceback of crashhunt."""
+        """Return the report on a failed case, without a traceback of crashhunt."""
         return str(excinfo.value) if isinstance(excinfo.value, _FailedError) else str(super().repr_failure(excinfo))
 
     def reportinfo(self) -> tuple[Path, int | None, str]:

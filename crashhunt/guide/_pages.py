@@ -1,4 +1,4 @@
-"""Pages: where they are, what they are called, and how they are read in a terminal."""
+"""Pages of the guide: their files, their names, and their display in a terminal."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ class Page:
     """A page of the guide.
 
     Args:
-        topic: its unique name on the command line.
-        section: the folder that it is in; empty for the top one.
-        title: its heading.
-        file: the Markdown, in which some comments are placeholders for generated parts.
+        topic: unique name of the page on the command line.
+        section: folder that contains the page; empty for the top folder.
+        title: heading of the page.
+        file: the Markdown file, in which some comments are placeholders for generated parts.
     """
 
     topic: str
@@ -71,7 +71,7 @@ class Page:
         """Return the whole page as Markdown.
 
         Args:
-            parser: parser of the command line, which is described on one of the pages.
+            parser: parser of the command line, which one of the pages describes.
         """
         return completed(self.file.read_text(encoding="utf-8"), parser)
 
@@ -82,7 +82,7 @@ def pages_folder() -> Path:
 
 
 def list_pages() -> list[Page]:
-    """Return all pages, section by section; the index, which is a list of them, is none."""
+    """Return all pages, section by section, except the index, which is a list of them."""
     found = []
     for section in SECTIONS:
         files = [file for file in (pages_folder() / section).glob("*.md") if file.stem != "index"]
@@ -94,10 +94,10 @@ def list_pages() -> list[Page]:
 
 
 def find_page(topic: str) -> Page:
-    """Return the page of a topic, also by a former name.
+    """Return the page of a topic, which may be a former name of the topic.
 
     Raises:
-        UsageError: there is none.
+        UsageError: the topic does not exist.
     """
     pages = {page.topic: page for page in list_pages()}
     topic = _FORMER_PAGES.get(topic, topic)
@@ -107,11 +107,11 @@ def find_page(topic: str) -> Page:
 
 
 def completed(text: str, parser: argparse.ArgumentParser) -> str:
-    """Return the text of a page with its generated parts.
+    """Return the text of a page, with its generated parts inserted.
 
     Args:
-        text: Markdown, in which ``<!-- made from the code: commands -->`` is a placeholder, as are ``api``,
-            ``keys`` and ``modules``.
+        text: Markdown text, in which ``<!-- made from the code: commands -->`` is a placeholder; ``api``, ``keys`` and
+            ``modules`` are further placeholders.
         parser: parser of the command line.
     """
     makers = {
@@ -125,7 +125,7 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
 
 
 def for_terminal(text: str) -> str:
-    """Return Markdown without what a terminal cannot show: a link to a page becomes the command that shows it."""
+    """Return Markdown without elements that a terminal cannot show: a link becomes the command that shows the page."""
     parts = _FENCED.split(text)
     for number in range(0, len(parts), 2):  # what is between the fences is shown as it is
         prose = _PICTURE.sub(lambda found: f"(picture: {' '.join(found[1].split())})", parts[number])

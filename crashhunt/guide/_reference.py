@@ -1,7 +1,7 @@
-"""The reference of the Python interface, made from signatures and docstrings.
+"""The reference of the Python interface, generated from signatures and docstrings.
 
-The sources are read and not imported: a page is there at once, and no package has to be installed that only some need.
-Only functions whose arguments are made from a list when they are imported are asked themselves.
+The sources are read and not imported, so that a page is available at once and optional packages need not be installed.
+Only functions whose arguments are generated at import are imported and inspected.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _Definition = ast.ClassDef | ast.FunctionDef
 
 
 def describe_api() -> str:
-    """Return what users import, with signatures and docstrings, as Markdown."""
+    """Return the objects that users import, with signatures and docstrings, as Markdown."""
     return "\n".join(line for module, names in _PUBLIC_MODULES.items() for line in _module(module, names.split()))
 
 
@@ -84,7 +84,7 @@ def _described(name: str, found: _Definition) -> Iterator[str]:
 
 
 def _signature_and_docstring(name: str) -> tuple[str, str | None]:
-    """Signature and docstring as the function itself has them."""
+    """Return the signature and the docstring of an imported function."""
     module, _, attribute = name.rpartition(".")
     function = getattr(importlib.import_module(module), attribute)
     known = inspect.signature(function)
@@ -108,7 +108,7 @@ def _default_text(value: object) -> str:
 
 
 def _attributes(found: ast.ClassDef) -> Iterator[str]:
-    """Return the attributes of a protocol, each with the string below it."""
+    """Return the attributes of a protocol, each with the text of the string below it."""
     for item, after in zip(found.body, [*found.body[1:], ast.Pass()], strict=True):
         if isinstance(item, ast.AnnAssign):
             yield f"**`{ast.unparse(item.target)}: {ast.unparse(item.annotation)}`**\n"
@@ -129,7 +129,7 @@ def _methods(found: ast.ClassDef) -> Iterator[str]:
 
 
 def _constructor(found: ast.ClassDef) -> str:
-    """Return the signature of the constructor; empty for protocols, errors and enumerations."""
+    """Return the signature of a constructor; empty for protocols, errors and enumerations."""
     for method in found.body:
         if isinstance(method, ast.FunctionDef) and method.name == "__init__":
             return _signature(method, bound=True).removesuffix(" -> None")
@@ -161,7 +161,7 @@ def _signature(function: ast.FunctionDef, *, bound: bool = False) -> str:
 
 
 def _parameters(given: ast.arguments) -> list[str]:
-    """The parameters, as they are written."""
+    """Return the parameters of a function as they are written in the source."""
     plain = [*given.posonlyargs, *given.args]
     defaults = [None] * (len(plain) - len(given.defaults)) + list(given.defaults)
     parts = [_parameter(name, default) for name, default in zip(plain, defaults, strict=True)]
@@ -190,7 +190,7 @@ def as_markdown(docstring: str | None) -> str:
 
 
 def _docstring(text: str | None) -> Iterator[str]:
-    """A docstring in Google's style as Markdown: prose stays, its sections become lists, examples are code."""
+    """Return a docstring in Google's style as Markdown: sections become lists, and examples become code."""
     section = ""
     for line in inspect.cleandoc(text or "").splitlines():
         begun = _SECTION.match(line)
@@ -216,7 +216,7 @@ def _item(line: str) -> str:
 
 
 def _prose(line: str) -> str:
-    """Prose with the marks of Markdown; what two colons announce is indented, which is enough."""
+    """Return prose for Markdown; blocks after two colons are already indented, so they need no change."""
     return re.sub(r"``([^`]+)``", r"`\1`", re.sub(r"^::$|:(?=:$)", "", line))
 
 
@@ -239,7 +239,7 @@ def _public_names(module: str) -> dict[str, tuple[str, str]]:
 
 
 def _listed(tree: ast.Module) -> list[str] | None:
-    """The names in ``__all__``; None if it is made when the module is imported."""
+    """Return the names in ``__all__``; None if ``__all__`` is computed at import."""
     for node in tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             return ast.literal_eval(node.value) if isinstance(node.value, ast.List) else None
@@ -247,7 +247,7 @@ def _listed(tree: ast.Module) -> list[str] | None:
 
 
 def definition(module: str, name: str) -> _Definition | None:
-    """The class or function behind a name, wherever it is defined; None for anything else."""
+    """Return the definition of the class or function with a name, in whatever module it is; None for other objects."""
     origin, known = _public_names(module).get(name, (module, name))
     if (origin, known) != (module, name):
         return definition(origin, known)
@@ -281,7 +281,7 @@ _NO_KEY = re.compile(r"^- `(?:tables|\w+`: .*not part of (?:the file|it)\b).*\n(
 
 
 def describe_keys() -> str:
-    """Return every table of both files with its keys, as Markdown."""
+    """Return all tables and keys of both TOML files, as Markdown."""
     return "\n".join((*_scenario(), *_suite()))
 
 
@@ -305,7 +305,7 @@ def _suite() -> Iterator[str]:
 
 
 def _keys(module: str, name: str) -> str:
-    """The keys of a table, without what the docstring says before them."""
+    """Return the keys of a table, without the part of the docstring before them."""
     found = definition(module, name)
     text = as_markdown(ast.get_docstring(found) if found else "")
     _, heading, keys = text.partition("*Arguments*:\n\n")
@@ -327,7 +327,7 @@ def describe_commands(parser: argparse.ArgumentParser) -> str:
 
 
 def _commands(parser: argparse.ArgumentParser) -> Iterator[tuple[argparse.ArgumentParser, str]]:
-    """The commands that do something, and the commands of these."""
+    """Return the commands that can be run, including the subcommands of commands."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for name, inner in action.choices.items():

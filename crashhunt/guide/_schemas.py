@@ -1,6 +1,7 @@
-"""The output of each command under ``--json``, as JSON Schema: one file per command in ``reference/schemas``.
+"""The output of each command with ``--json`` as JSON Schema, in one file per command in ``reference/schemas``.
 
-A shape that its own module declares is used from there. The others are declared here; tests validate all real outputs.
+Types that other modules declare are imported from these modules. All further types are declared here; tests validate
+all real outputs.
 """
 
 from __future__ import annotations
@@ -35,14 +36,14 @@ CaseResult = Literal["still", "fixed", "changed", "cannot_run"]
 
 
 class Bounds(TypedDict):
-    """An interval; null for an end that is not known."""
+    """An interval; null for an unknown end."""
 
     low: float | None
     high: float | None
 
 
 class EventCount(TypedDict):
-    """The number of occurrences of a traffic event, and of trials with one."""
+    """The number of traffic events of a type, and of trials with such an event."""
 
     count: int
     trials: int
@@ -57,7 +58,7 @@ class Exposure(TypedDict):
 
 
 class RatePartData(TypedDict):
-    """The rate of some of the crashes, or in some of the trials."""
+    """The rate of a part of the crashes, or in a part of the trials."""
 
     by: str
     name: str
@@ -68,13 +69,13 @@ class RatePartData(TypedDict):
 
 
 class CountedTrials(TypedDict):
-    """The trials that do not count for a rate: reason to number."""
+    """The trials that do not count for a rate: number of trials by reason."""
 
     left_out: dict[str, int]
 
 
 class RateEntry(CountedTrials):
-    """How often the agents of a hunt crash."""
+    """The crash rate of the agents of a hunt."""
 
     dir: str
     per: Literal["trial", "hour", "1000km"]
@@ -161,7 +162,7 @@ class OneReplay(ReplayData):
 
 
 class SeveralReplays(TypedDict):
-    """``crashhunt replay`` that films several crashes, or one from its log: then nothing is replayed."""
+    """The output of ``crashhunt replay`` that films several crashes, or one from its log without a replay."""
 
     crashes: list[ReplayData]
     written: dict[str, int]
@@ -316,7 +317,7 @@ class CrashesData(TypedDict):
 
 
 class PlainRunData(TypedDict):
-    """``crashhunt init``: what the plain traffic did in one run."""
+    """``crashhunt init``: the result of the traffic without an agent in one run."""
 
     demand: float
     simulated_s: float
@@ -388,7 +389,7 @@ class JudgementData(TypedDict):
 
 
 class JudgedCrash(JudgementData):
-    """The same with the id of the crash."""
+    """The result of ``crashhunt judge`` for one crash, with the id of the crash."""
 
     crash: str
 
@@ -400,7 +401,7 @@ class JudgeData(TypedDict):
 
 
 class RuleFinding(TypedDict):
-    """A traffic rule that an actor broke."""
+    """A fault rule that blames an actor."""
 
     rule: str
     blames: FaultVerdict
@@ -409,14 +410,14 @@ class RuleFinding(TypedDict):
 
 
 class FaultData(TypedDict):
-    """The vehicle at fault, with the rules."""
+    """The vehicle at fault, with the findings of the rules."""
 
     verdict: FaultVerdict
     findings: list[RuleFinding]
 
 
 class BrakingData(TypedDict):
-    """How the last step was found after which braking avoids the crash."""
+    """The last step from which braking avoids the crash, and how it was found."""
 
     by: Literal["running it", "calculation"] | None
     how: str | None
@@ -434,7 +435,7 @@ class NearestMoment(TypedDict):
 
 
 class DangerSummary(TypedDict):
-    """Criticality over a trial, and its greatest value."""
+    """The criticality of a trial, with its greatest value."""
 
     over_the_trial: float
     greatest: float
@@ -460,7 +461,7 @@ class DangerData(TypedDict):
 
 
 class MomentData(TypedDict):
-    """The agent and the collision partner after one step; null for what is unknown or infinite."""
+    """The states of the agent and the collision partner after one step; null for unknown or infinite values."""
 
     step: int
     time_s: float
@@ -494,7 +495,7 @@ class ShowData(TypedDict):
 
 
 class DashboardData(TypedDict):
-    """``crashhunt dashboard``: its address; printed before the server starts."""
+    """``crashhunt dashboard``: the address of the dashboard, printed before the server starts."""
 
     url: str
     host: str
@@ -529,7 +530,7 @@ class RerunData(TypedDict):
 
 
 class Origin(TypedDict):
-    """An origin whose code may run."""
+    """Trusted code that may run."""
 
     fingerprint: str
     path: str
@@ -550,7 +551,7 @@ class RemovedData(TypedDict):
 
 
 class SplitCrash(TypedDict):
-    """A crash in one of the parts."""
+    """A crash in the training part or the test part."""
 
     id: str
     hunt: str
@@ -587,7 +588,7 @@ class ComparedHunt(CountedTrials):
 
 
 class ComparedPair(TypedDict):
-    """The first hunt compared with another one."""
+    """The comparison of the first hunt with another hunt."""
 
     first: str
     second: str
@@ -616,7 +617,7 @@ class CompareData(TypedDict):
 
 
 class ScenarioPairs(TypedDict):
-    """The pairs of one scenario."""
+    """The pairs of trials in one scenario."""
 
     name: str
     pairs: int
@@ -627,7 +628,7 @@ class ScenarioPairs(TypedDict):
 
 
 class GateCorpus(TypedDict):
-    """The cases of the corpus that a gate ran with HEAD."""
+    """The corpus cases that a gate ran with HEAD."""
 
     ok: bool
     cases: int
@@ -636,7 +637,7 @@ class GateCorpus(TypedDict):
 
 
 class Compared(TypedDict):
-    """The commits or agents of a gate."""
+    """The commits or agents that a gate compares."""
 
     base: str
     head: str
@@ -746,7 +747,7 @@ SCHEMAS: dict[str, Any] = {
 
 
 def describe_schemas() -> dict[str, str]:
-    """Return the text of each schema file, by its name without the suffix."""
+    """Return the text of each schema file, by the file's name without its ending."""
     return {
         name: json.dumps(json_schema(kind, f"crashhunt {name.replace('-', ' ')} --json", _PUBLIC_NAMES), indent=1)
         + "\n"
