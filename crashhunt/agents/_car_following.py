@@ -40,8 +40,8 @@ class Leader:
     """The nearest vehicle ahead on a path.
 
     Args:
-        gap: bumper to bumper, in m, if both are cars: an observation has no lengths.
-        closing_speed: positive when the gap shrinks, in m/s.
+        gap: gap from bumper to bumper if both vehicles are cars, in m; an observation contains no lengths.
+        closing_speed: speed at which the gap shrinks, in m/s; negative if it grows.
     """
 
     gap: float
@@ -49,10 +49,10 @@ class Leader:
 
 
 def check_layout(space: Space[object] | None) -> None:
-    """Refuse an observation space that does not have the columns which are read here.
+    """Refuse an observation space that lacks the columns which the agent reads.
 
     Raises:
-        ValueError: it has others.
+        ValueError: the observation space has other columns.
     """
     columns = None if space is None else (space.shape or (0,))[-1]
     if columns not in (None, SIN_H + 1):
@@ -71,16 +71,16 @@ def actors(observation: NDArray[np.float32]) -> Iterator[list[float]]:
 
 
 def off_path(row: Sequence[float], *, lateral: float, curvature: float) -> float:
-    """Return how far an actor is from a path, in m; 0 if it may well be on it.
+    """Return how far an actor is from a path, in m; 0 if the actor may be on the path.
 
-    A bend begins or ends somewhere between here and there, and an observation does not say where. The path of
-    constant curvature is one extreme, the arc that ends in the actor's own heading is the other. An actor in between
-    counts as on the path, because braking for it is safe.
+    A bend may begin or end anywhere between the vehicle and the actor, and an observation does not show where. The path
+    of constant curvature is one extreme, and the arc that ends in the actor's own heading is the other extreme. An
+    actor in between counts as on the path, because braking for it is safe.
 
     Args:
-        row: row of the actor.
-        lateral: how far to the right of the vehicle the path runs, in m.
-        curvature: curvature of the path here, positive to the right, in 1/m.
+        row: row of the actor in the observation.
+        lateral: distance of the path to the right of the vehicle, in m.
+        curvature: curvature of the path at the vehicle, positive to the right, in 1/m.
     """
     ahead, right = row[X], row[Y] - lateral
     low = high = curvature * ahead * ahead / 2
@@ -95,13 +95,13 @@ def find_leader(
 ) -> Leader | None:
     """Return the nearest vehicle ahead whose centre is within ``half_width`` of a path.
 
-    Oncoming traffic is never a leader: it keeps to its own side.
+    Oncoming traffic is never a leader, because it keeps to its own side of the road.
 
     Args:
         observation: observation in the default layout.
-        lateral: how far to the right of the vehicle the path runs, in m.
-        curvature: curvature of the path here, positive to the right, in 1/m.
-        half_width: half width in m.
+        lateral: distance of the path to the right of the vehicle, in m.
+        curvature: curvature of the path at the vehicle, positive to the right, in 1/m.
+        half_width: half the width of the path, in m.
     """
     nearest: Leader | None = None
     for row in actors(observation):
@@ -114,7 +114,7 @@ def find_leader(
 
 
 class PathCurvature:
-    """Estimates the curvature of the own path from how the heading changes: a radar's path prediction.
+    """Estimates the curvature of the vehicle's path from changes of its heading, like the path prediction of a radar.
 
     Args:
         step_length_s: step length between two observations, in s.
@@ -125,7 +125,7 @@ class PathCurvature:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Delete all earlier observations."""
         self._heading: float | None = None
         self._value = 0.0
 
@@ -155,12 +155,12 @@ def idm_acceleration(
     simulations, Physical Review E 62 (2000), 1805, equations 2 and 3.
 
     Args:
-        speed: own, in m/s.
+        speed: speed of the vehicle, in m/s.
         leader: the vehicle ahead; None on a free road.
         desired_speed: desired speed on a free road, in m/s.
         headway_s: time gap, in s.
-        standstill_gap: standstill gap in m; leaves room for the half of a truck that is longer than that of a car.
-        comfort: both the largest acceleration and the comfortable deceleration, in m/s².
+        standstill_gap: gap at standstill, in m; it includes the part of half a truck that exceeds half a car.
+        comfort: maximum acceleration and comfortable deceleration, which are equal, in m/s².
     """
     free = 1 - (speed / max(desired_speed, 0.1)) ** 4
     if leader is None:
@@ -173,16 +173,16 @@ def idm_acceleration(
 class CarFollowing:
     """Follows the vehicle in front by the Intelligent Driver Model, with a delayed observation.
 
-    It is safe for most of its arguments. A long delay together with a short headway and weak brakes is not.
+    The agent is safe for most of its arguments. It is not safe with a long delay, a short headway and weak brakes.
 
     Args:
         delay_s: age of the observation on which the agent acts, in s.
         headway_s: time gap that the agent keeps, in s.
         max_brake: maximum deceleration, in m/s².
         desired_speed: desired speed with a free road, in m/s.
-        step_length_s: step length of the simulation, in s; turns the delay into steps.
+        step_length_s: step length of the simulation, in s; used to convert the delay to steps.
         observation_space: observation space of the vehicle.
-        action_space: action space of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
+        action_space: action space of the vehicle; with discrete meta-actions, the agent returns IDLE, FASTER or SLOWER.
 
     Raises:
         ValueError: an argument is out of range, or the observation does not have the default columns.
@@ -218,12 +218,12 @@ class CarFollowing:
         self._curvature = PathCurvature(step_length_s)
 
     def reset(self, seed: int) -> None:
-        """Forget all observations."""
+        """Delete all earlier observations."""
         self._seen.clear()
         self._curvature.reset()
 
     def act(self, observation: NDArray[np.float32]) -> tuple[float, int] | int:
-        """Return (target speed, 0), or the meta-action for it."""
+        """Return (target speed, 0), or the corresponding meta-action."""
         self._seen.append(observation)
         seen = self._seen[0]
         leader = find_leader(seen, curvature=self._curvature.update(seen))

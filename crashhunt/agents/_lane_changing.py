@@ -42,12 +42,13 @@ BRAKE = 4.0  # m/s²: deceleration that it accepts for the follower in the targe
 class LaneChanger:
     """Overtakes slower traffic on either side, and observes the next lane except for a blind spot.
 
-    Without a blind spot it changes lanes only into a gap in which no vehicle has to brake hard. It detects a lane to
-    its left by the layout of the observation, and a lane to its right once it or another vehicle has been there.
+    Without a blind spot, the agent changes lanes only into a gap in which no vehicle has to brake hard. It detects a
+    lane to its left by the layout of the observation, and a lane to its right after it or another vehicle has been
+    there.
 
     Args:
-        blind_spot_m: length of the blind spot in the next lane, backwards from the agent's centre, in m.
-        patience_s: time behind a slower vehicle before the agent overtakes, in s.
+        blind_spot_m: length of the blind spot in the neighbouring lane, backwards from the agent's centre, in m.
+        patience_s: time that the agent follows a slower vehicle before it overtakes, in s.
         desired_speed: desired speed in m/s.
         step_length_s: step length of the simulation, in s.
         observation_space: observation space of the vehicle.
@@ -91,7 +92,7 @@ class LaneChanger:
         self._rightmost = 0.0
 
     def act(self, observation: NDArray[np.float32]) -> tuple[float, int] | int:
-        """Return (target speed, lane change), or the meta-action for it."""
+        """Return (target speed, lane change), or the corresponding meta-action."""
         curvature = self._path.update(observation)
         self._update_lanes(observation, curvature)
         speed = float(observation[0, VX])
@@ -142,7 +143,7 @@ class LaneChanger:
 
 
 def _is_too_close(row: Sequence[float]) -> bool:
-    """Whether the hindmost of the two would have to brake harder than it is expected to."""
+    """Return whether the rear one of the agent and an actor would have to brake harder than expected of it."""
     closing = max(0.0, -row[VX] if row[X] > 0 else row[VX])
     gap = abs(row[X]) - CAR_LENGTH_M
     return gap < MIN_GAP_M + closing * REACTION_S + closing * closing / (2 * BRAKE)
@@ -205,7 +206,7 @@ class IntelligentDriver(LaneChanger):
         self.gain = gain
 
     def act(self, observation: NDArray[np.float32]) -> tuple[float, int] | int:
-        """Return (target speed, lane change), or the meta-action for it."""
+        """Return (target speed, lane change), or the corresponding meta-action."""
         curvature = self._path.update(observation)
         self._update_lanes(observation, curvature)
         speed = float(observation[0, VX])
@@ -253,7 +254,7 @@ class IntelligentDriver(LaneChanger):
 
 
 def _follower(observation: NDArray[np.float32], lateral: float, curvature: float) -> tuple[float, float] | None:
-    """The gap to the nearest actor behind on a path, in m, and how much faster it is, in m/s."""
+    """Return the gap to the nearest actor behind on a path, in m, and by how much it is faster, in m/s."""
     half = LANE_WIDTH_M / 2
     behind = [
         row for row in actors(observation) if row[X] <= 0 and off_path(row, lateral=lateral, curvature=curvature) < half

@@ -1,4 +1,4 @@
-"""Policies of other libraries: Stable-Baselines3, PyTorch, ONNX. Each library is imported where it is asked for."""
+"""Policies of other libraries: Stable-Baselines3, PyTorch and ONNX. Each library is imported at its first use."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class StableBaselines3:
     which the model was trained.
 
     Args:
-        path: path of the file that ``model.save`` wrote, with ``.zip``.
-        algorithm: the class of the model, or ``module:Class`` such as ``sb3_contrib:TQC``.
-        deterministic: whether to take the most probable action; otherwise draw an action.
+        path: path of the ``.zip`` file that ``model.save`` wrote.
+        algorithm: name of the model's class, or ``module:Class`` such as ``sb3_contrib:TQC``.
+        deterministic: whether to take the most probable action; otherwise an action is drawn.
         observation_space: observation space of the vehicle.
         action_space: action space of the vehicle.
 
@@ -99,7 +99,7 @@ class StableBaselines3:
 
 
 class _Network(ABC):
-    """One that is called with a batch of one observation."""
+    """A neural network that is called with a batch of one observation."""
 
     def __init__(
         self,
@@ -137,15 +137,15 @@ class _Network(ABC):
         self._forget(path)
 
     def _forget(self, path: str) -> None:  # noqa: B027 - most remember nothing
-        """Return to the state before the first decision."""
+        """Reset the state to that before the first decision."""
 
     @abstractmethod
     def _load(self, path: str) -> None:
-        """Load the library and the weights."""
+        """Load the library and the weights of the network."""
 
     @abstractmethod
     def _answer(self, batch: NDArray[np.float32]) -> NDArray[np.generic]:
-        """Return a value for each discrete action, or the continuous action, of each observation of a batch."""
+        """Return, for each observation of a batch, a value for each discrete action, or the continuous action."""
 
     def act(self, observation: object) -> object:
         """Return the action for the network's output."""
@@ -162,11 +162,12 @@ class _Network(ABC):
 class TorchPolicy(_Network):
     """Drives by a PyTorch module, saved by ``torch.export.save`` (``.pt2``) or ``torch.jit.save``.
 
-    It is called with a batch of one observation, float32. Of a discrete action it returns a value each, of which the
-    greatest is taken; of a continuous one the action, which is clipped to the space.
+    The module is called with a batch of one observation, float32. For discrete actions, it returns a value for each
+    action, and the action with the greatest value is taken. For continuous actions, it returns the action, which is
+    clipped to the action space.
 
     Args:
-        path: path of the module.
+        path: path of the saved module.
         flatten: whether the network expects an observation as one row of numbers.
         action_space: action space of the vehicle.
         observation_space: observation space of the vehicle.
@@ -190,7 +191,7 @@ class TorchPolicy(_Network):
             self._load(path)
 
     def reset(self, seed: int) -> None:
-        """Seed the generator of PyTorch."""
+        """Seed the random generator of PyTorch."""
         self._torch.manual_seed(seed)
 
     def _answer(self, batch: NDArray[np.float32]) -> NDArray[np.generic]:
@@ -203,7 +204,7 @@ class OnnxPolicy(_Network):
     """Drives by an ONNX model with one input and one output, with the same meaning as for `TorchPolicy`.
 
     Args:
-        path: path of the model.
+        path: path of the ONNX model.
         flatten: whether the network expects an observation as one row of numbers.
         action_space: action space of the vehicle.
         observation_space: observation space of the vehicle.
@@ -222,7 +223,7 @@ class OnnxPolicy(_Network):
         self._input = self._session.get_inputs()[0].name
 
     def reset(self, seed: int) -> None:
-        """Nothing to forget."""
+        """Do nothing, because the agent has no state."""
 
     def _answer(self, batch: NDArray[np.float32]) -> NDArray[np.generic]:
         answer: NDArray[np.generic] = self._session.run(None, {self._input: batch})[0]
@@ -243,7 +244,7 @@ def _existing(path: str) -> Path:
 
 
 def _first_line(error: BaseException) -> str:
-    """The message of a library in one line of at most 200 characters."""
+    """Return the message of a library in one line of at most 200 characters."""
     text = " ".join(str(error).split())
     return text if len(text) <= 200 else f"{text[:199]}…"
 
@@ -284,24 +285,24 @@ class NumpyPolicy:
     The weights are an ``.npz`` file with these arrays:
 
     - ``weight_0``, ``bias_0``, ``weight_1``, …: the layers, with rectified linear units between them. The last layer
-      has a value for each of highway-env's five meta-actions.
+      returns a value for each of highway-env's five meta-actions.
     - ``columns`` and ``scale``: the columns of the observation that the network sees, and their factors.
     - ``rows``: the number of rows that the network receives.
     - ``period_s``: the time between two decisions, in s.
-    - ``target_speeds``: in m/s.
+    - ``target_speeds``: the target speeds of FASTER and SLOWER, in m/s.
 
-    The distance that the vehicle itself has driven is replaced by 0.
+    The distance that the vehicle itself has driven is replaced by 0 in the network's input.
 
-    Where actions are (target speed, lane change), FASTER and SLOWER step through the target speeds.
+    If actions are (target speed, lane change), FASTER and SLOWER select the next of the target speeds.
 
     Args:
-        path: path of the weights.
+        path: path of the file with the weights.
         step_length_s: step length of the simulation, in s.
         observation_space: observation space of the vehicle.
         action_space: action space of the vehicle.
 
     Raises:
-        ValueError: the file has no such weights, or the observation has other columns than the default ones.
+        ValueError: the file does not contain such weights, or the observation does not have the default columns.
     """
 
     def __init__(
@@ -359,7 +360,7 @@ class NumpyPolicy:
         return seen.reshape(-1)
 
     def evaluate(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the value of each meta-action."""
+        """Return the network's value of each meta-action."""
         found = features
         for number, (weight, bias) in enumerate(self._layers):
             found = weight @ found + bias

@@ -1,4 +1,4 @@
-"""The agent protocol. No base class is needed."""
+"""The protocol of agents; a base class is not needed."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ __all__ = ["Agent", "Closes", "DrawsPanels", "NeedsLibraries", "meta_actions", "
 
 @runtime_checkable
 class Agent(Protocol):
-    """Drives one vehicle.
+    """The protocol of an agent, which drives one vehicle.
 
-    An agent is written as ``package.module:attribute`` and called with its arguments as keywords, once per trial and
-    vehicle. A parameter named ``observation_space`` or ``action_space`` receives the Gymnasium space. A parameter named
-    ``step_length_s`` receives the time from one step to the next, in s.
+    The user names the factory of an agent as ``package.module:attribute``. It is called with the agent's arguments as
+    keywords, once per trial and vehicle. A parameter named ``observation_space`` or ``action_space`` receives the
+    Gymnasium space. A parameter named ``step_length_s`` receives the time from one step to the next, in s.
 
     Optional capabilities are separate protocols: `DrawsPanels` and `Closes`, and `NeedsLibraries` for the factory of an
     agent. An object has a capability if it has the methods or attributes of the protocol.
     """
 
     def reset(self, seed: int) -> None:
-        """Begin an episode: forget all state, and draw random numbers from ``seed`` only."""
+        """Begin an episode: delete all state, and draw random numbers only from ``seed``."""
 
     def act(self, observation: Any) -> Any:
         """Return an action inside the vehicle's action space.
 
         Args:
-            observation: the observation, inside the observation space. No other process writes to it again.
+            observation: the observation, inside the observation space. No other code changes it afterwards.
         """
 
 
@@ -43,9 +43,9 @@ class DrawsPanels(Protocol):
     """An agent that shows its internal state."""
 
     def panels(self) -> object:
-        """Return panels in a nest of mappings and sequences, whose keys are their labels.
+        """Return panels in nested mappings and sequences, whose keys are the labels of the panels.
 
-        Called after `Agent.act`, and only during rendering: it must not change what the agent does next.
+        This method is called after `Agent.act`, only during rendering. It must not change the agent's later actions.
         """
 
 
@@ -53,15 +53,15 @@ class Closes(Protocol):
     """An agent that holds resources."""
 
     def close(self) -> None:
-        """Release all resources. Called once, at the end of the trial, with any outcome."""
+        """Release all resources. This method is called once, at the end of the trial, for any outcome."""
 
 
 class NeedsLibraries(Protocol):
-    """A class or function that makes agents, with libraries that take long to import."""
+    """A class or function that creates agents, and that needs libraries with a long import time."""
 
     @property
     def libraries(self) -> Sequence[str]:
-        """Modules to import before the first trial. A missing module is reported by the agent."""
+        """Return the names of modules to import before the first trial. If one is missing, the agent reports it."""
 
 
 # How agents that think in speeds and lanes say so in discrete meta-actions.
@@ -71,16 +71,16 @@ _FASTER, _SLOWER = 0.5, -0.75  # m/s²
 
 
 def meta_actions(space: Space[object] | None) -> Mapping[str, int] | None:
-    """Return the numbers of the meta-actions; None if actions are (target speed, lane change).
+    """Return the number of each meta-action by name; None if actions are (target speed, lane change).
 
-    What a space does not have, such as a lane change where only the speed is controlled, is IDLE.
+    A meta-action that the space lacks, such as a lane change if only the speed is controlled, is replaced by IDLE.
 
     Args:
-        space: space of the vehicle; the meanings of its numbers are its ``meanings``, or those of highway-env where
-            there are five.
+        space: action space of the vehicle. The names of its numbers are in its attribute ``meanings``, or those of
+            highway-env if there are five.
 
     Raises:
-        ValueError: its actions are neither.
+        ValueError: the actions are neither meta-actions nor (target speed, lane change).
     """
     if space is None:
         return None
@@ -107,7 +107,7 @@ def meta_actions(space: Space[object] | None) -> Mapping[str, int] | None:
 
 
 def wanted_meta_action(acceleration: float, change: int = 0) -> str:
-    """Return the name of the meta-action nearest to an acceleration, in m/s², and a lane change (1 is to the left)."""
+    """Return the name of the meta-action for an acceleration, in m/s², and a lane change (1 is to the left)."""
     if change:
         return "LANE_LEFT" if change > 0 else "LANE_RIGHT"
     return "FASTER" if acceleration > _FASTER else "SLOWER" if acceleration < _SLOWER else "IDLE"

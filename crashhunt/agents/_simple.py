@@ -1,4 +1,4 @@
-"""The simplest agent: one speed, never another lane."""
+"""The simplest agents: a constant speed, random actions, or recorded actions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class KeepLaneWithSpeed:
 
     Args:
         speed: speed in m/s.
-        action_space: action space of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
+        action_space: action space of the vehicle; with discrete meta-actions, the agent returns IDLE, FASTER or SLOWER.
 
     Raises:
         ValueError: the actions are neither (target speed, lane change) nor meta-actions.
@@ -37,7 +37,7 @@ class KeepLaneWithSpeed:
         self._meta = meta_actions(action_space)
 
     def reset(self, seed: int) -> None:
-        """Nothing to forget."""
+        """Do nothing, because the agent has no state."""
 
     def act(self, observation: Any) -> object:
         """Return (speed, 0), or the meta-action that brings the speed nearer."""
@@ -71,12 +71,12 @@ class RandomAgent:
         self._action: object = None
 
     def reset(self, seed: int) -> None:
-        """Seed the space."""
+        """Seed the action space."""
         self._space.seed(seed)
         self._left = 0
 
     def act(self, observation: object) -> object:
-        """Return the action that is held."""
+        """Return the action that the agent currently holds."""
         if self._left == 0:
             self._left = self._hold
             self._action = self._space.sample()
@@ -91,7 +91,7 @@ class Recorded:
     """Replays the recorded actions of one agent, one in each step.
 
     Args:
-        log: the path of a ``log.mcap``.
+        log: path of a ``log.mcap``.
         agent: id of the agent whose actions are replayed.
     """
 
@@ -106,11 +106,11 @@ class Recorded:
         self._next = 0
 
     def reset(self, seed: int) -> None:
-        """Begin at the first action."""
+        """Start again at the first recorded action."""
         self._next = 0
 
     def act(self, observation: object) -> object:
-        """Return the next action.
+        """Return the next recorded action.
 
         Raises:
             IndexError: the log has no further action.

@@ -1,7 +1,7 @@
-"""Which of several hunts crashes more often, and whether that is more than chance, at any time.
+"""Comparison of hunts: which hunt crashes more often, and whether the difference may be chance, at any time.
 
-Hunts with the same seed and traffic are compared pair by pair (`crashhunt.rates.PairSequence`). The answer is valid
-whenever you look: also while the hunts run, or where they were killed or stopped at their first crash. Hunts without
+Hunts with the same seed and traffic are compared pair by pair (`crashhunt.rates.PairSequence`). The answer is valid at
+any time, even while the hunts run, after they were killed, or after they stopped at their first crash. Hunts without
 common traffic are compared by their certain intervals, each with half of the error probability.
 """
 
@@ -45,28 +45,28 @@ _ALPHA = 1 - _CONFIDENCE
 
 @dataclass(frozen=True, slots=True)
 class HuntFigures:
-    """One hunt in numbers.
+    """The figures of one hunt in a comparison.
 
     Args:
-        dir: its directory.
+        dir: directory of the hunt.
         state: state of the hunt.
-        agents: vehicle to its agent.
-        trials: number of valid trials, up to the first one that has not ended.
+        agents: agent of each controlled vehicle.
+        trials: number of valid trials, up to the first trial that has not ended.
         crashes: number of crashes in these trials.
-        crash_rate: crash rate of the trials, from 0 to 1; NaN if it would be biased, or there is no trial.
-        interval: interval of the rate, of 95 % confidence, valid whenever you look; None if the trials do not allow
-            one.
-        why_not: why there is no interval, or no rate.
-        median_steps_to_crash: NaN if there was no crash.
-        median_time_to_collision_s: median time to collision of the trials without a crash, the least of each; infinite
-            if most never were on a collision course.
-        outcomes: outcome to its number of trials, over all trials, with invalid ones.
+        crash_rate: crash rate of these trials, from 0 to 1; NaN if it would be biased, or if there is no trial.
+        interval: interval of the crash rate with 95 % confidence, valid at any time; None if the trials do not allow an
+            interval.
+        why_not: reason why the interval or the rate is missing.
+        median_steps_to_crash: median number of steps until a crash; NaN if there was no crash.
+        median_time_to_collision_s: median, over trials without a crash, of the least time to collision, in s; infinite
+            if most trials had no collision course.
+        outcomes: number of trials with each outcome, over all trials, including invalid trials.
         counted: origin of the trials that count, if the search guided all others. Only unguided trials show a crash
             rate. Empty if all trials count.
         disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
         excluded: number of trials that do not count, because a trial with a lower number has not ended.
-        exclusions: reason to number of trials that do not count. Reason ``trained_on``: an agent of this hunt, or of
-            a compared hunt with the same seed, was trained on their traffic.
+        exclusions: number of trials that do not count, by reason. Reason ``trained_on``: an agent of this hunt, or of a
+            compared hunt with the same seed, was trained on their traffic.
     """
 
     dir: str
@@ -88,27 +88,31 @@ class HuntFigures:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two hunts over the trials that have the same number, seed and traffic; or as a whole, where there are none.
+    """Comparison of two hunts by trials with the same number, seed and traffic; without such trials, as a whole.
 
     Args:
-        first: directory.
-        second: directory.
+        first: directory of the first hunt.
+        second: directory of the second hunt.
         trials: number of pairs of valid trials.
-        only_first: pairs in which only the first crashed; with ``--seeds``, traffics in which it crashed more often.
-        only_second: likewise for the second.
-        both: in which both did, equally often.
-        p_value: *p* value of McNemar's or Fisher's exact test; None if the number of trials was not fixed ahead.
-        caution: why the answer may mean something else; empty for nothing.
-        test: what the verdict rests on: ``pairs``, the evidence of discordant pairs; ``intervals``, the certain
-            intervals of both; empty if there is none.
-        why_unpaired: why there are no pairs; empty if there are.
-        counts: crashes and valid trials of the first and of the second.
-        evidence: e-value that they do not crash equally often; 20 and more is 95 % confidence. None without pairs.
+        only_first: pairs in which only the first hunt crashed; with ``--seeds``, traffic seeds in which it crashed more
+            often.
+        only_second: pairs in which only the second hunt crashed; with ``--seeds``, traffic seeds in which it crashed
+            more often.
+        both: pairs in which both hunts crashed, equally often.
+        p_value: *p* value of McNemar's or Fisher's exact test; None if the number of trials was not fixed in advance.
+        caution: reason why the answer may have another meaning; empty if there is none.
+        test: basis of the verdict: ``pairs``, the evidence of discordant pairs; ``intervals``, the certain intervals of
+            both hunts; empty if there is none.
+        why_unpaired: reason why there are no pairs; empty if there are pairs.
+        counts: numbers of crashes and of valid trials, of the first hunt and of the second.
+        evidence: e-value against the hypothesis that both hunts crash equally often; 20 or more means 95 % confidence.
+            None without pairs.
         difference: interval of the difference in crashes per trial, second minus first; None if there is none.
-        units: independent pairs: of trials, or of traffics.
-        excluded: how many trials of both do not count, for one of three reasons. A trial of a lower number has not
-            ended. A trial is invalid in one hunt. An agent was trained on that part of the traffics.
-        answer: ``first`` or ``second``, which certainly crashes less; ``undecided``; empty if nothing can be said.
+        units: number of independent pairs, of trials or of traffic seeds.
+        excluded: number of trials of both hunts that do not count, for one of three reasons. A trial of a lower number
+            has not ended. A trial is invalid in one hunt. An agent was trained on that part of the traffic.
+        answer: ``first`` or ``second``, the hunt that certainly crashes less; ``undecided``; empty if no answer is
+            possible.
     """
 
     first: str
@@ -130,7 +134,7 @@ class Pair:
 
     @property
     def verdict(self) -> str:
-        """The answer in words."""
+        """Return the answer as text."""
         if self.test != "pairs":
             return self._unpaired()
         assert self.evidence is not None
@@ -172,7 +176,7 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Several hunts side by side.
+    """The comparison of several hunts.
 
     Args:
         hunts: hunts in the order in which they were given.
@@ -183,14 +187,14 @@ class Comparison:
     pairs: tuple[Pair, ...]
 
     def to_json(self) -> dict[str, object]:
-        """Return the shape that ``compare --json`` prints; what is no finite number is null."""
+        """Return the comparison in the form that ``compare --json`` prints; numbers that are not finite are null."""
         return {
             "hunts": [_plain_figures(hunt) for hunt in self.hunts],
             "pairs": [_plain(pair) for pair in self.pairs],
         }
 
     def write_csv(self, out: TextIO) -> None:
-        """Write a line per hunt."""
+        """Write one CSV line for each hunt."""
         names = ("dir", "state", "trials", "crashes", "crash_rate", "rate_low", "rate_high", "why_not",
                  "median_steps_to_crash", "median_time_to_collision_s", *map(str, Outcome))  # fmt: skip
         writer = csv.DictWriter(out, names)
@@ -219,11 +223,11 @@ def _plain(pair: Pair) -> dict[str, object]:
 
 @clear_calls()
 def compare(*directories: Path | str) -> Comparison:
-    """Compare the crash rates of hunts and, for trials with the same seeds, report whether a hunt crashes less.
+    """Compare the crash rates of hunts; for trials with equal seeds, report whether one hunt crashes less.
 
     Raises:
         UsageError: fewer than two directories are given.
-        HuntDirectoryError: a directory has no hunt, or its ledger is damaged.
+        HuntDirectoryError: a directory contains no hunt, or its ledger is damaged.
     """
     if len(directories) < 2:
         raise UsageError("a single hunt cannot be compared", fix="give the directories of at least two hunts")
@@ -240,10 +244,10 @@ def compare(*directories: Path | str) -> Comparison:
 
 
 def held_out_of(hunt: HuntResults, compared: Sequence[HuntResults]) -> HeldOutTraffics:
-    """Return the rule for the trials of a hunt that count in a comparison: the same for all hunts with its seed.
+    """Return the rule that selects a hunt's trials for a comparison; it is the same for all hunts with its seed.
 
     Raises:
-        HuntDirectoryError: the record of a training is damaged.
+        HuntDirectoryError: a training record is damaged.
         BundleError: a snapshot is damaged.
     """
     alike = [other.directory for other in compared if other.settings.seed == hunt.settings.seed]
@@ -256,14 +260,14 @@ class _Side:
 
     Args:
         hunt: the hunt.
-        held_out: rule for its trials that count.
+        held_out: rule that selects the trials that count.
     """
 
     hunt: HuntResults
     held_out: HeldOutTraffics
 
     def rate(self, confidence: float = 100 * _CONFIDENCE) -> CrashRate:
-        """Return the rate per trial."""
+        """Return the crash rate per trial."""
         found = measure_rates(self.hunt.directory, per="trial", confidence=confidence, held_out=self.held_out)
         return found[0]
 
@@ -307,9 +311,9 @@ def _share(hunt: HuntResults, rate: CrashRate) -> float:
 
 
 def _table(side: _Side) -> NDArray[np.void]:
-    """Number, steps, least time to collision, whether it counts and whether it crashed, in order of numbers.
+    """Return number, steps, least time to collision, whether it counts and whether it crashed, for each trial in order.
 
-    Of a hunt that guided its trials, those that it did not. Trials on training traffic are excluded.
+    If the search guided the hunt, only unguided trials are returned. Trials with training traffic are excluded.
     """
     hunt, held_out = side.hunt, side.held_out
     crash_on = hunt.settings.crash_on
@@ -441,13 +445,13 @@ def _by_intervals(one: _Side, two: _Side, why_not: str, counts: tuple[int, int, 
 
 
 def _is_fixed_ahead(side: _Side) -> bool:
-    """Return whether the number of trials did not depend on the crashes, so that a test with one look is valid."""
+    """Return whether the number of trials did not depend on crashes, so that a single test at the end is valid."""
     settings = side.hunt.settings
     return not (settings.seeds or settings.run.until_rate) and side.rate().estimate is not None
 
 
 def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, PairTest, int]:
-    """Return the pairs, their evidence, and how many do not count because an agent was trained on their traffics."""
+    """Return the pairs, their evidence, and how many trials are excluded because of training traffic."""
     hunts = first, second
     held_out = held_out_traffics(first.settings, [hunt.directory for hunt in hunts])
     trained_on = 0
@@ -471,7 +475,7 @@ def _rule(hunt: HuntResults) -> CountingRule:
 
 
 def _trials(hunt: HuntResults, *, with_arguments: bool) -> Iterator[TrialFacts]:
-    """Yield the trials of a hunt, tagged with what a pair has in common."""
+    """Yield the trials of a hunt, tagged with the properties that the trials of a pair have in common."""
     crash_on = hunt.settings.crash_on
     with closing(Ledger(hunt.directory / layout.LEDGER)) as ledger:
         for data in ledger.plain_results():
@@ -483,14 +487,14 @@ def _trials(hunt: HuntResults, *, with_arguments: bool) -> Iterator[TrialFacts]:
 
 
 def _text_of(arguments: dict[str, object]) -> str:
-    """Return arguments as text that is equal where they are; 20 is 20.0."""
+    """Return arguments as text that is equal for equal values; 20 equals 20.0."""
     is_whole = {name: isinstance(value, int) and not isinstance(value, bool) for name, value in arguments.items()}
     plain = {name: float(str(value)) if is_whole[name] else value for name, value in arguments.items()}
     return json.dumps(plain, sort_keys=True)
 
 
 def why_unpaired(one: HuntSettings, other: HuntSettings) -> str:
-    """Return why trials of two hunts with the same number are no pairs, as a clause; empty if they are."""
+    """Return as a clause why trials of two hunts with the same number are not pairs; empty if they are pairs."""
     if one.rare and other.rare:
         return "they are in rare mode, in which one of five trials is undisturbed; each hunt itself reports its rate"
     if one.rare != other.rare:
@@ -519,7 +523,7 @@ def _disturbances(settings: HuntSettings) -> str:
 
 
 def _same_draws(first: HuntResults, second: HuntResults) -> bool:
-    """Whether it is sure that trials of the same number and seed have the same scenario arguments."""
+    """Return whether trials with the same number and seed certainly have the same scenario arguments."""
     if all(isinstance(spec.distribution, Constant) for spec in first.settings.scenario_arguments.values()):
         return True
     # Independent samplers draw them before any agent's.

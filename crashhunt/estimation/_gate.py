@@ -1,8 +1,8 @@
-"""Pairs of hunts that run, read as they grow, and what a gate reports of them.
+"""Pairs of running hunts, which are read while they grow, and the report of a gate on them.
 
 A gate compares two versions, BASE and HEAD, in pairs of trials with the same number, seed, traffic and disturbances.
-Its pairs are in one order that does not depend on results: hunt after hunt, and in each by number. So `PairWatch` may
-decide after any pair, whatever the number of workers.
+The pairs have an order that does not depend on results: hunt after hunt, and in each hunt by number. Therefore
+`PairWatch` may decide after any pair, and the number of workers has no influence.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ _FAILED_STATES = ("no_valid_trial", "error")
 
 @dataclass(frozen=True, slots=True)
 class GateCase:
-    """What became of a case of HEAD's corpus.
+    """The result of a case of HEAD's corpus.
 
     Args:
-        name: name of its folder.
+        name: name of the case's folder.
         expected: ``still`` or ``fixed``.
         got: ``still``, ``fixed``, ``changed`` or ``cannot_run``.
-        now: the result in words.
+        now: description of the present result.
     """
 
     name: str
@@ -53,7 +53,7 @@ class GateCase:
 
     @property
     def has_come_back(self) -> bool:
-        """Whether it has to stay fixed, and crashes."""
+        """Whether the case has to stay fixed, but crashes again."""
         return self.expected == "fixed" and self.got in ("still", "changed")
 
 
@@ -62,12 +62,12 @@ class ScenarioCounts:
     """The pairs of one hunt of BASE and HEAD.
 
     Args:
-        name: name of the hunt: its id and run in the suite, or the scenario.
-        pairs: that count.
+        name: name of the hunt: its id and run in the suite, or the name of the scenario.
+        pairs: number of pairs that count.
         only_base: number of the pairs in which only BASE crashes.
         only_head: number of pairs in which only HEAD crashes.
         both: number of pairs in which both crash.
-        invalid: pairs with an invalid trial, which leave both sides.
+        invalid: number of pairs with an invalid trial, which are excluded for both versions.
     """
 
     name: str
@@ -78,7 +78,7 @@ class ScenarioCounts:
     invalid: int = 0
 
     def to_json(self) -> JsonObject:
-        """Return plain data."""
+        """Return the counts as JSON-compatible data."""
         return {
             "name": self.name, "pairs": self.pairs, "only_base": self.only_base, "only_head": self.only_head,
             "both": self.both, "invalid": self.invalid,
@@ -87,28 +87,29 @@ class ScenarioCounts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateReport:
-    """What a gate reports.
+    """The report of a gate.
 
     Args:
-        verdict: ``better``, ``worse``, ``no_difference`` or ``undecided``: of HEAD, compared with BASE.
-        base: what was compared: a commit, or an agent.
-        head: likewise.
-        pairs: that count.
+        verdict: verdict on HEAD, compared with BASE: ``better``, ``worse``, ``no_difference`` or ``undecided``.
+        base: the version BASE: a commit or an agent.
+        head: the version HEAD: a commit or an agent.
+        pairs: number of pairs that count.
         only_base: number of the pairs in which only BASE crashes.
         only_head: number of pairs in which only HEAD crashes.
-        both: in which both crash.
-        evidence: e-value that they do not crash equally often.
+        both: number of pairs in which both versions crash.
+        evidence: e-value against the hypothesis that both versions crash equally often.
         difference: interval of the difference in crashes per trial, HEAD minus BASE; None without a pair.
-        margin: the greatest difference that counts as none; 0 for no such verdict.
+        margin: the greatest difference that counts as no difference; 0 to disable this verdict.
         confidence: confidence in percent, of the verdict and of the interval.
         seed: seed of the hunts.
-        scenarios: the same counts for each hunt.
-        rates: rates of BASE and of HEAD, where there is one hunt of each that has begun.
+        scenarios: the counts of pairs for each hunt.
+        rates: crash rates of BASE and of HEAD, if each has only one hunt, and it has begun.
         corpus: the cases that were run; None if there is no corpus.
-        why: why the verdict is not that of the pairs, or why there is none; empty if nothing has to be said.
-        is_interrupted: whether a request to stop came before the end.
-        dir: where the hunts are; empty if they are not kept.
-        trained_on: number of pairs that do not count, because an agent was trained on this part of the traffics.
+        why: reason why the verdict differs from the verdict of the pairs, or why there is no verdict; empty if neither
+            applies.
+        is_interrupted: whether the gate was interrupted before its end.
+        dir: directory of the hunts; empty if they are not kept.
+        trained_on: number of pairs that do not count, because an agent was trained on their traffic.
     """
 
     verdict: PairVerdict
@@ -133,11 +134,11 @@ class GateReport:
 
     @property
     def back(self) -> tuple[GateCase, ...]:
-        """The cases that had to stay fixed, and crash with HEAD."""
+        """The cases that had to stay fixed, but crash with HEAD."""
         return tuple(case for case in self.corpus or () if case.has_come_back)
 
     def to_json(self) -> JsonObject:
-        """Return the shape that ``gate --json`` prints; what is no finite number is null."""
+        """Return the report in the form that ``gate --json`` prints; numbers that are not finite are null."""
         corpus = None
         if self.corpus is not None:
             corpus = {
@@ -176,11 +177,11 @@ class PairedHunts:
     Args:
         name: name of the hunt.
         base: directory of BASE's hunt.
-        head: directory of HEAD's.
+        head: directory of HEAD's hunt.
         pairs: maximum number of trials of each hunt.
 
     Attributes:
-        trained_on: number of pairs that do not count, because an agent was trained on this part of the traffics.
+        trained_on: number of pairs that do not count, because an agent was trained on their traffic.
     """
 
     def __init__(self, name: str, base: Path, head: Path, pairs: int) -> None:
@@ -193,14 +194,14 @@ class PairedHunts:
         self._began = time.time()  # as ledgers have it
 
     def take(self, watch: PairWatch, *, may_end: bool = True) -> None:
-        """Give the pairs that are complete by now to a watch, until one decides.
+        """Pass the pairs that are complete to a watch, until a pair decides.
 
         Args:
             watch: watch of all pairs of the gate.
-            may_end: whether better and no difference are verdicts yet; worse always is one.
+            may_end: whether the verdicts *better* and *no difference* are allowed yet; *worse* is always allowed.
 
         Raises:
-            HuntDirectoryError: the two hunts are not of the same traffic, or a ledger is damaged.
+            HuntDirectoryError: the two hunts do not have the same traffic, or a ledger is damaged.
         """
         sequence = self._sequence = self._sequence or self._pair_sequence()
         if sequence is None:
@@ -221,7 +222,7 @@ class PairedHunts:
 
     @property
     def counts(self) -> ScenarioCounts:
-        """The pairs so far."""
+        """Return the counts of the pairs until now."""
         test, sequence = self._test, self._sequence
         return ScenarioCounts(
             name=self.name,
@@ -239,21 +240,21 @@ class PairedHunts:
 
     @property
     def why_not(self) -> str:
-        """Why the pairs so far say nothing; empty if they do."""
+        """The reason why the pairs until now allow no verdict; empty if they allow one."""
         return "" if self._sequence is None else self._sequence.why_not
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether certainly too many pairs have an invalid trial, so that more of them change nothing.
+        """Whether too many pairs certainly have an invalid trial, so that further pairs change nothing.
 
-        Without any valid pair it is False: the hunt itself ends then, and reports why.
+        Without any valid pair, the result is False, because the hunt itself then ends and reports the reason.
         """
         return self._sequence is not None and self._sequence.valid > 0 and self._sequence.is_hopeless
 
     def failure(self) -> tuple[str, str, str] | None:
-        """Return ``base`` or ``head``, the state in which its hunt failed, and why; None if both can run.
+        """Return which hunt failed (``base`` or ``head``), its state, and the reason; None if both can run.
 
-        Failures of an earlier run of the gate do not count: this run may do better.
+        Failures of an earlier run of the gate do not count, because this run may succeed.
         """
         for side, folder in zip(("base", "head"), self.folders, strict=True):
             if has_begun(folder / layout.LEDGER):
@@ -265,7 +266,7 @@ class PairedHunts:
         return None
 
     def _pair_sequence(self) -> PairSequence | None:
-        """Return the sequence of the pairs once both hunts have begun, and see that they are of the same traffic."""
+        """Return the sequence of the pairs after both hunts have begun, and check that they have the same traffic."""
         if not all((folder / layout.HUNT).exists() and has_begun(folder / layout.LEDGER) for folder in self.folders):
             return None
         base, head = (read_settings(folder / layout.HUNT) for folder in self.folders)

@@ -1,10 +1,10 @@
-"""How often the agents of a hunt crash, from what its directory holds.
+"""The crash rate of a hunt's agents, from the files in the hunt's directory.
 
-Reads the trials of a hunt in the order of their numbers, counts them by `crashhunt.rates`, and divides the rate into
-parts. Each part of a rate has its own interval. All parts together have the confidence that was asked for (C. E.
-Bonferroni, 1936): with 5 parts at 95 %, each interval is one of 99 %.
+The module reads the trials of a hunt in the order of their numbers, counts them with `crashhunt.rates`, and divides the
+rate into parts. Each part of a rate has its own interval. All parts together have the requested confidence (C. E.
+Bonferroni, 1936): with 5 parts at 95 %, each interval has 99 % confidence.
 
-Cost: a ledger is read once for all measures, at 30,000 trials per second or so.
+Cost: a ledger is read once for all measures, at about 30,000 trials per second.
 """
 
 from __future__ import annotations
@@ -54,21 +54,21 @@ def measure_rates(
     bar: float | None = None,
     held_out: HeldOutTraffics | None = None,
 ) -> tuple[CrashRate, ...]:
-    """Return how often the agents of a hunt crash: per trial, per hour and per 1,000 km.
+    """Return the crash rate of a hunt's agents: per trial, per hour and per 1,000 km.
 
     Args:
         directory: directory of the hunt.
-        per: ``trial``, ``hour`` or ``1000km``: only that rate.
+        per: the only rate to return: ``trial``, ``hour`` or ``1000km``.
         confidence: confidence of the certain intervals, in percent.
-        by: ``kind``, ``fault``, ``disturbance`` or an argument, perhaps with a number of bins, as in ``speed:5``: what
-            divides the rate into parts.
-        bar: a rate, to compare with; needs `per`.
-        held_out: rule for the traffics that count, where the hunt is compared with others; None for those that the
-            hunt's own agents were not trained on.
+        by: the property that divides the rate into parts: ``kind``, ``fault``, ``disturbance`` or an argument,
+            optionally with a number of bins as in ``speed:5``.
+        bar: threshold with which the rate is compared; needs `per`.
+        held_out: rule for the traffic that counts, if the hunt is compared with others; None for all traffic on which
+            the hunt's own agents were not trained.
 
     Raises:
         UsageError: a value is not allowed.
-        HuntDirectoryError: it is not the directory of a hunt, or its ledger or the record of a training is damaged.
+        HuntDirectoryError: the directory contains no hunt, or its ledger or a training record is damaged.
         BundleError: a snapshot is damaged.
     """
     check_confidence(confidence)
@@ -106,7 +106,7 @@ def measure_rates(
 
 
 def counts_suffice(settings: HuntSettings, facts: Facts, held_out: HeldOutTraffics) -> bool:
-    """Whether the rate per trial follows from counts of the first trials alone, without reading each of them."""
+    """Return whether the rate per trial follows from the counts of the first trials, without reading each trial."""
     rule = counting_rule(settings, facts, held_out)
     is_each = not rule.traffics and not rule.plain_origin and rule.is_held_out is None
     return is_each and not facts.get("until_rate")
@@ -124,17 +124,17 @@ def rate_of_counts(
     excluded: int,
     confidence: float = 95.0,
 ) -> CrashRate:
-    """Return the rate per trial that `measure_rates` returns, from counts; only where `counts_suffice`.
+    """Return the same rate per trial as `measure_rates`, from counts; only allowed if `counts_suffice`.
 
     Args:
         directory: directory of the hunt.
         settings: settings of the hunt.
-        facts: facts of its ledger.
+        facts: facts from the hunt's ledger.
         valid: number of valid trials before the first unfinished one.
-        invalid: number of invalid trials among them.
-        crashes: crashes of the valid ones.
-        steps: that the valid ones took.
-        excluded: number of trials that have ended after the first unfinished one.
+        invalid: number of invalid trials before the first unfinished one.
+        crashes: number of crashes among the valid trials.
+        steps: number of simulated steps of the valid trials.
+        excluded: number of trials that ended after the first unfinished one.
         confidence: confidence of the certain interval, in percent.
     """
     rule = counting_rule(settings, facts)
@@ -157,14 +157,14 @@ def rate_of_trials(
     held_out: HeldOutTraffics,
     confidence: float = 95.0,
 ) -> CrashRate:
-    """Return the rate per trial that `measure_rates` returns, without parts, from trials that the caller reads.
+    """Return the same rate per trial as `measure_rates`, without parts, from trials that the caller reads.
 
     Args:
         directory: directory of the hunt.
         settings: settings of the hunt.
-        facts: facts of its ledger.
-        trials: plain data of all trials, in the order of their numbers.
-        held_out: rule for the traffics that count.
+        facts: facts from the hunt's ledger.
+        trials: JSON data of all trials, in the order of their numbers.
+        held_out: rule for the traffic that counts.
         confidence: confidence of the certain interval, in percent.
     """
     rule = counting_rule(settings, facts, held_out)
@@ -182,7 +182,7 @@ def rate_of_trials(
 
 
 def _why_no_estimate(settings: HuntSettings, sequence: UnitSequence, decided: int | None) -> str:
-    """Return why crashes by exposure would be biased; empty if the number of units does not depend on them."""
+    """Return why crashes divided by exposure would be biased; empty if the number of units is independent of them."""
     run = settings.run
     if decided is not None:
         return ""
@@ -204,13 +204,14 @@ def _why_no_estimate(settings: HuntSettings, sequence: UnitSequence, decided: in
 
 @dataclass(frozen=True, slots=True)
 class _Division:
-    """What divides a rate.
+    """A division of a rate into parts.
 
     Args:
-        by: in words.
-        tag: returns the name of the part that a trial, or its crash, belongs to; of a ledger's plain data.
-        of_crashes: whether crashes are divided, and not trials.
-        names: names of the parts; empty if the crashes decide which there are.
+        by: the dividing property, as text.
+        tag: function that returns the name of the part to which a trial or its crash belongs, from the ledger's JSON
+            data.
+        of_crashes: whether crashes are divided instead of trials.
+        names: names of the parts; empty if the crashes determine the parts.
     """
 
     by: str
@@ -241,7 +242,7 @@ def _first_disturbance(data: JsonObject) -> str:
 
 
 def _of_bundles(hunt: HuntResults, facts: Facts, by: str) -> dict[int, str]:
-    """Return the kind or the fault of each crash, by the number of its trial."""
+    """Return the type or the fault of each crash, by the number of the trial."""
     found: dict[int, str] = {}
     for words, numbers in (facts.get("dropped") or {}).items() if by == "kind" else ():
         found |= dict.fromkeys(numbers, words)
@@ -256,10 +257,10 @@ def _of_bundles(hunt: HuntResults, facts: Facts, by: str) -> dict[int, str]:
 
 
 def _by_argument(by: str, settings: HuntSettings) -> _Division:
-    """Return the division by bins of an argument, which its distribution fixes ahead.
+    """Return the division by bins of an argument; the argument's distribution fixes the bins in advance.
 
     Raises:
-        UsageError: there is no such argument, or the number of bins is not allowed.
+        UsageError: the argument does not exist, or the number of bins is not allowed.
     """
     space = settings.space
     names = {f"{agent or 'scenario'}.{name}": (agent, name) for agent, name in space}
@@ -287,7 +288,7 @@ def _by_argument(by: str, settings: HuntSettings) -> _Division:
 
 
 def _bins(distribution: Distribution, count: int) -> tuple[tuple[str, ...], Callable[[object], int]]:
-    """Return the labels of bins of equal probability, and what finds the bin of a value."""
+    """Return the labels of bins of equal probability, and a function that finds the bin of a value."""
     if not isinstance(distribution, Range) or _few_values(distribution, count):
         options = distribution.options if isinstance(distribution, Choice) else distribution.grid(count)
         labels = tuple(str(option) for option in options)
