@@ -1,4 +1,4 @@
-"""Disturbances: draws faults of other actors and of the agent's sensors, and returns their log-likelihood."""
+"""Disturbances: faults of other actors and of the agent's sensors, which are drawn with a known log-likelihood."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Foreign models of disturbances, which draw in a process of their own."""
+"""Foreign disturbance models, which draw in a separate process."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ __all__ = ["ModelApart", "described_model"]
 
 
 def described_model(name: str) -> str:
-    """Make a model in this process, and return its kind.
+    """Create a model in this process, and return its kind.
 
     Raises:
-        CrashhuntError: there is no such model, or it cannot be made.
+        CrashhuntError: the model does not exist, or cannot be created.
     """
     kind: object = locate_model(name).what
     if not isinstance(kind, str):
@@ -33,12 +33,12 @@ def described_model(name: str) -> str:
 
 
 class ModelApart:
-    """A model that runs in its own process. The process starts when it is needed first.
+    """A model that runs in its own process, which starts at the first use.
 
     Args:
         name: name of the model, or ``module:attribute``.
         kind: kind of the model, if it is known.
-        timeout_s: time limit of each draw, in s of wall time; the first one imports the model.
+        timeout_s: maximum wall time of each draw, in s; the first draw also imports the model.
     """
 
     def __init__(self, name: str, kind: str = "", *, timeout_s: float) -> None:
@@ -48,24 +48,24 @@ class ModelApart:
 
     @property
     def what(self) -> str:
-        """Kind of the model."""
+        """Return the kind of the model."""
         if not self._kind:
             self._kind = self._ask({})["what"]
         return self._kind
 
     def draw(self, rng: np.random.Generator) -> Drawn:
-        """Return what the model draws. The generator is as if the model had drawn in this process."""
+        """Return a draw of the model. The random generator advances as if the model had drawn in this process."""
         found = self._ask({"generator": rng.bit_generator.state})
         rng.bit_generator.state = found["generator"]
         return Drawn(*found["drawn"])
 
     def log_likelihood(self, drawn: Drawn) -> float:
-        """Return the natural logarithm of the probability that a disturbance of the model is this one."""
+        """Return the natural logarithm of the probability with which the model draws this disturbance."""
         likely: float = self._ask({"drawn": [drawn.who, drawn.how_strong, drawn.how_long]})["likely"]
         return likely
 
     def close(self) -> None:
-        """End the process; may be called twice."""
+        """End the process; a second call does nothing."""
         if self._server is not None:
             self._server.close()
 

@@ -1,4 +1,4 @@
-"""The included models; each draws place, strength and duration independently from a few values."""
+"""The built-in models, each of which draws place, strength and duration independently from a few values."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ class Choices:
     """A model that draws place, strength and duration independently of each other.
 
     Args:
-        what: the kind.
-        who: places in the grid around the agent, each with its weight.
-        how_strong: strength, in the unit of the kind.
-        how_long: duration, in s.
+        what: kind of the disturbance.
+        who: places around the agent, each with its weight.
+        how_strong: possible strengths with their weights, in the unit of the kind.
+        how_long: possible durations with their weights, in s.
     """
 
     what: str
@@ -53,7 +53,7 @@ class Choices:
     how_long: Mapping[float, float]
 
     def draw(self, rng: np.random.Generator) -> Drawn:
-        """Draw the three, in this order."""
+        """Draw place, strength and duration, in this order."""
         return Drawn(one_of(self.who, rng), one_of(self.how_strong, rng), one_of(self.how_long, rng))
 
     def possibilities(self) -> Iterator[tuple[Drawn, float]]:
@@ -65,7 +65,7 @@ class Choices:
                 yield Drawn(who[0], strong[0], long[0]), share
 
     def log_likelihood(self, drawn: Drawn) -> float:
-        """Return the sum of the three logarithms."""
+        """Return the sum of the log-probabilities of place, strength and duration."""
         return (
             _log_share(self.who, drawn.who)
             + _log_share(self.how_strong, drawn.how_strong)
@@ -117,7 +117,7 @@ def late_merge() -> Choices:
 
 
 def step_out() -> Choices:
-    """A person at the roadside steps onto the road, and turns back in the middle of the agent's way."""
+    """A pedestrian at the roadside steps onto the road, and turns back in the middle of the agent's path."""
     places = {"right ahead": 2.0, "left ahead": 1.0}
     return Choices(
         what="step_out", who=places, how_strong={0.8: 1.0, 1.4: 2.0, 2.0: 1.0}, how_long={6.0: 1.0, 10.0: 1.0}
@@ -131,7 +131,7 @@ def ignore_priority() -> Choices:
 
 
 def late_observation() -> Choices:
-    """The agent sees everything late."""
+    """The agent receives all observations with a delay."""
     return Choices(
         what="late_observation",
         who={"itself": 1.0},
@@ -141,7 +141,7 @@ def late_observation() -> Choices:
 
 
 def noisy_observation() -> Choices:
-    """Every number that the agent sees is off by some share of itself."""
+    """Every number in the agent's observation is wrong by some share of itself."""
     return Choices(
         what="noisy_observation",
         who={"itself": 1.0},

@@ -1,39 +1,42 @@
-"""The law of the first onset: proposes first onsets in a running root, each with an exact weight.
+"""The probability law of the first disturbance: proposes first disturbances in a running trial, with weights.
 
-A root is a trial in which no disturbance begins after step 1. Each trial of the hunt has either no effective onset
-before it ends, or a first one, of a model in a step. For independent chances per step the probability of each case has
-a closed form. Copies of the root cover the second case. Each copy begins with one forced onset. Every later disturbance
-is drawn as in any trial.
+A root is a trial in which no disturbance begins after step 1. An onset is the beginning of a disturbance. In each trial
+of the hunt, either no onset is effective before the trial ends, or there is a first effective onset, which belongs to a
+model and a step. If the probabilities per step are independent, the probability of each case has a closed form. Copies
+of the root cover the second case. Each copy begins with one forced onset. All later disturbances are drawn as in any
+trial.
 
 Let S be the probability that no onset is effective so far, and c the chance of a model per step. Let a be the
 probability that its draw finds a vehicle. The first onset is of this model with probability S * c * a, and then S is
 multiplied by 1 - c * a. Draws without a vehicle have no effect, so they neither begin nor end anything. The draws that
-find a vehicle are known one step ahead, since the root is undisturbed so far.
+find a vehicle are known one step ahead, because the root is undisturbed until then.
 
-The proposal multiplies the law of each cell (a model with one strength) by a ratio. The proposed probability
-accumulates along the root. Each interval of `Forcing.spacing` of it gets one onset, at a uniform point. The weight of
-an onset is spacing / ratio.
+The proposal multiplies the probability of each cell (a model with one strength) by a ratio. The proposed probability
+accumulates along the root. In each interval of length `Forcing.spacing` of this probability, one onset is placed at a
+uniformly drawn point. The weight of an onset is spacing / ratio.
 
-Invariant: the expected sum of weights over any set of first onsets is the probability of that set, given the root.
-The estimate is the weighted crashes of all copies, plus S at the end where the root itself crashes. The estimate is
-therefore unbiased, for all ratios above 0 and for any spacing.
+Invariant: the expected sum of weights over any set of first onsets is the probability of that set, given the root. The
+estimate is the sum of the weighted crashes of all copies; if the root itself crashes, S at its end is added. The
+estimate is therefore unbiased, for all ratios above 0 and for any spacing.
 
-Why intervals of fixed length, and not eight equal parts of each root: the total is known only at the end of the root.
-A second run would cost its steps again. The spacing is learned, so that a root has eight copies on average.
+Reason for intervals of fixed length: for eight equal parts of each root, the total probability would be needed, which is
+known only at the end of the root. A second run of the root would cost its steps again. The spacing is learned, so that
+a root has eight copies on average.
 
 Order within a step: disturbances of the agent first, because the agent notices them one step earlier, when the vehicles
-around it in the next step are not known. Models later in this order are drawn as ever in the step of the onset. Models
-before it are drawn on the condition that they are not effective.
+around it in the next step are not known. In the step of the onset, models later in this order are drawn as usual.
+Models earlier in the order are drawn on the condition that they are not effective.
 
-Second onsets: a copy with its first onset is a root again. It has either no further effective onset before it ends, or
-a second one, with the same closed form: of the models after the first in the step of the first, and of all models from
-the next step on. So a copy may run without later disturbances, and copies of it begin with one forced second onset
-each. The copy itself then counts with the probability of no second onset. The choice of these copies does not depend on
-their results, so there is no bias. Forcing says for which first onsets it pays: at first for all, because the hunt
-learns from that where it pays. Later one copy of each root does it in addition.
+Second onsets: a copy with its first onset can be treated as a root again. Either it has no further effective onset
+before it ends, or it has a second one. The same closed form applies to the models after the first onset in the same
+step, and to all models from the next step on. A copy may therefore run without later disturbances, and each of its own
+copies begins with one forced second onset. The copy itself then counts with the probability of no second onset. The
+choice of these copies does not depend on their results, so there is no bias. `Forcing` selects the first onsets that
+get second onsets: at first all, because the hunt learns from their results where second onsets are useful. Later, one
+copy of each root gets second onsets in addition.
 
-Source: stratified importance sampling (Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 and 9).
-Cost: per step of the root one look at each place around the agent at which a model may find a vehicle.
+Source: stratified importance sampling (Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 and 9). Cost:
+in each step of the root, one check of every place around the agent at which a model may find a vehicle.
 """
 
 from __future__ import annotations
@@ -84,16 +87,16 @@ _KIND_WITH_STRENGTH_TARGETS = (
 
 @dataclass(frozen=True, slots=True)
 class Onset:
-    """A first onset for a copy of the root.
+    """The beginning of a first disturbance, which is forced on a copy of the root trial.
 
     Args:
         cell: the model and strength, such as ``brake=4.0``.
-        weight: probability of the onsets that it represents.
-        step: in which it begins.
-        planned: the onset and all later disturbances of the copy, in turn.
-        alone: the onset itself, for a copy on which second onsets are forced.
-        number: number of the onset in its root.
-        place: its place in the order within a step.
+        weight: probability of the disturbances that this one represents.
+        step: the step in which the disturbance begins.
+        planned: the forced disturbance and all later disturbances of the copy, in order.
+        alone: only the forced disturbance, for a copy on which second disturbances are forced.
+        number: number of the forced disturbance in its root trial.
+        place: position of its model in the order within a step.
     """
 
     cell: str
@@ -115,7 +118,7 @@ class _Cell:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """One model around one agent, with its cells by disturbance."""
+    """One model around one agent, with the cell of each of its disturbances."""
 
     order: int  # within a step
     agent: str
@@ -132,14 +135,15 @@ def cell_of(name: str, how_strong: float | None = None) -> str:
 
 
 def first_forcing(sampler: DisturbanceSampler, last: int) -> Forcing:
-    """Return the forcing of the first roots: the law itself, at most eight copies, and second onsets on all of them.
+    """Return the forcing of the first roots: the original law, at most eight copies, second onsets on all copies.
 
     If only later roots had second onsets, crashes that need two onsets would have large weights in the first roots, and
-    small weights in the others. An estimate that has missed the large ones looks precise, and is too low.
+    small weights in later roots. An estimate that has missed the large weights would look precise, but would be too
+    low.
 
     Args:
-        sampler: sampler of the hunt.
-        last: the last step of a trial.
+        sampler: sampler of the hunt's disturbances.
+        last: number of the last step of a trial.
     """
     draws = len(sampler.agents) * max(0, last - FIRST_STEP + 1)
     log_none = draws * math.fsum(math.log1p(-sampler.chance(name)) for name in sampler.models)
@@ -158,21 +162,22 @@ def _cells_of(sampler: DisturbanceSampler) -> tuple[str, ...]:
 
 
 class FirstOnsets:
-    """Proposes the first onsets of one root while it runs.
+    """Proposes the first disturbances for the copies of one root trial while the trial runs.
 
     Args:
-        sampler: sampler of the hunt, without disturbances that are fixed.
-        forcing: forcing of the root.
-        seed: seed of the root.
-        last: the last step of the root.
-        first: the first step in which an onset is forced.
-        after_place: in that step, only onsets of later places in the order are forced.
-        stream: numbers that separate the draws from others with the same seed.
-        places: places of the sampler with the ratios of the forcing; None to make them.
+        sampler: sampler of the hunt's disturbances, without fixed disturbances.
+        forcing: forcing of the root trial.
+        seed: seed of the root trial.
+        last: number of the last step of the root trial.
+        first: the first step in which a disturbance is forced.
+        after_place: in the first step, disturbances are forced only at later positions in the order than this one.
+        stream: numbers that separate these random numbers from others with the same seed.
+        places: places of the sampler with the ratios of the forcing; None to create them.
 
     Attributes:
-        survival: probability that no onset was effective so far.
-        masses: masses by cell, the probability that the first onset is of this cell and begins so far.
+        survival: probability that no disturbance has been effective until the present step.
+        masses: probability, by cell, that the first disturbance belongs to the cell and has begun before the present
+            step.
     """
 
     def __init__(
@@ -201,11 +206,11 @@ class FirstOnsets:
         self._point = self._points.random() * forcing.spacing
 
     def after(self, step: int, has_target: HasTarget) -> list[Onset]:
-        """Return the onsets for copies that leave the root after a step; it has to be called after every step from 0.
+        """Return the disturbances for copies that are forked after a step; call it after every step, from step 0 on.
 
         Args:
-            step: the step that is complete.
-            has_target: returns whether a disturbance that begins in the next step has a target vehicle.
+            step: the completed step.
+            has_target: function that returns whether a disturbance that begins in the next step has a target vehicle.
         """
         found: list[Onset] = []
         begins = step + 1
@@ -238,9 +243,10 @@ class FirstOnsets:
         return found
 
     def following(self, onset: Onset) -> FirstOnsets | None:
-        """Return what proposes the second onsets in the copy of an onset; None if none are forced on it.
+        """Return an object that proposes second disturbances for a copy; None if none are forced on this copy.
 
-        It has to be called after every step of the copy, from the one after which the copy leaves the root.
+        The method `after` of this object must be called after every step of the copy, from the step on after which the
+        copy was forked.
         """
         forcing = self._forcing
         is_pilot = onset.number == self._seed % COPIES_PER_ROOT
@@ -260,7 +266,7 @@ class FirstOnsets:
         )
 
     def _propose(self, place: _Place, cells: Sequence[_Cell]) -> list[tuple[_Cell, int]]:
-        """Return the cells at the points that fall on a place in a step, with their numbers, and move past it."""
+        """Return the cells that are drawn for a place in a step, with their numbers, and advance the probability."""
         found = []
         here = self.survival * place.chance
         share = proposed = 0.0
@@ -282,15 +288,15 @@ class FirstOnsets:
         self, place: _Place, cell: _Cell, step: int, in_step: Sequence[tuple[_Place, frozenset[Drawn] | None]],
         number: int,
     ) -> Onset:  # fmt: skip
-        """Return an onset with all later disturbances.
+        """Return a forced disturbance with all later disturbances of the copy.
 
         Args:
-            place: place of the onset.
-            cell: cell of the onset.
-            step: in which it begins.
-            in_step: the other places from which a disturbance may begin in the same step, each with the draws that are
-                excluded because they are effective; None to draw as ever.
-            number: number of the onset in the root.
+            place: place (model and agent) of the disturbance.
+            cell: cell of the disturbance.
+            step: the step in which the disturbance begins.
+            in_step: the other places from which a disturbance may begin in the same step. Each has the draws that are
+                excluded because they would be effective; None to draw as usual.
+            number: number of the disturbance in the root trial.
         """
         rng = np.random.default_rng(
             np.random.SeedSequence(self._seed, spawn_key=(_LATER_STREAM, number, *self._stream))
@@ -321,7 +327,7 @@ class FirstOnsets:
 
 
 def _places_of(sampler: DisturbanceSampler, ratios: Mapping[str, float]) -> list[_Place]:
-    """Return the places of all models around all agents, those of the agents' own disturbances first."""
+    """Return the places of all models around all agents; those of the agents' own disturbances come first."""
     names = [(agent, name) for agent in sampler.agents for name in sampler.models]
     names.sort(key=lambda pair: sampler.models[pair[1]].what not in SENSOR_KINDS)
     return [_place_of(sampler, ratios, order, agent, name) for order, (agent, name) in enumerate(names)]

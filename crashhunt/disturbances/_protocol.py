@@ -1,4 +1,4 @@
-"""The protocol of models: which disturbances of a kind there are, and how likely each is."""
+"""The protocol of disturbance models: which disturbances of a kind are possible, and how likely each is."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Drawn:
     """A disturbance that a model has drawn.
 
     Args:
-        who: the place in the grid around the agent, one of `crashhunt.trial.CELLS`.
-        how_strong: strength in the unit of the kind.
-        how_long: duration in s.
+        who: the place around the agent, one of `crashhunt.trial.CELLS`.
+        how_strong: strength of the disturbance, in the unit of the kind.
+        how_long: duration of the disturbance, in s.
     """
 
     who: str
@@ -31,12 +31,13 @@ class Drawn:
 class DisturbanceModel(Protocol):
     """Draws the actor, strength and duration of disturbances of one kind; the hunt sets their rate.
 
-    To give one a name, register what makes it, called without arguments::
+    To give a model a name, register a factory that creates it, which is called without arguments::
 
         [project.entry-points."crashhunt.disturbances"]
         truck_cut_in = "mypackage.disturbances:TruckCutIn"
 
-    Contract: `draw` draws from its argument alone, and two models that were made alike draw alike. The model draws one
+    Contract: `draw` uses only the random generator that it receives, and two models that were created in the same way
+    draw the same values. The model draws one
         of countably many possibilities; `log_likelihood` returns the probability of each. A model keeps no state.
     """
 
@@ -45,7 +46,7 @@ class DisturbanceModel(Protocol):
         """The kind of disturbance, such as ``brake``."""
 
     def draw(self, rng: np.random.Generator) -> Drawn:
-        """Draw a disturbance with the given generator."""
+        """Draw a disturbance with the given random generator."""
 
     def log_likelihood(self, drawn: Drawn) -> float:
         """Return the natural logarithm of the probability of a draw; -inf if the model never draws it."""
@@ -61,7 +62,7 @@ class Enumerates(Protocol):
 
 @runtime_checkable
 class Closes(Protocol):
-    """A model that has something to end."""
+    """A model that holds resources, which it releases when it is closed."""
 
     def close(self) -> None:
-        """End it; may be called twice."""
+        """Release the resources; a second call does nothing."""

@@ -1,4 +1,4 @@
-"""Rates of disturbances, such as ``brake=0.02,cut_in=0.01``, and the draws of disturbances for a trial.
+"""Rates of disturbances, such as ``brake=0.02,cut_in=0.01``, and the disturbances that are drawn for a trial.
 
 Each model has a separate random generator around each agent, seeded by the trial's seed and the model's name. Adding a
 model therefore changes neither the draws of other models nor anything else that is drawn from the seed.
@@ -48,20 +48,20 @@ _FORM_FIX = f"write {FORM}, such as brake@124=ahead:4:2 for 4 m/s² and 2 s from
 
 
 def is_fixed(word: str) -> bool:
-    """Return whether a word gives a disturbance at a given step, not a rate."""
+    """Return whether a word describes a disturbance at a given step instead of a rate."""
     return "@" in word
 
 
 def parse_fixed(words: Iterable[str], agents: Sequence[str], *, shown: str = "--disturb") -> tuple[Disturbance, ...]:
-    """Return the disturbances that words fix, ``[AGENT.]KIND@STEP=WHO:HOW_STRONG:HOW_LONG``, in the order of steps.
+    """Return the disturbances at given steps, ``[AGENT.]KIND@STEP=WHO:HOW_STRONG:HOW_LONG``, in the order of steps.
 
     Args:
         words: the words of the option; words with a rate are ignored.
-        agents: the controlled vehicles, around which they are.
-        shown: the option or key that has the words, for the error.
+        agents: the controlled vehicles, around which the disturbances occur.
+        shown: option or key that contains the words, for error messages.
 
     Raises:
-        UsageError: a word is not valid, or a kind begins twice in one step around one agent.
+        UsageError: a word is invalid, or two disturbances of a kind begin in the same step around the same agent.
     """
     found: dict[tuple[int, str, str], Disturbance] = {}
     for word in filter(is_fixed, words):
@@ -74,7 +74,7 @@ def parse_fixed(words: Iterable[str], agents: Sequence[str], *, shown: str = "--
 
 
 def word_of(one: Disturbance, agents: Sequence[str]) -> str:
-    """Return the word that fixes a disturbance; it names the agent only if there are several."""
+    """Return the word that describes a disturbance at a given step; it names the agent only if there are several."""
     whose = f"{one.agent}." if len(agents) > 1 else ""
     place = one.who.replace(" ", "_")  # so that no shell needs quotes
     return f"{whose}{one.what}@{one.step}={place}:{one.how_strong!r}:{one.how_long!r}"
@@ -99,7 +99,7 @@ def _parsed(word: str, agents: Sequence[str], shown: str) -> Disturbance:
 
 
 def _agent_and_kind(name: str, agents: Sequence[str], shown: str) -> tuple[str, str]:
-    """The agent around which it is, and the kind."""
+    """Return the agent around which the disturbance occurs, and the kind of the disturbance."""
     agent, dot, what = name.rpartition(".")
     if dot and agent not in agents:
         raise UsageError(f"{shown}: there is no controlled vehicle {agent!r}", fix=one_of(agent, agents))
@@ -126,7 +126,7 @@ _OPTION = "--disturb"
 
 
 def parse_rates(words: Iterable[str]) -> dict[str, float]:
-    """Return the rate of each disturbance in 1/s, from ``NAME=RATE``; rates of 0 are excluded.
+    """Return the rate of each disturbance in 1/s, from words such as ``NAME=RATE``; rates of 0 are omitted.
 
     Args:
         words: the words of the option; ``none`` for no disturbances. Words that give a disturbance at a given step are
@@ -173,20 +173,20 @@ def disturber_of(
     simulator: str = "the simulator", fixed: Sequence[Disturbance] = (),
     find: Callable[[str], DisturbanceModel] | None = None,
 ) -> DisturbanceSampler:  # fmt: skip
-    """Return the sampler of the disturbances of trials.
+    """Return the sampler of a hunt's disturbances.
 
     Args:
-        rates: name of a model to its rate per second around each agent.
-        agents: the controlled vehicles.
+        rates: rate per second around each agent, by name of the model.
+        agents: the controlled vehicles, around which disturbances occur.
         step_length_s: step length in s.
-        known: the kinds that the simulator supports; None if that is unknown.
-        simulator: its name in messages.
-        fixed: what every trial has besides.
-        find: returns the model of a name; by default `locate_model`.
+        known: the kinds that the simulator supports; None if they are unknown.
+        simulator: name of the simulator in messages.
+        fixed: disturbances that every trial has in addition.
+        find: function that returns the model of a name; by default `locate_model`.
 
     Raises:
-        PluginError: there is no such model.
-        UsageError: it happens more than once a step, or the simulator cannot do it.
+        PluginError: a model does not exist.
+        UsageError: a rate means more than one disturbance per step, or the simulator does not support a kind.
     """
     models: dict[str, DisturbanceModel] = {}
     for name, rate in rates.items():
@@ -223,15 +223,15 @@ def _refuse_unsupported(name: str, what: str, known: Sequence[str] | None, simul
 
 
 def modules_of_models(words: Iterable[str]) -> list[str]:
-    """Return the modules of the models that words name as ``module:attribute``; nothing is imported."""
+    """Return the modules of the models that words name as ``module:attribute``, without importing them."""
     return [name.partition(":")[0] for name in parse_rates(words) if ":" in name]
 
 
 def locate_model(name: str) -> DisturbanceModel:
-    """Return the model of a name, or of a ``module:attribute``.
+    """Return the model with a registered name or a ``module:attribute``.
 
     Raises:
-        PluginError: there is none.
+        PluginError: the model does not exist.
     """
     if ":" not in name and name not in registered("disturbances"):
         fix = f"{one_of(name, registered('disturbances'), none='(none)')}, or module:attribute"
@@ -249,10 +249,10 @@ def locate_model(name: str) -> DisturbanceModel:
 
 
 def draw_checked(name: str, model: DisturbanceModel, rng: np.random.Generator) -> Drawn:
-    """Return what a model draws.
+    """Return a disturbance that a model draws, after checking it.
 
     Raises:
-        PluginError: the model fails, or what it draws is no disturbance.
+        PluginError: the model failed, or did not draw a valid disturbance.
     """
     try:
         drawn = model.draw(rng)
@@ -271,15 +271,15 @@ def draw_checked(name: str, model: DisturbanceModel, rng: np.random.Generator) -
 class DisturbanceSampler:
     """Draws the disturbances of trials, and returns their log-likelihood.
 
-    In every step, each model begins one around each agent with a probability of rate times step length, whatever else
-    is going on.
+    In every step, each model begins a disturbance around each agent with a probability of rate times step length, even
+    while other disturbances are active.
 
     Args:
         models: models by name.
-        rates: rates of each, in 1/s.
-        agents: the controlled vehicles.
+        rates: rate of each model, in 1/s, by name.
+        agents: the controlled vehicles, around which disturbances occur.
         step_length_s: step length in s.
-        fixed: what every trial has besides, whatever is drawn.
+        fixed: disturbances that every trial has in addition to the drawn ones.
     """
 
     models: Mapping[str, DisturbanceModel]
@@ -304,14 +304,14 @@ class DisturbanceSampler:
         return self._with_fixed(found, 0, max_steps)
 
     def draw_another(self, seed: int, number: int, after: int, soon: int, last: int) -> tuple[Disturbance, ...]:
-        """Return what else might begin after a step of a trial: at least one disturbance soon, others as ever.
+        """Return other disturbances after a step of a trial: at least one begins soon, the others are drawn as usual.
 
         Args:
             seed: seed of the trial.
-            number: which of several draws.
-            after: the step.
-            soon: the first one begins within so many steps.
-            last: the last step in which one begins.
+            number: number that distinguishes several draws.
+            after: the step after which the disturbances begin.
+            soon: number of steps within which the first disturbance begins.
+            last: the last step in which a disturbance begins.
         """
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_BRANCH_STREAM, after, number)))
         places = [(agent, name) for agent in self.agents for name in self.models]
@@ -322,16 +322,16 @@ class DisturbanceSampler:
         return self._with_fixed([first, *others], after, last)
 
     def draw_strongest(self, seed: int, number: int, after: int, soon: int) -> tuple[tuple[Disturbance, ...], ...]:
-        """Return how strongly each model may disturb each agent soon: of many draws, the strongest first.
+        """Return the strongest disturbances with which each model may soon disturb each agent, from many draws.
 
         Args:
             seed: seed of the trial.
-            number: which of several draws.
-            after: the step.
-            soon: all begin within so many steps after it.
+            number: number that distinguishes several draws.
+            after: the step after which the disturbances begin.
+            soon: number of steps within which all disturbances begin.
 
         Returns:
-            Several alternatives per model and agent, because not every place has an actor that can be disturbed.
+            Several alternatives for each model and agent, because a place may have no actor that can be disturbed.
         """
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STRONGEST_STREAM, after, number)))
         found = []
@@ -349,14 +349,14 @@ class DisturbanceSampler:
         return in_turn([*(one for one in drawn if _key(one) not in taken), *given])
 
     def draw_between(self, after: int, last: int, name: str, agent: str, rng: np.random.Generator) -> list[Disturbance]:
-        """Return what a model begins around an agent.
+        """Return the disturbances that a model begins around an agent between two steps.
 
         Args:
-            after: the first step is the next one.
-            last: the last step.
+            after: the step before the first step in which a disturbance may begin.
+            last: the last step in which a disturbance may begin.
             name: name of the model.
             agent: identifier of the controlled vehicle.
-            rng: draws steps and disturbances.
+            rng: random generator for steps and disturbances.
         """
         chance, step, found = self.chance(name), after, []
         # A waiting time can be longer than any number of steps: that of a rate near 0.
@@ -377,13 +377,13 @@ class DisturbanceSampler:
         return one
 
     def log_likelihood(self, disturbances: Iterable[Disturbance], steps: int) -> float:
-        """Return the natural logarithm of the probability that just these begin in so many steps.
+        """Return the natural logarithm of the probability that exactly these disturbances begin in the given steps.
 
-        Fixed disturbances always begin, independent of the draws of models in that step.
+        Disturbances at given steps always begin, regardless of the models' draws in these steps.
 
         Args:
-            disturbances: the drawn disturbances; later ones are ignored.
-            steps: number of steps.
+            disturbances: the drawn disturbances; disturbances after the given steps are ignored.
+            steps: number of steps of the trial.
         """
         given = {_key(one) for one in self.fixed if one.step <= steps}
         begun = [one for one in disturbances if one.step <= steps and _key(one) not in given]
@@ -401,10 +401,10 @@ class DisturbanceSampler:
         return total if all(one.what in known and one.agent in self.agents for one in begun) else -math.inf
 
     def log_likelihood_of(self, result: TrialResult) -> float | None:
-        """Return the logarithm of the probability that just what took place in a trial begins in its steps.
+        """Return the log-probability that exactly the disturbances of a trial begin in its steps.
 
-        A draw without a target vehicle has no effect, so it does not lower the likelihood. None if nothing is drawn at
-        all.
+        A draw without a target vehicle has no effect, so it does not lower the likelihood. The result is None if the
+        hunt draws no disturbances.
         """
         if not self.models:
             return None
@@ -413,7 +413,7 @@ class DisturbanceSampler:
         return self.log_likelihood(drawn, result.steps_begun)
 
     def close(self) -> None:
-        """End the processes in which models draw."""
+        """End the processes in which foreign models draw."""
         for model in self.models.values():
             if isinstance(model, Closes):
                 model.close()

@@ -1,13 +1,13 @@
-"""For tests: `assert_survives`, and suites that check the contracts of agents, simulators, samplers and other plugins.
+"""Tools for tests: `assert_survives`, and suites that check the contracts of agents, simulators and other plugins.
 
-Subclass a suite in a test module, give it its fixture, and let pytest collect it::
+Derive a test class from a suite in a test module, define the fixtures of the suite, and let pytest collect the class::
 
     class TestMySimulator(SimulatorContract):
         @pytest.fixture
         def make(self, tmp_path):
             return lambda: MySimulator(scenario, tmp_path)
 
-The suites need pytest.
+The suites need the package pytest.
 """
 
 import lazy_loader

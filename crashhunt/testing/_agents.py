@@ -1,4 +1,4 @@
-"""What every agent must do."""
+"""The contract suite for agents."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ Make = Callable[[], Agent]
 
 
 class AgentContract:
-    """Checks `crashhunt.agents.Agent`, and the faculties that an agent offers.
+    """Checks an agent against `crashhunt.agents.Agent`, and its optional capabilities.
 
-    The fixture ``make`` returns a function that makes an agent, ``form`` the form of its actions, and ``observations``
-    its observations in order.
+    The fixture ``make`` returns a function that creates an agent. ``form`` is the form of its actions, and
+    ``observations`` are its observations in order.
     """
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return a function that makes an agent."""
+        """Return a function that creates an agent."""
         raise NotImplementedError("the contract suite needs a fixture named make")
 
     @pytest.fixture
@@ -41,13 +41,13 @@ class AgentContract:
 
     @pytest.fixture
     def observations(self) -> list[NDArray[np.generic]]:
-        """Return the observations of the agent, in order."""
+        """Return observations of the agent, in order."""
         raise NotImplementedError("the contract suite needs a fixture named observations")
 
     def test_it_acts_inside_its_space_and_by_its_seed_alone(
         self, make: Make, form: ActionForm, observations: list[NDArray[np.generic]]
     ) -> None:
-        """After a reset, and in another instance, the agent has the same actions again."""
+        """After a reset, and in another instance, the agent returns the same actions again."""
 
         def drive(agent: Agent, seed: int) -> list[bytes]:
             agent.reset(seed)
@@ -60,7 +60,7 @@ class AgentContract:
         assert drive(make(), 1) == first
 
     def test_it_leaves_what_it_is_shown_alone(self, make: Make, observations: list[NDArray[np.generic]]) -> None:
-        """Observations are shared with the recorder and other agents."""
+        """The agent must not change observations, because the recorder and other agents use the same objects."""
         agent = make()
         agent.reset(1)
         for observation in observations:
@@ -71,7 +71,7 @@ class AgentContract:
     def test_panels_are_pictures_and_change_nothing(
         self, make: Make, form: ActionForm, observations: list[NDArray[np.generic]]
     ) -> None:
-        """`DrawsPanels`: panels do not change its actions, and they can be drawn and distinguished."""
+        """`DrawsPanels`: panels do not change the agent's actions, can be drawn, and have different labels."""
 
         def drive(*, looked_at: bool) -> list[bytes]:
             agent = make()
@@ -91,7 +91,7 @@ class AgentContract:
     def test_it_can_be_closed_whenever_a_trial_may_end(
         self, make: Make, observations: list[NDArray[np.generic]]
     ) -> None:
-        """`Closes`: before its reset, after it, and after it has acted; and a new agent drives afterwards."""
+        """`Closes`: an agent can be closed before its reset, after it and after an action; a new agent then drives."""
         for ends_after in (-1, 0, 1):
             agent = make()
             if ends_after >= 0:
@@ -105,7 +105,7 @@ class AgentContract:
         agent.act(observations[0])
 
     def test_the_libraries_that_it_needs_are_names(self, make: Make) -> None:
-        """`NeedsLibraries`: a sequence of names of modules, and not one text."""
+        """`NeedsLibraries`: the value is a sequence of module names, and not a single text."""
         kind = type(make())
         libraries: Sequence[str] = kind.libraries if supports(kind, NeedsLibraries) else ()
         assert not isinstance(libraries, str)

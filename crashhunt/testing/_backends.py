@@ -1,4 +1,4 @@
-"""What every descriptor of a simulator must do."""
+"""The contract suite for descriptors of simulators."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ print(registered("simulators")[sys.argv[1]].value.partition(":")[0] in sys.modul
 
 
 class BackendContract:
-    """Checks `crashhunt.scenario.Backend`.
+    """Checks a descriptor against `crashhunt.scenario.Backend`.
 
-    The fixture ``name`` returns the name under which the simulator and its descriptor are registered, and ``scenario``
-    the folder of a valid scenario for it, which has everything that one may have: files, texts, options.
+    The fixture ``name`` returns the name under which the simulator and its descriptor are registered. ``scenario``
+    returns the folder of a valid scenario that uses all features of the simulator's table: files, texts and options.
     """
 
     @pytest.fixture
@@ -66,13 +66,13 @@ class BackendContract:
         assert loaded.backends == {name: self._backend(name)}
 
     def test_it_is_known_without_the_simulator(self, name: str, scenario: Path) -> None:
-        """Commands that only read a scenario do not import what takes long, or runs once a process."""
+        """Commands that only read a scenario import neither slow libraries nor libraries that run once per process."""
         command = [sys.executable, "-c", _IMPORTED, name, str(scenario)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.stdout.strip() == "False", done.stderr
 
     def test_a_wrong_key_in_its_table_is_named(self, name: str, scenario: Path, tmp_path: Path) -> None:
-        """The message has the most similar name."""
+        """The error message contains the most similar key."""
         backend = self._backend(name)
         if backend.table is None:
             with pytest.raises(ScenarioError, match=f"unknown key '{name}'"):
@@ -95,7 +95,7 @@ class BackendContract:
         return load_scenario(copy)
 
     def test_its_files_are_all_that_an_episode_reads(self, name: str, scenario: Path, tmp_path: Path) -> None:
-        """They lie in the folder; with scenario.toml they are the complete scenario."""
+        """All files lie in the folder; together with scenario.toml they are the complete scenario."""
         loaded = load_scenario(scenario)
         files = list(loaded.files())
         assert len(files) == len(set(files))
@@ -113,7 +113,7 @@ class BackendContract:
             assert relocated is None or isinstance(relocated(loaded.folder / file), bytes | None)
 
     def test_the_digest_is_that_of_every_file(self, scenario: Path, tmp_path: Path) -> None:
-        """Other content gives another digest."""
+        """Other contents of a file result in another digest."""
         loaded = load_scenario(shutil.copytree(scenario, tmp_path / "copied" / scenario.name))
         before = scenario_digest(loaded)
         assert scenario_digest(load_scenario(scenario)) == before
@@ -126,7 +126,7 @@ class BackendContract:
         assert scenario_digest(loaded) == before
 
     def test_it_crosses_to_workers_and_to_snapshots(self, scenario: Path, tmp_path: Path) -> None:
-        """Reading returns what was written; the table has its own name."""
+        """Reading a written scenario returns the same scenario; the table keeps its name."""
         loaded = load_scenario(scenario)
         settings = WorkerSettings(scenario=loaded, oracles=(), crash_on=(), scratch=tmp_path)
         sent = json.loads(json.dumps(settings.to_json()))
@@ -139,7 +139,7 @@ class BackendContract:
         assert scenario_digest(kept) == scenario_digest(loaded)
 
     def test_what_it_states_of_the_simulator_can_be_used(self, name: str, scenario: Path) -> None:
-        """Versions are of what is installed, times are times, words are words."""
+        """Versions belong to installed packages, times are numbers of seconds, and descriptions are texts."""
         backend, loaded = self._backend(name), load_scenario(scenario)
         assert backend.title
         for distribution in backend.versions:
@@ -155,7 +155,7 @@ class BackendContract:
                 assert with_action(loaded, agent, form).agents[agent].action == form
 
     def test_without_its_accelerator_it_is_the_same_scenario(self, name: str, scenario: Path) -> None:
-        """Disabling the accelerator twice is the same as once, and gives no note."""
+        """Disabling the accelerator twice has the same result as once, and results in no note."""
         accelerator, loaded = self._backend(name).accelerator, load_scenario(scenario)
         if accelerator is not None:
             plain = accelerator.switched_off(loaded)
@@ -163,7 +163,7 @@ class BackendContract:
             assert accelerator.note(plain) == ""
 
     def test_it_answers_for_strangers_or_not_at_all(self, name: str, scenario: Path) -> None:
-        """What a stranger's scenario would do besides simulating is reported in one line."""
+        """The side effects of an untrusted scenario are reported in one line."""
         backend = self._backend(name)
         loaded, settings = plan(Request(trials=1, max_steps=1, scenario=scenario, seed=1))
         values = {argument: setup.default for argument, setup in loaded.arguments.items() if setup.default is not None}

@@ -1,4 +1,4 @@
-"""What every model of disturbances must do."""
+"""The contract suite for disturbance models."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ _DEVIATIONS = 6.0  # of a share that is drawn from its probability: once in a bi
 
 
 class DisturbanceContract:
-    """Checks `crashhunt.disturbances.DisturbanceModel`.
+    """Checks a model against `crashhunt.disturbances.DisturbanceModel`.
 
-    The fixture ``make`` returns a function that makes a model.
+    The fixture ``make`` returns a function that creates a model.
     """
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return a function that makes a disturbance model."""
+        """Return a function that creates a disturbance model."""
         raise NotImplementedError("the contract suite needs a fixture named make")
 
     def test_what_is_drawn_is_a_disturbance(self, make: Make) -> None:
-        """A place in the grid around the agent, a finite strength, and a length above 0 s."""
+        """A draw has a place around the agent, a finite strength, and a duration above 0 s."""
         model = make()
         assert isinstance(model.what, str)
         assert model.what
@@ -43,7 +43,7 @@ class DisturbanceContract:
             assert 0 < drawn.how_long < math.inf
 
     def test_the_generator_alone_decides(self, make: Make) -> None:
-        """The model uses no other generator, and has no memory."""
+        """The model uses no other random generator, and keeps no state."""
         model = make()
         found = []
         for seed in (1, 2):
@@ -53,7 +53,7 @@ class DisturbanceContract:
         assert found[0] == found[1] == _draws(make(), seed=3)
 
     def test_the_likelihood_is_that_of_the_draws(self, make: Make) -> None:
-        """Each draw has a probability, draws occur as often as it states, and all probabilities add up to at most 1."""
+        """Each draw has a positive probability and occurs that often, and all probabilities add up to at most 1."""
         model = make()
         counts = Counter(_draws(model, seed=5))
         total = 0.0

@@ -1,4 +1,4 @@
-"""Whether what a crash says about braking is so: tried by driving its recorded actions, and braking from a step on."""
+"""Check of a crash's last avoidable step, by repeating its recorded actions and braking after a step."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class EscapeCheck:
 
     Args:
         crash: id of the crash.
-        step: the last avoidable step according to the crash.
-        too_late: a step after which braking does not help, according to the crash.
+        step: the last avoidable step, as recorded in the crash.
+        too_late: the step after which braking does not avoid the crash, as recorded in the crash.
         avoided: whether braking after ``step`` avoided the collision; None if the crash has no such step.
         avoided_later: whether braking after ``too_late`` avoided the collision.
     """
@@ -44,19 +44,20 @@ class EscapeCheck:
 
     @property
     def verdict(self) -> Literal["right", "silent", "wrong"]:
-        """The verdict of the check."""
+        """Return the verdict of the check as text."""
         if self.step is None and self.too_late is None:
             return "silent"
         return "wrong" if self.avoided is False or self.avoided_later else "right"
 
 
 class RecordedThenBrakes:
-    """Plays the recorded actions of an agent up to a step; then brakes: target speed 0, or SLOWER.
+    """Agent that repeats recorded actions up to a step, and then brakes: target speed 0, or SLOWER.
 
     Args:
-        log: the path of a ``log.mcap``.
-        agent: id of the agent whose actions are replayed.
-        after: the step; an agent that is not overruled repeats its last action when the log is exhausted.
+        log: path of a ``log.mcap``.
+        agent: identifier of the agent whose actions are repeated.
+        after: the step after which the agent brakes. If it is not overruled and the log has no further action, the last
+            action is repeated.
         action_space: action space of the vehicle.
     """
 
@@ -68,11 +69,11 @@ class RecordedThenBrakes:
         self._step = 0
 
     def reset(self, seed: int) -> None:
-        """Begin at the first action."""
+        """Start again at the first recorded action."""
         self._step = 0
 
     def act(self, observation: object) -> object:
-        """Return the next action."""
+        """Return the next recorded action, or the braking action."""
         step, self._step = self._step, self._step + 1
         return self._brake if step >= self._after else self._actions[min(step, len(self._actions) - 1)]
 
@@ -80,7 +81,7 @@ class RecordedThenBrakes:
 def check_escape(bundle: Bundle) -> EscapeCheck:
     """Check the last avoidable step of a crash by runs, each in a new process.
 
-    The check is independent of the hunt's own search: it runs no code of the agents.
+    The check is independent of the hunt's own search, and runs no code of the agents.
     """
     said = bundle.result.escape
     if said is None:

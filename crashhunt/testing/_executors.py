@@ -1,4 +1,4 @@
-"""What every executor must do. The trials run on the toy simulator, which fails in every way on request."""
+"""The contract suite for executors. The trials run on the toy simulator, which fails in every way on request."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ _SWITCHES = ("fail_at_step", "exit_at_step", "segfault_at_step", "hang_at_step")
 
 
 class ExecutorContract:
-    """Checks `crashhunt.executors.Executor`.
+    """Checks an executor against `crashhunt.executors.Executor`.
 
-    The fixture ``make`` returns a function that makes an executor of settings and a number of workers.
+    The fixture ``make`` returns a function that creates an executor, given settings and a number of workers.
     """
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return a function that makes an executor."""
+        """Return a function that creates an executor."""
         raise NotImplementedError("the contract suite needs a fixture named make")
 
     @pytest.fixture
     def executor(self, make: Make, tmp_path: Path) -> Iterator[Executor]:
-        """An executor of two workers, with a time limit of two seconds."""
+        """Return an executor with two workers and a time limit of two seconds."""
         scratch = tmp_path / "scratch"
         scratch.mkdir()
         scenario = Scenario(
@@ -71,7 +71,7 @@ class ExecutorContract:
         return found
 
     def _see_nodes(self, executor: Executor, place: HasNodes, ended: int) -> None:
-        """The figures of nodes add up, within some seconds."""
+        """Check that the figures of the nodes add up within some seconds."""
         deadline = time.monotonic() + 30
         while sum(node.trials for node in place.nodes()) != ended:
             assert time.monotonic() < deadline, f"{ended} trials have ended, and the nodes are {place.nodes()}"
@@ -80,7 +80,7 @@ class ExecutorContract:
         assert all(node.name and node.rate_per_s >= 0 for node in place.nodes())
 
     def test_every_trial_comes_back_once(self, executor: Executor) -> None:
-        """And with the specification that was submitted."""
+        """Every trial returns with the specification that was submitted."""
         specs = [self._spec(number) for number in range(6)]
         for spec in specs:
             executor.submit(spec)
@@ -106,7 +106,7 @@ class ExecutorContract:
         assert all(result.steps == 30 and result.digest for result in good.values())
 
     def test_cancelled_trials_do_not_come_back(self, executor: Executor) -> None:
-        """They block no other trial, even if they hang. Trials submitted later run."""
+        """Cancelled trials block no other trial, even if they hang. Trials that are submitted later run."""
         executor.submit(self._spec(0))
         self._collect(executor, 1)
         for number in range(1, 6):
@@ -119,7 +119,7 @@ class ExecutorContract:
         assert set(self._collect(executor, 1)) == {9}
 
     def test_it_states_how_much_it_runs_and_where_that_is(self, executor: Executor) -> None:
-        """A trial that runs is somewhere, or its place is unknown; nothing that has not been submitted is anywhere."""
+        """A running trial has a progress or an unknown one; trials that were not submitted have none."""
         assert executor.capacity == 2
         assert dict(executor.where()) == {}
         executor.submit(self._spec(3, hang_at_step=5))
@@ -133,7 +133,7 @@ class ExecutorContract:
         assert dict(executor.where()) == {}
 
     def test_what_is_reported_is_reported_once(self, executor: Executor) -> None:
-        """Notes are lines for the user."""
+        """Notices are lines of text for the user, each returned once."""
         executor.submit(self._spec(0))
         self._collect(executor, 1)
         notes = executor.notes()
@@ -141,7 +141,7 @@ class ExecutorContract:
         assert executor.notes() == []
 
     def test_what_is_kept_has_its_black_box_here(self, executor: Executor, tmp_path: Path) -> None:
-        """Before its result comes back."""
+        """The black box of a kept trial is on this machine before the result is returned."""
         executor.submit(self._spec(0))
         executor.submit(self._spec(1, fail_at_step=10))
         found = self._collect(executor, 2)
@@ -150,7 +150,7 @@ class ExecutorContract:
         assert Recording(read_black_box(scratch_of(scratch, 1) / layout.BLACK_BOX)).steps == found[1].steps
 
     def test_closing_twice_is_fine(self, executor: Executor) -> None:
-        """Closing ends every process at once, whatever it does."""
+        """Closing ends every process at once, regardless of what it is doing."""
         executor.submit(self._spec(0, hang_at_step=5))
         list(executor.completed(0.5))
         began = time.monotonic()

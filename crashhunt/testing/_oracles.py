@@ -1,4 +1,4 @@
-"""What every oracle must do."""
+"""The contract suite for oracles."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ _LANES = [Lane("road_0", 3.2, ((0.0, 0.0), (400.0, 0.0))), Lane("road_1", 3.2, (
 
 
 class OracleContract:
-    """Checks `crashhunt.oracles.Oracle`, and `SeesMap` and `BringsOutcomes` where they are offered.
+    """Checks an oracle against `crashhunt.oracles.Oracle`, and against `SeesMap` and `BringsOutcomes` if supported.
 
-    The fixture ``make`` returns a function that makes an oracle.
+    The fixture ``make`` returns a function that creates an oracle.
     """
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return a function that makes an oracle."""
+        """Return a function that creates an oracle."""
         raise NotImplementedError("the contract suite needs a fixture named make")
 
     def test_it_has_a_name_and_states_which_outcomes_it_brings(self, make: Make) -> None:
-        """As names and categories that reports can print."""
+        """The name and the outcomes with their categories are texts that reports can print."""
         oracle = make()
         assert isinstance(oracle.name, str)
         assert oracle.name
@@ -42,7 +42,7 @@ class OracleContract:
                 assert Outcome.own(name, category).category in ("traffic crash", "traffic event")
 
     def test_it_finds_what_agents_do_and_gives_the_evidence(self, make: Make) -> None:
-        """One piece of it, about one of the agents, with an outcome that every hunt has or that it has declared."""
+        """A finding has one piece of evidence on one agent, and a built-in or declared outcome."""
         oracle = make()
         brings = set(oracle.outcomes) if isinstance(oracle, BringsOutcomes) else set()
         for findings in _watch(oracle):
@@ -53,11 +53,11 @@ class OracleContract:
                 assert [part.agent in _AGENTS for part in evidence] == [True]
 
     def test_the_same_scenes_give_the_same_findings(self, make: Make) -> None:
-        """It draws no random numbers, keeps no clock, and a new oracle has no memory of earlier scenes."""
+        """The oracle uses no random numbers and no clock, and a new oracle has no memory of earlier scenes."""
         assert list(_watch(make(), seed=1)) == list(_watch(make(), seed=2))
 
     def test_it_leaves_scenes_as_they_are(self, make: Make) -> None:
-        """Scenes are recorded, and other oracles receive them."""
+        """The oracle must not change scenes, because scenes are recorded and other oracles receive them."""
         oracle = make()
         _show_map(oracle)
         for scene in drive():
@@ -66,7 +66,7 @@ class OracleContract:
             assert (scene.data.tolist(), scene.contacts, scene.off_road, scene.events, scene.lanes) == before
 
     def test_it_bears_agents_that_are_not_there_and_empty_roads(self, make: Make) -> None:
-        """A vehicle that has arrived is in no scene any more."""
+        """A vehicle that has arrived is not in the scenes any more, and the oracle must accept this."""
         oracle = make()
         _show_map(oracle, lanes=())
         assert oracle.check(Scene(0.0, Roster(()), [], [], []), _AGENTS) == []
@@ -78,7 +78,8 @@ class OracleContract:
 def drive() -> Iterator[Scene]:
     """Yield the scenes of an episode with many traffic events, each with its previous scene.
 
-    ``ego`` drives into ``other``, passes ``near`` closely, runs a red light and leaves the road; ``second`` stands.
+    The vehicle ``ego`` drives into ``other``, passes ``near`` closely, runs a red light and leaves the road; ``second``
+    stands still.
     """
     actors = [Actor(id=name, kind="car", length=4.5, width=1.8) for name in ("ego", "second", "other", "near")]
     roster, previous = Roster(tuple(actors)), None

@@ -1,4 +1,4 @@
-"""What every sampler must do."""
+"""The contract suite for samplers."""
 
 from __future__ import annotations
 
@@ -26,23 +26,24 @@ _OUTCOMES = (Outcome.SURVIVED, Outcome.COLLISION, Outcome.INVALID, Outcome.FINIS
 
 
 class SamplerContract:
-    """Checks `crashhunt.samplers.Sampler`.
+    """Checks a sampler against `crashhunt.samplers.Sampler`.
 
-    The fixture ``make`` returns a function that makes a sampler of a space, and ``space`` one that it can sample.
+    The fixture ``make`` returns a function that creates a sampler for a space, and ``space`` a space that it can
+    sample.
     """
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return a function that makes a sampler."""
+        """Return a function that creates a sampler."""
         raise NotImplementedError("the contract suite needs a fixture named make")
 
     @pytest.fixture
     def space(self) -> Space:
-        """Return a space."""
+        """Return a space that the sampler can sample."""
         raise NotImplementedError("the contract suite needs a fixture named space")
 
     def test_every_proposal_is_complete_and_inside_the_space(self, make: Make, space: Space) -> None:
-        """A value for every key, and no other, as plain data; before it received results, and after."""
+        """A proposal has a value for every key and no other value, before and after results were reported."""
         asked: set[int] = set()
         for number, (_, proposal) in enumerate(_talk(make(space))):
             assert set(proposal.arguments) == set(space)
@@ -54,13 +55,13 @@ class SamplerContract:
             asked.add(number)
 
     def test_a_proposal_depends_on_number_and_generator_alone(self, make: Make, space: Space) -> None:
-        """Before it received results, the order of asking does not matter."""
+        """As long as no results have been reported, the order of the requests does not matter."""
         forward, backward = make(space), make(space)
         asked = {number: _ask(forward, number) for number in range(20)}
         assert {number: _ask(backward, number) for number in reversed(range(20))} == asked
 
     def test_one_that_is_made_again_and_reported_the_same_proposes_the_same(self, make: Make, space: Space) -> None:
-        """A resumed hunt continues as if it had not ended; some results are out of order, as the rule allows."""
+        """A resumed hunt continues as if it had not been interrupted; some results arrive out of order, as allowed."""
         turns = _talk(make(space))
         for number in (0, 1, _LAG + 1, 9, 16, 23, _TRIALS - 1):
             again = make(space)
@@ -70,20 +71,20 @@ class SamplerContract:
             assert _ask(again, number) == turns[number][1], f"it was asked for trial {number}"
 
     def test_one_that_does_not_learn_proposes_the_same_whatever_it_is_reported(self, make: Make, space: Space) -> None:
-        """The hunt passes it no results."""
+        """The hunt passes no results to such a sampler, and reported results have no effect."""
         sampler = make(space)
         if not sampler.learns:
             fresh = make(space)
             assert [proposal for _, proposal in _talk(sampler)] == [_ask(fresh, number) for number in range(_TRIALS)]
 
     def test_it_states_whether_it_learns(self, make: Make, space: Space) -> None:
-        """The hunt checks this before it passes results."""
+        """The hunt checks this attribute before it passes results to the sampler."""
         sampler = make(space)
         assert isinstance(sampler.learns, bool)
         assert not isinstance(sampler, OnlyAsked) or isinstance(sampler.only_asked, bool)
 
     def test_trials_that_it_keeps_apart_are_plain_random_ones(self, make: Make, space: Space) -> None:
-        """At fixed numbers, whatever results it received: their share of crashes is the crash rate of the agent."""
+        """These trials have fixed numbers and ignore results, so their share of crashes is the agent's crash rate."""
         sampler = make(space)
         if not isinstance(sampler, PlainStream):
             return
@@ -98,7 +99,7 @@ class SamplerContract:
         assert apart == {number for number in range(_TRIALS) if _ask(never_told, number).origin == origin} != set()
 
     def test_independent_draws_of_the_scenario_do_not_depend_on_who_drives(self, make: Make, space: Space) -> None:
-        """So that two hunts with one seed have the same traffic; and what learns is not independent."""
+        """Two hunts with the same seed therefore have the same traffic; samplers that learn are not independent."""
         sampler = make(space)
         if not (isinstance(sampler, Independent) and sampler.independent):
             return
@@ -131,7 +132,7 @@ def _talk(sampler: Sampler) -> list[tuple[list[TrialResult], Proposal]]:
 
 
 def _result(number: int, proposal: Proposal) -> TrialResult:
-    """How a trial might end: now and then without ever having been near to anything."""
+    """Return a possible result of a trial; some results have no measured criticality."""
     arguments: dict[str, dict[str, Value]] = {}
     for (agent, name), value in proposal.arguments.items():
         arguments.setdefault(agent, {})[name] = value

@@ -1,4 +1,4 @@
-"""What every simulator must do."""
+"""The contract suite for simulators."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ _Shown = tuple[float, bytes, list[str], list[tuple[str, bytes]], list[tuple[str,
 
 
 class SimulatorContract:
-    """Checks `crashhunt.simulators.Simulator`, and the faculties that a simulator offers.
+    """Checks a simulator against `crashhunt.simulators.Simulator`, and its optional capabilities.
 
-    The fixture ``make`` returns a function that makes a simulator; ``steps`` is how far an episode must get with the
-    action that each agent's space samples first.
+    The fixture ``make`` returns a function that creates a simulator. ``steps`` is the number of steps that an episode
+    must reach with the first sample from each agent's action space.
     """
 
     steps = 20
 
     @pytest.fixture
     def make(self) -> Make:
-        """Return a function that makes a simulator."""
+        """Return a function that creates a simulator."""
         raise NotImplementedError("the contract suite needs a fixture named make")
 
     def _drive(self, simulator: Simulator, seed: int, reseeded: tuple[int, int] | None = None) -> list[_Shown]:
-        """Everything that an episode shows, as bytes and numbers."""
+        """Return all outputs of an episode, as bytes and numbers."""
         observations, _ = simulator.reset(seed=seed)
         trace: list[_Shown] = [self._shown(simulator, observations, {})]
         held = {}
@@ -95,7 +95,7 @@ class SimulatorContract:
         )
 
     def _events(self, simulator: Simulator) -> list[Event]:
-        """What happens in an episode, besides crashes."""
+        """Return the events of an episode, except crashes."""
         simulator.reset(seed=1)
         found = list(simulator.scene().events)
         for agent in simulator.agents:
@@ -118,7 +118,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_another_seed_within_an_episode_changes_only_what_follows(self, make: Make) -> None:
-        """With another seed from a step on, the steps before stay equal, and equal seeds give equal episodes."""
+        """After another seed is set at a step, the earlier steps stay equal, and equal seeds give equal episodes."""
         simulator = make()
         if not supports(simulator, SupportsReseeding) or simulator.why_no_reseeding:
             return
@@ -131,7 +131,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_a_second_instance_does_the_same(self, make: Make) -> None:
-        """Nothing depends on the instance."""
+        """The results do not depend on the instance of the simulator."""
         one = make()
         first = self._drive(one, 5)
         one.close()
@@ -140,7 +140,7 @@ class SimulatorContract:
         two.close()
 
     def test_what_is_handed_out_stays_as_it_is(self, make: Make) -> None:
-        """Neither observations nor scenes change when the episode continues."""
+        """Neither observations nor scenes that were returned change when the episode continues."""
         simulator = make()
         observations, _ = simulator.reset(seed=1)
         scene = simulator.scene()
@@ -155,14 +155,14 @@ class SimulatorContract:
         simulator.close()
 
     def test_time_grows_by_the_step_length(self, make: Make) -> None:
-        """Simulation time is the scene's, and each step adds one step length."""
+        """The simulation time of the scene increases by one step length in each step."""
         simulator = make()
         times = [entry[0] for entry in self._drive(simulator, 1)]
         assert np.allclose(np.diff(times), simulator.step_length_s)
         simulator.close()
 
     def test_actions_are_checked_and_encoded_once_and_for_all(self, make: Make) -> None:
-        """An encoded action is encoded to itself, and what is outside the space is refused."""
+        """Encoding an encoded action changes nothing, and actions outside of the space are refused."""
         simulator = make()
         simulator.reset(seed=1)
         for agent in simulator.agents:
@@ -188,7 +188,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_braking_as_hard_as_it_can_is_an_action_that_does_not_speed_up(self, make: Make) -> None:
-        """The action of `SupportsFullBraking` is inside the space, and slows the vehicle down."""
+        """The action of `SupportsFullBraking` is inside the action space, and slows the vehicle down."""
         simulator = make()
         simulator.reset(seed=1)
         names = tuple(simulator.agents)
@@ -213,7 +213,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_the_map_has_every_lane_once(self, make: Make) -> None:
-        """`HasMap`: lanes have a name of their own, a width and at least two points; and they stay the same."""
+        """`HasMap`: every lane has a unique name, a width and at least two points, and the lanes do not change."""
         simulator = make()
         simulator.reset(seed=1)
         if supports(simulator, HasMap):
@@ -228,7 +228,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_structured_observations_can_be_had_back(self, make: Make) -> None:
-        """`FlattensObservations`: what an agent is shown is unflattened from what is recorded, and flattens to it."""
+        """`FlattensObservations`: the agent's observation is unflattened from the recorded one, and vice versa."""
         simulator = make()
         observations, _ = simulator.reset(seed=1)
         shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
@@ -243,7 +243,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_columns_have_a_name_each(self, make: Make) -> None:
-        """`NamesObservations`: as many names as the last axis is long, where there are any."""
+        """`NamesObservations`: there are as many names as the last axis is long, unless there are none."""
         simulator = make()
         observations, _ = simulator.reset(seed=1)
         names = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()
@@ -253,7 +253,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_only_events_that_it_looks_for_happen(self, make: Make) -> None:
-        """`ReportsEvents`: its scenes have events of those kinds only, and none without it."""
+        """`ReportsEvents`: scenes have only events of the reported types; without the protocol, they have none."""
         simulator = make()
         kinds = tuple(simulator.reported_events) if supports(simulator, ReportsEvents) else ()
         assert {Outcome(kind).is_traffic_event for kind in kinds} <= {True}
@@ -261,7 +261,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_others_err_and_the_next_episode_knows_nothing_of_it(self, make: Make) -> None:
-        """`SupportsDisturbances`: a target is in the scene and is no agent; `reset` ends every disturbance."""
+        """`SupportsDisturbances`: a target is in the scene and is not an agent; `reset` ends every disturbance."""
         simulator = make()
         if not supports(simulator, SupportsDisturbances):
             simulator.close()
@@ -297,7 +297,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_notices_are_lines(self, make: Make) -> None:
-        """`ReportsNotices`: each is one line of text."""
+        """`ReportsNotices`: each notice is one line of text."""
         simulator = make()
         if supports(simulator, ReportsNotices):
             self._drive(simulator, 1)
@@ -307,7 +307,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_what_is_simulated_before_the_first_step_is_the_same_again(self, make: Make) -> None:
-        """`CountsSetUp`: a number of steps, after each reset."""
+        """`CountsSetUp`: the simulator counts the same number of steps after each reset."""
         simulator = make()
         simulator.reset(seed=1)
         if supports(simulator, CountsSetUp):
@@ -319,7 +319,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_tidying_changes_no_episode(self, make: Make) -> None:
-        """`RestoresState`: before the first episode, and between two."""
+        """`RestoresState`: restoring the state before the first episode and between two episodes changes no result."""
         simulator = make()
         if not supports(simulator, RestoresState):
             simulator.close()

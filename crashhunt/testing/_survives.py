@@ -34,10 +34,10 @@ class Example(TypedDict, total=False):
 
     Args:
         seed: seed of the trial.
-        arguments: arguments of the agents, by their ids.
+        arguments: arguments of the agents, by agent id.
         scenario_arguments: arguments of the scenario.
-        only: ids of the other actors that take part; all if the key is missing.
-        disturbances: as in `crash.json`; none where it is missing.
+        only: ids of the other actors that take part; all actors take part if the key is missing.
+        disturbances: disturbances of the trial, as in `crash.json`; no disturbances if the key is missing.
     """
 
     seed: int
@@ -61,26 +61,26 @@ def assert_survives(
     parallel: int = 0,
     directory: Path | str | None = None,
 ) -> None:
-    """Fail if the agent crashes in one of the trials, and print the minimized crash.
+    """Run trials with an agent; if it crashes in one, fail and print the minimized crash.
 
-    The same seed runs the same trials. The printed call can be pasted into a test: with ``example``, it runs this
-    single trial.
+    The same seed runs the same trials. The printed call can be pasted into a test; it contains ``example``, with which
+    it runs only this trial.
 
     Args:
-        agent: class or function of a module, or ``module:attribute``.
+        agent: class or function in a module, or ``module:attribute``.
         scenario: name of an included scenario, or a path.
-        trials: number of trials.
+        trials: number of trials to run.
         max_steps: maximum number of steps of a trial.
         seed: seed of the hunt.
-        arguments: arguments of the agent: values or specifications, as in `crashhunt.run`.
-        scenario_arguments: arguments of the scenario: values or specifications.
+        arguments: arguments of the agent, as values or specifications; see `crashhunt.run`.
+        scenario_arguments: arguments of the scenario, as values or specifications.
         example: the single trial to run. Its arguments replace those in ``arguments``.
         budget: maximum number of trials to minimize a crash; 0 to skip the minimization.
-        parallel: trials at a time; 0 for one per core.
-        directory: directory that keeps the hunt, such as pytest's ``tmp_path``; None to remove the hunt.
+        parallel: number of trials at a time; 0 for one per core.
+        directory: directory in which the hunt is kept, such as pytest's ``tmp_path``; None to delete the hunt.
 
     Raises:
-        AssertionError: the agent crashes.
+        AssertionError: the agent crashes in a trial.
         UsageError: the example has an unknown key.
         CrashhuntError: no trial could be run.
     """
@@ -120,10 +120,10 @@ def _smaller(bundle: Bundle, budget: int, parallel: int) -> Bundle:
 
 
 def _asking(options: HuntOptions, example: Example) -> HuntOptions:
-    """Return the options of a hunt that has just the values of an example: an agent may need some, or not know one.
+    """Return the options of a hunt with only the values of an example; an agent may not know all other options.
 
     Raises:
-        UsageError: the example has another key, or unknown arguments.
+        UsageError: the example has an unknown key, or unknown arguments.
     """
     known = Example.__annotations__
     for key in example:
