@@ -1,4 +1,4 @@
-"""Gymnasium environments: ``crashhunt/SUMO-v0``."""
+"""Gymnasium environments on SUMO: ``crashhunt/SUMO-v0``."""
 
 import lazy_loader
 

@@ -47,7 +47,7 @@ class Episodes:
         agent: The controlled vehicle; if empty, the first agent of the scenario.
         action: ``continuous``, ``meta``, or empty for the scenario's own choice.
         disturb: Rates of disturbances, such as ``brake=0.02``.
-        max_steps: The longest episode in steps; 0 for no limit. Disturbances need a limit.
+        max_steps: Maximum number of steps of an episode; 0 for no limit. Disturbances need a limit.
 
     Attributes:
         observation_space: The observation space of the vehicle.
@@ -108,7 +108,7 @@ class Episodes:
         return self._episode.observations[self.agent], info
 
     def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, dict[str, object]]:
-        """Advance one control step; return observation, reward, whether it has ended, and the info."""
+        """Advance one control step; return observation, reward, whether the episode has ended, and the info."""
         encoded = self._form.encode(action)  # a wrong action is an error of the caller, so it does not end the episode
         episode = self._episode
         if episode is None:
@@ -134,11 +134,11 @@ class Episodes:
         return episode.observations[self.agent], episode.rewards[self.agent], terminated, info
 
     def require_branch(self, *, reseeded: bool) -> None:
-        """Check that there can be copies of the running episode.
+        """Check that copies of the running episode are possible.
 
         Raises:
-            SimulatorError: no episode runs.
-            UsageError: the copies are to be re-seeded, and the simulator does not support that.
+            SimulatorError: no episode is running.
+            UsageError: the copies are to be re-seeded, but the simulator does not support re-seeding.
         """
         if self._episode is None or self._episode.result is not None or self.agent not in self._simulator.agents:
             raise SimulatorError("no episode is running, so there is nothing to branch", fix="call reset")
@@ -184,10 +184,10 @@ class Episodes:
 
 
 class _Trail(Observer):
-    """Remembers the last scenes for the picture, and the disturbances of the episode.
+    """Stores the last scenes for the picture, and the disturbances of the episode.
 
     Args:
-        length: Number of scenes.
+        length: Number of scenes to store.
     """
 
     def __init__(self, length: int) -> None:
@@ -215,7 +215,7 @@ def _disturber(scenario: Scenario, agent: str, disturb: Sequence[str], max_steps
 
 
 def _make_agent(agent: str, simulator: Simulator, _arguments: Mapping[str, Value]) -> KeepLaneWithSpeed:
-    """Return the agent for the scenario's other controlled vehicles; the caller drives the environment's vehicle."""
+    """Return the agent of the scenario's other controlled vehicles; the caller drives the environment's vehicle."""
     return KeepLaneWithSpeed(_ASSUMED_SPEED_MPS, simulator.actions[agent].space)
 
 

@@ -1,9 +1,9 @@
 """Episodes in their own process: libsumo has one simulation per process.
 
-Such a process can be forked between two steps (`RemoteEpisodes.branch`). SUMO's `loadState` does not continue as the
-original run did, and a fork does: it has all of SUMO's memory. The copy serves its own connection, so that the
-user's program steps it as it steps the original. The user's program itself is never forked: it may have threads, which
-have no copy.
+Such a process can be forked between two steps (`RemoteEpisodes.branch`). After SUMO's `loadState`, a run differs from
+the original run. A fork continues exactly, because it has all of SUMO's memory. The fork has its own connection, so
+that the user's program can step it like the original. The user's program itself is never forked, because it may have
+threads, which a fork does not have.
 
 Invariant: a process ends when its connection is closed, and when the user's program ends.
 """
@@ -54,7 +54,7 @@ class RemoteEpisodes:
     Exceptions of the child process are raised here.
 
     Args:
-        words: The arguments of `Episodes`, or of the class that a subclass serves. They can be pickled.
+        words: The arguments of `Episodes`, or of the class that a subclass uses; they can be pickled.
     """
 
     served = "crashhunt.envs._episodes:Episodes"
@@ -86,7 +86,7 @@ class RemoteEpisodes:
         return found
 
     def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, dict[str, object]]:
-        """Advance one control step."""
+        """Advance the episode by one control step."""
         found: tuple[NDArray[np.generic], float, bool, dict[str, object]] = self._ask("step", action)
         return found
 
@@ -94,12 +94,12 @@ class RemoteEpisodes:
         """Return copies of the running episode, each in a fork of its process.
 
         Args:
-            seeds: seeds for each copy, that of SUMO's random generators from its next step on; None to keep their
+            seeds: seed for SUMO's random generators in each copy, with effect from the next step on; None to keep their
                 state.
 
         Raises:
             SimulatorError: no episode is running, or the process cannot be forked.
-            UsageError: the generators cannot be re-seeded.
+            UsageError: the random generators cannot be re-seeded.
         """
         copies: list[RemoteEpisodes] = []
         try:
@@ -137,7 +137,7 @@ class RemoteEpisodes:
 
     @property
     def is_closed(self) -> bool:
-        """Whether the process has ended, so that there are no further episodes."""
+        """Whether the process has ended, so that no further episodes are possible."""
         return self._pipe.closed
 
     def close(self) -> None:
@@ -162,10 +162,10 @@ class RemoteEpisodes:
         return answer
 
     def _exchange(self, name: str, words: tuple[object, ...], passes: int) -> tuple[bool, Any]:
-        """Send a request, and return its answer.
+        """Send a request to the process, and return its answer.
 
         Ctrl-C nearly always arrives during the wait. If a request was interrupted, its answer arrives later and is
-        skipped, so that the next request does not receive it. In the middle of a message Ctrl-C ends the process,
+        skipped, so that the next request does not receive it. A Ctrl-C in the middle of a message ends the process,
         because the rest of the stream cannot be read.
         """
         is_in_message = False
@@ -199,10 +199,10 @@ class RemoteEpisodes:
 
 
 class _Fork:
-    """A fork that another process has made, as far as a `subprocess.Popen` is used here.
+    """A fork that another process has made, with the methods of `subprocess.Popen` that are used here.
 
     Args:
-        pid: pid of the fork, which is alive.
+        pid: process id of the fork, which is running.
     """
 
     returncode: int | None = None  # only its parent learns that
@@ -211,10 +211,10 @@ class _Fork:
         self._ends = os.pidfd_open(pid)
 
     def wait(self, timeout: float | None = None) -> None:
-        """Wait for the end of the process.
+        """Wait for the end of the process, and return its exit code.
 
         Raises:
-            subprocess.TimeoutExpired: it runs on.
+            subprocess.TimeoutExpired: the process is still running.
         """
         if self._ends < 0:
             return
@@ -243,7 +243,7 @@ def _end(process: subprocess.Popen[bytes] | _Fork, pipe: Ours, owner: int) -> No
 
 
 def main() -> None:
-    """Answer until the user's program is gone."""
+    """Answer requests until the user's program has ended."""
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps copies that end
     parent = int(sys.argv[2])
     episodes = _serve(Connection(int(sys.argv[1])), lambda: os.getppid() != parent, None)
@@ -252,7 +252,7 @@ def main() -> None:
 
 
 def _serve(pipe: Ours, is_orphan: Callable[[], bool], episodes: Episodes | None) -> Episodes | None:
-    """Answer requests until the connection is closed, or the user's program is gone."""
+    """Answer requests until the connection is closed, or the user's program has ended."""
     with suppress(EOFError, ConnectionError):
         while True:
             # Forks of the user's program hold the other end open as well, so its end does not close the connection.
@@ -280,13 +280,13 @@ def _serve(pipe: Ours, is_orphan: Callable[[], bool], episodes: Episodes | None)
 
 
 def _fork(pipe: Ours, episodes: Episodes, seed: int | None, owner: int) -> tuple[int, str]:
-    """Fork this process; return the id of the fork, and why there is none.
+    """Fork this process; return the id of the fork, and the reason if there is none.
 
     Args:
         pipe: pipe from which the connection of the fork is received.
-        episodes: the episode.
+        episodes: the running episode.
         seed: seed of the random generators in the fork; None to keep their state.
-        owner: the process of the user's program.
+        owner: process id of the user's program.
     """
     end = recv_handle(pipe)
 

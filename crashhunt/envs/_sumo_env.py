@@ -30,22 +30,22 @@ _process: list[int] = []
 
 
 class SumoEnv(gymnasium.Env[Any, Any]):
-    """``gymnasium.make("crashhunt:crashhunt/SUMO-v0")``.
+    """The environment that ``gymnasium.make("crashhunt:crashhunt/SUMO-v0")`` returns.
 
     The observation has the layout of highway-env's Kinematics: float32, shape (vehicles, features). The reward is the
     distance driven in a step, in m. An episode terminates when the vehicle arrives or crashes, and ``info["outcome"]``
-    says which. An episode is truncated after ``max_steps``.
+    is how it ended. An episode is truncated after ``max_steps``.
 
     Args:
         scenario: Name of a shipped scenario, or a path.
         agent: The controlled vehicle; by default the first agent of the scenario. The other agents keep their lane.
         action: ``continuous`` is (target speed in m/s, lane change). ``meta`` is highway-env's DiscreteMetaAction. The
             default is the scenario's own choice.
-        max_steps: The longest episode in steps; None for no limit.
+        max_steps: Maximum number of steps of an episode; None for no limit.
         render_mode: None, or ``rgb_array``: `render` returns the scene from above, uint8, shape (540, 960, 3).
-        process: Whether the environment runs in its own process, which costs up to a millisecond per step. libsumo
-            has one simulation per process. So by default the first environment runs in the caller's process, and each
-            further environment in its own process.
+        process: Whether the environment runs in its own process, which costs up to a millisecond per step. libsumo has
+            one simulation per process. Therefore, by default, the first environment runs in the caller's process, and
+            each further environment in its own process.
         disturb: Rates of disturbances per second, as in ``--disturb``: ``brake=0.02,cut_in=0.01``. Disturbances need
             ``max_steps``, and the seed of the episode determines them. ``info["disturbances"]`` describes the
             disturbances that began in the step, and those that begin with the returned observation.
@@ -97,7 +97,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         """Begin an episode.
 
         Args:
-            seed: Seed of the environment's generator, which draws the seeds of this and of all later episodes.
+            seed: Seed of the environment's random generator, which draws the seeds of this and of all later episodes.
             options: ``{"arguments": {name: value}}``: scenario arguments that differ from their defaults.
         """
         if self._is_copy:
@@ -124,13 +124,14 @@ class SumoEnv(gymnasium.Env[Any, Any]):
     def branch(self, n: int, *, seed: int | None = None) -> list[SumoEnv]:
         """Return independent copies of the running episode, each in a fork of the process of this environment.
 
-        Each copy continues where this environment is. With the same actions, copies without a ``seed`` return
-        bit-identical observations. Copies may be branched again, and outlive this environment. Close each of them.
+        Each copy continues from the present state of this environment. With the same actions, copies without a ``seed``
+        return bit-identical observations. Copies may be branched again, and continue to exist after this environment is
+        closed. Close each copy.
 
         Args:
             n: number of copies, at least 1.
             seed: seed from which each copy gets another seed for SUMO's random generators, so that drivers behave
-                differently; when vehicles depart stays as planned. None to keep the state of the generators.
+                differently. The departure times of vehicles stay as planned. None to keep the state of the generators.
 
         Raises:
             UsageError: this environment runs in the user's process, or SUMO's generators cannot be re-seeded.

@@ -1,4 +1,4 @@
-"""The compiled parts: the optional core, whose results are bit-identical, and the fixed order of SUMO's links."""
+"""The compiled parts: the optional core with bit-identical results, and the library for the order of SUMO's links."""
 
 import lazy_loader
 

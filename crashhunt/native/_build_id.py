@@ -1,9 +1,10 @@
-"""The check whether compiled modules were built from the C++ sources of this checkout.
+"""The check whether compiled modules were built from the C++ sources of the checkout.
 
-Reason: ``git pull`` changes the sources of an editable installation, but not the compiled modules. They still load,
-and compute what the older sources say. So the linker stores a digest of the sources as the build id of the file.
+Reason: ``git pull`` changes the sources of an editable installation, but not the compiled modules. They can still be
+loaded, but compute the results of the older sources. Therefore the linker stores a digest of the sources as the build
+id of each module.
 
-This file imports the standard library only, because scripts/build_core.py runs it by its path.
+This file imports only the standard library, because scripts/build_core.py runs it by its path.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def build_id(folder: Path) -> str:
 def outdated_modules(package: Path = Path(__file__).parents[1]) -> list[str]:
     """Return the installed compiled modules that were built from other sources than those of the package.
 
-    A package without sources, such as a snapshot of the code, has no outdated modules.
+    A package without sources, such as a snapshot, has no outdated modules.
     """
     outdated = []
     for module, folder in _MODULES.items():

@@ -47,7 +47,7 @@ Part = tuple[object, int, list[float], list[float], list[int]]
 
 
 class Columns(Protocol):
-    """The numbers of one scene, as they are recorded."""
+    """The positions, headings and speeds of one scene, in the form in which they are recorded."""
 
     points: Points
     """x and y (m), as a new list, like the other attributes."""
@@ -64,23 +64,23 @@ class Vehicles(Protocol):
     """Some vehicles of the running simulation, and the sizes of all actors of the same scene."""
 
     def read(self) -> Columns | None:
-        """Return the state of the vehicles; None if libsumo fails, as its getters then do."""
+        """Return the state of the vehicles; None if libsumo fails."""
 
     def look(self, controlled: Vehicles, squared: float, /) -> Columns | tuple[str, ...] | None:
-        """Return the state of the vehicles; None if a vehicle has entered, left or collided, or a person is present.
+        """Return the state of the vehicles; None if a vehicle entered, left or collided, or if a person is present.
 
         Args:
-            controlled: The vehicles around which this group was selected.
-            squared: A squared distance, in m²; 0 for none. If the vehicles within this distance are not those of this
-                group, the method returns their ids.
+            controlled: The vehicles around which this group of vehicles was selected.
+            squared: A squared distance, in m²; 0 for none. If the vehicles within this distance differ from this group,
+                the method returns their ids.
         """
 
 
 class UsualSteps(Protocol):
     """Runs steps of an episode with one agent and without any event, each in one call.
 
-    A step does the same as `Episode.step` with a recorder, SUMO and crashhunt's own oracles, in the same order. After
-    the first event, this object runs no more steps.
+    A step has the same effects as `Episode.step` with a recorder, SUMO and crashhunt's own oracles, in the same order.
+    After the first event, this object runs no more steps.
     """
 
     answer: object
@@ -91,16 +91,16 @@ class UsualSteps(Protocol):
     """Whether the last call reached the simulator; otherwise it stopped at the agent."""
 
     def take(self, agents: Mapping[str, object], /) -> int:
-        """Take a step; return its result, such as `DONE`. Exceptions of agent and simulator pass through."""
+        """Run a step; return its status, such as `DONE`. Exceptions of agent and simulator are not caught."""
 
     def note(self, action: object, /) -> bool:
-        """Record an action after `ANSWERED`; return whether that was possible."""
+        """Record an action after the status `ANSWERED`; return whether that was possible."""
 
     def go_on(self, quiet: bool, /) -> int:
-        """Simulate after `ANSWERED`, and read the scene if there was no event; return the result."""
+        """Simulate after the status `ANSWERED`, and read the scene if there was no event; return the status."""
 
     def heed(self, limits: dict[str, float], limit: float, stood: dict[str, int], standstill: int, /) -> None:
-        """Set the limits of events: hard braking (m/s², 0 for each vehicle's own), standing (steps)."""
+        """Set the limits of events: hard braking (m/s², 0 for each vehicle's own limit) and standstill (steps)."""
 
     def listen(
         self,
@@ -108,22 +108,23 @@ class UsualSteps(Protocol):
         record_roster: Callable[[], object],
         /,
     ) -> None:
-        """Set the callbacks for a change of the visible vehicles.
+        """Set the functions that are called when the visible vehicles change.
 
         Args:
-            enter: receives their ids, and returns the vehicles as `resume` takes them, or None for an incomplete scene.
-            record_roster: called when they are recorded; it borrows a buffer again.
+            enter: function that receives their ids, and returns the vehicles in the form for `resume`, or None for an
+                incomplete scene.
+            record_roster: function called when these vehicles are recorded; it provides a recording buffer again.
         """
 
     def judge(self, overlaps: bool, hardest: float, always: bool, last: int, now_and_then: int, /) -> None:
-        """Set the conditions under which oracles evaluate a step.
+        """Set the conditions under which oracles examine a step.
 
         Args:
-            overlaps: Whether the oracle ``overlap`` may find a contact.
-            hardest: Upper bound of braking, in m/s².
-            always: Whether oracles evaluate every step.
-            last: Oracles evaluate all steps from this step on.
-            now_and_then: Oracles evaluate every n-th step, with this n.
+            overlaps: Whether the oracle ``overlap`` may detect a contact.
+            hardest: Upper bound of the deceleration of vehicles, in m/s².
+            always: Whether oracles examine every step.
+            last: The step from which on oracles examine all steps.
+            now_and_then: A number n: oracles examine every n-th step.
         """
 
     def resume(
@@ -138,46 +139,47 @@ class UsualSteps(Protocol):
         step: int,
         /,
     ) -> None:
-        """Resume after a complete step.
+        """Resume after a completed step.
 
         Args:
-            who: The vehicles of the scene, their ids, the row of the agent, the controlled vehicles.
+            who: The vehicles of the scene, their ids, the row of the agent, and the controlled vehicles.
             observation: The next observation of the agent.
-            columns: The numbers of the scene.
+            columns: The positions, headings and speeds of the scene.
             time_s: The time of the scene, in s.
             lanes: The lanes of all vehicles in the scene, one per line, or an empty text.
-            where: The agent's edge, the number and the name of its lane, and the lane's distance from the leftmost (m).
+            where: The agent's edge, the number and the name of its lane, and the distance of the lane from the leftmost
+                lane (m).
             follower: The vehicle behind the agent.
             step: The number of the step.
         """
 
     def borrow(self, tape: object, offset: int, reserved: int, tags: tuple[int, int, int, int], /) -> None:
-        """Record into a buffer, with the tags of observation, action, step and lanes."""
+        """Record into a given buffer, with the tags of observation, action, step and lanes."""
 
     def give_back(self) -> tuple[int, int, list[int]]:
         """Stop recording; return the end of the records, the last complete step, and the offsets of all steps."""
 
     def pause(self) -> None:
-        """Take no steps and report nothing until `resume`, while other code takes a step."""
+        """Run no steps and report nothing until `resume`, while other code runs a step."""
 
     def stop(self) -> None:
-        """Take no further steps; complete steps are still reported."""
+        """Run no further steps; completed steps are still reported."""
 
     def told(
         self,
     ) -> tuple[int, object, float, str, tuple[_Vehicles, float, str], tuple[_Vehicles, float, str]] | None:
-        """Return the state after the last complete step; None if there is none.
+        """Return the state after the last completed step; None if there is none.
 
         Returns:
-            The step, the observation, the reward, the follower, and for this scene and the previous scene: the
-            vehicles, the time in s, the lanes.
+            The step, the observation, the reward and the follower; then, for the last and the previous scene, the
+            vehicles, the time in s and the lanes.
         """
 
     def columns(self, back: bool, /) -> Columns | None:
-        """Return the numbers of the last scene, or of the previous scene if ``back`` is true."""
+        """Return the columns of the last scene, or of the previous scene if ``back`` is true."""
 
     def reads(self, vehicles: _Vehicles, /) -> tuple[object, ...] | None:
-        """Return the values that only this object reads, for a comparison with libsumo's getters."""
+        """Return the values that are read only by this object, for a comparison with libsumo's getters."""
 
 
 _Vehicles = Vehicles  # `Core` has methods with the names of these classes
@@ -185,12 +187,12 @@ _UsualSteps = UsualSteps
 
 
 class Core(Protocol):
-    """The compiled module. A function returns None if only the equivalent Python code can do the work."""
+    """The compiled module. If only the equivalent Python code can do the work, a function returns None."""
 
     INTERFACE: int
 
     def bind(self, library: str) -> None:
-        """Find libsumo's functions in its loaded library.
+        """Find the functions of libsumo in its loaded library.
 
         Raises:
             OSError: The library lacks a function.
@@ -199,7 +201,7 @@ class Core(Protocol):
     def Vehicles(  # noqa: N802 - a class
         self, ids: tuple[str, ...], lengths: list[float], widths: list[float], reaches: list[float], /
     ) -> _Vehicles:
-        """Return vehicles by their ids, with the sizes of all actors of a scene, as `Roster` has them."""
+        """Return vehicles by their ids, with the sizes of all actors of a scene, as in `Roster`."""
 
     def UsualSteps(  # noqa: N802 - a class
         self,
@@ -217,50 +219,51 @@ class Core(Protocol):
         """Return the object that runs the uneventful steps of an episode.
 
         Args:
-            agent: The agent that acts.
-            libsumo: The module whose ``simulationStep`` is called.
+            agent: Identifier of the agent that acts.
+            libsumo: The module whose function ``simulationStep`` is called.
             array: The class, the shape and the type of an observation.
             others: Number of other actors in an observation.
             step_s: Step length, in s.
             lateral: Whether vehicles may leave the centre line of a lane.
-            takes_speed: Whether actions are a speed and a change of lane.
-            sight: The vehicles around which to look, the steps between two looks, and the squared range (m²).
+            takes_speed: Whether actions consist of a speed and a lane change.
+            sight: The vehicles around which actors are selected, the steps between two selections, and the squared
+                range (m²).
             start_m: The distance that the agent had driven at the start, in m.
         """
 
     def columns(
         self, vehicles: _Vehicles, points: Sequence[object], headings: Sequence[float], speeds: Sequence[float], /
     ) -> Columns | None:
-        """Return the numbers of a scene with persons; None if the arguments are not lists of numbers."""
+        """Return the columns of a scene with persons; None if the arguments are not lists of numbers."""
 
     def is_coming_or_going(self) -> bool | None:
-        """Whether a vehicle has entered or left in the last step."""
+        """Return whether a vehicle has entered or left in the last step."""
 
     def in_sight(self, controlled: _Vehicles, squared: float, /) -> tuple[tuple[str, ...], Points] | None:
         """Return the ids of all vehicles near the controlled vehicles, and the positions of these; None on failure.
 
         Args:
-            controlled: the centres; absent vehicles are ignored.
-            squared: the distance below which a vehicle is near, squared, in m².
+            controlled: the vehicles at the centres of the search; absent vehicles are ignored.
+            squared: the squared distance below which a vehicle is near, in m².
         """
 
     def observe(
         self, columns: Columns, row: int, others: int, distance: float, from_left: float, lateral_speed: float, /
     ) -> bytes | None:
-        """Return the usual observation of `Kinematics`, as float32."""
+        """Return the default observation of `Kinematics`, as float32."""
 
     def within_reach(
         self, columns: Columns, earlier: Columns, row: int, step_s: float, hardest: float,
         earlier_rows: list[int] | None, /,
     ) -> list[int] | None:  # fmt: skip
-        """Return the rows that the oracle ``overlap`` looks at, nearest first.
+        """Return the rows of the actors that the oracle ``overlap`` examines, the nearest first.
 
         Args:
-            columns: The numbers of a scene.
-            earlier: The numbers of the previous scene.
-            row: The row of the actor that they may touch.
+            columns: The columns of a scene.
+            earlier: The columns of the previous scene.
+            row: The row of the actor that the others may touch.
             step_s: The time between the two scenes, in s.
-            hardest: upper bound of braking, in m/s².
+            hardest: upper bound of the deceleration, in m/s².
             earlier_rows: The row of each actor in the previous scene, or -1; None if both scenes have the same actors.
         """
 
@@ -273,18 +276,19 @@ class Core(Protocol):
         In each scene with such actors, the agent comes first.
 
         Args:
-            parts: The parts of an episode, in order.
-            gap: Pairs further apart do not count, in m.
-            horizon: Pairs that touch later do not count, in s.
-            known_gap: Pairs further apart may be skipped, in m.
-            known_time: Pairs that touch later may be skipped, in s, if they also need less than `known_braking`.
-            known_braking: See `known_time`, in m/s².
-            only_best: Whether a pair may be skipped that is further apart, touches later and needs less braking
-                than another pair.
+            parts: The frames of an episode, in order.
+            gap: Pairs with a larger gap do not count, in m.
+            horizon: Pairs that would touch later do not count, in s.
+            known_gap: Pairs with a larger gap may be skipped, in m.
+            known_time: Pairs that would touch later may be skipped, in s, if they also need less deceleration than
+                `known_braking`.
+            known_braking: Deceleration for `known_time`, in m/s².
+            only_best: Whether a pair may be skipped if another pair is closer, would touch earlier and needs more
+                deceleration.
 
         Returns:
-            Columns one after another. As float64: x, y, heading, speed, half the length, half the width. As int64: the
-            number of the scene, and the position of the agent among the returned actors.
+            The columns in this order. As float64: x, y, heading, speed, half the length, half the width. As int64: the
+            number of the scene, and the index of the agent among the returned actors.
         """
 
     def tracks(
@@ -293,12 +297,12 @@ class Core(Protocol):
         """Return the path of an agent, and the actors near it.
 
         Args:
-            parts: The parts of an episode, in order.
-            every: Every n-th scene is used, with this n.
-            within: The range, between fronts and without the lengths of both actors, in m.
-            ahead: If it is not 0, actors off the agent's path within this distance ahead are skipped, in m.
-            behind: The same behind the agent, in m.
-            unknown: How far the agent's path is continued straight at its end, in m.
+            parts: The frames of an episode, in order.
+            every: A number n: every n-th scene is used.
+            within: The maximum distance between front bumpers, without the lengths of both actors, in m.
+            ahead: If it is not 0, actors off the agent's path within this distance ahead are skipped; in m.
+            behind: The corresponding distance behind the agent, in m.
+            unknown: The length by which the agent's path is continued straight at its end, in m.
 
         Returns:
             Columns as float64 and as int64, for the agent and for the other actors. As float64: x, y, heading, half the
@@ -307,18 +311,18 @@ class Core(Protocol):
         """
 
     def least_change(self, earlier: Columns, later: Columns, /) -> float | None:
-        """Return the least change of speed (m/s) between two scenes; 0 in an empty scene."""
+        """Return the least change of speed of any actor between two scenes (m/s); 0 in an empty scene."""
 
     def write_step(
         self, buffer: object, offset: int, tag: int, step: int, time_s: float, rewards: tuple[float, ...],
         columns: Columns, phase: int, /,
     ) -> int | None:  # fmt: skip
-        """Write the record of a step and the phase of the process; return the end of the record."""
+        """Write the record of a step and the phase of the process; return the position after the record."""
 
     def write_array(
         self, buffer: object, offset: int, tag: int, agent: int, array: object, step: int, phase: int, /
     ) -> int | None:
-        """Write the record of an array and the phase of the process; return the end of the record."""
+        """Write the record of an array and the phase of the process; return the position after the record."""
 
 
 @cache
@@ -331,7 +335,7 @@ def _load_module() -> Core | None:
 
 
 def why_not(libsumo: str) -> str:
-    """Return why the core is not used with a version of libsumo; empty if it is used."""
+    """Return why the core is not used with a version of libsumo; empty if the core is used."""
     core = _load_module()
     if core is None:
         return "it is not built"
@@ -346,7 +350,7 @@ def core_for(libsumo: str, library: str) -> Core | None:
     """Return the core, ready for use; None if it cannot be used.
 
     Args:
-        libsumo: The version of libsumo.
+        libsumo: The installed version of libsumo.
         library: The path of libsumo's loaded library.
     """
     core = _load_module()

@@ -1,9 +1,9 @@
 """Re-seeds SUMO's random generators in a running simulation, with symbols that libsumo's library exports.
 
-libsumo has no function for that. SUMO reads ``--seed`` at load, and a simulation after ``simulation.loadState``
+libsumo has no function for re-seeding. SUMO reads ``--seed`` at load, and a simulation after ``simulation.loadState``
 deviates from the original (`crashhunt guide sumo`). The library exports the generators and ``RandHelper::initRand``,
-which seeds them at load. The layout of the generators belongs to a version of libsumo. So other versions are refused,
-and each seed is read back after it was written.
+which seeds them at load. The memory layout of the generators differs between versions of libsumo. Therefore other
+versions are refused, and each seed is read back after it was written.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def why_no_reseeding(libsumo: str, library: str) -> str:
     """Return why the generators cannot be re-seeded with a version of libsumo; empty if they can.
 
     Args:
-        libsumo: The version of libsumo.
+        libsumo: The installed version of libsumo.
         library: The path of libsumo's loaded library.
     """
     if libsumo not in _CHECKED_VERSIONS:
@@ -52,7 +52,7 @@ def why_no_reseeding(libsumo: str, library: str) -> str:
 
 
 def reseed_generators(library: str, seed: int) -> int:
-    """Give each generator of the running simulation its own seed, drawn from one seed.
+    """Give each random generator of the running simulation its own seed, derived from one seed.
 
     Args:
         library: The path of libsumo's library, for which `why_no_reseeding` returned an empty text.
@@ -62,7 +62,7 @@ def reseed_generators(library: str, seed: int) -> int:
         The number of re-seeded generators.
 
     Raises:
-        RuntimeError: The generators have an unknown layout; discard the simulation then.
+        RuntimeError: The generators have an unknown layout; the simulation must then be discarded.
     """
     loaded = ctypes.CDLL(library)
     first, last, _ = (ctypes.c_void_p * 3).in_dll(loaded, _LANE_GENERATORS_SYMBOL)

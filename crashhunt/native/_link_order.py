@@ -1,8 +1,8 @@
-"""A fixed order of SUMO's links at load, by a library that replaces two functions of libsumo.
+"""A fixed order of SUMO's links at load, through a library that replaces two functions of libsumo.
 
 libsumo processes conflicting links in the order of their memory addresses, on which the behaviour at junctions depends
-(see the guide's page on SUMO). With the library it processes them in the order of their construction. The library does
-not belong to the compiled core: results must not depend on whether the core is used.
+(see the guide's page on SUMO). With this library, libsumo processes them in the order of their construction. The
+library does not belong to the compiled core: results must not depend on whether the core is used.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _UNKNOWN_LINKS = "libsumo constructs links in another way"
 
 
 class LinkOrder:
-    """The library, bound to libsumo.
+    """The library for the link order, connected with libsumo.
 
     Args:
         library: The loaded library; None if it cannot be used.
-        reason: Why the order is not fixed; empty if it is fixed.
+        reason: Why the order of links is not fixed; empty if it is fixed.
     """
 
     def __init__(self, library: ctypes.CDLL | None, reason: str) -> None:
@@ -36,14 +36,14 @@ class LinkOrder:
         self._loads = self._count_calls()
 
     def use(self, use: bool) -> None:
-        """Order the links of the next loads; otherwise keep libsumo's own order."""
+        """Choose whether links of the next loads have the fixed order, or libsumo's own order."""
         if self._library is not None:
             self._library.crashhunt_link_order_use(use)
 
     def check_load(self) -> str:
-        """Return why the links of the last load have no fixed order; empty if they have one.
+        """Return why the links of the last load have no fixed order; empty if they have a fixed order.
 
-        Call this method once per load.
+        Call this method once after each load.
         """
         ordered, unordered = self._count_calls()
         before, self._loads = self._loads, (ordered, unordered)
@@ -61,7 +61,7 @@ class LinkOrder:
 
 
 def why_no_link_order(libsumo: str) -> str:
-    """Return why the order is not fixed with a version of libsumo; empty if it is fixed."""
+    """Return why the link order cannot be fixed with a version of libsumo; empty if it can."""
     path = _load_library()
     if path is None:
         return "the library is not built"
@@ -78,7 +78,7 @@ def link_order(libsumo: str, library: str) -> LinkOrder:
     """Load the library that fixes the link order, connect it with libsumo, and return it.
 
     Args:
-        libsumo: The version of libsumo.
+        libsumo: The installed version of libsumo.
         library: The path of libsumo's loaded library.
     """
     if reason := why_no_link_order(libsumo):
@@ -100,7 +100,7 @@ def _load_library() -> str | None:
 
 @cache
 def _interface() -> int:
-    """Return the interface version of the installed library; 0 if it has none."""
+    """Return the interface version of the installed library; 0 if the library has none."""
     try:
         return int(ctypes.CDLL(str(_load_library())).crashhunt_link_order_interface())
     except (OSError, AttributeError):  # a damaged file, or a foreign library

@@ -1,4 +1,4 @@
-"""``environment.json`` of a snapshot: Python, the machine, and the installed distributions. Results depend on them."""
+"""``environment.json`` of a snapshot: Python, the machine and the installed distributions, on which results depend."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ __all__ = ["Environment", "environment", "environment_changes", "environment_of_
 
 
 class Environment(TypedDict):
-    """The content of ``environment.json``: everything besides code on which a result depends.
+    """The contents of ``environment.json``: everything besides code on which a result depends.
 
-    The entry ``git`` has the revision of each work tree. The entry ``core`` says whether the simulator's compiled core
-    was used, which does not change results. If results depend on an order at load, ``load_order`` is ``fixed`` or
-    ``not fixed: REASON``. Snapshots of earlier versions lack it.
+    The entry ``git`` has the revision of each work tree. The entry ``core`` is whether the simulator's compiled core
+    was used, which does not change results. If results depend on an order at load, ``load_order`` is ``fixed`` or ``not
+    fixed: REASON``. Snapshots of earlier versions lack it.
     """
 
     schema: int
@@ -42,9 +42,10 @@ _RECORDED_VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "OMP_NUM_THREADS", "VIRTU
 
 
 def environment(imported: ImportedModules | None = None) -> Environment:
-    """Return the content of ``environment.json``.
+    """Return the contents of ``environment.json``.
 
-    ``loaded`` lists the distributions with an imported module, and those of simulators. Results may depend on them.
+    ``loaded`` lists the distributions with an imported module, and those of simulators, because results may depend on
+    them.
 
     Args:
         imported: The imported modules; by default those of this process.
@@ -81,7 +82,7 @@ def _facts_of(distribution: metadata.Distribution) -> tuple[str, str, set[str]]:
 
 
 def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
-    """Return name and version from the head of the text, because `Distribution.metadata` parses the whole text."""
+    """Return a distribution's name and version from the head of its metadata; parsing all of it is slow."""
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
     head, _, _ = text.partition("\n\n")
     found = dict(line.split(": ", 1) for line in head.splitlines() if line.startswith(("Name: ", "Version: ")))
@@ -95,7 +96,7 @@ def _version_of(name: str) -> str:
 
 
 def _top_level_modules(distribution: metadata.Distribution) -> set[str]:
-    """Return the modules of a distribution, as `importlib.metadata.packages_distributions` does, but faster."""
+    """Return the modules of a distribution, like `importlib.metadata.packages_distributions`, but faster."""
     declared = (distribution.read_text("top_level.txt") or "").split()
     if declared:
         return set(declared)
@@ -123,7 +124,7 @@ def _variables() -> tuple[str, ...]:
 
 
 def environment_changes(recorded: Environment) -> dict[str, tuple[str, str]]:
-    """Return the versions that differ from an ``environment.json``: name to (recorded, current)."""
+    """Return the versions that differ from an ``environment.json``, each as (recorded, current), by name."""
     changes = {}
     for name, then, now in (
         ("python", recorded.get("python"), platform.python_version()),

@@ -43,10 +43,11 @@ __all__ = [
 
 
 class Manifest(TypedDict):
-    """The content of ``manifest.json``: the files of a snapshot, and the folders from which modules are imported.
+    """The contents of ``manifest.json``: the files of a snapshot, and the folders from which modules are imported.
 
-    ``described`` lists the files that describe the snapshot and are no part of its digest. The earliest snapshots have
-    neither ``described`` nor ``integrity``. ``authentication_code`` proves to its user that the snapshot is unchanged.
+    ``described`` lists the files that describe the snapshot and do not belong to its digest. The earliest snapshots
+    have neither ``described`` nor ``integrity``. ``authentication_code`` proves to the user who took the snapshot that
+    it is unchanged.
     """
 
     schema: int
@@ -68,14 +69,14 @@ _IMPORTABLE_SUFFIXES = {".py", ".pyc", ".pyo", ".so", ".pth", *importlib.machine
 
 
 class Snapshot:
-    """A snapshot on disk.
+    """A snapshot that is stored on disk.
 
-    The folders are ``code/``, ``scenario/`` and ``files/``, with the files that arguments name. The file
-    ``manifest.json`` has the size and hash of each file. The files ``hunt.toml``, ``environment.json`` and ``git.diff``
-    describe the snapshot.
+    A snapshot has the folders ``code/``, ``scenario/`` and ``files/``, which contains the files that arguments name.
+    The file ``manifest.json`` contains the size and hash of each file. The files ``hunt.toml``, ``environment.json``
+    and ``git.diff`` describe the snapshot.
 
     Args:
-        path: The folder, whose name is the digest of the snapshot.
+        path: The folder of the snapshot, whose name is the snapshot's digest.
     """
 
     def __init__(self, path: Path) -> None:
@@ -84,10 +85,10 @@ class Snapshot:
 
     @cached_property
     def manifest(self) -> Manifest:
-        """Return the manifest.
+        """Return the contents of the manifest.
 
         Raises:
-            BundleError: it is missing, damaged or of another version.
+            BundleError: the manifest is missing, damaged or of another version.
         """
         file = self.path / layout.MANIFEST
         try:
@@ -116,22 +117,22 @@ class Snapshot:
 
     @property
     def has_code(self) -> bool:
-        """Whether it holds the code."""
+        """Whether the snapshot contains the code."""
         return bool(self.manifest["paths"])
 
     @property
     def code(self) -> tuple[str, ...]:
-        """The folders whose modules win over installed ones, the first one first."""
+        """The folders whose modules take precedence over installed modules, the first folder first."""
         return tuple(str((self.path / place).resolve()) for place in self.manifest["paths"])
 
     @property
     def argument_files(self) -> dict[str, str]:
-        """The files that arguments name: the value of the argument to the file in the snapshot."""
+        """The files that arguments name: path in the snapshot by value of the argument."""
         found = self.manifest["argument_files"]
         return {value: str((self.path / place).resolve()) for value, place in found.items()}
 
     def scenario(self) -> Scenario:
-        """Return the scenario as it was; it is read once."""
+        """Return the scenario that the snapshot contains; it is read only once."""
         return self._scenario
 
     @cached_property
@@ -139,7 +140,7 @@ class Snapshot:
         return load_scenario(self.path / layout.SCENARIO_FILES / layout.SCENARIO, kept=True)
 
     def settings(self) -> HuntSettings:
-        """Return the settings of the hunt as they were; they are read once."""
+        """Return the settings of the hunt that the snapshot contains; they are read only once."""
         return self._settings
 
     @cached_property
@@ -147,7 +148,7 @@ class Snapshot:
         return read_settings(self.path / layout.HUNT)
 
     def environment(self) -> Environment:
-        """Return the installed packages; they are read once.
+        """Return the recorded environment; it is read only once.
 
         Raises:
             BundleError: the file is missing or damaged.
@@ -169,7 +170,7 @@ class Snapshot:
 
     @property
     def is_made_here(self) -> bool:
-        """Whether this user took the snapshot on this machine; `faults` says whether its files have changed since.
+        """Return whether this user took the snapshot on this machine; `faults` returns later changes of its files.
 
         Raises:
             BundleError: the manifest is missing or damaged.
@@ -192,7 +193,7 @@ class Snapshot:
         return found.hexdigest()
 
     def changes(self) -> list[str]:
-        """Return the faults of the files that the manifest lists: missing and changed ones. Nothing is written."""
+        """Return the faults of the files that the manifest lists: missing and changed files. Nothing is written."""
         manifest = self.manifest
         found = []
         for name, entry in {**manifest["files"], **manifest.get("described", {})}.items():
@@ -205,7 +206,7 @@ class Snapshot:
         return found
 
     def faults(self) -> list[str]:
-        """Return the faults: missing files, changed files, and added modules.
+        """Return the faults of the snapshot: missing files, changed files, and added modules.
 
         The method first removes compiled files, because they may not match the source files next to them.
         """
@@ -214,11 +215,11 @@ class Snapshot:
         return found + [f"{name} was not there" for name in self._added() if self._may_run(name)]
 
     def additions(self) -> list[str]:
-        """Return the added files that are no modules, because an agent may write data into its folder."""
+        """Return the added files that are not modules; an agent may write data into its folder."""
         return [name for name in self._added() if not self._may_run(name)]
 
     def discard_compiled(self) -> None:
-        """Remove compiled files, which Python would run in place of the source files next to them."""
+        """Delete compiled files, which Python would run instead of the source files next to them."""
         for path in (self.path / layout.CODE).rglob("__pycache__/*.pyc"):
             if path.relative_to(self.path).as_posix() not in self.manifest["files"]:
                 with suppress(OSError):  # `faults` then reports the file as added
@@ -240,7 +241,8 @@ class Snapshot:
         """Check that the snapshot is unchanged.
 
         Args:
-            to_run: whether its code is to run, so that added modules are faults, and compiled files are removed.
+            to_run: whether the snapshot's code is to run; then added modules are faults, and compiled files are
+                deleted.
 
         Raises:
             BundleError: The snapshot has changed; the message names the first fault.
@@ -256,7 +258,7 @@ class Snapshot:
 
 
 def code_of_manifest(manifest: Manifest) -> str:
-    """Return the authentication code of a manifest, which lists all files with their digests."""
+    """Return the authentication code of a manifest, which covers all files by their digests."""
     return authentication_code("snapshot", _authenticated(manifest))
 
 
@@ -268,7 +270,7 @@ _DAMAGE_FIX = "get an undamaged copy of the hunt's directory"
 
 
 def _check_names(manifest: Manifest) -> None:
-    """Raise ValueError if a name in a manifest leads out of the snapshot."""
+    """Raise ValueError if a name in a manifest leads out of the snapshot's folder."""
     names = [*manifest["files"], *manifest["paths"], *manifest["argument_files"].values()]
     for name in names:
         parts = name.split("/")
@@ -282,7 +284,7 @@ def _check_names(manifest: Manifest) -> None:
 
 
 def latest_snapshot(hunt: Path) -> Snapshot | None:
-    """Return the latest snapshot of a hunt; None if it has none."""
+    """Return the latest snapshot of a hunt; None if the hunt has none."""
     found = sorted((hunt / layout.SNAPSHOTS).glob(layout.SHOWN), key=lambda path: path.stat().st_mtime)
     return Snapshot(found[-1]) if found else None
 

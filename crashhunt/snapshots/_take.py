@@ -1,4 +1,4 @@
-"""Takes snapshots: copies the code, the scenario and the files of a hunt into a folder named by their digest."""
+"""Taking of snapshots: code, scenario and files of a hunt are copied into a folder named by their digest."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Sources:
     """Files of code, and their places in a snapshot.
 
     Attributes:
-        files: The source file of each place in the snapshot (``code/…``).
+        files: The source file for each place in the snapshot (``code/…``).
         paths: The folders of the snapshot from which modules are imported, in the order of ``sys.path``.
         trees: The git work trees that are part of the snapshot.
         excluded: The files that were not taken, each with the reason.
@@ -61,12 +61,12 @@ class Sources:
 
 
 def find_sources(imported: ImportedModules, *, roots: Sequence[Path] = (), without: Path | None = None) -> Sources:
-    """Find crashhunt itself, the project of each agent, and all other imported modules that are not installed.
+    """Return crashhunt itself, the project of each agent, and all other imported modules that are not installed.
 
     An installed module that was imported by name is included, too, unless its wheel has libraries next to it
-    (``NAME.libs``). A project is the git work tree that holds a module, with its tracked files in their current state
-    and its untracked files that git does not ignore. A module outside of work trees comes with its package, or alone.
-    Links that lead out of a work tree are not followed. The directories of hunts are excluded.
+    (``NAME.libs``). A project is the git work tree that contains a module, with its tracked files in their current
+    state and its untracked files that git does not ignore. A module outside of work trees is included with its package,
+    or alone. Links that lead out of a work tree are not followed. The directories of hunts are excluded.
 
     Args:
         imported: The imported modules.
@@ -105,7 +105,7 @@ def find_sources(imported: ImportedModules, *, roots: Sequence[Path] = (), witho
 
 
 def git(folder: Path, *arguments: str) -> bytes | None:
-    """Return git's output, without changing its index; None if git or the repository does not exist."""
+    """Return the output of a git command that does not change the index; None if git or the repository is missing."""
     command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
     try:
         done = subprocess.run(command, capture_output=True, check=False, timeout=60, env=environment_of_git())
@@ -119,7 +119,7 @@ def _not_installed(places: Mapping[str, Path | None]) -> set[str]:
 
 
 def _is_installed(place: Path | None) -> bool:
-    """Whether a module is installed, so that its version identifies it."""
+    """Return whether a module is installed, so that its version identifies it."""
     if place is None or not {"site-packages", "dist-packages"}.isdisjoint(place.parts):
         return True
     return f"{place}{os.sep}".startswith(_installed_places())
@@ -146,7 +146,7 @@ def _real_folder(folder: str) -> Path:
 
 
 def _take_module(name: str, imported: ImportedModules, found: Sources) -> None:
-    """Add a package, or a module that is a single file."""
+    """Add a package, or a module that is a single file, to the sources."""
     file, folders = imported.places.get(name, (None, ()))
     for folder in map(Path, folders):
         for path in _walk(folder):
@@ -171,7 +171,7 @@ def _walk(folder: Path) -> Iterator[str]:
 
 
 def _work_tree_of(folder: Path) -> Path | None:
-    """Return the git work tree that holds a folder, if there is one."""
+    """Return the git work tree that contains a folder, or None."""
     top = git(folder, "rev-parse", "--show-toplevel")
     return None if top is None else Path(os.fsdecode(top.rstrip(b"\n"))).resolve()
 
@@ -188,7 +188,7 @@ def _listing_that_has(tree: Path, path: Path, found: Sources) -> tuple[Path, lis
 
 
 def _listed(tree: Path) -> Iterator[str]:
-    """Yield tracked files and untracked files that are not ignored, without generated files; also of submodules."""
+    """Yield tracked files and untracked, not ignored files, without generated files; also those of submodules."""
     output = git(tree, "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--deduplicate") or b""
     for entry in filter(None, output.split(b"\0")):
         name = os.fsdecode(entry).rstrip("/")
@@ -202,7 +202,7 @@ def _listed(tree: Path) -> Iterator[str]:
 def _take_tree(
     tree: Path, names: Sequence[str], found: Sources, *, imports: Iterable[Path], without: Path | None
 ) -> None:
-    """Add the files of a work tree or of a folder, under a name that no module can have."""
+    """Add the files of a work tree or a folder to the sources, under a name that no module can have."""
     if tree in found.trees:
         base = _base_of(tree, found)
     else:
@@ -268,15 +268,15 @@ _SMALL_FILE_BYTES = 1 << 20  # bytes
 @clear_constructor
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SnapshotOptions:
-    """Options of a snapshot.
+    """Options of the snapshot of a hunt.
 
     Args:
         code: Whether the snapshot contains code; without code, a replay runs the current code.
         roots: Files and folders to include in addition to those found.
-        limit_mb: Largest size of the snapshot, in MB.
+        limit_mb: Maximum size of the snapshot, in MB.
 
     Raises:
-        UsageError: The limit is not above 0.
+        UsageError: The maximum size is not above 0.
     """
 
     code: bool = True
@@ -292,7 +292,7 @@ class SnapshotOptions:
         """Return the options that a hunt's settings contain.
 
         Raises:
-            UsageError: The limit is not above 0.
+            UsageError: The maximum size is not above 0.
         """
         limit_mb = choices.snapshot_limit_mb
         return cls(code=choices.snapshot_code, roots=tuple(map(Path, choices.snapshot_roots)), limit_mb=limit_mb)
@@ -308,15 +308,15 @@ def take_snapshot(
 ) -> Snapshot:
     """Store the scenario, the agents' own projects, the files that their arguments name, and crashhunt itself.
 
-    Equal content is stored only once.
+    Equal contents are stored only once.
 
     Args:
         snapshots: The folder of all snapshots of a hunt.
         scenario: The scenario with its agents.
         settings: The settings of the hunt.
         options: The options of the snapshot.
-        imported: The modules that are imported for a trial, as `plan_with_code` returns them. By default, a process of
-            its own imports them now.
+        imported: The modules that are imported for a trial, as returned by `plan_with_code`. By default, a separate
+            process imports them now.
 
     Raises:
         SnapshotError: The snapshot is too large, or a file cannot be read or written.
@@ -353,7 +353,7 @@ def _build(
     settings: HuntSettings,
     around: Environment,
 ) -> Snapshot:
-    """Copy all files into a folder and rename the folder to its digest, unless that snapshot exists already."""
+    """Copy all files into a folder and rename it to its digest, unless a snapshot with this digest exists already."""
     building.mkdir()
     for folder in {name.rpartition("/")[0] for name in files}:
         (building / folder).mkdir(parents=True, exist_ok=True)
@@ -397,7 +397,7 @@ def _is_damaged(snapshot: Snapshot) -> bool:
 
 
 def _argument_files(settings: HuntSettings) -> dict[str, str]:
-    """Return the files that arguments of agents name, such as the weights of a policy, and their places."""
+    """Return the files that agents' arguments name, such as the weights of a policy, and their places."""
     found: dict[str, str] = {}
     for agent in settings.agents.values():
         for spec in agent.arguments.values():
@@ -414,9 +414,9 @@ def _argument_files(settings: HuntSettings) -> dict[str, str]:
 
 
 def _training_records(modules: Sequence[str], argument_files: dict[str, str]) -> dict[str, str]:
-    """Return the records of trainings next to policies and next to the files of agents' modules, and their places.
+    """Return the training records next to policies and next to the files of agents' modules, and their places.
 
-    A comparison of hunts must know which traffics an agent was trained on.
+    A comparison of hunts needs these records to know on which traffic an agent was trained.
     """
     records = dict.fromkeys(str(Path(policy).parent / layout.TRAINED_ON) for policy in (*argument_files, *modules))
     there = [record for record in records if os.path.isfile(record)]  # noqa: PTH113
@@ -444,7 +444,7 @@ def _size(path: str) -> int:
 
 
 def _store(path: str, copy: str) -> FileEntry | None:
-    """Copy a file with its permissions; return None if the file has been deleted meanwhile."""
+    """Copy a file with its permissions; return None if the file has been deleted in the meantime."""
     try:
         with open(path, "rb", buffering=0) as file:
             status = os.fstat(file.fileno())
@@ -487,7 +487,7 @@ def _store_scenario(scenario: Scenario, building: Path) -> dict[str, FileEntry |
 
 
 def _describe_trees(trees: Sequence[Path], diff: Path) -> dict[str, str]:
-    """Write the uncommitted changes of work trees into a file; return the revisions of the work trees."""
+    """Write the uncommitted changes of work trees to a file; return the revisions of the work trees."""
     revisions = {}
     for tree in trees:
         revision = git(tree, "rev-parse", "HEAD")
