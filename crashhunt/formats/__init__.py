@@ -1,7 +1,7 @@
 """Export of a recorded crash as a scenario for other tools.
 
-Written as plain XML with what Python brings along. ``scripts/readers`` tests that the libraries of the formats read
-back what was recorded. Writing does not need them.
+The files are written as plain XML with Python's standard library. ``scripts/readers`` tests that the formats' own
+libraries read back the recorded values. These libraries are not needed for writing.
 """
 
 import lazy_loader

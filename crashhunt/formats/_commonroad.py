@@ -32,17 +32,17 @@ _UNKNOWN_LOCATION = {"geoNameId": "-999", "gpsLatitude": "999", "gpsLongitude": 
 def write_commonroad(bundle: Bundle, target: Path, *, with_agents: bool = False) -> dict[str, list[int]]:
     """Write a crash as a CommonRoad scenario of version 2020a; the file is never incomplete.
 
-    Lengths are in m, angles in rad, speeds in m/s, times in steps of ``timeStepSize`` s; step 0 is before the first.
-    A position is the middle of a vehicle. Each lane that the agent came near is a lanelet; the order of lanelets
+    Lengths are in m, angles in rad, speeds in m/s, times in steps of ``timeStepSize`` s; step 0 is before the first
+    step. A position is the centre of a vehicle. Each lane that the agent came near is a lanelet; the order of lanelets
     follows from the shapes. Every other actor is a dynamic obstacle from the step in which it was first seen. Each
-    agent is a planning problem: its start, with the goal of still driving at the end of the recording.
-    A planner that avoids the crash solves the planning problem. Its yaw rate is that of the first step, its slip angle
-    unknown and 0.
+    agent is a planning problem: its start, with the goal of still driving at the end of the recording. A planner that
+    avoids the crash solves the planning problem. The yaw rate is that of the first step. The slip angle is unknown and
+    written as 0.
 
     Args:
-        bundle: the crash.
-        target: the file; an existing one is replaced.
-        with_agents: whether the recorded paths of the agents are obstacles, too.
+        bundle: the crash to write.
+        target: path of the file; an existing file is replaced.
+        with_agents: whether the recorded paths of the agents are written as obstacles as well.
 
     Returns:
         The number of each actor in the file, including planning problems.
@@ -135,7 +135,7 @@ def _add_problem(root: ET.Element, index: int, way: RecordedPath, recorded: Reco
 
 
 def _type(kind: str) -> str:
-    """Return the format's word; highway-env calls its cars by the class that drives them."""
+    """Return the format's word for a class of actor; highway-env names its cars after their driver model."""
     return _TYPES.get(kind) or ("car" if kind.endswith("Vehicle") else "unknown")
 
 

@@ -29,10 +29,10 @@ _CONSTANT_POLYNOMIAL = {"b": "0", "c": "0", "d": "0"}  # of a polynomial that is
 
 
 def opendrive_of(recorded: RecordedCrash) -> ET.Element:
-    """Return the road network: each lane as a road with one lane, along its centre line, of straight pieces.
+    """Return the road network: each lane is a road with one lane along its centre line, made of straight pieces.
 
-    Lengths are in m, headings in rad. A road is linked with its only successor, if that has no other
-    predecessor. Several successors would be a junction; the file has none. The ground is flat.
+    Lengths are in m, headings in rad. A road is linked with its only successor, if this successor has no other
+    predecessor. Several successors would need a junction, and the file has no junctions. The ground is flat.
     """
     root = ET.Element("OpenDRIVE")
     points = np.concatenate([road.centre for road in recorded.roads])
@@ -70,7 +70,7 @@ def _add_road(root: ET.Element, index: int, roads: tuple[Road, ...]) -> None:
 
 
 def _add_lane(lanes: ET.Element, road: Road, *, before: bool, after: bool) -> None:
-    """Add the one lane, which lies to the right of a line half its width to the left."""
+    """Add the only lane of a road, to the right of a line that is shifted to the left by half the lane's width."""
     add(lanes, "laneOffset", s="0", a=number(road.width / 2), **_CONSTANT_POLYNOMIAL)
     section = add(lanes, "laneSection", s="0")
     add(add(section, "center"), "lane", id="0", type="none", level="false")
@@ -96,16 +96,16 @@ def write_openscenario(bundle: Bundle, target: Path, *, with_agents: bool = Fals
     """Write a crash in OpenSCENARIO 1.0, and its roads in OpenDRIVE 1.6; each file is complete or absent.
 
     Lengths are in m, angles in rad, speeds in m/s, times in s, 0 before the first recorded step. Every actor follows
-    its recorded way, with a vertex per step, from when it was first seen until it was last seen. The reference
-    point of a vehicle is its middle, and the file places its rear axle there. The real place was not recorded, and
-    esmini shifts a vehicle ahead if its axle is behind the reference point. Performance, axles and missing heights are
-    invented.
+    its recorded path, with a vertex per step, from the first to the last step in which it was seen. The reference point
+    of a vehicle is its centre, and the file places its rear axle there. The real position of the axle was not recorded,
+    and esmini shifts a vehicle ahead if its axle is behind the reference point. Performance, axles and missing heights
+    are invented.
 
     Args:
-        bundle: the crash.
-        target: the scenario, ``….xosc``; the roads are in ``….xodr``. Existing files are replaced.
-        with_agents: whether the agents follow their recorded ways, too; else they are placed where they began, with the
-            speed that they had, for whatever is to drive them.
+        bundle: the crash to write.
+        target: path of the scenario, ``….xosc``; the roads are written to ``….xodr``. Existing files are replaced.
+        with_agents: whether the agents follow their recorded paths as well. Otherwise, they are placed at their start
+            with their initial speed, so that another program can drive them.
 
     Returns:
         The names under which each actor is in the file.

@@ -31,10 +31,10 @@ class Pose(NamedTuple):
     """The position of the centre of an actor after a step.
 
     Args:
-        step: 0 is before the first.
-        x: in m.
-        y: y of the front bumper of the controlled vehicle, in m.
-        z: likewise; 0 if the map is flat.
+        step: number of the step; 0 is before the first step.
+        x: x of the centre, in m.
+        y: y of the centre, in m.
+        z: z of the centre, in m; 0 if the map is flat.
         heading: heading in rad, from -pi to pi, counter-clockwise from the x axis.
         speed: speed in m/s.
     """
@@ -52,8 +52,8 @@ class RecordedPath:
     """The path of an actor while it was in sight. An actor that came back into sight has several paths.
 
     Args:
-        path: as it was recorded.
-        name: unique in the file, of letters, digits, points, dashes and underscores.
+        path: the path as it was recorded.
+        name: name of the path, unique in the file, of letters, digits, points, dashes and underscores.
     """
 
     path: Path
@@ -61,7 +61,7 @@ class RecordedPath:
 
     @property
     def poses(self) -> list[Pose]:
-        """Its middle, after each step: it was recorded by the middle of its front bumper."""
+        """The position of the actor's centre after each step; the recording contains the centre of its front bumper."""
         half = self.path.actor.length / 2
         return [
             Pose(
@@ -78,13 +78,13 @@ class RecordedPath:
 
 @dataclass(frozen=True, slots=True)
 class Road:
-    """A lane, with the lanes that it leads to.
+    """A lane, with the lanes before and after it.
 
     Args:
-        right: its right border, shape (n, 2), in m.
-        left: its left one, with as many points.
-        after: numbers of the lanes that begin where it ends, derived from shapes, because recordings lack them.
-        before: numbers of the lanes that end where it begins.
+        right: right border of the lane, shape (n, 2), in m.
+        left: left border of the lane, with as many points.
+        after: numbers of the lanes that begin where this lane ends, derived from shapes, because recordings lack them.
+        before: numbers of the lanes that end where this lane begins.
     """
 
     right: NDArray[np.float64]
@@ -94,25 +94,25 @@ class Road:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """Its centre line, shape (n, 2), in m."""
+        """The centre line of the lane, shape (n, 2), in m."""
         return (self.right + self.left) / 2
 
     @property
     def width(self) -> float:
-        """In m, where it begins."""
+        """The width of the lane at its beginning, in m."""
         return float(np.hypot(*(self.left[0] - self.right[0])))
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedCrash:
-    """A crash for the export.
+    """The recorded parts of a crash that are exported.
 
     Args:
         title: description of the crash, in one line.
-        number: number of its trial.
+        number: number of the crash's trial.
         step_length_s: step length in s.
         steps: number of recorded steps.
-        agents: the ways of the controlled vehicles.
+        agents: paths of the controlled vehicles.
         others: the paths of all other actors.
         roads: the lanes that an agent came near.
     """
@@ -127,7 +127,7 @@ class RecordedCrash:
 
 
 def recorded_of(bundle: Bundle) -> RecordedCrash:
-    """Return what of a crash can be handed on.
+    """Return the parts of a crash that can be exported.
 
     Raises:
         BundleError: the crash has no scenes with its agent, no map was recorded, or its log is damaged.
@@ -167,7 +167,7 @@ def recorded_of(bundle: Bundle) -> RecordedCrash:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Return a name for each that every format takes: some give ``$`` and blanks a meaning."""
+    """Return a name for each path that every format accepts, because ``$`` and spaces have a meaning in some."""
     names: dict[str, None] = {}
     for path in paths:
         name = plain = "".join(c if c.isascii() and (c.isalnum() or c in ".-_") else "_" for c in path.actor.id) or "_"
@@ -197,7 +197,7 @@ def _roads(lanes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> 
 def _without_duplicates(
     lane: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the borders without points that are where the one before was: they have no direction."""
+    """Return the borders of a lane without points that equal the point before, because these have no direction."""
     right, left = lane
     centre = (right + left) / 2
     kept = np.append(True, np.hypot(*np.diff(centre, axis=0).T) > _SAME_PLACE_M)

@@ -1,4 +1,4 @@
-"""XML as the formats want it."""
+"""XML in the form that the formats require."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ __all__ = ["add", "comment", "number", "plain_text", "write_xml"]
 
 
 def add(parent: ET.Element, tag: str, text: str = "", **attributes: str) -> ET.Element:
-    """Add an element and return it."""
+    """Add an element to its parent and return it."""
     element = ET.SubElement(parent, tag, attributes)
     element.text = text or None
     return element
 
 
 def comment(parent: ET.Element, text: str) -> None:
-    """Add a comment, which must not have two dashes in a row."""
+    """Add a comment, in which two consecutive dashes are not allowed."""
     parent.append(ET.Comment(f" {re.sub('-(?=-)', '- ', plain_text(text))} "))
 
 
 def number(value: float) -> str:
-    """Return a number of which every bit is read back, without an exponent: a decimal of XML has none."""
+    """Return a number as text that preserves every bit, without an exponent, because decimals in XML have none."""
     return format(Decimal(repr(float(value))), "f")
 
 
 def plain_text(text: str) -> str:
-    """Return a text in one line, of characters that XML can hold."""
+    """Return a text as one line, with only those characters that XML allows."""
     return one_line(text).encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def write_xml(root: ET.Element, target: Path) -> None:
-    """Write a document; the file is never incomplete.
+    """Write an XML document. The file is never incomplete.
 
     Raises:
-        HuntDirectoryError: it cannot be written.
+        HuntDirectoryError: the file cannot be written.
     """
     ET.indent(root)
     with whole_file(target) as temporary:

@@ -1,4 +1,4 @@
-"""The oracles that come with crashhunt."""
+"""The oracles for crashes that come with crashhunt."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ MAX_BRAKING_MPS2 = 10.0
 class ReportedCollision:
     """Detects the collisions of controlled vehicles that the simulator reports.
 
-    The ways of both actors decide the collider, the speeds and the time. After a long step or a lane change the
-    simulator may report the two vehicles in the wrong order, and a lane that is not the agent's.
+    Collider, speeds and time are determined from the paths of both actors. After a long step or a lane change, the
+    simulator may report the two vehicles in the wrong order, and a lane that is not the agent's lane.
     """
 
     name = "reported"
@@ -66,10 +66,11 @@ class ReportedCollision:
 
 
 class Overlap:
-    """Sees a collision where the outlines of a controlled vehicle and another actor overlap, or did within the step.
+    """Detects a collision if the outlines of an agent and another actor overlap, or overlapped during the step.
 
-    Simulators miss some: SUMO compares vehicles of one lane only. The collider is the vehicle that moves into the
-    other's lane, or that has the other in front of it at the first touch. A standing vehicle is never the collider.
+    Simulators miss some of these collisions, because SUMO compares only vehicles of the same lane. The collider is the
+    vehicle that moves into the other's lane, or that has the other vehicle in front of it at the first touch. A
+    standing vehicle is never the collider.
     """
 
     name = "overlap"
@@ -123,10 +124,10 @@ class OffRoad:
 
 
 def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
-    """Return the rows of actors that may have touched an actor since the previous scene, nearest first; mostly none.
+    """Return the rows of actors that may have touched an actor since the previous scene, nearest first; often none.
 
-    An actor that is further away than both could have moved relative to each other cannot have touched the agent. This
-    function examines every near vehicle in every step, so it avoids all unnecessary work.
+    An actor that is further away than both actors could have moved relative to each other cannot have touched the
+    agent. This function examines every near vehicle in every step, so it avoids all unnecessary work.
     """
     roster, further = scene.roster, 0.0
     if previous is not None:
@@ -166,10 +167,10 @@ def _may_touch(scene: Scene, previous: Scene | None, row: int, other: int, margi
     """Return whether two outlines overlap, or may have overlapped between the two scenes.
 
     Args:
-        scene: the present one.
-        previous: the one before.
-        row: one actor.
-        other: another.
+        scene: the present scene.
+        previous: the scene one step before.
+        row: row of the first actor.
+        other: row of the second actor.
         margin: distance that the two actors have moved relative to each other, in m.
     """
     if scene.spines or (previous is not None and previous.spines):
@@ -193,7 +194,7 @@ def _were_near(previous: Scene, scene: Scene, row: int, other: int, margin: floa
 
 
 def _displacement(previous: Scene, scene: Scene, row: int) -> tuple[float, float, float]:
-    """Return the displacement of an actor (x, y), and how much further one of its corners may have moved on the way."""
+    """Return the displacement of an actor (x, y), and how much further one of its corners may have moved meanwhile."""
     was = row
     if previous.roster is not scene.roster:
         found = previous.roster.index.get(scene.roster.actors[row].id)

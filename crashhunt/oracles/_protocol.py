@@ -1,4 +1,4 @@
-"""The oracle protocol: whether a step is a crash; and the choice of oracles by name."""
+"""The oracle protocol, which decides whether a step is a crash, and the choice of oracles by name."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ class Finding:
     """A traffic crash or a traffic event that an oracle has detected.
 
     Args:
-        outcome: ``collision``, ``off_road``, the kind of an event, or an outcome of the oracle's own.
+        outcome: ``collision``, ``off_road``, the type of an event, or an outcome that the oracle adds.
         collision: the evidence of a crash.
-        event: the evidence of a traffic event; its ``what`` describes the event in words.
+        event: the evidence of a traffic event; its field ``what`` describes the event.
     """
 
     outcome: Outcome
@@ -52,19 +52,19 @@ class Finding:
 
 
 class Oracle(Protocol):
-    """Examines scenes and detects crashes. It uses no random numbers and no clock.
+    """The protocol of an oracle, which examines scenes and detects crashes, without random numbers and without a clock.
 
-    Contract: a new oracle is made for every trial, with the arguments of ``--oracle NAME:key=value``. Its state
-    therefore belongs to this trial only. `check` is called once a step, in order, also with the
-    scene before the first step. ``scene.previous`` is the scene one step before, None at the start. A finding ends the
-    trial if ``--crash-on`` has its outcome, and is discarded otherwise. An exception counts as a fault of the oracle.
+    Contract: a new oracle is created for every trial, with the arguments of ``--oracle NAME:key=value``. Its state
+    therefore belongs to this trial only. `check` is called once per step, in order, and also for the scene before the
+    first step. ``scene.previous`` is the scene one step before, and None at the start. A finding ends the trial if
+    ``--crash-on`` contains its outcome, and is discarded otherwise. An exception counts as a fault of the oracle.
     """
 
     name: str
     """As it appears in ``seen_by``."""
 
     def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
-        """Return the crashes of these controlled vehicles in this scene; usually none."""
+        """Return the crashes of the given controlled vehicles in a scene; usually none."""
 
 
 @runtime_checkable
@@ -77,7 +77,7 @@ class SeesMap(Protocol):
 
 @runtime_checkable
 class BringsOutcomes(Protocol):
-    """Implemented by oracles with their own outcomes, or with findings that are crashes only on request."""
+    """An oracle that adds outcomes, or whose findings are crashes only if the user requests it."""
 
     outcomes: Mapping[str, Category]
     """Name to ``traffic crash`` or ``traffic event``. A hunt that chooses the oracle stops on them, unless
@@ -85,7 +85,7 @@ class BringsOutcomes(Protocol):
 
 
 def merge_findings(findings: Sequence[Finding]) -> Finding | None:
-    """Return the first finding, with the names of all oracles that detected the same; None if there is none."""
+    """Return the first finding, with the names of all oracles that detected the same; None if there is no finding."""
     if not findings:
         return None
     first = findings[0]
@@ -115,7 +115,7 @@ class OracleChoice:
     Args:
         name: name of a registered object, or ``module:attribute``.
         arguments: arguments by name.
-        factory: the object of that name, kept because each trial makes an oracle and a lookup takes milliseconds.
+        factory: the object with this name, stored because each trial creates an oracle and a lookup takes milliseconds.
     """
 
     name: str
@@ -123,10 +123,10 @@ class OracleChoice:
     factory: Callable[..., Oracle]
 
     def make(self) -> Oracle:
-        """Return a new oracle.
+        """Create the oracle, and return it.
 
         Raises:
-            CrashhuntError: it cannot be made.
+            CrashhuntError: the oracle cannot be created.
         """
         try:
             made = self.factory(**self.arguments)
@@ -141,10 +141,10 @@ class OracleChoice:
         return made
 
     def outcomes(self) -> dict[str, Category]:
-        """The outcomes that it brings, and their categories.
+        """Return the outcomes that the oracle adds, and their categories.
 
         Raises:
-            CrashhuntError: as of `make`.
+            CrashhuntError: the oracle cannot be created, as for `make`.
         """
         made = self.make()
         return (
@@ -166,7 +166,7 @@ def modules_of(oracles: Iterable[str]) -> list[str]:
 
 
 def parse_oracle(text: str) -> OracleChoice:
-    """Read a choice.
+    """Parse the choice of an oracle.
 
     Raises:
         CrashhuntError: the oracle does not exist, has no such argument, or a value has the wrong type.
@@ -195,23 +195,23 @@ def parse_oracle(text: str) -> OracleChoice:
 
 
 def described_oracle(text: str) -> dict[str, Category]:
-    """Make a chosen oracle, and return the outcomes that it brings, with their categories.
+    """Create a chosen oracle, and return the outcomes that it adds, with their categories.
 
     Raises:
-        CrashhuntError: it cannot be had.
+        CrashhuntError: the oracle cannot be created.
     """
     return parse_oracle(text).outcomes()
 
 
 def chosen_oracles(asked: Sequence[str], described: Collection[str] = ()) -> tuple[str, ...]:
-    """Return the oracles of a hunt in the order of their checks: the default ones, then the chosen ones.
+    """Return the oracles of a hunt in the order of their checks: the default oracles, then the chosen ones.
 
     Args:
         asked: the values of all ``--oracle`` options; ``none`` removes the default oracles.
-        described: those that another process has made, so that they are not made here.
+        described: oracles that another process has created and described, so that they are not created here.
 
     Raises:
-        CrashhuntError: an oracle cannot be made, or none is chosen.
+        CrashhuntError: an oracle cannot be created, or no oracle is chosen.
     """
     added = [text for text in asked if text != _NONE]
     found = tuple(dict.fromkeys([*(() if _NONE in asked else DEFAULT_ORACLES), *added]))
@@ -226,11 +226,11 @@ def chosen_oracles(asked: Sequence[str], described: Collection[str] = ()) -> tup
 def outcomes_brought(
     oracles: Iterable[str], described: Mapping[str, Mapping[str, Category]] = MappingProxyType({})
 ) -> tuple[Outcome, ...]:
-    """Return the outcomes that oracles bring, beyond those that every hunt stops on.
+    """Return the outcomes that oracles add to those on which every hunt stops.
 
     Args:
         oracles: the chosen oracles.
-        described: the outcomes of those that another process has made, with their categories.
+        described: outcomes, with their categories, of oracles that another process has created.
 
     Raises:
         CrashhuntError: an oracle cannot be created.

@@ -1,4 +1,4 @@
-"""The oracle of near misses."""
+"""The oracle for near misses, and the oracles for traffic events."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ __all__ = ["OffRoute", "RedLight", "Teleport", "TooClose", "TrafficEvents", "Wro
 
 
 class TooClose:
-    """Detects a near miss: a moving agent comes closer to another actor than a gap, without touching it.
+    """Detects a near miss: a moving agent comes closer to another actor than a given gap, without touching it.
 
     Args:
-        gap_m: gap between the outlines.
-        speed: least speed of the agent relative to the other actor, in m/s; 0 includes an agent that creeps forward in
-            a queue.
+        gap_m: gap between the outlines, in m.
+        speed: minimum speed of the agent relative to the other actor, in m/s; 0 includes an agent that creeps forward
+            in a queue.
     """
 
     name = "too-close"
@@ -71,7 +71,7 @@ class TooClose:
         return found
 
     def _gap(self, scene: Scene, row: int, other: int) -> tuple[float, int] | None:
-        """The gap to another actor, in m, and its row; None if it counts as no near miss."""
+        """Return the gap to another actor, in m, and the actor's row; None if it does not count as a near miss."""
         vx, vy = (
             scene.speeds[row] * turn(scene.headings[row]) - scene.speeds[other] * turn(scene.headings[other])
             for turn in (math.cos, math.sin)
@@ -99,45 +99,45 @@ class TooClose:
 class TrafficEvents:
     """Reports the simulator's own traffic events, such as red lights, standstills and teleports.
 
-    An episode uses it as the last oracle, and only if ``--crash-on`` names a traffic event, so that a collision in the
-    same step comes first.
+    An episode uses this oracle as the last one, so that a collision in the same step takes precedence. It is used only
+    if ``--crash-on`` names a traffic event.
     """
 
     name = "traffic-events"
 
     def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
-        """Return the events that the agents have part in."""
+        """Return the events in which the agents take part."""
         return [Finding(Outcome(event.kind), event=event) for event in scene.events if event.agent in agents]
 
 
 class _ReportedEvent:
-    """Has a hunt stop on one kind of event: ``--oracle red-light`` is short for adding it to ``--crash-on``."""
+    """Makes one type of event a crash: ``--oracle red-light`` is short for adding the type to ``--crash-on``."""
 
     name: str
     outcomes: Mapping[str, Category]
 
     def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
-        """Return the events of this kind that the agents have part in."""
+        """Return the events of this type in which the agents take part."""
         events = [event for event in scene.events if event.kind in self.outcomes and event.agent in agents]
         return [Finding(Outcome(event.kind), event=event) for event in events]
 
 
 class RedLight(_ReportedEvent):
-    """Sees an agent run a red light, where the simulator reports it."""
+    """Detects that an agent runs a red light, if the simulator reports this."""
 
     name = "red-light"
     outcomes: Mapping[str, Category] = {"red_light": "traffic event"}
 
 
 class WrongWay(_ReportedEvent):
-    """Sees an agent drive against the traffic, where the simulator reports it."""
+    """Detects that an agent drives in the wrong direction, if the simulator reports this."""
 
     name = "wrong-way"
     outcomes: Mapping[str, Category] = {"wrong_way": "traffic event"}
 
 
 class OffRoute(_ReportedEvent):
-    """Sees an agent miss its route, where the simulator reports it."""
+    """Detects that an agent misses its route, if the simulator reports this."""
 
     name = "off-route"
     outcomes: Mapping[str, Category] = {"off_route": "traffic event"}

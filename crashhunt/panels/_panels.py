@@ -1,6 +1,7 @@
-"""Panels: views of an agent's internal state, shown next to the scene. They are plain data, drawn on request.
+"""Panels: views of an agent's internal state next to the scene. They are plain data, and are drawn when requested.
 
-An agent makes panels in every step, also where nothing draws them. Pillow is therefore imported by the first drawing.
+An agent creates panels in every step, even if they are not drawn. Pillow is therefore imported only by the first
+drawing.
 """
 
 from __future__ import annotations
@@ -69,8 +70,8 @@ def current_scope() -> tuple[str, ...]:
 def labelled(nest: object) -> list[tuple[str, Panel]]:
     """Return every panel in nested mappings and sequences, with its label; other objects are ignored.
 
-    A label is made of the scopes in which the panel was made, its keys in the nest, and its title. Of two panels with
-    the same label, the second gets a number.
+    A label consists of the scopes in which the panel was created, its keys in the nested objects, and its title. If two
+    panels have the same label, the second gets a number.
     """
     found: list[tuple[str, Panel]] = []
     labels: dict[str, int] = {}
@@ -93,41 +94,41 @@ def labelled(nest: object) -> list[tuple[str, Panel]]:
 
 @dataclass(kw_only=True)
 class Panel:
-    """A picture of something inside an agent.
+    """A picture of a part of an agent's internal state.
 
     Args:
-        title: title above the panel; the label has scopes and keys before the title.
+        title: title above the panel; in the label, scopes and keys precede the title.
 
     Attributes:
-        scopes: scopes in which it was made.
+        scopes: names of the scopes in which the panel was created.
     """
 
     title: str = ""
     scopes: tuple[str, ...] = field(default_factory=current_scope, init=False, repr=False)
 
     def draw(self, width: int = 240, height: int = 160, label: str = "") -> NDArray[np.uint8]:
-        """Return it as uint8, shape (height, width, 3).
+        """Return the panel as a picture, uint8, shape (height, width, 3).
 
         Args:
-            width: width in pixels.
-            height: height in pixels.
-            label: above it; its title by default.
+            width: width of the picture, in pixels.
+            height: height of the picture, in pixels.
+            label: text above the panel; by default its title.
 
         Raises:
             TypeError: the panel has a class of the user without a method `draw`.
-            ValueError: its content has the wrong shape.
+            ValueError: the content of the panel has the wrong shape.
         """
         return painted(self, width, height, label or self.title)
 
 
 @dataclass
 class Heatmap(Panel):
-    """A matrix as colours, the first row on top, with a colour bar.
+    """A matrix shown as colours, with the first row at the top and a colour bar.
 
     Args:
-        values: shape (rows, columns).
-        low: the value of the darkest colour; the least value by default.
-        high: the value of the brightest colour; the greatest value by default.
+        values: values of the matrix, shape (rows, columns).
+        low: value with the darkest colour; by default the least value.
+        high: value with the brightest colour; by default the greatest value.
         annotate: whether to write the values into the cells.
     """
 
@@ -139,12 +140,12 @@ class Heatmap(Panel):
 
 @dataclass
 class Contour(Panel):
-    """A matrix as a landscape with contour lines.
+    """A matrix shown as a landscape with contour lines.
 
     Args:
-        values: shape (rows, columns).
-        low: value of the lowest level; the least value by default.
-        high: value of the highest level; the greatest by default.
+        values: values of the matrix, shape (rows, columns).
+        low: value of the lowest contour line; by default the least value.
+        high: value of the highest contour line; by default the greatest value.
         levels: number of levels.
     """
 
@@ -159,11 +160,11 @@ class Curve(Panel):
     """One or several curves.
 
     Args:
-        series: name to values; or the values of the only one.
-        x: x of all values; by default their index.
-        low: lower end of the vertical axis; the least value by default.
-        high: upper end of the axis; by default the greatest value.
-        cursor: x of a vertical line.
+        series: values of each curve by name, or the values of a single curve.
+        x: x of all values; by default the index of each value.
+        low: lower end of the vertical axis; by default the least value.
+        high: upper end of the vertical axis; by default the greatest value.
+        cursor: position of a vertical line on the x axis.
     """
 
     series: Mapping[str, ArrayLike] | ArrayLike
@@ -175,10 +176,10 @@ class Curve(Panel):
 
 @dataclass
 class Curve3D(Panel):
-    """A path in space, seen from above at an angle; it begins dark and ends bright.
+    """A path in space, seen from above at an angle; its colour changes from dark to bright.
 
     Args:
-        points: shape (n, 3).
+        points: points of the path, shape (n, 3).
         azimuth: direction from which the scene is seen, in degrees.
     """
 
@@ -191,8 +192,8 @@ class Bar(Panel):
     """Bars with their values.
 
     Args:
-        values: name to value, or values.
-        low: lower end of the axis; 0 or the least value by default.
+        values: value of each bar by name, or values without names.
+        low: lower end of the axis; by default 0 or the least value.
         high: upper end of the axis; by default the greatest value.
     """
 
@@ -206,7 +207,7 @@ class Text(Panel):
     """Some lines of text.
 
     Args:
-        text: the text.
+        text: the lines of text.
     """
 
     text: str
@@ -214,13 +215,13 @@ class Text(Panel):
 
 @dataclass
 class Action(Panel):
-    """An action: bars within their bounds, or an integer.
+    """An action, shown as bars within their bounds, or as an integer.
 
     Args:
-        value: value of a Box space, or the integer of a discrete one.
-        low: lower bound of each part; needed for bars.
-        high: upper bound of each part.
-        names: names of the parts.
+        value: value from a Box space, or the integer of a discrete action.
+        low: lower bound of each component; needed for bars.
+        high: upper bound of each component.
+        names: names of the components.
     """
 
     value: ArrayLike
@@ -234,10 +235,10 @@ class ActionDistribution(Panel):
     """The probability of each action of an agent.
 
     Args:
-        probabilities: probabilities of each discrete action.
-        mean: mean of each part of a continuous action, with ``std``.
-        std: standard deviation of each part of a continuous action.
-        names: names of the actions or parts.
+        probabilities: probability of each discrete action.
+        mean: mean of each component of a continuous action; given together with ``std``.
+        std: standard deviation of each component of a continuous action.
+        names: names of the actions or components.
     """
 
     probabilities: ArrayLike | None = None
@@ -248,10 +249,10 @@ class ActionDistribution(Panel):
 
 @dataclass
 class Picture(Panel):
-    """An image, as large as fits.
+    """An image, drawn as large as possible.
 
     Args:
-        image: shape (height, width, 3) or (height, width); uint8, or floats from 0 to 1.
+        image: pixels of the image, shape (height, width, 3) or (height, width); uint8, or floats from 0 to 1.
     """
 
     image: ArrayLike
@@ -273,7 +274,7 @@ _VIRIDIS = (
 
 @lru_cache(maxsize=16)
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Return a font; Pillow brings it along."""
+    """Return a font that comes with Pillow."""
     from PIL import ImageFont
 
     return ImageFont.load_default(size)
@@ -281,14 +282,14 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 @lru_cache(maxsize=1)
 def color_map() -> NDArray[np.uint8]:
-    """Return 256 colours from low to high, shape (256, 3)."""
+    """Return 256 colours from the lowest to the highest value, shape (256, 3)."""
     places = np.linspace(0, 255, len(_VIRIDIS))
     columns = [np.interp(np.arange(256), places, [color[part] for color in _VIRIDIS]) for part in range(3)]
     return np.stack(columns, axis=1).round().astype(np.uint8)
 
 
 def map_colors(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.uint8]:
-    """Return the colours of values, shape (*values.shape, 3); grey where a value is not finite."""
+    """Return the colours of values, shape (*values.shape, 3); values that are not finite are grey."""
     finite = np.isfinite(values)
     share = (np.where(finite, values, low) - low) / span_of(low, high)
     colors = color_map()[np.clip(share * 255, 0, 255).astype(np.uint8)]
@@ -297,7 +298,7 @@ def map_colors(values: NDArray[np.float64], low: float, high: float) -> NDArray[
 
 
 def span_of(low: float, high: float) -> float:
-    """Return the distance of two limits; 1 if they are equal."""
+    """Return the difference of two limits; 1 if they are equal."""
     return high - low if high - low > _MIN_DISTANCE else 1.0
 
 
@@ -308,7 +309,7 @@ def number(value: float) -> str:
 
 @lru_cache(maxsize=256)
 def ticks(low: float, high: float, most: int = 4) -> tuple[float, ...]:
-    """Return round numbers between two limits."""
+    """Return round numbers between two limits, for the labels of an axis."""
     if not high - low > max(_MIN_DISTANCE, abs(low) * 1e-12, abs(high) * 1e-12):  # as far as floats can tell
         return (low,)
     raw = (high - low) / most
@@ -333,13 +334,13 @@ class Canvas:
     """An empty panel with its title, to draw on.
 
     Args:
-        width: width in pixels.
-        height: height in pixels.
-        title: above it.
+        width: width of the panel, in pixels.
+        height: height of the panel, in pixels.
+        title: title above the panel.
 
     Attributes:
-        image: the picture.
-        draw: Pillow's object that draws on the picture.
+        image: image on which the panel is drawn.
+        draw: Pillow's object that draws on the image.
     """
 
     def __init__(self, width: int, height: int, title: str) -> None:
@@ -352,11 +353,11 @@ class Canvas:
     def text(
         self, at: tuple[float, float], text: str, color: tuple[int, int, int], size: int, anchor: str = "la"
     ) -> None:
-        """Write one line."""
+        """Write one line of text onto the panel."""
         self.draw.text(at, _one_line(text), color, font(size), anchor=anchor)
 
     def pixels(self) -> NDArray[np.uint8]:
-        """Return it as uint8, shape (height, width, 3)."""
+        """Return the panel as uint8, shape (height, width, 3)."""
         return as_array(self.image)
 
 
@@ -376,11 +377,11 @@ _MAX_DRAWN_VALUE = 1e100  # beyond it, the difference of two numbers may overflo
 
 
 def painted(panel: Panel, width: int, height: int, label: str) -> NDArray[np.uint8]:
-    """Return a panel as uint8, shape (height, width, 3).
+    """Return a panel as a picture, uint8, shape (height, width, 3).
 
     Raises:
         TypeError: the panel has no known type.
-        ValueError: its content has the wrong shape.
+        ValueError: the content of the panel has the wrong shape.
     """
     canvas = Canvas(width, height, label)
     with np.errstate(all="ignore"):  # agents show what they have
@@ -558,7 +559,7 @@ def _paint_picture(panel: Picture, canvas: Canvas) -> None:
 
 
 class _Axes:
-    """Axes with labels, and the conversion of values to pixels."""
+    """Axes with labels, and the conversion of values to pixel positions."""
 
     def __init__(self, canvas: Canvas, left: float, right: float, low: float, high: float) -> None:
         self._draw = canvas.draw

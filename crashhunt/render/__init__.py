@@ -1,7 +1,7 @@
-"""Pictures: the scene from above, panels that an agent may show of itself, and films of both.
+"""Pictures: the scene from above, panels that an agent provides, and films of both.
 
-Needs Pillow, and for MP4 PyAV: ``pip install 'crashhunt[video]'``. Panels themselves need neither: an agent can make
-them where they are not drawn.
+Drawing needs Pillow, and MP4 needs PyAV: ``pip install 'crashhunt[video]'``. Panels themselves need neither, so an
+agent can create panels that are not drawn.
 """
 
 import lazy_loader

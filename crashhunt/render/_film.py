@@ -64,14 +64,14 @@ class FilmOptions:
     """The options of a film.
 
     Args:
-        fps: pictures a second; as many as there are steps by default, so that it runs in real time.
+        fps: pictures per second; by default as many as there are steps per second, so that the film runs in real time.
         size: size of the scene, in pixels.
-        last_s: length of the film, in s: the end of a crash, or the time around the nearest moment of a near miss. 0
-            shows all of a crash and 10 s of a near miss.
-        last_step_repeats: number of repeats of the last picture.
-        blank_frames: blank frames between two crashes.
-        panels: whether to show panels at all.
-        scale: pixels a metre.
+        last_s: duration to show, in s: the end of a crash, or the time around the nearest moment of a near miss. 0
+            shows the whole crash, or 10 s of a near miss.
+        last_step_repeats: number of times that the last picture is repeated.
+        blank_frames: number of blank pictures between two crashes.
+        panels: whether to show panels next to the scene.
+        scale: scale of the scene, in pixels per metre.
     """
 
     fps: float = 0.0
@@ -98,14 +98,14 @@ class Shot:
     """One crash or near miss of a film.
 
     Args:
-        recording: what to show.
-        lanes: lanes of its map.
-        agent: the vehicle in the centre of the picture.
-        other: the collision partner.
-        crash_step: where the crash is.
-        panels: step to the agent's own panels, by label, as pictures.
-        meanings: names of its discrete actions, where they are known.
-        nearest: of a near miss, the step that the film is about; -1 of a crash, whose film ends with it.
+        recording: recording of the crash.
+        lanes: lanes of the crash's map.
+        agent: identifier of the vehicle in the centre of the picture.
+        other: identifier of the collision partner.
+        crash_step: the step of the crash.
+        panels: pictures of the agent's own panels, by step and label.
+        meanings: names of the agent's discrete actions, if they are known.
+        nearest: for a near miss, the step around which the film is made; -1 for a crash, with which the film ends.
     """
 
     recording: Recording
@@ -119,12 +119,12 @@ class Shot:
 
 
 class Layout:
-    """Positions of panels: next to the scene or below it, whichever makes the smaller picture; decided once.
+    """Positions of panels, next to the scene or below it, whichever makes the smaller picture; determined only once.
 
     Args:
-        frame: width and height of the scene.
+        frame: width and height of the scene, in pixels.
         labels: labels of all panels.
-        panel: width and height of one.
+        panel: width and height of one panel, in pixels.
     """
 
     def __init__(self, frame: tuple[int, int], labels: Sequence[str], panel: tuple[int, int] = _PANEL_PIXELS) -> None:
@@ -147,7 +147,7 @@ class Layout:
         self.size = self.size[0] + self.size[0] % 2, self.size[1] + self.size[1] % 2
 
     def compose(self, scene: NDArray[np.uint8], panels: Mapping[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
-        """Return one picture; a panel that is not there leaves its place white."""
+        """Return one picture with scene and panels; the place of a missing panel stays white."""
         picture = np.full((self.size[1], self.size[0], 3), _BACKGROUND, np.uint8)
         picture[: scene.shape[0], : scene.shape[1]] = scene
         for label, panel in panels.items():
@@ -158,10 +158,10 @@ class Layout:
 
 
 def check_places(*, video: Path | None = None, gif: Path | None = None, folder: Path | None = None) -> None:
-    """Find out before a film is made whether it can be written.
+    """Check before a film is made whether its files can be written.
 
     Raises:
-        UsageError: a name has the wrong ending or is in no folder, the folder for frames has something in it, or PyAV
+        UsageError: a file name has the wrong ending or is not in a folder, the folder for frames is not empty, or PyAV
             is not installed.
     """
     for option, place, ending in (("--video", video, ".mp4"), ("--gif", gif, ".gif"), ("--frames", folder, "")):
@@ -224,7 +224,7 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
 
 
 def _count(shots: Sequence[Shot], options: FilmOptions) -> int:
-    """Return how many pictures `frames` yields."""
+    """Return the number of pictures that `frames` yields."""
     shown = sum(len(_steps(shot, options)) + options.last_step_repeats for shot in shots)
     return shown + max(0, len(shots) - 1) * options.blank_frames
 
@@ -261,7 +261,7 @@ def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watc
 
 
 def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:
-    """Write an animated GIF; return how many pictures it has.
+    """Write an animated GIF; return the number of its pictures.
 
     Raises:
         HuntDirectoryError: the file cannot be written.
@@ -282,7 +282,7 @@ def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watch:
 
 
 def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:
-    """Write ``000000.png`` and so on; return how many.
+    """Write the pictures as ``000000.png`` and so on; return their number.
 
     Raises:
         HuntDirectoryError: the folder cannot be written.
@@ -343,7 +343,7 @@ class _Builtin:
         self._low, self._high = np.minimum(spread.min(axis=0), 0.0), np.maximum(spread.max(axis=0), 1.0)
 
     def panels(self, step: int) -> list[tuple[str, Panel]]:
-        """Return label and panel."""
+        """Return each panel with its label."""
         first = max(0, step - round(_SHOWN_S / self._dt))
         part = slice(first, step + 1)
         x = self._seconds[part]
@@ -372,8 +372,8 @@ def shown_steps(recording: Recording, last_s: float, nearest: int) -> tuple[int,
 
     Args:
         recording: recording of the trial.
-        last_s: as in `FilmOptions`.
-        nearest: as in `Shot`.
+        last_s: duration to show, as in `FilmOptions`.
+        nearest: step of a near miss, as in `Shot`.
     """
     dt, end = recording.prologue.step_length_s, recording.steps
     if nearest < 0:
@@ -404,7 +404,7 @@ def explanation(error: Exception) -> Text:
 
 
 def save_panels(folder: Path, step: int, panels: Sequence[tuple[str, Panel]]) -> None:
-    """Draw and add the panels of one agent and step; one that cannot be drawn says why."""
+    """Draw and add the panels of one agent and step; a panel that cannot be drawn is replaced by the reason."""
     from PIL import Image
 
     with (folder / "index.jsonl").open("a", encoding="utf-8") as index:
@@ -423,14 +423,14 @@ def save_panels(folder: Path, step: int, panels: Sequence[tuple[str, Panel]]) ->
 
 
 def save_meanings(folder: Path, agent: str, meanings: Sequence[str]) -> None:
-    """Write the names of an agent's discrete actions to a file; no file where there are no names."""
+    """Write the names of an agent's discrete actions to a file; without names, no file is written."""
     if meanings:
         with (folder / "meanings.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps([agent, list(map(str, meanings))]) + "\n")
 
 
 def load_meanings(folder: Path) -> dict[str, tuple[str, ...]]:
-    """Return agent to what `save_meanings` was given."""
+    """Return the names of actions that `save_meanings` has written, by agent."""
     try:
         lines = (folder / "meanings.jsonl").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -439,7 +439,7 @@ def load_meanings(folder: Path) -> dict[str, tuple[str, ...]]:
 
 
 def load_panels(folder: Path) -> dict[int, dict[str, NDArray[np.uint8]]]:
-    """Return step to label to picture, uint8, shape (height, width, 3)."""
+    """Return the pictures of panels by step and label, uint8, shape (height, width, 3)."""
     from PIL import Image
 
     found: dict[int, dict[str, NDArray[np.uint8]]] = {}

@@ -1,4 +1,4 @@
-"""Panels, under the name by which agents import them: ``from crashhunt.render import Bar``."""
+"""Panels under the name from which agents import them: ``from crashhunt.render import Bar``."""
 
 from crashhunt.panels import (
     Action,

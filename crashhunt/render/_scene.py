@@ -1,4 +1,4 @@
-"""The scene from above, following one vehicle."""
+"""The scene from above, centred on one vehicle."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ class SceneView:
 
     Args:
         recording: recording of the episode.
-        lanes: the right and left border of each, shape (n, 2), in m.
-        agent: the vehicle in the centre of the picture.
-        other: the one it crashed with; empty for none.
-        width: width in pixels.
-        height: height in pixels.
-        scale: pixels a metre.
-        crash_step: where to mark the crash; -1 for nowhere.
-        nearest_step: where to mark that a near miss was nearest, for a second; -1 for nowhere.
+        lanes: right and left border of each lane, shape (n, 2), in m.
+        agent: identifier of the vehicle in the centre of the picture.
+        other: identifier of the collision partner; empty if there is none.
+        width: width of the picture, in pixels.
+        height: height of the picture, in pixels.
+        scale: scale of the picture, in pixels per metre.
+        crash_step: step at which to mark the crash; -1 for none.
+        nearest_step: step at which to mark the nearest moment of a near miss, for a second; -1 for none.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class SceneView:
         self._trail = round(_TRAIL_S / recording.prologue.step_length_s)
 
     def draw(self, step: int) -> NDArray[np.uint8]:
-        """Return a scene as uint8, shape (height, width, 3).
+        """Return a picture of a scene, uint8, shape (height, width, 3).
 
         Raises:
             IndexError: the recording has no such step.
@@ -107,7 +107,7 @@ class SceneView:
         return "NEAREST" if self._nearest_step >= 0 and 0 <= since <= self._second else ""
 
     def _to_pixels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Metres to pixels of the fine image."""
+        """Convert positions in metres to pixels of the high-resolution image."""
         offset = (points - self._center) * (self._scale * _OVERSAMPLING)
         offset[:, 1] *= -1
         placed: NDArray[np.float64] = offset + np.array([self.width, self.height]) * (_OVERSAMPLING / 2)
@@ -161,7 +161,7 @@ class SceneView:
         return [one for one in self._recording.disturbances if one.vehicle and one.is_active(step, step_length_s)]
 
     def _ring(self, draw: ImageDraw.ImageDraw, scene: Scene, name: str) -> None:
-        """Mark an actor that is disturbed, or that the agent does not see."""
+        """Draw a ring around an actor that is disturbed, or that the agent does not observe."""
         row = scene.roster.index.get(name)
         if row is None:
             return
