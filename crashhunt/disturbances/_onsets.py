@@ -19,9 +19,9 @@ Invariant: the expected sum of weights over any set of first onsets is the proba
 estimate is the sum of the weighted crashes of all copies; if the root itself crashes, S at its end is added. The
 estimate is therefore unbiased, for all ratios above 0 and for any spacing.
 
-Reason for intervals of fixed length: for eight equal parts of each root, the total probability would be needed, which is
-known only at the end of the root. A second run of the root would cost its steps again. The spacing is learned, so that
-a root has eight copies on average.
+Reason for intervals of fixed length: eight equal parts of each root would need the total probability, which is known
+only at the end of the root. A second run of the root would cost its steps again. The spacing is learned, so that a root
+has eight copies on average.
 
 Order within a step: disturbances of the agent first, because the agent notices them one step earlier, when the vehicles
 around it in the next step are not known. In the step of the onset, models later in this order are drawn as usual.
