@@ -333,8 +333,8 @@ class Acceleration:
 def accelerate() -> Acceleration:
     """Accelerate highway-env in this process: bit-identical results in a fraction of the time.
 
-    Hunts call this function automatically. Call it in your own process, for example for training. highway-env's own
-    code runs in all cases that the accelerator does not know. The accelerator checks for these cases in every step:
+    Hunts call this function automatically. Call it in your own process, for example for training. In every
+    step, the accelerator checks for cases that it does not know. highway-env's own code runs in these cases:
 
     - another version of highway-env
     - an installation of crashhunt without the compiled kernel, which needs a C++ compiler

@@ -4,7 +4,7 @@ A foreign module may end its process when it is imported, hang, replace function
 process of the command decides what a hunt reports, so it imports no module of an agent.
 
 The work is done in a fork of a fork. The first fork, the keeper, runs no foreign code, so it can end every program that
-the work has started: at the end of the work, and when the command is interrupted or killed.
+the work has started. It does so at the end of the work, and when the command is interrupted or killed.
 """
 
 from __future__ import annotations

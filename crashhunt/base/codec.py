@@ -1,7 +1,8 @@
 """Converts dataclasses to the JSON objects of files and messages, and back.
 
 The annotations of a dataclass determine how each field is converted, so each data format is defined only once.
-Deviations from the annotations are declared in the metadata of a field: `OMIT_DEFAULT`, `null_is`, `written_if`.
+Deviations from the annotations are declared in the metadata of a field, with `OMIT_DEFAULT`, `null_is` and
+`written_if`.
 
 Invariants: keys are written in the order of `Serializable.json_keys`, which is part of the file formats. A missing key
 means the default of its field. Unknown keys are ignored; `known_part` and `merged` preserve them when a file is written

@@ -15,8 +15,8 @@ Every open descriptor is therefore handled in one of four ways before the work b
 Reason for forks instead of saved states of the simulator: after SUMO's `loadState`, a run differs from the original
 run, even with saved random generators. A fork copies the whole memory, including that of libraries and of the agent.
 
-Cost: the kernel copies page tables, and later every page that parent or fork writes. ``gc.freeze`` prevents Python's
-garbage collector from writing to all other pages. Sources: fork(2), prctl(2), proc(5).
+Cost: the kernel copies page tables, and later every page that parent or fork writes. ``gc.freeze`` prevents
+Python's garbage collector from writing to all other pages. Sources: fork(2), prctl(2), proc(5).
 """
 
 from __future__ import annotations

@@ -7,8 +7,9 @@ files (``TMPDIR``, else ``/tmp``). `OwnerProcess` defines the token. The folder 
 * a symbolic link for each temporary file or folder in another place (`temporary_beside`). Such files become permanent
 by a rename, or the user has chosen their disk. The link is made before the file, and removed after it.
 
-`remove_leftovers` removes files that killed processes left. Each command calls it when it starts, and each process
-calls it before it creates its first temporary file. A leftover is removed only if all of these conditions hold:
+`remove_leftovers` removes files that killed processes left. Each command calls this function at its start, and each
+process calls it before the first temporary file. A leftover is removed only if three conditions hold
+(`has_ended` checks a part of the first):
 
 * its process has certainly ended (`has_ended`), and no process holds the lock of its folder,
 * the leftover belongs to this user, and its name contains the token of that process,

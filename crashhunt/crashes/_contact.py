@@ -227,7 +227,8 @@ class ContactRecord:
 
         There are two such cases. In the first, the outlines did not touch, and their positions make the other actor the
         collider. In the second, the simulator detected a collision within a step, and the next scene already shows the
-        consequences: another collider, or a slower vehicle that drives into the back of a faster one.
+        consequences. Such a consequence is another collider, or a slower vehicle that drives into the back of a faster
+        vehicle.
         """
         hit = self.reported
         if hit is None:

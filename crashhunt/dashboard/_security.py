@@ -1,7 +1,7 @@
 """Refuses requests that do not come from the user, before any data are read for them.
 
-The page shows files of this machine, so other web sites in the same browser, and other users of the network, must not
-get access:
+The page shows files of this machine. Other web sites in the same browser and other users of the network must not get
+access (`Guard`):
 
 - The name in the Host header must be a name of this server. A site that makes its own name point to this machine (DNS
   rebinding) sends its own name.

@@ -1,8 +1,8 @@
 """Counts the trials of a hunt in each part of the hunt, and keeps a sample of the trials for plots.
 
 A hunt may have a million trials and write a thousand each second. The memory therefore does not grow with the number of
-trials. A refresh reads only new trials: those with numbers above the greatest known number, and those in gaps below
-this number. Trials end in any order, so their numbers do not show the order in which they ended.
+trials. A refresh reads only new trials, namely those with numbers above the greatest known number, and those in gaps
+below this number. Trials end in any order, so their numbers do not show the order in which they ended.
 
 Invariants: `outcomes`, the parts and the counts up to the first gap are exact. The sample contains every crash, up to
 `MAX_CRASHES`, and an evenly spaced share of the other trials. This share is halved whenever the sample has more than

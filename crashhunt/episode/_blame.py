@@ -70,8 +70,9 @@ def party_of_simulator(simulator: Simulator) -> Party:
 def blame(error: BaseException, simulator: Simulator, place: str = "") -> Blame:
     """Return the owner of the code that raised an exception, if the code is not an agent's.
 
-    Code at a boundary wraps an exception and names the owner. Exceptions without a wrapper are crashhunt's own, except
-    for two cases: an adapter has raised a `SimulatorError`, or the exception has passed through `foreign_packages`.
+    Code at a boundary wraps an exception and names the owner. Exceptions without a wrapper are
+    crashhunt's own, except for two cases: an adapter has raised a `SimulatorError`, or the exception has
+    passed through `foreign_packages`.
 
     Args:
         error: The exception.

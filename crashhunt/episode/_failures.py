@@ -258,7 +258,7 @@ def attribute_error(
 ) -> Attribution | None:
     """Return the agent that caused an exception; None if another part caused it, or if the cause is unknown.
 
-    The exception is attributed to an agent if
+    The exception is attributed to an agent if one of these conditions holds:
 
     - a function on its traceback, or on the traceback of its cause, is a method of the agent's class, or is defined in
       a module that only the agent uses. A module that environment, oracles or observers use as well does not count.

@@ -1,7 +1,7 @@
 """Pairs of running hunts, which are read while they grow, and the report of a gate on them.
 
 A gate compares two versions, BASE and HEAD, in pairs of trials with the same number, seed, traffic and disturbances.
-The pairs have an order that does not depend on results: hunt after hunt, and in each hunt by number. Therefore
+The pairs have an order that does not depend on results, namely hunt after hunt, and in each hunt by number. Therefore
 `PairWatch` may decide after any pair, and the number of workers has no influence.
 """
 

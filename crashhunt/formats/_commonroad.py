@@ -35,9 +35,9 @@ def write_commonroad(bundle: Bundle, target: Path, *, with_agents: bool = False)
     Lengths are in m, angles in rad, speeds in m/s, times in steps of ``timeStepSize`` s; step 0 is before the first
     step. A position is the centre of a vehicle. Each lane that the agent came near is a lanelet; the order of lanelets
     follows from the shapes. Every other actor is a dynamic obstacle from the step in which it was first seen. Each
-    agent is a planning problem: its start, with the goal of still driving at the end of the recording. A planner that
-    avoids the crash solves the planning problem. The yaw rate is that of the first step. The slip angle is unknown and
-    written as 0.
+    agent is a planning problem, which consists of its start and the goal of still driving at the end of the recording.
+    A planner that avoids the crash solves the planning problem. The yaw rate is that of the first step. The slip angle
+    is unknown and written as 0.
 
     Args:
         bundle: the crash to write.

@@ -305,9 +305,9 @@ class Core(Protocol):
             unknown: The length by which the agent's path is continued straight at its end, in m.
 
         Returns:
-            Columns as float64 and as int64, for the agent and for the other actors. As float64: x, y, heading, half the
-            length, half the width. As int64 for the agent: the number of each scene. As int64 for the other actors:
-            the index of the scene, and the number of the actor.
+            Columns as float64 and as int64, for the agent and for the other actors. The float64 columns are x, y,
+            heading, half the length and half the width. The int64 column for the agent is the number of each scene. The
+            int64 columns for the other actors are the index of the scene and the number of the actor.
         """
 
     def least_change(self, earlier: Columns, later: Columns, /) -> float | None:

@@ -2,7 +2,7 @@
 
 libsumo processes conflicting links in the order of their memory addresses, on which the behaviour at junctions depends
 (see the guide's page on SUMO). With this library, libsumo processes them in the order of their construction. The
-library does not belong to the compiled core: results must not depend on whether the core is used.
+library does not belong to the compiled core, because results must not depend on whether the core is used.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The list of all hunt options, the single source for every interface.
 
-The command line, `crashhunt.prepare` and ``run``, ``suite.toml``, ``request.json`` and ``hunt.toml`` are made from it.
-To add an option to all of them, add a field to one of the classes here. The class determines where the option is
-stored:
+The command line, `crashhunt.prepare` and ``run``, ``suite.toml``, ``request.json`` and ``hunt.toml`` are derived from
+this list. To add an option to all of them, add a field to one of the base classes of `HuntOptions`:
 
 - `Subject`: `plan` resolves the option into ``hunt.toml``, and has to be changed for a new option;
 - `TrialOptions`: the option determines trials and is a key of ``hunt.toml``, and another value makes another hunt;

@@ -1,8 +1,8 @@
 """Intervals for a rate that are valid at any time, and a test whether two rates differ.
 
 Each unit has Y events (0 to b) and an exposure D (above 0, at most Dmax). The rate is E[Y] / E[D]. For each possible
-rate r, the module computes the capital of bets against r. The interval consists of the rates whose capital is below 1 /
-alpha:
+rate r, the module computes the capital of bets against r. The interval consists of the rates whose capital is below 1
+/ alpha:
 
     E(r) = sum_j w_j prod_i (1 + k_j(r) (Y_i - r D_i)),    k_j(r) = clip(q_j / r - 1, -0.999 / b, 0.999 / (r Dmax)).
 
@@ -30,7 +30,7 @@ variables by betting, JRSS B 86(1), 2024, for the bets. P. Grünwald, R. de Heid
 86(5), 2024, for e-values.
 
 Cost: a unit increments a counter. A capital needs one logarithm for each component and each different unit. With trials
-as exposure there are two different units. Many different exposures are spread over a fixed grid: a unit between two
+as exposure there are two different units. Many different exposures are spread over a fixed grid. A unit between two
 grid points counts partly at each of the two points, with the same sum. The logarithm of each factor is concave in the
 exposure, so the grid increases no capital, and the interval stays valid.
 """

@@ -4,9 +4,9 @@ A pair is one trial of each agent with the same number, seed and traffic. Pairs 
 to the first number whose trials have not both ended. A crash ends a trial early, so the finished pairs are not a fair
 sample, but the first k pairs are. With `--seeds`, a pair consists of all trials of a traffic seed.
 
-The difference of a pair is Z = (crashes of the second - crashes of the first) / trials, from -1 to 1. The interval of
-E[Z] has two ends, each with half of the error probability. For the upper end, each component bets that E[Z] is less
-than d, with a share s of its maximum stake:
+The difference of a pair is Z = (crashes of the second - crashes of the first) / trials, from -1 to 1. The
+interval of E[Z] has two ends, each with half of the error probability. For the upper end, each component bets
+that E[Z] is less than d, with a share s of its maximum stake:
 
     E(d) = sum_j w_j / 2 prod_i (1 - s_j (Z_i - d) / (1 - d)).
 

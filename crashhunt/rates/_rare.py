@@ -14,9 +14,9 @@ that no copy has met.
 
 Learning: the forcing of a block of 32 roots depends only on the blocks before the previous block. The forcing is
 therefore independent of the number of workers, and no worker waits for the end of a block. The proposal distribution
-consists of two parts: 10 % is the law of the disturbances, and 90 % is this law times the square root of each cell's
-smoothed crash share. This proposal minimizes the variance for independent copies of equal cost; the 10 % bound all
-weights.
+consists of two parts. Of the probability, 10 % is the law of the disturbances, and 90 % is this law times the square
+root of each cell's smoothed crash share. This proposal minimizes the variance for independent copies of equal cost; the
+10 % bound all weights.
 
 The estimated interval combines two parts. Undisturbed crashes of roots and plain trials are counted, so their share has
 Clopper and Pearson's interval, which is valid for any number of crashes. The part with weights has Student's t interval

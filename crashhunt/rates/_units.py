@@ -9,7 +9,7 @@ if a hunt stopped at its first crash, was killed, ran out of time, or used many 
 
 Invalid trials count neither as crashes nor as exposure. If more than 5 % of the trials are invalid, the rate would
 refer to other traffic than described, so no rate is reported. A trial whose process was killed from outside has not
-ended: a resumed hunt runs it again.
+ended, and a resumed hunt runs the trial again.
 
 Cost: constant for each trial. A trial stays in memory only until all trials of lower numbers have ended.
 """

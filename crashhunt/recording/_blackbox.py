@@ -1,12 +1,12 @@
 """The black box: compact binary records in a memory-mapped scratch file.
 
 Nothing is encoded while the episode runs, and the pages belong to the kernel, so that the records outlive a process
-that is killed in the middle of a step. Layout: a header of 64 bytes, then records, each of 8 bytes of head (tag, aux,
-length) and its payload, padded to 8 bytes. Everything is little-endian. Only what lies before the header's
-``committed`` offset counts. The header also has the position of the process: step, phase and agent.
+that is killed in the middle of a step. The layout consists of a header of 64 bytes and records, each with 8 bytes of
+head (tag, aux, length) and its payload, padded to 8 bytes. Everything is little-endian. Only what lies before the
+header's ``committed`` offset counts. The header also has the position of the process: step, phase and agent.
 
 Behind the records, the process of a finished trial leaves one report, which the header announces by its length. The
-report is not a record: it belongs neither to the digest nor to the log.
+report is not a record, and belongs neither to the digest nor to the log.
 """
 
 from __future__ import annotations

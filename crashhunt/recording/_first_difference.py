@@ -94,7 +94,7 @@ def has_same_scenes(recorded: Recording, rerun: Recording, step: int) -> bool:
     """Return whether the scenes of a run are bit-identical to the recorded scenes up to and including a step.
 
     If a change begins after this step, only such a run gives information about the recorded trial. Observations and
-    actions are not compared: other versions may record them in another form.
+    actions are not compared, because other versions may record them in another form.
 
     Args:
         recorded: the recording of the trial; it must contain the step.

@@ -1,9 +1,9 @@
 """Values of any class as text, for observations and actions whose space has no fixed size.
 
 The text is JSON in ASCII. Numbers, texts, None and lists are JSON values. Any other value is a JSON object with one key
-that names its class: ``tuple``, ``dict``, ``bytes``, ``array``, ``scalar``, ``graph`` and so on. A value of an unknown
-class is written as ``opaque``, with the name of its class and a digest of its content. Equal values have equal texts,
-in every process. Pickle is not used.
+that names its class, such as ``tuple``, ``dict``, ``bytes``, ``array``, ``scalar``, ``graph`` and so on. A value of an
+unknown class is written as ``opaque``, with the name of its class and a digest of its content. Equal values have equal
+texts, in every process. Pickle is not used.
 """
 
 from __future__ import annotations

@@ -2,14 +2,15 @@
 
 Computes shares of trials by payoff. A trial that is more critical than a share of 1 - q of the unguided trials has
 payoff -log q. The mean payoff is 1 where a strategy learns nothing, so only ranks matter for payoffs. Two thresholds
-read the scale of criticality: the progress of strategies, and the criticality of 0.5 that caps their share.
+read the scale of criticality, namely the progress of strategies, and the criticality of 0.5 that caps their share.
 
 Invariant: a strategy keeps at least 2 % of the trials (probes), and the even search gets everything that strategies
 do not earn. A hunt with a misleading criticality is therefore never much worse than an even search.
 
 Why not the best strategy alone: rising criticality does not imply a crash, which is unknown before the first one. Two
-signs show that it misleads: strategies are far ahead of the unguided trials and make no progress, or they never
-exceed a criticality of 0.5. In both cases their share is capped, and a part of it explores other peaks (`Niches`).
+signs show that criticality misleads. Either strategies are far ahead of the unguided trials and make no progress, or
+they never exceed a criticality of 0.5. In both cases their share is capped, and a part of it explores other peaks
+(`Niches`).
 
 After the first crash, new crash types count. Before each proposal, the rate of new types that strategies find is drawn
 from its posterior, and so is that of unguided trials (Thompson 1933). Strategies do not search in basins of crashes

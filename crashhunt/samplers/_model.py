@@ -1,7 +1,7 @@
 """A model of criticality over arguments and seeds, which selects the most promising of many candidates.
 
 Computes a Gaussian process (Rasmussen and Williams 2006) over the most critical and the latest trials. Its kernel has
-two parts: one of arguments alone, and one of arguments that counts only between trials with the same seed, because the
+two parts, one of arguments alone, and one of arguments that counts only between trials with the same seed, because the
 seed determines the traffic. The rest is noise. Length scales and shares are fitted while results arrive. Of 64
 candidates, most of them neighbours of critical trials, the model proposes the one that most likely exceeds the best
 score so far (Kushner 1964).

@@ -3,8 +3,8 @@
 The search is independent of trials: it works on items of any kind.
 
 Delta debugging (Zeller and Hildebrandt, *Simplifying and Isolating Failure-Inducing Input*, 2002) reduces sets. For a
-value, simpler values are tried first, as in Hypothesis. The search is deterministic: the next candidate depends on
-earlier results, and not on the number of workers.
+value, simpler values are tried first, as in Hypothesis. The search is deterministic, because the next candidate depends
+on earlier results, and not on the number of workers.
 """
 
 from __future__ import annotations

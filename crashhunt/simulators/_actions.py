@@ -65,7 +65,7 @@ class SpaceAction:
     """An action inside a Box, Discrete, MultiDiscrete or MultiBinary space.
 
     Numbers count by their value: True is 1, and a float64 value is accepted by a float32 space. Values that the type of
-    the space cannot hold are refused: a float for an integer, 300 for eight bits, complex and masked numbers.
+    the space cannot hold are refused, such as a float for an integer, 300 for eight bits, complex and masked numbers.
     """
 
     names: tuple[str, ...] = ()

@@ -7,10 +7,10 @@ that differs does not count, because it would start the change in another situat
 Invariant: which runs count depends only on their numbers. Runs end in the order of their lengths, and crashed runs are
 short. If the runs are stopped, only runs before the first unfinished number count.
 
-Cost: a run is a fork of a simulator that has been set up, so only its steps are simulated. Measured on a busy machine,
-one run at a time: 72 ms per run of 148 steps on loop, 108 ms per run of 392 steps on merge. The trial itself takes 45
-and 91 ms of that. A fork 20 steps before the end would cost about 9 ms and save all steps before it. The runs would be
-about 1.7 and 3.5 times as fast: 50 futures would take 3.4 s each instead of 4.7 s and 6.8 s, start-up included. Such
+Cost: a run is a fork of a simulator that has been set up, so only its steps are simulated. On a busy machine, one run
+at a time took 72 ms for 148 steps on loop, and 108 ms for 392 steps on merge. The trial itself takes 45 and 91 ms of
+this time. A fork 20 steps before the end would cost about 9 ms and save all steps before it. The runs would be about
+1.7 and 3.5 times as fast, and 50 futures would take 3.4 s each instead of 4.7 s and 6.8 s, start-up included. Such
 forks are not implemented, because the steps before the fork would be verified only once. Without forks, each counted
 run is verified separately.
 """

@@ -17,8 +17,9 @@ The criticality of a trial grows with the time integral over its steps, in s, li
 (TIT; M. M. Minderhoud and P. H. L. Bovy, Extended time-to-collision measures for road traffic safety assessment, 2001):
 integral / (integral + 10 s), and 1 after a touch. If there are several agents, the maximum over the agents counts.
 
-Reason for the integral: it ranks trials better than the maximum over steps, as measured by `scripts/danger`. Reason for
-real paths: with constant velocities, every oncoming vehicle in a bend would be on a collision course.
+Reason for the integral: it ranks trials better than the maximum over steps, as measured by
+`scripts/danger`. Reason for real paths: with constant velocities, every oncoming vehicle in a bend would be
+on a collision course.
 
 Invariant: actors that approach from behind on the same path do not count. Their criticality is the rear criticality, a
 separate number (`followers_danger`).

@@ -127,8 +127,8 @@ def time_to_contact(
     """Return when pairs of rectangles first touch if both move at constant velocity; infinite for never.
 
     On every separating axis, the projections overlap during one interval of time. The outlines touch while all four
-    projections overlap. Source: the swept separating axis test, D. Eberly: Intersection of convex objects, the method
-    of separating axes.
+    projections overlap. Source (swept separating axis test): D. Eberly, Intersection of convex objects, the method of
+    separating axes.
 
     Args:
         offset: as in `rectangle_gap`.

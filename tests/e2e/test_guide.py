@@ -126,7 +126,7 @@ def test_the_python_reference_has_what_users_import():
     assert "run(\n    directory: Path | str," in text
     assert "    snapshot_limit_mb: float = 500.0,\n" in text
     assert "'process_died', 'hang')" in text
-    assert "- `parallel`: trials at a time; 0 for one per core." in text
+    assert "- `parallel`: number of trials at a time; 0 for one per core." in text
     assert "**`act(observation: Any) -> Any`**" in text
     assert "(observation: Any, self" not in text
 

@@ -32,7 +32,7 @@ def keep_xml_ready() -> bool:
 
     SUMO terminates the library after each simulation and initializes it again for the next one. That takes a third of
     the time for loading a small network, because the library builds its Unicode tables. The library counts its
-    initializations: with one more initialization, the count never reaches 0. Call this function once per process, while
+    initializations. With one more initialization, the count never reaches 0. Call this function once per process, while
     a simulation runs.
     """
     try:
