@@ -45,7 +45,7 @@ class Traffic(Protocol):
         """Compute `Road.step`; return False before the search for lanes if a number is no longer finite."""
 
     def run(self, count: int, dt: float, stops: bool, /) -> tuple[int, bool]:
-        """Run several sub-steps; return the number of complete ones, and whether `step` would have returned False.
+        """Run several sub-steps; return the number of complete sub-steps, and whether `step` would have returned False.
 
         If the kernel stops at crashes, the sub-step in which a vehicle crashes is the last one.
         """

@@ -177,7 +177,7 @@ def _visible_rows(
     Args:
         kinematic: The observation object.
         frame: The positions on the road.
-        close: The close objects, nearest first; only the last ones are used.
+        close: The close objects, nearest first; if there are too many, only the last objects are used.
         replaced: Features of the agent that replace its own features.
     """
     vehicle, features = kinematic.observer_vehicle, kinematic.features

@@ -1,7 +1,7 @@
 """The loop over an environment's sub-steps, which keeps the vehicles' state in the kernel while no foreign code runs.
 
-Foreign code is the code of the user or of a library other than highway-env. It may change a vehicle at any time, so the
-state is read again after foreign code has run.
+Foreign code is the code of the user or of a library other than highway-env. Foreign code may change a vehicle at any
+time, so the state is read again after foreign code has run.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = ["Onlooker", "SkippedObservation", "can_run_alone", "simulate"]
 
 
 class Onlooker:
-    """Replaces the ``step`` of a road object by one that calls observers before and after each sub-step.
+    """Replaces the ``step`` of a road object by a function that calls observers before and after each sub-step.
 
     The kept state of the road stays valid as long as the observers do not change the road.
 

@@ -342,9 +342,9 @@ def accelerate() -> Acceleration:
     - functions and methods that other code has replaced, on a class, a module or an object
 
     Returns:
-        The state of the acceleration. Its truth value is whether highway-env is accelerated. ``reason`` is the reason
-        if not. ``left_alone`` lists classes that are not accelerated. ``undo()``, or the end of a ``with`` block,
-        switches the accelerator off.
+        The state of the acceleration. The truth value of this object is whether highway-env is accelerated. ``reason``
+        is the reason if not. ``left_alone`` lists classes that are not accelerated. ``undo()``, or the end of a
+        ``with`` block, switches the accelerator off.
 
     Example:
         >>> import crashhunt

@@ -286,7 +286,7 @@ class Own:
 
     Args:
         kind: The class.
-        base: Its base class in highway-env.
+        base: The class in highway-env from which it is derived.
         values: Names of members that must be plain values.
     """
 

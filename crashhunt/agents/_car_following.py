@@ -173,7 +173,8 @@ def idm_acceleration(
 class CarFollowing:
     """Follows the vehicle in front by the Intelligent Driver Model, with a delayed observation.
 
-    The agent is safe for most of its arguments. It is not safe with a long delay, a short headway and weak brakes.
+    The agent is safe for most of its arguments. The agent is not safe with a long delay, a short headway and weak
+    brakes.
 
     Args:
         delay_s: age of the observation on which the agent acts, in s.

@@ -42,9 +42,9 @@ BRAKE = 4.0  # m/s²: deceleration that it accepts for the follower in the targe
 class LaneChanger:
     """Overtakes slower traffic on either side, and observes the next lane except for a blind spot.
 
-    Without a blind spot, the agent changes lanes only into a gap in which no vehicle has to brake hard. It detects a
-    lane to its left by the layout of the observation, and a lane to its right after it or another vehicle has been
-    there.
+    Without a blind spot, the agent changes lanes only into a gap in which no vehicle has to brake hard. The agent
+    detects a lane to its left by the layout of the observation. It detects a lane to its right only after a vehicle has
+    been there.
 
     Args:
         blind_spot_m: length of the blind spot in the neighbouring lane, backwards from the agent's centre, in m.

@@ -31,8 +31,8 @@ _ALGORITHMS = ("PPO", "DQN", "A2C", "SAC", "TD3", "DDPG")
 class StableBaselines3:
     """Drives by a model that Stable-Baselines3 has saved.
 
-    Such a file contains pickles, so load only your own files. The environment must have the observations and actions on
-    which the model was trained.
+    Files of Stable-Baselines3 contain pickles, so load only your own files. The environment must have the observations
+    and actions on which the model was trained.
 
     Args:
         path: path of the ``.zip`` file that ``model.save`` wrote.
@@ -280,7 +280,7 @@ _META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 
 
 class NumpyPolicy:
-    """Drives by a network that was trained elsewhere, such as the one that ships with the scenario highway-policy.
+    """Drives by a network that was trained elsewhere, such as the network of the shipped scenario highway-policy.
 
     The weights are an ``.npz`` file with these arrays:
 

@@ -20,9 +20,9 @@ __all__ = ["Agent", "Closes", "DrawsPanels", "NeedsLibraries", "meta_actions", "
 class Agent(Protocol):
     """The protocol of an agent, which drives one vehicle.
 
-    The user names the factory of an agent as ``package.module:attribute``. It is called with the agent's arguments as
-    keywords, once per trial and vehicle. A parameter named ``observation_space`` or ``action_space`` receives the
-    Gymnasium space. A parameter named ``step_length_s`` receives the time from one step to the next, in s.
+    The user names the factory of an agent as ``package.module:attribute``. The factory is called with the agent's
+    arguments as keywords, once per trial and vehicle. A parameter named ``observation_space`` or ``action_space``
+    receives the Gymnasium space. A parameter named ``step_length_s`` receives the time from one step to the next, in s.
 
     Optional capabilities are separate protocols: `DrawsPanels` and `Closes`, and `NeedsLibraries` for the factory of an
     agent. An object has a capability if it has the methods or attributes of the protocol.
@@ -45,7 +45,8 @@ class DrawsPanels(Protocol):
     def panels(self) -> object:
         """Return panels in nested mappings and sequences, whose keys are the labels of the panels.
 
-        This method is called after `Agent.act`, only during rendering. It must not change the agent's later actions.
+        This method is called after `Agent.act`, only during rendering. Drawing panels must not change the agent's later
+        actions.
         """
 
 
@@ -61,7 +62,7 @@ class NeedsLibraries(Protocol):
 
     @property
     def libraries(self) -> Sequence[str]:
-        """Return the names of modules to import before the first trial. If one is missing, the agent reports it."""
+        """Return the names of modules to import before the first trial. The agent reports a missing module."""
 
 
 # How agents that think in speeds and lanes say so in discrete meta-actions.

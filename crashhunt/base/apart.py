@@ -4,7 +4,8 @@ A foreign module may end its process when it is imported, hang, replace function
 process of the command decides what a hunt reports, so it imports no module of an agent.
 
 The work is done in a fork of a fork. The first fork, the keeper, runs no foreign code, so it can end every program that
-the work has started. It does so at the end of the work, and when the command is interrupted or killed.
+the work has started. The keeper ends these programs at the end of the work, and when the command is interrupted or
+killed.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ def work_apart(work: Callable[[Report], Plain], *, task: str, timeout_s: float) 
     other threads is a user's program that calls crashhunt, and that imports the user's modules anyway.
 
     Args:
-        work: the function to call; its result must be expressible as JSON. Its argument is a function that it calls
-            with each new task.
+        work: the function to call; its result must be expressible as JSON. The argument of the function is another
+            function, to be called with each new task.
         task: the error to report if there is no result, such as "'planner:Planner' cannot be imported".
         timeout_s: time limit, in s of wall time.
 

@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 def clear_calls() -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Return a decorator for public functions: an unknown keyword raises a `CallError` that suggests the likely one."""
+    """Return a decorator for public functions: an unknown keyword raises a `CallError` with the likely keyword."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         signature = inspect.signature(function)

@@ -167,7 +167,7 @@ class WorkerError(CrashhuntError):
 
 
 class InternalError(CrashhuntError):
-    """crashhunt itself failed. This is a defect to report, and it ends a hunt.
+    """A failure of crashhunt itself: a defect to report, which ends a hunt.
 
     Attributes:
         traceback: The traceback, for the bug report.

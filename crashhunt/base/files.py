@@ -51,7 +51,7 @@ def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Itera
 
 
 def _refuse_device(path: Path) -> None:
-    """Raise an error if a file would replace a device or a pipe, or a link to one: root could replace /dev/null."""
+    """Raise an error if a file would replace a device, a pipe or a link to these; root could replace /dev/null."""
     try:
         is_special = path.exists() and not (path.is_file() or path.is_dir())
     except OSError as error:  # such as a name that is too long

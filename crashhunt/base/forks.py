@@ -191,7 +191,10 @@ class Watchdog:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Return a context in which the time limit is paused. It resumes only in this process, not in a fork."""
+        """Return a context in which the time limit is paused.
+
+        The time limit resumes only in this process, not in a fork.
+        """
         if self.file is None:
             yield
             return
@@ -367,7 +370,7 @@ def fork(work: Callable[[], object], known: Held | None = None, *, keeps: Collec
     """Fork this process; the fork runs a function and exits.
 
     Args:
-        work: the function to run. Its output and its exceptions are discarded.
+        work: the function to run. Output and exceptions of the function are discarded.
         known: resources that were held before user code ran; None if they are unknown, so that every resource may be
             the user's.
         keeps: file descriptors that the function needs, such as an end of a pipe.

@@ -1,6 +1,6 @@
 """Digests that detect corruption and accidental edits of files and rows.
 
-They do not detect deliberate tampering, because they have no key.
+These digests do not detect deliberate tampering, because they have no key.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def landlock_version() -> int:
 
 
 def confine(folder: Path, readable: Iterable[Path | str] = ()) -> bool:
-    """Restrict this process and its children to writing below one folder. This cannot be undone.
+    """Restrict this process and its children permanently to writing below one folder.
 
     The process can still read installed packages, this folder and the named files. If the kernel's version of Landlock
     supports it, the process can open no port and send no signal to other processes.

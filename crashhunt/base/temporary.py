@@ -238,7 +238,7 @@ def release_shared_memory(scratch: Path, *, of_ended: bool = False) -> None:
 
 
 def _remove(name: str, device: int, number: int) -> None:
-    """Remove a shared-memory segment, if it is still the one that was recorded."""
+    """Remove a shared-memory segment, if it is still the recorded segment and not a later one of the same name."""
     path = _SHARED_MEMORY_FOLDER / name
     if path.parent != _SHARED_MEMORY_FOLDER or not name.strip("."):
         return
@@ -391,7 +391,7 @@ def remove_tree(path: Path) -> None:
 
 
 class _TemporaryFiles:
-    """The temporary files of this process. Their folder exists only while it has contents."""
+    """The temporary files of this process. The folder for temporary files exists only while it has contents."""
 
     def __init__(self) -> None:
         self.swept = False

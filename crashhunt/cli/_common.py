@@ -236,8 +236,8 @@ def run_trusted(
     """Call a function that runs the code of a crash; if the code is not trusted, ask the user once for each origin.
 
     Args:
-        run: function called with True if the code is trusted, or with None to determine it. It raises `UntrustedError`
-            before any code runs.
+        run: function called with True if the code is trusted, or with None to determine it. The function raises
+            `UntrustedError` before any code runs.
         bundle: the crash whose code runs.
         archive: the archive that contained the crash; None if there was none.
         options: the options ``trust``, ``json`` and ``directory`` of the command line.

@@ -173,7 +173,7 @@ def _run_with_trust(run: Callable[[bool], T], options: argparse.Namespace) -> T:
 
 
 def _watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Callable[[], None]]:
-    """Return a function that shows the progress, and one that ends the display: a table on a terminal, else lines."""
+    """Return a function that shows the progress as a table or as lines, and a function that ends the display."""
     from rich.live import Live
 
     console = states_console(stderr=as_json)

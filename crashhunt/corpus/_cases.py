@@ -1,7 +1,7 @@
 """Cases of a corpus: folders with a crash and the expected result of the current code.
 
-A case has the layout of a hunt's directory with one crash, so that all commands that read crashes can read it. It also
-contains the file ``crashhunt-case.toml``, which users edit.
+A case has the layout of a hunt's directory with one crash, so that all commands that read crashes can read it. A case
+also contains the file ``crashhunt-case.toml``, which users edit.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class CaseReport(Serializable):
 
     @property
     def ok(self) -> bool:
-        """Whether the actual status is the expected one, or a better one."""
+        """Whether the actual status is the expected status, or better."""
         return self.got == self.expected or self.got == "fixed"
 
     @property

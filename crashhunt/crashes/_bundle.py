@@ -360,7 +360,7 @@ class Bundle:
         return found
 
     def write(self, into: Path | None = None) -> None:
-        """Write ``crash.json`` atomically into the bundle's folder, or into another one while the bundle is built."""
+        """Write ``crash.json`` atomically into the bundle's folder, or into the folder in which it is being built."""
         folder = into or self.path
         result = self.result
         plain = result.to_json()

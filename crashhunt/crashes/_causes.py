@@ -27,14 +27,14 @@ _RELEVANT_DIFFERENCES = {"speed": 5.0, "gap": 5.0, "length": 4.0}  # m/s, m, m: 
 class Cause(Serializable):
     """The cause of a crash, as determined by runs.
 
-    It contains no speeds, identifiers or times, because these differ between trials.
+    A cause contains no speeds, identifiers or times, because these differ between trials.
 
     Args:
         kind: ``omission``, ``decision``, ``disturbance``, ``argument``, ``traffic``, ``software fault`` or ``unknown``.
         what: For an omission, what the agent disregarded, as in `Omission`. For a lane change into an unsafe gap, ``gap
             left`` or ``gap right``. For a decision, the action of the agent; for a disturbance, its type; for an
             argument, its name.
-        instead: the action of the agent in place of the omitted one.
+        instead: the action of the agent in place of the omitted action.
         actor: ``long`` if the disregarded actor is longer than a car, else empty.
     """
 
@@ -64,7 +64,7 @@ class CauseGroup:
         cause: the common cause of the crashes.
         members: the crashes, in the order in which they were found.
         judged: the crashes whose cause was determined by runs. Every other crash is given the cause of the most similar
-            one.
+            judged crash.
     """
 
     cause: Cause
@@ -178,7 +178,7 @@ def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[flo
 
 
 class Division:
-    """The crashes of one type; some are judged by runs, each other one has the cause of the nearest judged crash.
+    """The crashes of one type: runs judge some crashes, and all others get the cause of the nearest judged crash.
 
     The crashes chosen for judgement differ as much as possible. The shortest crash is chosen first, then always the
     crash furthest from all chosen crashes (farthest-first traversal: T. F. Gonzalez, Clustering to minimize the maximum

@@ -192,7 +192,7 @@ class ContactRecord:
     def _bend_m(self) -> float:
         """The greatest distance between a bend and its chord from one scene to the next, in m.
 
-        Between two scenes, the path in a bend is an estimate. Its error is a fraction of this distance.
+        Between two scenes, the path in a bend is an estimate. The error of the estimate is a fraction of this distance.
         """
         found = 0.0
         for before, after in pairwise(self.through):
@@ -225,10 +225,10 @@ class ContactRecord:
 
         In that case no fault rule can decide.
 
-        There are two such cases. In the first, the outlines did not touch, and their positions make the other actor the
-        collider. In the second, the simulator detected a collision within a step, and the next scene already shows the
-        consequences. Such a consequence is another collider, or a slower vehicle that drives into the back of a faster
-        vehicle.
+        The contradiction occurs in two cases. In the first, the outlines did not touch, and their positions make the
+        other actor the collider. In the second, the simulator detected a collision within a step, and the next scene
+        already shows the consequences. Examples of consequences are another collider, or a slower vehicle that drives
+        into the back of a faster vehicle.
         """
         hit = self.reported
         if hit is None:

@@ -194,7 +194,7 @@ class Encounter:
         ]
 
     def _bent(self, scene: Scene, rows: tuple[int, int], straight_m: float) -> tuple[float, float]:
-        """Return time to collision and gap between an articulated and another vehicle; distant ones are straight."""
+        """Return time to collision and gap of an articulated and another vehicle; if distant, it counts as straight."""
         pair = Scene(
             scene.time_s,
             Roster(tuple(scene.roster.actors[row] for row in rows)),
@@ -343,8 +343,8 @@ _UNKNOWN_S = 4.0  # before the end, a criticality of 0 is unknown: later actors 
 class DangerCourse:
     """The criticality of a recorded trial over time, computed after the trial.
 
-    The criticality is NaN in steps without the agent. It is also NaN if it would be 0 within the last 4 s, because
-    it depends on later steps, which were not recorded.
+    The criticality is NaN in steps without the agent. Instead of 0, the criticality is also NaN within the last 4 s,
+    because later steps that are not recorded could raise it.
 
     Args:
         agent: identifier of the agent.

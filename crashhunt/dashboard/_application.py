@@ -360,8 +360,8 @@ def _assets() -> dict[str, bytes]:
 def _plotly() -> bytes:
     """Return the script of plotly from its Python package, with its single large function in parentheses.
 
-    A browser compiles a function in parentheses while the script loads. It compiles any other function at its first
-    call, which would delay the first view of the page by 0.2 s.
+    A browser compiles a function in parentheses while the script loads. A browser compiles any other function at its
+    first call, which would delay the first view of the page by 0.2 s.
     """
     script = resources.files("plotly").joinpath("package_data", "plotly.min.js").read_bytes()
     head, opening, rest = script.partition(b" : this, () => {\n")

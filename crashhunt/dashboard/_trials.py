@@ -5,8 +5,8 @@ trials. A refresh reads only new trials, namely those with numbers above the gre
 below this number. Trials end in any order, so their numbers do not show the order in which they ended.
 
 Invariants: `outcomes`, the parts and the counts up to the first gap are exact. The sample contains every crash, up to
-`MAX_CRASHES`, and an evenly spaced share of the other trials. This share is halved whenever the sample has more than
-`MAX_POINTS` trials.
+`MAX_CRASHES`, and an evenly spaced share of the other trials. The share of the other trials is halved whenever the
+sample has more than `MAX_POINTS` trials.
 """
 
 from __future__ import annotations
@@ -150,8 +150,9 @@ class TrialCounts:
     def _usual(self, ledger: Ledger, known: Mapping[str, tuple[int, int, int]]) -> str:
         """Return the most frequent outcome if its trials in each part follow from those of other outcomes; else empty.
 
-        This is possible if all trials with this outcome took the same number of steps, as with ``survived``, and
-        numbers are missing only near the end. It avoids sorting a million numbers by part.
+        The method can derive the parts if all trials with this outcome took the same number of steps, as with
+        ``survived``, and numbers are missing only near the end. The derivation avoids sorting a million numbers by
+        part.
         """
         # Steps of invalid trials are counted apart from those of others.
         usual = max(known.keys() - {Outcome.INVALID}, key=lambda outcome: known[outcome][0], default="")

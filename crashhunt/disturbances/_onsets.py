@@ -27,13 +27,13 @@ Order within a step: disturbances of the agent first, because the agent notices 
 around it in the next step are not known. In the step of the onset, models later in this order are drawn as usual.
 Models earlier in the order are drawn on the condition that they are not effective.
 
-Second onsets: a copy with its first onset can be treated as a root again. Either it has no further effective
-onset before it ends, or it has a second one. The same closed form applies to the models after the first onset
-in the same step, and to all models from the next step on. A copy may therefore run without later disturbances,
-and each of its own copies begins with one forced second onset. The copy itself then counts with the
-probability of no second onset. The choice of these copies does not depend on their results, so there is no
-bias. `Forcing` selects the first onsets that get second onsets: at first all, because the hunt learns from
-their results where second onsets are useful. Later, one copy of each root gets second onsets in addition.
+Second onsets: a copy with its first onset can be treated as a root again. Either the copy has no further effective
+onset before its end, or it has a second onset. The same closed form applies to the models after the first onset in the
+same step, and to all models from the next step on. A copy may therefore run without later disturbances, and each of its
+own copies begins with one forced second onset. The copy itself then counts with the probability of no second onset. The
+choice of these copies does not depend on their results, so there is no bias. `Forcing` selects the first onsets that
+get second onsets. At first, all of them do, because the hunt learns from their results where second onsets are useful.
+Later, one copy of each root gets second onsets in addition.
 
 Source: stratified importance sampling (Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 and 9). Cost:
 in each step of the root, one check of every place around the agent at which a model may find a vehicle.
@@ -91,7 +91,7 @@ class Onset:
 
     Args:
         cell: the model and strength, such as ``brake=4.0``.
-        weight: probability of the disturbances that this one represents.
+        weight: probability of all the disturbances that this forced disturbance represents.
         step: the step in which the disturbance begins.
         planned: the forced disturbance and all later disturbances of the copy, in order.
         alone: only the forced disturbance, for a copy on which second disturbances are forced.
@@ -170,7 +170,7 @@ class FirstOnsets:
         seed: seed of the root trial.
         last: number of the last step of the root trial.
         first: the first step in which a disturbance is forced.
-        after_place: in the first step, disturbances are forced only at later positions in the order than this one.
+        after_place: in the first step, disturbances are forced only at later positions in the order than this position.
         stream: numbers that separate these random numbers from others with the same seed.
         places: places of the sampler with the ratios of the forcing; None to create them.
 

@@ -1,9 +1,9 @@
 """Episodes in their own process: libsumo has one simulation per process.
 
-Such a process can be forked between two steps (`RemoteEpisodes.branch`). After SUMO's `loadState`, a run differs from
-the original run. A fork continues exactly, because it has all of SUMO's memory. The fork has its own connection, so
-that the user's program can step it like the original. The user's program itself is never forked, because it may have
-threads, which a fork does not have.
+The process of an environment can be forked between two steps (`RemoteEpisodes.branch`). After SUMO's `loadState`, a run
+differs from the original run. A fork continues exactly, because it has all of SUMO's memory. The fork has its own
+connection, so that the user's program can step it like the original. The user's program itself is never forked, because
+it may have threads, which a fork does not have.
 
 Invariant: a process ends when its connection is closed, and when the user's program ends.
 """

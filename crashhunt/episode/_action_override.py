@@ -148,9 +148,9 @@ class Keeping:
 class HandedOver:
     """Repeats the recorded actions of a vehicle up to a step, and lets its agent act after that.
 
-    The agent is created before the first step, as in every trial. It is reset after the last recorded action, with the
-    seed of the trial. Its first observation is the observation after this step, so it has no observation of earlier
-    steps.
+    The agent is created before the first step, as in every trial. The agent is reset after the last recorded action,
+    with the seed of the trial. The agent's first observation is the observation after this step, so the agent does not
+    receive observations of earlier steps.
 
     Args:
         driver: the agent that takes control.
@@ -191,7 +191,7 @@ def _idle(form: ActionForm) -> int | None:
 
 
 def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
-    """Return the action that changes lanes, and also brakes if one action can do both.
+    """Return the action that changes lanes, and that also brakes if the action space allows both at once.
 
     Raises:
         InvalidEpisodeError: the vehicle has no action for a lane change.
@@ -373,9 +373,9 @@ class ReferenceDriver:
     def _stop_before(self, crossing: Crossing, target: float, around: Surroundings) -> Neighbor | None:
         """Return the position at which the agent must stop for a crossing actor; None if both can pass.
 
-        Both have a time window in the conflict area: the agent accelerates to its target speed, and the actor keeps its
-        speed. According to RSS, right of way is given and not taken, so the agent also stops for an actor that can no
-        longer yield.
+        Agent and actor each have a time window in the conflict area: the agent accelerates to its target speed, and the
+        actor keeps its speed. According to RSS, right of way is given and not taken, so the agent also stops for an
+        actor that can no longer yield.
         """
         if crossing.distance_m <= 0 or (crossing.speed_mps < _STANDS_MPS and crossing.actor_distance_m > 0):
             return None  # it is in the area already and clears it, or the actor waits

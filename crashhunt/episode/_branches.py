@@ -141,7 +141,7 @@ class Brancher(Observer):
         return episode.steps % self._second == 0
 
     def ask(self, episode: Episode) -> None:
-        """Leave a suspended fork if an actor is near, and run the due branches of this fork and of earlier ones."""
+        """Leave a suspended fork if an actor is near, and run the due branches of this fork and of earlier forks."""
         began = time.monotonic()
         try:
             self._ask(episode)

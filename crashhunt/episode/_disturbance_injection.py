@@ -224,7 +224,7 @@ class DisturbanceInjector:
         return found
 
     def _begin_of_agent(self, planned: Disturbance, observations: Observations) -> None:
-        """Begin a disturbance of an agent's observations or actions in the next step, unless one is active."""
+        """Begin a disturbance of an agent's observations or actions in the next step, unless another one is active."""
         agent, kind = planned.agent, planned.what
         going_on = (going for going in self._active if going.last > self._step)  # others are let go in the next step
         already = any(going.vehicle == agent and going.what == kind for going in going_on)

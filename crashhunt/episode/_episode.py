@@ -60,9 +60,10 @@ class Forkable:
         """Fork this process between two steps; the fork continues exactly as the original process would.
 
         Args:
-            work: Function that runs in the fork, which then ends; it may fork again. Its return value is sent to the
-                original process.
-            observed: Whether observers are still called in the fork. Their recordings then go to other files.
+            work: Function that runs in the fork, which then ends; it may fork again. The return value of the function
+                is sent to the original process.
+            observed: Whether observers are still called in the fork. Recordings of the observers in the fork then go to
+                other files.
 
         Raises:
             CannotForkError: The process has resources that a fork cannot copy, such as threads.

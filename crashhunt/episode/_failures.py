@@ -110,7 +110,7 @@ def is_emptied() -> bool:
 
 
 def message_of_error(error: BaseException) -> str:
-    """Return the message of an exception, even if its class cannot produce one; a long message is cut."""
+    """Return the message of an exception, even if its class fails to produce it; a long message is cut."""
     return message_of(error)
 
 

@@ -1,8 +1,8 @@
 """Episodes on SUMO whose uneventful steps run in the compiled core, each in one call.
 
-`FastEpisode` is an `Episode` with the same results, bit by bit. It is the only class that knows the core: `Episode`
-runs each part of each step in Python. After a step of the core, the simulator and the attributes of the episode hold an
-older state. Reading a public attribute first updates them to the state of the core.
+`FastEpisode` is an `Episode` with the same results, bit by bit. `FastEpisode` is the only class that knows the core:
+`Episode` runs each part of each step in Python. After a step of the core, the simulator and the attributes of the
+episode hold an older state. Reading a public attribute first updates them to the state of the core.
 
 The core does not complete a step if an event needs Python code: an agent appears, a vehicle has an unknown property, a
 signal changes the action. `FastPath` then completes the step, or passes the rest of the step to `Episode`. An observer,

@@ -262,7 +262,7 @@ class Nearness(Observer):
 class Recorder(Observer):
     """Observer that records an episode; it adds the digest and the number of traffic events to the result.
 
-    It is the first observer, because a step is complete only after it is recorded.
+    The recorder is the first observer, because a step is complete only after it is recorded.
 
     Args:
         box: the black box, for which `BlackBox.begin` has been called.

@@ -31,8 +31,8 @@ class Questions:
 
     A fork that was killed from outside, by the kernel because of memory or by an administrator, is replaced by another
     fork. A fork that raised an exception, crashed or hung by itself would do so again, so it is not replaced. After
-    three consecutive forks without a result, no more forks run. This applies to the trial if the cause was outside, and
-    to the process if forks failed by themselves.
+    three consecutive forks without a result, no more forks run. The limit applies to the trial if the cause was
+    outside, and to the process if forks failed by themselves.
 
     Args:
         what: name of the forks in the plural, such as ``probes``.

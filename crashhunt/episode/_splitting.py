@@ -10,8 +10,8 @@ the expected weight of the crashes of a tree is the crash probability of a plain
 before the root begins. The measure may depend only on past and current scenes, because a measure of later scenes would
 select paths by their ends. The root is bit-identical to a plain trial.
 
-The random numbers of the agent and of disturbances are the same in all copies. This correlates the paths of a tree, but
-causes no bias. Trees are independent.
+The random numbers of the agent and of disturbances are the same in all copies. Equal random numbers correlate the paths
+of a tree, but cause no bias. Trees are independent.
 
 A copy always runs to the end of its trial. A tree in which a copy has no result counts as incomplete.
 

@@ -100,7 +100,7 @@ class Pair:
             more often.
         both: pairs in which both hunts crashed, equally often.
         p_value: *p* value of McNemar's or Fisher's exact test; None if the number of trials was not fixed in advance.
-        caution: reason why the answer may have another meaning; empty if there is none.
+        caution: a warning that limits the meaning of the answer; empty if there is none.
         test: basis of the verdict: ``pairs``, the evidence of discordant pairs; ``intervals``, the certain intervals of
             both hunts; empty if there is none.
         why_unpaired: reason why there are no pairs; empty if there are pairs.

@@ -130,11 +130,11 @@ def rate_of_counts(
         directory: directory of the hunt.
         settings: settings of the hunt.
         facts: facts from the hunt's ledger.
-        valid: number of valid trials before the first unfinished one.
-        invalid: number of invalid trials before the first unfinished one.
+        valid: number of valid trials before the first unfinished trial.
+        invalid: number of invalid trials before the first unfinished trial.
         crashes: number of crashes among the valid trials.
         steps: number of simulated steps of the valid trials.
-        excluded: number of trials that ended after the first unfinished one.
+        excluded: number of trials that ended after the first unfinished trial.
         confidence: confidence of the certain interval, in percent.
     """
     rule = counting_rule(settings, facts)

@@ -7,8 +7,8 @@
 
 The fork server and the supervisors are forked before any foreign code is imported. The template imports the agents and
 runs no trial. A zygote is a fork of the template that has created the simulator. Every trial runs in a fork of its
-slot's zygote. This process ends with its trial, so a trial cannot be affected by another trial. A zygote carries out
-the requests of its supervisor, which are to fork, to kill, and to report how a process ended.
+slot's zygote. The process of a trial ends with the trial, so a trial cannot be affected by another trial. A zygote
+carries out the requests of its supervisor, which are to fork, to kill, and to report how a process ended.
 """
 
 from __future__ import annotations

@@ -57,8 +57,8 @@ class Executor(Protocol):
 
     The files of a trial are needed only if its result has ``kept``. In this case, the folder
     ``scratch_of(settings.scratch, number)`` of this machine must contain its black box and output before the result is
-    returned. This folder or ``settings.scratch`` must contain the map, if the simulator has a map. An executor on
-    another machine returns no other files.
+    returned. The folder of the trial or ``settings.scratch`` must contain the map, if the simulator has a map. An
+    executor on another machine returns no other files.
     """
 
     @property
@@ -344,8 +344,8 @@ def worker_environment() -> dict[str, str]:
 def snapshot_environment(settings: WorkerSettings) -> dict[str, str]:
     """Return the environment of a process that uses the crashhunt of the snapshot.
 
-    Compiled code must not lie in the snapshot, because it would then count as code. It lies in the cache of this user,
-    in a folder named by the snapshot's digest.
+    Compiled code must not lie in the snapshot, because it would then count as code. Compiled code lies in the cache of
+    this user, in a folder named by the snapshot's digest.
     """
     if not settings.code:
         return {**os.environ, **worker_environment()}

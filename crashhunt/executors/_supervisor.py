@@ -1,4 +1,6 @@
-"""The supervisor of a slot: it gives trials to a zygote, and determines their results. It never runs foreign code.
+"""The supervisor of a slot: it gives trials to a zygote, and determines their results.
+
+A supervisor never runs foreign code.
 
 The supervisor owns the socket to the hunt, the black box, the scratch folder of the trial and its result.
 `check_report` checks the report and the recording that the process of a trial leaves.
@@ -104,7 +106,7 @@ class Supervisor:
         self._made = self._trials = 0
 
     def run(self, spec: TrialSpec) -> EndedTrial:
-        """Run a trial, and return it. Its scratch folder remains if the trial is kept.
+        """Run a trial, and return it. The scratch folder of the trial remains if the trial is kept.
 
         Raises:
             LostTrialError: the process of the trial was killed from outside, or its zygote has ended.
@@ -353,7 +355,7 @@ def be_supervisor(pool: socket.socket, zygote: socket.socket, settings: WorkerSe
         pool: connection to the pool.
         zygote: connection to the zygote of this slot.
         settings: settings of the hunt.
-        parent: the process that started this one; this process ends with it.
+        parent: the process that started this process; this process ends when its parent ends.
     """
     code = 1
     try:

@@ -47,7 +47,7 @@ _MAX_VERIFIED_BRANCHES = 10  # trials; each takes two processes of its own
 
 
 def verify_branches(copies: VerificationRuns) -> BranchReport | None:
-    """Sum up the branches of all trials, and run the likeliest crashed ones from the start in new processes.
+    """Sum up the branches of all trials, and run the likeliest crashed branches from the start in new processes.
 
     Args:
         copies: object that runs crashes of forks from the start.
@@ -124,7 +124,7 @@ _MAX_VERIFIED_PROBES = 3  # trials; each takes two processes of its own
 
 
 def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
-    """Sum up the probes of all trials, and run the mildest crashed ones from the start in new processes.
+    """Sum up the probes of all trials, and run the mildest crashed probes from the start in new processes.
 
     Args:
         copies: object that runs crashes of forks from the start.
@@ -199,8 +199,9 @@ class ForkCrashes:
     """Runs crashes of forks from the start, if such a crash may end the hunt.
 
     Only crashes with the disturbance kinds of the hunt may end the hunt. Probes also try all other kinds, and with the
-    strongest plausible disturbance nearly every trial crashes. Such a crash measures the robustness of the trial, but
-    the hunt does not search for it. If the hunt counts crash types or crashes at fault, only trials end the hunt.
+    strongest plausible disturbance nearly every trial crashes. A crash of such a probe measures the robustness of the
+    trial, but the hunt does not search for this crash. If the hunt counts crash types or crashes at fault, only trials
+    end the hunt.
 
     Args:
         copies: object that runs crashes of forks from the start.
@@ -344,9 +345,9 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
     """Save bundles of the most critical trials of a hunt, and delete other bundles; return them in this order.
 
     Args:
-        again: object that runs trials of the hunt again. Its settings contain the number of bundles to keep; if this is
-            0, existing bundles are not changed. For each trial that could not be kept, a line with the reason is added
-            to its notes.
+        again: object that runs trials of the hunt again. The settings of this object contain the number of bundles to
+            keep; if this is 0, existing bundles are not changed. For each trial that could not be kept, a line with the
+            reason is added to the notes of this object.
     """
     directory, ledger, keep = again.place.path, again.ledger, again.settings.run.near_misses
     if not keep or len(again.stops):

@@ -242,10 +242,11 @@ def spec_of(
     """Return the trial that a sampler proposes, with the disturbances that follow from the trial's seed.
 
     With `--seeds`, trials use the given number of traffic seeds in turn. A traffic seed also determines the scenario's
-    arguments if the sampler is independent. Other samplers propose these arguments themselves.
+    arguments if the sampler is independent. Samplers that are not independent propose the scenario's arguments
+    themselves.
 
-    With a forcing, the trial is a root. In a root, no disturbance is drawn from the first step on in which one may be
-    forced. With splitting, a root has the disturbances of a plain trial.
+    With a forcing, the trial is a root. In a root, no disturbance is drawn from the first step on in which a
+    disturbance may be forced. With splitting, a root has the disturbances of a plain trial.
 
     Raises:
         CrashhuntError: the sampler failed.
@@ -345,7 +346,7 @@ def find_unanswered(ledger: Ledger) -> list[TrialResult]:
 
 
 class Unanswered:
-    """The trials of a hunt that run again. Their rows stay in the ledger until the new results replace them.
+    """The trials of a hunt that run again. The rows of these trials stay in the ledger until new results replace them.
 
     Args:
         ledger: ledger of the hunt.

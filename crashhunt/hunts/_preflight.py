@@ -69,7 +69,7 @@ class Preflight:
         self._listen = listen
 
     def filter_setup_failures(self, result: TrialResult) -> list[TrialResult]:
-        """Return the results to count: none as long as results are held back, or this result and the held-back ones.
+        """Return the results to count: none as long as results are held back, else all held-back results and this one.
 
         Raises:
             ArgumentError: the agent does not start in any trial.
@@ -128,7 +128,7 @@ class Preflight:
 
 
 class WorkerNotices:
-    """Notices of workers. They are read before the first result is recorded, because a notice may refuse the hunt.
+    """Notices of workers. Notices are read before the first result is recorded, because a notice may refuse the hunt.
 
     Args:
         settings: settings of the hunt.

@@ -162,7 +162,7 @@ class HuntStatus:
         outcomes: number of trials with each outcome.
         rate_per_s: trials per second in this run of the hunt.
         elapsed_s: wall time of this run of the hunt, in s.
-        nearest: the trial without a crash that came nearest to one.
+        nearest: the trial without a crash that came nearest to a crash.
         workers: progress of each running trial, by number.
         crashes: number of crashes, with or without a bundle.
         nodes: the machines that currently run trials; None if only this machine does.

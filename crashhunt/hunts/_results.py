@@ -318,8 +318,8 @@ class HuntResults:
     def trials(self) -> NDArray[np.generic]:
         """Return a table with a row for each trial, as a structured array of shape (trials,).
 
-        Its fields are the columns of ``crashhunt trials``; times are in s, distances in m, decelerations in m/s². A
-        missing number is NaN.
+        The fields of the array are the columns of ``crashhunt trials``; times are in s, distances in m, decelerations
+        in m/s². A missing number is NaN.
         """
         names = self.columns
         columns: dict[str, list[Cell]] = {name: [] for name in names}

@@ -368,8 +368,8 @@ class VerificationRuns:
 
         Args:
             found: crashes of forks of different trials.
-            folder: subfolder of the hunt's directory for the bundles. Its former contents are deleted, except bundles
-                that are kept. If a stop is requested, nothing is deleted.
+            folder: subfolder of the hunt's directory for the bundles. The former contents of the folder are deleted,
+                except bundles that are kept. If a stop is requested, nothing is deleted.
             name: name of the phase.
         """
         if self.is_stopped:

@@ -47,7 +47,7 @@ class HuntOwner(TypedDict):
 
 
 class UntilRate(TypedDict):
-    """The progress of a hunt with ``--until-rate``; ``decided_at`` is the number of a trial, or None."""
+    """The progress of a hunt with ``--until-rate``; ``decided_at`` is the number of the deciding trial."""
 
     bar: str
     decided_at: int | None
@@ -336,7 +336,7 @@ class LedgerReader:
         return list(self._select(f"SELECT {what} FROM ({each} FROM {trials})"))
 
     def disturbed_crashes(self, outcomes: tuple[str, ...]) -> tuple[int, tuple[int, str, float] | None]:
-        """Return the number of crashes with disturbances, and number, outcome and log-likelihood of the likeliest one.
+        """Return the number of disturbed crashes, and number, outcome and log-likelihood of the likeliest crash.
 
         Args:
             outcomes: the outcomes that count as a crash.

@@ -164,8 +164,8 @@ class Ledger(LedgerReader):
     def note(self, **facts: Unpack[Facts]) -> None:
         """Set facts about the hunt as a whole, such as its state; the value None removes a fact.
 
-        After the method has returned, all earlier records are on the disk and survive a power failure. It is called
-        about once a second. A call after every trial would cost more than the trials.
+        After the method has returned, all earlier records are on the disk and survive a power failure. This method is
+        called about once a second. A call after every trial would cost more than the trials.
         """
         try:
             with self._lasting():

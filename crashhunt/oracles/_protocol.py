@@ -54,10 +54,11 @@ class Finding:
 class Oracle(Protocol):
     """The protocol of an oracle, which examines scenes and detects crashes, without random numbers and without a clock.
 
-    Contract: a new oracle is created for every trial, with the arguments of ``--oracle NAME:key=value``. Its state
-    therefore belongs to this trial only. `check` is called once per step, in order, and also for the scene before the
-    first step. ``scene.previous`` is the scene one step before, and None at the start. A finding ends the trial if
-    ``--crash-on`` contains its outcome, and is discarded otherwise. An exception counts as a fault of the oracle.
+    Contract: a new oracle is created for every trial, with the arguments of ``--oracle NAME:key=value``. The state of
+    an oracle therefore belongs to one trial only. `check` is called once per step, in order, and also for the scene
+    before the first step. ``scene.previous`` is the scene one step before, and None at the start. A finding ends the
+    trial if ``--crash-on`` contains its outcome, and is discarded otherwise. An exception counts as a fault of the
+    oracle.
     """
 
     name: str
@@ -204,7 +205,7 @@ def described_oracle(text: str) -> dict[str, Category]:
 
 
 def chosen_oracles(asked: Sequence[str], described: Collection[str] = ()) -> tuple[str, ...]:
-    """Return the oracles of a hunt in the order of their checks: the default oracles, then the chosen ones.
+    """Return the oracles of a hunt in the order of their checks: the default oracles, then the chosen oracles.
 
     Args:
         asked: the values of all ``--oracle`` options; ``none`` removes the default oracles.

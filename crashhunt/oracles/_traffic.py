@@ -45,7 +45,7 @@ class TooClose:
         self._gap_m, self._speed = gap_m, speed
 
     def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
-        """Return the nearest miss of each agent that has one in this scene."""
+        """Return the nearest near miss of each agent in this scene, if there is any."""
         findings = []
         for agent in agents:
             row = scene.roster.index.get(agent)
@@ -99,8 +99,8 @@ class TooClose:
 class TrafficEvents:
     """Reports the simulator's own traffic events, such as red lights, standstills and teleports.
 
-    An episode uses this oracle as the last one, so that a collision in the same step takes precedence. It is used only
-    if ``--crash-on`` names a traffic event.
+    An episode uses this oracle as the last one, so that a collision in the same step takes precedence. The oracle is
+    used only if ``--crash-on`` names a traffic event.
     """
 
     name = "traffic-events"

@@ -1,4 +1,4 @@
-"""Panels: views of an agent's internal state next to the scene. They are plain data, and are drawn when requested.
+"""Panels: views of an agent's internal state next to the scene. Panels are plain data, and are drawn when requested.
 
 An agent creates panels in every step, even if they are not drawn. Pillow is therefore imported only by the first
 drawing.

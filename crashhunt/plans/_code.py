@@ -105,7 +105,9 @@ def describe_code(
 
 
 def imported_by(scenario: Scenario, settings: HuntSettings) -> ImportedModules:
-    """Return the modules that trials import. A separate process imports them if one is not crashhunt's own.
+    """Return the modules that trials import.
+
+    A separate process imports the modules if any module is not crashhunt's own.
 
     Raises:
         CrashhuntError: a module cannot be imported, or has ended or stopped its process.

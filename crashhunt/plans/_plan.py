@@ -190,7 +190,7 @@ class Owners:
         Args:
             word: name of the argument as the user wrote it.
             ask: function that returns the arguments of an agent from its code; called only if the record does not
-                contain the name. It returns None if the code may not run.
+                contain the name. The function returns None if the code may not run.
             option: option that contains the name, for error messages.
 
         Raises:
@@ -226,8 +226,8 @@ class Owners:
 def agent_of(word: str, agents: Collection[str]) -> str:
     """Return the agent whose id and a dot begin the given word; empty if the word has no such prefix.
 
-    Identifiers may contain dots, and one may be a
-    prefix of another. If several match, the longest is used.
+    Identifiers may contain dots, and an identifier may be a prefix of another identifier. If several match, the longest
+    is used.
     """
     return next((agent for agent in sorted(agents, key=len, reverse=True) if word.startswith(f"{agent}.")), "")
 
@@ -270,8 +270,8 @@ def plan_with_code(request: Request, *, survey: Surveyor | None = None) -> tuple
 
     Args:
         request: the request of the user.
-        survey: function that returns the scenario with the vehicles that an agent can replace. It is called last
-            because it may take long, and invalid requests are refused before.
+        survey: function that returns the scenario with the vehicles that an agent can replace. The function is called
+            last because it may take long, and invalid requests are refused before.
 
     Raises:
         CrashhuntError: the request is invalid.
@@ -398,7 +398,8 @@ def disturber(
 
     Args:
         scenario: scenario in which disturbances take place.
-        disturb: the disturbances: ``NAME=RATE`` for random ones, or the exact disturbances at given steps.
+        disturb: the disturbances as words: ``NAME=RATE`` for random disturbances, or the exact disturbances at given
+            steps.
         agents: identifiers of the agents around which disturbances take place.
         find: function that returns the disturbance model of a name; by default the model is imported in this process.
 

@@ -21,19 +21,20 @@ root of each cell's smoothed crash share. This proposal minimizes the variance f
 The estimated interval combines two parts. Undisturbed crashes of roots and plain trials are counted, so their share has
 Clopper and Pearson's interval, which is valid for any number of crashes. The part with weights has Student's t interval
 with Hall's correction for skewness. Few roots have large values, so without the correction the interval would too often
-be too low. It is reported only under two conditions. The effective sample size and the number of roots with a crash are
-at least 20, and no root contributes more than 20 % of the sum. The distances of both intervals from their estimates are
-added as squares. No interval from weighted copies can exclude a failure mode that no copy has met. The estimated
-interval does not include undisturbed crashes before the first one occurs.
+be too low. The estimated interval is reported only under two conditions. The effective sample size and the number of
+roots with a crash are at least 20, and no root contributes more than 20 % of the sum. The distances of both intervals
+from their estimates are added as squares. No interval from weighted copies can exclude a failure mode that no copy has
+met. The estimated interval does not include undisturbed crashes before the first undisturbed crash occurs.
 
-The certain interval covers such failure modes as well. It is the interval of `crashhunt.rates._certain_interval`, so it
-is valid at any number of roots. A plain trial is a unit with 0 or 1 crashes and exposure 1. A root is a unit with the
-value V, which is at most B. The forcing fixes B before the root begins. V / B therefore counts as events and 1 / B as
-exposure, and the ratio of their means is the rate. A root without a crash counts as 1 / B of a trial. The lower end has
-a second source, the copies alone. The value of the copies is bounded by their weights, so the bound is far below 1 if
-disturbances are rare. The crash probability in the copies is a part of the whole crash probability, so its lower bound
-is also a lower bound of the whole. By Bonferroni's inequality, both intervals together have the given confidence. The
-first interval has three quarters of the error probability, the second a quarter.
+The certain interval covers such failure modes as well. The certain interval comes from
+`crashhunt.rates._certain_interval`, so it is valid at any number of roots. A plain trial is a unit with 0 or 1 crashes
+and exposure 1. A root is a unit with the value V, which is at most B. The forcing fixes B before the root begins. V / B
+therefore counts as events and 1 / B as exposure, and the ratio of their means is the rate. A root without a crash
+counts as 1 / B of a trial. The lower end has a second source, the copies alone. The value of the copies is bounded by
+their weights, so the bound is far below 1 if disturbances are rare. The crash probability in the copies is a part of
+the whole crash probability, so its lower bound is also a lower bound of the whole. By Bonferroni's inequality, both
+intervals together have the given confidence. The first interval has three quarters of the error probability, the second
+a quarter.
 
 Sources: Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 to 9; Kish, Survey sampling, 1965, for the
 effective sample size; P. Hall, On the removal of skewness by transformation, JRSS B 54(1), 1992; C. J. Clopper and

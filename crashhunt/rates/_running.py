@@ -99,8 +99,8 @@ class RateWatch:
         """Return the current rate of the hunt.
 
         Args:
-            now: whether the rate must be up to date; otherwise a rate some moments old is returned if a new one takes
-                too long.
+            now: whether the rate must be up to date; otherwise a rate some moments old is returned if computing a new
+                rate takes too long.
         """
         sequence = self.sequence
         version = sequence.valid + sequence.invalid + sequence.not_random + sequence.trained_on
@@ -140,7 +140,7 @@ class BarWatch(RateWatch):
     not count. Decision, interval and estimate therefore do not depend on the number of workers.
 
     The watch ends undecided if the rate is certainly within 20 % of the threshold, because a rate equal to the
-    threshold would never be decided. It also ends undecided if too many trials are invalid, or if trials have no
+    threshold would never be decided. The watch also ends undecided if too many trials are invalid, or if trials have no
     exposure.
 
     Args:

@@ -77,7 +77,7 @@ def crash_shares(trees: Iterable[tuple[Forced, bool]], levels: int) -> list[floa
     """Return the crash probability of all paths, and of the paths that reach each level; NaN if no path does.
 
     Args:
-        trees: results of trees, each with whether the root trial itself crashed.
+        trees: pairs of a tree's result and whether its root trial itself crashed.
         levels: number of levels.
     """
     paths = [

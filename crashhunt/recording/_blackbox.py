@@ -524,7 +524,7 @@ class BlackBoxFile:
         self._reserved += CHUNK
 
     def begin(self, *, trial: int, started: float) -> None:
-        """Discard the previous trial and prepare for the next one, whose process writes its own number at its start."""
+        """Discard the previous trial and prepare for the next; its process writes its own number at its start."""
         header = HEADER.pack(MAGIC, os.getpid(), 0, trial, started, FIRST, 0, Phase.SETUP, 0)
         os.pwrite(self._file, header + REPORT.pack(0), 0)
 

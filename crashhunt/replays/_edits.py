@@ -93,7 +93,7 @@ def with_other_words(
     """Return the disturbances of a trial after an edit of ``disturb`` in its ``hunt.toml``.
 
     Disturbances at given steps are replaced by those of the new text. Drawn disturbances are removed if their kind no
-    longer has a rate. They are not drawn again if their rate has changed.
+    longer has a rate. Drawn disturbances are not drawn again if their rate has changed.
 
     Args:
         planned: the planned disturbances of the trial.
@@ -206,8 +206,8 @@ class Edits:
 
     Args:
         agents: differences in the agents and their arguments.
-        others: all other differences, such as traffic, length and crash criteria. They may explain why a crash does not
-            reproduce.
+        others: all other differences, such as traffic, length and crash criteria. Other differences may explain why a
+            crash does not reproduce.
         ignored: changes in ``hunt.toml`` that have no effect on a replay.
     """
 

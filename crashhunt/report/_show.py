@@ -451,6 +451,6 @@ def _thinned(steps: list[StepRecord], rows: int, *, always: int | None) -> list[
 
 
 def _steps_around(steps: list[StepRecord], rows: int, middle: int) -> list[StepRecord]:
-    """Return about `rows` evenly spaced steps that contain the middle one."""
+    """Return about `rows` evenly spaced steps that include the step in the middle."""
     every = math.ceil(len(steps) / rows)
     return [step for step in steps if (step.step - middle) % every == 0]

@@ -287,7 +287,7 @@ def describe_types(count: int, by_cause: int | None, noun: str = "type") -> str:
 
 
 def describe_kinds(status: HuntStatus) -> str:
-    """Return as text the number of crash types, of causes if these count, and the age of the last new type."""
+    """Return as text the numbers of crash types and causes, and the age of the last new crash type."""
     words = describe_types(len(status.kinds or ()), status.types_by_cause, "crash type")
     if status.newest_kind_s is None:
         return words

@@ -202,7 +202,7 @@ def _summary(moment: DangerousMoment, total: float) -> dict[str, object]:
 
 
 def about_disturbances(recording: Recording, result: TrialResult, first_step: int) -> list[str]:
-    """Return the disturbances in the last steps of a trial, one sentence each, and the number of earlier ones.
+    """Return the disturbances in a trial's last steps, one sentence each, and the number of earlier disturbances.
 
     Args:
         recording: recording of the episode.

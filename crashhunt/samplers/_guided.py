@@ -7,10 +7,10 @@ read the scale of criticality, namely the progress of strategies, and the critic
 Invariant: a strategy keeps at least 2 % of the trials (probes), and the even search gets everything that strategies
 do not earn. A hunt with a misleading criticality is therefore never much worse than an even search.
 
-Why not the best strategy alone: rising criticality does not imply a crash, which is unknown before the first one. Two
-signs show that criticality misleads. Either strategies are far ahead of the unguided trials and make no progress, or
-they never exceed a criticality of 0.5. In both cases their share is capped, and a part of it explores other peaks
-(`Niches`).
+Reason against using only the best strategy: rising criticality does not imply a crash, and before the first crash this
+is unknown. Two signs show that criticality misleads. Either strategies are far ahead of the unguided trials and make no
+progress, or they never exceed a criticality of 0.5. In both cases their share is capped, and a part of it explores
+other peaks (`Niches`).
 
 After the first crash, new crash types count. Before each proposal, the rate of new types that strategies find is drawn
 from its posterior, and so is that of unguided trials (Thompson 1933). Strategies do not search in basins of crashes
@@ -163,9 +163,9 @@ class KnownCrashes:
     """The places in the space of arguments that are not worth another trial.
 
     A crash excludes a neighbourhood that depends on its type. If the result has no type, a wide neighbourhood and the
-    basin of the crash are excluded at once. If it has one, almost nothing is excluded at first, because the same
-    arguments may lead to other types. After three consecutive crashes of known types, the wide neighbourhood and the
-    basin are excluded.
+    basin of the crash are excluded at once. If the result has a type, almost nothing is excluded at first, because the
+    same arguments may lead to other types. After three consecutive crashes of known types, the wide neighbourhood and
+    the basin are excluded.
 
     The same traffic leads to the same crash even with other arguments, so no proposal reuses the seed of a crash.
 
@@ -190,7 +190,7 @@ class KnownCrashes:
         return bool(len(self._radii))
 
     def cover(self, point: NDArray[np.float64], seed: int | None = None) -> bool:
-        """Return whether a point is near a known crash or in its basin, or a seed is that of one."""
+        """Return whether a point is near a known crash or in its basin, or a seed is the seed of a known crash."""
         return seed in self._seeds or bool(self._covered(point[None])[0])
 
     def is_new(self, trial: ScoredTrial) -> bool:
@@ -198,7 +198,7 @@ class KnownCrashes:
         return trial.kind not in self._kinds if trial.kind else not self.cover(trial.point)
 
     def outside(self, trials: Sequence[ScoredTrial]) -> list[ScoredTrial]:
-        """Return the trials that are neither near a known crash or in its basin, nor have the seed of one."""
+        """Return the trials that are not near a known crash, not in its basin, and do not have its seed."""
         if not trials:
             return []
         covered = self._covered(np.array([trial.point for trial in trials])).tolist()
@@ -291,7 +291,7 @@ class KnownCrashes:
 def nearest_better(
     points: NDArray[np.float64], scores: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Return the distance from each point to the nearest one with a greater score, and its index; infinity if none."""
+    """Return the distance from each point to the nearest point with a greater score (or infinity), and its index."""
     away = (points**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * points @ points.T
     away = np.sqrt(np.maximum(away, 0.0))
     away[scores <= scores[:, None]] = np.inf

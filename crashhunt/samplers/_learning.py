@@ -1,4 +1,4 @@
-"""Samplers that learn: each has one strategy, and every fifth trial is a plain random one."""
+"""Samplers that learn: each has one strategy, and every fifth trial is drawn at random."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
 """A model of criticality over arguments and seeds, which selects the most promising of many candidates.
 
-Computes a Gaussian process (Rasmussen and Williams 2006) over the most critical and the latest trials. Its kernel has
-two parts, one of arguments alone, and one of arguments that counts only between trials with the same seed, because the
-seed determines the traffic. The rest is noise. Length scales and shares are fitted while results arrive. Of 64
-candidates, most of them neighbours of critical trials, the model proposes the one that most likely exceeds the best
-score so far (Kushner 1964).
+Computes a Gaussian process (Rasmussen and Williams 2006) over the most critical and the latest trials. The kernel of
+this process has two parts. The first depends only on the arguments. The second counts only between trials with the same
+seed, because the seed determines the traffic. The rest is noise. Length scales and shares are fitted while results
+arrive. Of 64 candidates, most of them neighbours of critical trials, the model proposes the candidate that most likely
+exceeds the best score so far (Kushner 1964).
 
 Why not a library: proposals must follow from the reported results bit by bit, and take milliseconds.
 
@@ -139,7 +139,7 @@ class Model:
 
     Args:
         cube: cube of the arguments.
-        like: a model whose fitted parameters are the initial ones.
+        like: a model whose fitted parameters are the initial parameters of this model.
     """
 
     def __init__(self, cube: Cube, like: Model | None = None) -> None:

@@ -57,7 +57,7 @@ class OptunaMaker:
     wants_hunt: ClassVar[bool] = True
 
     def __call__(self, space: Space, *, points: int = 10, hunt: HuntFacts = HuntFacts()) -> Learning:  # noqa: B008
-        """Return a sampler of a space; every fifth of its trials is a plain random one."""
+        """Return a sampler of a space; every fifth of its trials is drawn at random."""
         return _OptunaSampler(space, self.kind, points=points, hunt=hunt)
 
 
@@ -231,7 +231,7 @@ class Storage(InMemoryStorage):  # type: ignore[misc] # whose types are not look
             self._asked = None
 
     def create_new_trial(self, study_id: int, template_trial: FrozenTrial | None = None) -> int:
-        """Return the id of the requested trial, or of a new one."""
+        """Return the id of the requested trial, or of a new trial."""
         if self._asked is not None:
             return _ASKED
         self.count += 1

@@ -66,23 +66,23 @@ class Sampler(Protocol):
     """Proposes trials, and may learn from their results.
 
     A sampler is created with the space and, as a keyword, ``points``: the number of values to try for a range without a
-    step. It also receives ``hunt`` if it requests this (`ReceivesHuntFacts`).
+    step. A sampler also receives ``hunt`` if the sampler requests this (`ReceivesHuntFacts`).
 
     Contract: a proposal depends on the constructor's arguments, the trial's number, its generator, and the reported
-    results in their order. It never depends on time, on earlier requests or on anything else. A new sampler that
-    receives the same results therefore makes the same proposals, so an interrupted hunt can resume.
+    results in their order. A proposal never depends on time, on earlier requests or on anything else. A new sampler
+    that receives the same results therefore makes the same proposals, so an interrupted hunt can resume.
 
-    A sampler whose ``learns`` is false receives no results. Its proposal for a number is the same for any number of
-    parallel trials.
+    A sampler whose ``learns`` is false receives no results. The proposal of such a sampler for a trial is the same for
+    any number of parallel trials.
 
     A sampler that learns receives results by this rule. The lag is the number of parallel trials of the hunt.
 
     - Before the proposal for trial n, it receives all new results up to trial n - lag, in the order of their numbers.
     - A trial that has not ended by then is reported late, before the first proposal after its end. One trial that
       hangs therefore does not stop the sampler from learning.
-    - A hunt with ``--deterministic`` waits: the sampler receives exactly the results up to n - lag. The lag is
-      4 + n / 8, rounded down. It is at most 32, or the parallel trials of the first run if those are more. The trials
-      are then the same at any speed.
+    - A hunt with ``--deterministic`` waits: the sampler receives exactly the results up to n - lag. The lag is 4 + n /
+      8, rounded down. The lag is at most 32, or the number of parallel trials of the first run if that is greater. The
+      trials are then the same at any speed.
     - The ledger stores proposals, and the results reported before each, before their trials start. A resumed hunt runs
       the same trials, and reports results in the same order.
     """
@@ -138,8 +138,8 @@ class Independent(Protocol):
     """A sampler that may draw every trial from the distributions of its space, independently of all other trials.
 
     If ``independent`` is true, the share of trials that crash estimates the crash rate of the agent, so the rate gets a
-    confidence interval. Such a sampler draws the scenario's arguments first, in order of their names. Two hunts with
-    the same seed therefore have the same traffic for any agent.
+    confidence interval. An independent sampler draws the scenario's arguments first, in order of their names. Two hunts
+    with the same seed therefore have the same traffic for any agent.
     """
 
     independent: bool

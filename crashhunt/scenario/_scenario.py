@@ -1,6 +1,6 @@
 """Scenarios, and the descriptors of the simulators in which scenarios run.
 
-A `Scenario` describes how to set up an episode. It is plain data, so reading, writing or hashing a scenario imports no
+A `Scenario` describes how to set up an episode. A scenario is plain data, so reading, writing or hashing it imports no
 simulator. A `Backend` is the descriptor of a simulator. Scenarios, plans, snapshots and replays use the descriptor for
 everything that differs between simulators.
 
@@ -468,8 +468,8 @@ class Backend:
 
     Args:
         title: name of the simulator for users.
-        table: the dataclass of the simulator's table in ``scenario.toml``. Its types must be importable at run time.
-            Allowed are numbers, text, lists, tuples, tables of these, and further dataclasses.
+        table: the dataclass of the simulator's table in ``scenario.toml``. The types of its fields must be importable
+            at run time. Allowed are numbers, text, lists, tuples, tables of these, and further dataclasses.
         example: the required keys of the table, for the message about a missing table.
         keys: the optional keys of ``scenario.toml`` that this simulator uses (``warmup_s``, ``insertion_timeout_s``,
             ``agents.route``, …). All other optional keys are refused. None if the keys are unknown.
@@ -500,8 +500,8 @@ class Backend:
         explained: function that returns the error in the scenario after a failed setup, from the failure's message and
             the printed output; None if the scenario is not the cause.
         side_effect: function that returns the side effects of an untrusted scenario, as a text after "the crash is a
-            stranger's, and"; empty if there are none. It receives the values of the trial's scenario arguments, and the
-            specifications of text arguments. Without this function, untrusted scenarios are refused.
+            stranger's, and"; empty if there are none. The function receives the values of the trial's scenario
+            arguments, and the specifications of text arguments. Without this function, untrusted scenarios are refused.
         right_of_way: function that returns which vehicles must yield at the junctions of the map; None if this is
             unknown.
         plays_paths: whether the simulator can move other actors along recorded paths.
@@ -649,7 +649,7 @@ class TrafficSurvey:
         module: module with a function ``main()``, which runs in its own process; its only argument is the file of a
             `SurveyJob`.
         refine: function that returns the scenario with the candidates that the runs confirm, given the output of
-            ``module``. It raises `ScenarioError` if no trial can be valid.
+            ``module``. The function raises `ScenarioError` if no trial can be valid.
         restore: function that returns the scenario with the candidates of an earlier hunt, given that hunt's scenario;
             None if the hunt drew no candidates.
     """

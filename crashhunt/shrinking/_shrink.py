@@ -223,7 +223,7 @@ def _constructor_defaults(rerun: Rerun) -> dict[tuple[str, str], Value]:
 def _write_smallest(rerun: Rerun, search: Minimizer, signature: Signature) -> Bundle | None:
     """Run the smallest candidate in a new process, and write its bundle, which another process then confirms.
 
-    If a candidate does not reproduce, the next larger one is run. The result is None if no candidate reproduces.
+    If a candidate does not reproduce, the next larger candidate is run. The result is None if no candidate reproduces.
     """
     bundle = rerun.bundle
     tries = _MAX_CONFIRMATIONS if bundle.confirmed is False else 1
@@ -240,7 +240,10 @@ def _write_smallest(rerun: Rerun, search: Minimizer, signature: Signature) -> Bu
 
 
 def _confirm_smallest(small: Bundle) -> Bundle:
-    """Confirm the minimized crash. Its bundle is already written, because the confirmation may take a minute."""
+    """Confirm the minimized crash.
+
+    The bundle of this crash is already written, because the confirmation may take a minute.
+    """
     try:
         small.write()
         small = confirm(small, trusted=True) or small  # it runs what the whole crash was trusted to run

@@ -43,8 +43,8 @@ class Minimizer:
         rerun: the crash to minimize.
         runs: object that runs the candidates.
         form: Whether the other actors drive; with ``either``, they drive if few of them remain.
-        constructor_defaults: The defaults in the agents' own code, by agent and name. They take precedence over the
-            defaults of the scenario, because the user sees them where the agent is fixed.
+        constructor_defaults: The defaults in the agents' own code, by agent and name. The defaults in the code take
+            precedence over the defaults of the scenario, because the user sees them where the agent is fixed.
 
     Attributes:
         best: the smallest candidate that crashed in the same manner.
@@ -138,7 +138,7 @@ class Minimizer:
 
     @contextmanager
     def _no_longer(self) -> Iterator[None]:
-        """Refuse candidates that crash later than the best one: steps count more than arguments and disturbances."""
+        """Refuse candidates that crash later than the best candidate; steps count more than arguments."""
         before, self._runs.most_steps = self._runs.most_steps, min(self._runs.most_steps, self._steps)
         try:
             yield
@@ -290,7 +290,7 @@ class Minimizer:
         """Remove more actors with a later beginning; actors that mattered only before it are then unnecessary.
 
         The method first tries each other actor alone, and in a pair with the collision partner. Then the method starts
-        again from all actors and removes the unnecessary ones. An agent that reacts to all visible actors may need
+        again from all actors and removes all unnecessary actors. An agent that reacts to all visible actors may need
         other actors than with the original beginning.
         """
         begins = list(dict.fromkeys((part.begin, *scripting.begins(part.agents), 0)))

@@ -123,8 +123,8 @@ class Simulator(Protocol):
     """Runs the episodes of a scenario, one after another.
 
     Contract: after two calls of `reset` with equal arguments, all methods return bit-identical results for equal
-    actions. This holds in the same process and in another process, whatever ran before. The simulator never changes an
-    array that it has returned.
+    actions. This guarantee holds in the same process and in another process, whatever ran before. The simulator never
+    changes an array that it has returned.
 
     Each optional capability is its own protocol: `ReportsNotices`, `FlattensObservations`, `RestoresObservations`,
     `NamesObservations`, `ReportsEvents`, `HasMap`, `HasWindow`, `SupportsFullBraking`, `ReportsSurroundings`,
@@ -324,7 +324,7 @@ class TranslatesMotion(Protocol):
         Args:
             agent: The identifier of an agent's vehicle that has not left the simulation.
             action: The action that is corrected.
-            speed_mps: The speed after the step, in m/s; None leaves the acceleration.
+            speed_mps: The speed after the step, in m/s; None keeps the acceleration of the given action.
             keeps_lane: Whether the vehicle steers to the middle of its lane.
         """
 
@@ -482,7 +482,7 @@ class FastStepper(Protocol):
 
     @property
     def roster(self) -> Roster:
-        """The actors in sight. They may already be the actors after the step that `core` runs."""
+        """The actors in sight; while `core` runs a step, they may already be the actors after this step."""
 
     def enter(self, ids: tuple[str, ...], /) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:
         """Set the vehicles in sight; return their data for `core`, or None if `core` cannot continue with them."""

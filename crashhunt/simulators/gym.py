@@ -1,4 +1,7 @@
-"""Any Gymnasium environment as a simulator. Its scenes have no actors: recordings hold observations and actions."""
+"""Any Gymnasium environment as a simulator.
+
+Scenes of such environments have no actors: recordings contain observations and actions.
+"""
 
 from __future__ import annotations
 

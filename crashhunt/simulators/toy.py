@@ -1,7 +1,7 @@
 """The toy simulator: controlled vehicles in a row on one straight lane, behind a leader that brakes at random.
 
-The toy replaces simulators in tests, and is the shortest example of the protocol. It is pure Python, needs microseconds
-per step, and can fail on purpose in every way in which a simulator can fail.
+The toy replaces simulators in tests, and is the shortest example of the protocol. The toy is pure Python, needs
+microseconds per step, and can fail on purpose in every way in which a simulator can fail.
 """
 
 from __future__ import annotations

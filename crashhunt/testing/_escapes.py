@@ -56,8 +56,8 @@ class RecordedThenBrakes:
     Args:
         log: path of a ``log.mcap``.
         agent: identifier of the agent whose actions are repeated.
-        after: the step after which the agent brakes. If it is not overruled and the log has no further action, the last
-            action is repeated.
+        after: the step after which the agent brakes. If the agent is not overruled and the log has no further action,
+            the last action is repeated.
         action_space: action space of the vehicle.
     """
 

@@ -119,7 +119,7 @@ class ExecutorContract:
         assert set(self._collect(executor, 1)) == {9}
 
     def test_it_states_how_much_it_runs_and_where_that_is(self, executor: Executor) -> None:
-        """A running trial has a progress or an unknown one; trials that were not submitted have none."""
+        """A running trial has a known or unknown progress; trials that were not submitted have no progress."""
         assert executor.capacity == 2
         assert dict(executor.where()) == {}
         executor.submit(self._spec(3, hang_at_step=5))

@@ -61,7 +61,7 @@ def assert_survives(
     parallel: int = 0,
     directory: Path | str | None = None,
 ) -> None:
-    """Run trials with an agent; if it crashes in one, fail and print the minimized crash.
+    """Run trials with an agent; if the agent crashes, fail and print the minimized crash.
 
     The same seed runs the same trials. The printed call can be pasted into a test; it contains ``example``, with which
     it runs only this trial.
@@ -74,7 +74,7 @@ def assert_survives(
         seed: seed of the hunt.
         arguments: arguments of the agent, as values or specifications; see `crashhunt.run`.
         scenario_arguments: arguments of the scenario, as values or specifications.
-        example: the single trial to run. Its arguments replace those in ``arguments``.
+        example: the single trial to run. The arguments of the example replace those in ``arguments``.
         budget: maximum number of trials to minimize a crash; 0 to skip the minimization.
         parallel: number of trials at a time; 0 for one per core.
         directory: directory in which the hunt is kept, such as pytest's ``tmp_path``; None to delete the hunt.

@@ -1,8 +1,8 @@
 """Episodes that begin shortly before a saved crash, or with new traffic of the same hunt.
 
-The recorded actions are repeated up to the step at which the agent takes over. This needs neither the code of the
-recorded agent nor its state. Each observation and scene of these steps is compared with the recording bit for bit, to
-ensure that the agent faces the situation that led to the crash.
+The recorded actions are repeated up to the step at which the agent takes over. Repeating the actions needs neither the
+code of the recorded agent nor its state. Each observation and scene of these steps is compared with the recording bit
+for bit, to ensure that the agent faces the situation that led to the crash.
 """
 
 from __future__ import annotations

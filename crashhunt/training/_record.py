@@ -1,6 +1,6 @@
 """``trained_on.json``: the traffic seeds on which a policy was trained.
 
-It lies next to the policy and is part of snapshots.
+The file lies next to the policy and is part of snapshots.
 
 A comparison on these traffic seeds shows only what the policy has memorized. `held_out_traffics` returns the rule by
 which `crashhunt compare`, `gate` and `rate` keep only the traffic seeds of the test part, regardless of their outcome.

@@ -114,8 +114,8 @@ class Disturbance(Serializable):
             value.
         how_long: The duration in s of simulation time.
         agent: The controlled vehicle around which the place is chosen.
-        vehicle: The vehicle that was at the place. It is empty if the disturbance is only planned, or if no vehicle was
-            at the place. A hold (`HOLD_KINDS`) names its vehicle from the beginning.
+        vehicle: The vehicle that was at the place. The field is empty if the disturbance is only planned, or if no
+            vehicle was at the place. A hold (`HOLD_KINDS`) names its vehicle from the beginning.
     """
 
     step: int

@@ -90,9 +90,9 @@ class ForcedCopy(Serializable):
         step: the step at which the copy ended.
         disturbed: whether any disturbance had an effect in the copy.
         disturbances: if the copy crashed, all disturbances that were planned from the start of the trial.
-        within: conditional probability of this copy, given its first disturbance. It is 1 if later disturbances are
-            drawn as usual. With forced second disturbances, it is the probability of the forced second disturbance, or
-            of none.
+        within: conditional probability of this copy, given its first disturbance. The probability is 1 if later
+            disturbances are drawn as usual. With forced second disturbances, it is the probability of the forced second
+            disturbance, or of none.
         second: the cell (model and strength) of the forced second disturbance; empty if there is none.
         reseeding: with splitting, the steps after which the simulator got other seeds, with these seeds; None without
             splitting.
@@ -158,8 +158,8 @@ class Stress(Serializable):
 
     Args:
         margin: The robustness margin: strength of the minimal disturbance that made a probe crash, as a share of the
-            strongest plausible one. It is 1 if no probe crashed, and 0 if the trial crashed without a disturbance. None
-            if a probe has no result.
+            strongest plausible disturbance. The margin is 1 if no probe crashed, and 0 if the trial crashed without a
+            disturbance. None if a probe has no result.
         probes: Number of probes.
         steps: Number of simulated steps of the probes.
         left_out: Number of probes that were skipped because the budget of steps was used up.

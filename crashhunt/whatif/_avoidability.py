@@ -92,7 +92,8 @@ class _Tries:
 class AvoidanceSearch:
     """Search for the last step from which a manoeuvre of the agent avoids a crash.
 
-    The search bisects. It then runs the steps after the last step that helped, because a later step may help again.
+    The search bisects. The search then runs the steps after the last step that helped, because a later step may help
+    again.
 
     Args:
         end: number of the step of the crash.
@@ -225,8 +226,8 @@ def judge(
     """Return until when and how a collision could have been avoided, and the causes of the crash, by running it again.
 
     The agent is overruled after some step: it brakes as hard as its vehicle can, or changes lanes and brakes. The other
-    vehicles react freely. The search begins at a calculated step and bisects. It then runs the steps after the last
-    step that avoided the crash, as far as the number of runs allows. The reason is that a later step may avoid the
+    vehicles react freely. The search begins at a calculated step and bisects. The search then runs the steps after the
+    last step that avoided the crash, as far as the number of runs allows. The reason is that a later step may avoid the
     crash even if an earlier step does not. Causes are found by removing one candidate at a time.
 
     Args:

@@ -10,9 +10,9 @@ short. If the runs are stopped, only runs before the first unfinished number cou
 Cost: a run is a fork of a simulator that has been set up, so only its steps are simulated. On a busy machine, one run
 at a time took 72 ms for 148 steps on loop, and 108 ms for 392 steps on merge. The trial itself takes 45 and 91 ms of
 this time. A fork 20 steps before the end would cost about 9 ms and save all steps before it. The runs would be about
-1.7 and 3.5 times as fast, and 50 futures would take 3.4 s each instead of 4.7 s and 6.8 s, start-up included. Such
-forks are not implemented, because the steps before the fork would be verified only once. Without forks, each counted
-run is verified separately.
+1.7 and 3.5 times as fast, and 50 futures would take 3.4 s each instead of 4.7 s and 6.8 s, start-up included. Forks at
+a later step are not implemented, because the steps before the fork would be verified only once. Without forks, each
+counted run is verified separately.
 """
 
 from __future__ import annotations
@@ -306,7 +306,7 @@ class _Runs:
 
 
 def _equal_futures(runs: Iterable[Run]) -> int:
-    """Return the number of futures if all are equal; 0 if they differ, or if there is only one."""
+    """Return the number of futures if all are equal; 0 if they differ, or if there is only one future."""
     digests = {run.number: run.digest for run in runs if not run.excluded}
     return len(digests) if len(digests) > 1 and len(set(digests.values())) == 1 else 0
 

@@ -1,11 +1,11 @@
 """Finds what an agent omitted: reruns the trial of a crash with a reference driver that controls a part of the driving.
 
-First the reference driver only watches. That run must be bit-identical to the recording, and reports the periods in
-which the agent was not safe. Then the reference driver takes control of speed or lanes from the beginning of such a
-period, and from 0.5 s and 1 s before. The period is the cause if no such run ends in a crash. The run from its
-beginning is made twice, and must have the same digest. If all crashes of such runs differ from the recorded crash, the
-part of the driving that the agent kept may have caused them. Then the reference driver takes control of speed and lanes
-from the same steps, and no run may end in a crash.
+First the reference driver only watches. The run with the watching driver must be bit-identical to the recording, and
+reports the periods in which the agent was not safe. Then the reference driver takes control of speed or lanes from the
+beginning of such a period, and from 0.5 s and 1 s before. The period is the cause if no such run ends in a crash. The
+run from its beginning is made twice, and must have the same digest. If all crashes of such runs differ from the
+recorded crash, the part of the driving that the agent kept may have caused them. Then the reference driver takes
+control of speed and lanes from the same steps, and no run may end in a crash.
 
 Cost: one run in which the reference driver watches, three or six for each candidate, and one repetition; at most
 `_MAX_CANDIDATES` candidates.

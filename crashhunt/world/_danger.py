@@ -3,9 +3,9 @@
 The criticality of a step is the greater of two measures:
 
 - Post-encroachment time (PET; B. L. Allen, B. T. Shin and P. J. Cooper, Analysis of traffic conflicts and collisions,
-  1978): the time between the agent's and another actor's presence at the same place. It is measured along the path that
-  the agent really drove, so oncoming traffic in a bend does not count. For the vehicle ahead in a queue, this is the
-  time gap. For a PET of t s, the criticality is exp(-t / 1.2 s): 0.92 for 0.1 s, 0.43 for 1 s, 0.19 for 2 s.
+  1978): the time between the agent's and another actor's presence at the same place. PET is measured along the path
+  that the agent really drove, so oncoming traffic in a bend does not count. For the vehicle ahead in a queue, this is
+  the time gap. For a PET of t s, the criticality is exp(-t / 1.2 s): 0.92 for 0.1 s, 0.43 for 1 s, 0.19 for 2 s.
 - Deceleration rate to avoid a crash (DRAC; D. F. Cooper and N. Ferguson, Traffic studies at T-junctions, 1976): the
   least constant deceleration with which the agent, on the path that it drove, touches no actor within 4 s. Actors
   move along their real paths, not at constant velocities. The criticality is the ratio of this deceleration to
@@ -21,8 +21,8 @@ Reason for the integral: it ranks trials better than the maximum over steps, as 
 `scripts/danger`. Reason for real paths: with constant velocities, every oncoming vehicle in a bend would be
 on a collision course.
 
-Invariant: actors that approach from behind on the same path do not count. Their criticality is the rear criticality, a
-separate number (`followers_danger`).
+Invariant: actors that approach from behind on the same path do not count. The criticality of such actors is the rear
+criticality, a separate number (`followers_danger`).
 
 Cost: only actors within reach of the path are tested, at positions 1 m to 4 m apart (0.8 of the agent's length). Each
 first touch is refined by bisection. Long episodes are summed in windows of 4096 scenes, so memory stays bounded.
@@ -138,7 +138,7 @@ def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float
     """Return the criticality of each scene, shape (scenes,), and the most critical moment.
 
     Args:
-        frames: frames of the whole episode, in order; later scenes determine the criticality of earlier ones.
+        frames: frames of the whole episode, in order; later scenes determine the criticality of earlier scenes.
         agents: identifiers of the controlled vehicles.
         step_length_s: step length in s.
     """

@@ -244,7 +244,7 @@ def levels(scene: Scene, row: int, *, parts: int = 0) -> list[Level]:
 
 
 def same_level(one: Rectangle, level: Level, two: Rectangle, other_level: Level, lower_m: float) -> bool:
-    """Return whether two rectangles are on the same level; False if one is on a bridge above the other.
+    """Return whether two rectangles are on the same level; False if one rectangle is on a bridge above the other.
 
     On the same road, the grades at both rectangles explain the difference of their heights.
 

@@ -157,7 +157,7 @@ def silent(address: str) -> str:
 
 
 def _protocol_error(connection: socket.socket) -> str:
-    """Return why a listening process is not the head of a Ray cluster, which uses HTTP/2; empty if it may be one."""
+    """Return why a listening process is not a Ray cluster's head, which uses HTTP/2; empty if it may be the head."""
     if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):
         return ""
     found = b""
@@ -243,7 +243,7 @@ class Found:
 
 
 class Cluster:
-    """A connection to a Ray cluster; a process can have only one.
+    """A connection to a Ray cluster; a process can have only one connection.
 
     Args:
         address: address of the cluster; empty for the hunt's own cluster, which ends with this process.

@@ -209,7 +209,7 @@ class Folder:
 
 
 def owned(lock: Path) -> IO[str]:
-    """Create the lock of a folder and hold it as long as it is open. It becomes visible only after it is held."""
+    """Create the lock of a folder and hold it as long as it is open. The lock becomes visible only after it is held."""
     part = lock.with_name(f".{lock.name}")
     file = part.open("w")
     fcntl.flock(file, fcntl.LOCK_EX)

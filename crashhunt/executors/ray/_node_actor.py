@@ -1,6 +1,6 @@
 """The Ray actor that runs on each node.
 
-The actor is sent as source code, so that it can report a node without crashhunt. It therefore imports nothing of
+The actor is sent as source code, so that it can report a node without crashhunt. The actor therefore imports nothing of
 crashhunt before it has checked the installed version.
 """
 

@@ -1,4 +1,7 @@
-"""Descriptor of Gymnasium environments: the table of a scenario, and its consequences. It does not import Gymnasium."""
+"""Descriptor of Gymnasium environments: the table of a scenario, and its consequences.
+
+The descriptor does not import Gymnasium.
+"""
 
 from __future__ import annotations
 

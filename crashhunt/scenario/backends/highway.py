@@ -1,4 +1,7 @@
-"""Descriptor of highway-env: the table of a scenario, and its consequences. It does not import highway-env."""
+"""Descriptor of highway-env: the table of a scenario, and its consequences.
+
+The descriptor does not import highway-env.
+"""
 
 from __future__ import annotations
 

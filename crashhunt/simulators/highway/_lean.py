@@ -1,7 +1,7 @@
 """Imports highway-env without matplotlib and pandas, which take most of its import time.
 
-Both are imported on first use. An episode does not use matplotlib, and uses pandas only for observations that the
-accelerator does not compute.
+Both libraries are imported on first use. An episode does not use matplotlib, and uses pandas only for observations that
+the accelerator does not compute.
 """
 
 from __future__ import annotations

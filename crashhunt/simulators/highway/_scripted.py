@@ -84,7 +84,7 @@ class Puppets:
     Args:
         road: The road of the environment. All other vehicles on it are removed.
         script: The recorded paths.
-        agents: The controlled vehicles by identifier. They are placed at their recorded start.
+        agents: The controlled vehicles by identifier. These vehicles are placed at their recorded start.
         sub_steps: Number of sub-steps in each step.
         step_length_s: Step length, in s.
 

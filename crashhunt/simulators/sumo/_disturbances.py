@@ -163,8 +163,8 @@ class _JunctionLane:
 class _Nearest(NamedTuple):
     """The nearest point of a lane: its distance in m, and the lane's direction there in SUMO's degrees.
 
-    ``ambiguous_m`` is the difference between the distance to the foot of a perpendicular and ``distance_m``. It is
-    above 0 beyond the ends of the lane.
+    ``ambiguous_m`` is the difference between the distance to the foot of a perpendicular and ``distance_m``. This
+    difference is above 0 beyond the ends of the lane.
     """
 
     distance_m: float
@@ -249,7 +249,8 @@ class SteppingOut:
         speed: The walking speed in m/s, bounded by the person's maximum speed.
         steps: Number of steps for the way out and back.
         step_length_s: Step length of the simulation, in s.
-        speeds: Speeds of moved persons by SUMO id, because SUMO reports 0 for them. This person's speed is added.
+        speeds: Speeds of moved persons by SUMO id, because SUMO reports 0 for them. The speed of this person is added
+            to the collection.
     """
 
     def __init__(

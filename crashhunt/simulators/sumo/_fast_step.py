@@ -127,7 +127,7 @@ class UsualSteps:
 
     @property
     def roster(self) -> Roster:
-        """The actors in sight. They may already be the actors after the step that the core runs."""
+        """The actors in sight; while the core runs a step, they may already be the actors after this step."""
         return self._sight.roster
 
     def _enter(self, ids: tuple[str, ...]) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:

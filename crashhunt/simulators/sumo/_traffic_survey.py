@@ -1,8 +1,8 @@
 """Simulates the unmodified traffic of a scenario, without a controlled vehicle, and reports which vehicles enter when.
 
-libsumo holds one simulation per process, so this module runs in its own process, with this command:
-``python -m crashhunt.simulators.sumo._traffic_survey JOB``. It reads the job from the JSON file JOB and writes the
-answer to another JSON file. SUMO's own output goes to standard output.
+libsumo holds one simulation per process, so this module runs in its own process, with this command: ``python -m
+crashhunt.simulators.sumo._traffic_survey JOB``. The module reads the job from the JSON file JOB and writes the answer
+to another JSON file. SUMO's own output goes to standard output.
 """
 
 from __future__ import annotations

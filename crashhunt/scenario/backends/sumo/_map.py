@@ -18,7 +18,7 @@ __all__ = ["load_map"]
 
 
 def load_map(path: Path, ego: str) -> Scenario:
-    """Return the scenario of a map. It is made once, and then kept in the user's cache.
+    """Return the scenario of a map. The scenario is made once, and then kept in the user's cache.
 
     Raises:
         ScenarioError: the map cannot be used, or ``ego`` names a vehicle.
