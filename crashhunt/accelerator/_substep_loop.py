@@ -52,8 +52,8 @@ class Onlooker:
         interferes: Function that returns whether the two observers may change the road; called before and after each
             sub-step. By default, they never do.
         waits: Function that returns whether the observers act only in sub-steps in which a vehicle crashes. If so,
-            ``after`` is called only after these sub-steps, and ``before`` is never called. By default, both are always
-            called.
+            ``after`` is called only after these sub-steps, and ``before`` is never called. By default, both observers
+            are always called.
     """
 
     def __init__(

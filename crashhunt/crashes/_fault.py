@@ -157,7 +157,7 @@ def _lane_change(case: ContactRecord) -> FaultFinding | None:
 
 
 def _into_changed_vehicle(case: ContactRecord, changer: str, source: str) -> FaultFinding | None:
-    """Blame an actor that moved sideways into a vehicle whose lane change was complete a response time before."""
+    """Blame an actor that moved sideways into a vehicle which had completed its lane change long enough before."""
     other = case.partner(changer)
     since = case.changed_s(other)
     if since is None or since < _RESPONSE_S - 1e-6 or case.turned(since) > SAME_WAY:

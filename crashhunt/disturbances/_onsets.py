@@ -243,7 +243,7 @@ class FirstOnsets:
         return found
 
     def following(self, onset: Onset) -> FirstOnsets | None:
-        """Return an object that proposes second disturbances for a copy; None if none are forced on this copy.
+        """Return an object that proposes second disturbances for a copy; None if the copy gets no second disturbances.
 
         The method `after` of this object must be called after every step of the copy, from the step on after which the
         copy was forked.

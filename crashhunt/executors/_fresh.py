@@ -338,8 +338,8 @@ class _Shared:
     A cancelled trial may still be running when the same trial is submitted again. Therefore each run has its own
     number, which is the name of its folder.
 
-    An executor reports only once that it can run no trial. The error is stored for all threads, which would otherwise
-    wait forever.
+    If an executor can run no trial, it reports this error only once. The error is stored for all threads, which would
+    otherwise wait forever.
     """
 
     def __init__(self, executor: Executor, scratch: Path) -> None:

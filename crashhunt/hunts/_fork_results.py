@@ -199,8 +199,8 @@ class ForkCrashes:
     """Runs crashes of forks from the start, if such a crash may end the hunt.
 
     Only crashes with the disturbance kinds of the hunt may end the hunt. Probes also try all other kinds, and with the
-    strongest plausible disturbance nearly every trial crashes. A crash of such a probe measures the robustness of the
-    trial, but the hunt does not search for this crash. If the hunt counts crash types or crashes at fault, only trials
+    strongest plausible disturbance nearly every trial crashes. A crash of a probe measures the robustness of the trial,
+    but the hunt does not search for crashes of probes. If the hunt counts crash types or crashes at fault, only trials
     end the hunt.
 
     Args:

@@ -68,7 +68,7 @@ class ProbeSums(TypedDict):
         trials: number of trials in which all probes have a result.
         not_fully_asked: number of further trials in which a probe has no result.
         least: the least robustness margin of the trials in which all probes have a result; None if there is none.
-        trial: the number of the trial with this margin; None if there is none.
+        trial: the number of the trial with the least margin; None if there is none.
         probes: number of probes.
         steps: number of simulated steps of the forks.
         left_out: number of probes that were skipped because the forks had used up their steps.

@@ -160,7 +160,7 @@ class TrialReruns:
         parallel: number of runs at a time.
         notes: list to which a line is added for each problem.
         failed: list to which runs are added that should have confirmed a crash, but ended differently.
-        stops: list that becomes non-empty as soon as a stop is requested.
+        stops: collection that becomes non-empty as soon as a stop is requested.
         executors: the executors that run crashes again.
         phases: object to which the progress of these runs is reported.
         taken: digest of the snapshot that this process has taken; if empty, each snapshot has to be trusted.

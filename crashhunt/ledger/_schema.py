@@ -246,7 +246,7 @@ def _add_danger(database: sqlite3.Connection) -> None:
 
 
 def _add_other_steps(database: sqlite3.Connection) -> None:
-    """Add the simulated steps outside of trials: steps of forks are in the existing data, steps of warm-ups unknown."""
+    """Add the simulated steps outside of trials; forks are in the existing data, and warm-ups are unknown."""
     database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
     database.execute("ALTER TABLE trials ADD COLUMN other_steps INTEGER")
     was = ", ".join((*FIRST["trials"], "danger"))

@@ -223,7 +223,7 @@ class RateTest:
         return Interval(low, high)
 
     def _crossing(self, inside: float, factor: float, threshold: float, bound: float = math.inf) -> float:
-        """Return the rate at which the evidence reaches a threshold, searched from a rate by a factor up to a bound."""
+        """Return the rate at which the evidence reaches a threshold, found by a search from a given rate outwards."""
         outside = inside * factor
         while self.log_evidence(min(outside, bound)) < threshold:
             if outside >= bound:

@@ -141,7 +141,7 @@ class Estimated:
     Args:
         low: lower end of the interval.
         high: upper end of the interval.
-        effective: effective sample size of the part with weights, as a number of roots.
+        effective: effective sample size of the weighted part of the estimate, as a number of roots.
         largest_share: share of the root with the greatest value in the sum of this part, 0 to 1.
         roots_with_crash: number of roots with a value above 0 in this part.
     """
@@ -664,7 +664,7 @@ def _clopper_pearson(events: float, trials: int, confidence: float) -> tuple[flo
     """Return Clopper and Pearson's interval for a probability.
 
     Args:
-        events: number of events, above 0; a trial may count as a part of one, which makes the interval wider only.
+        events: number of events, above 0; a trial may count as a fraction of an event, which only widens the interval.
         trials: number of trials.
         confidence: of the interval, in (0, 1).
     """

@@ -246,7 +246,7 @@ def confirm(
         bundle: the crash to confirm.
         stopped: function that returns whether to stop; called repeatedly. A replay that fails after a stop does not
             count.
-        failed: function called with the result of the replay if the replay does not crash in the same way.
+        failed: list to which the result of the replay is added if the replay does not crash in the same way.
         executors: the executors that run the trial; None for a new Python process.
         trusted: whether the code of the crash may run; None to determine it.
 

@@ -54,7 +54,7 @@ class Process:
         categorical: which arguments are choices.
         scales: factors of the arguments, the reciprocals of length scales.
         noise: the share of the variance of scores that is noise, above 0 and below 1.
-        seeded: the share of the remaining variance that counts only between trials with the same seed.
+        seeded: the share of the remaining variance that is explained only by an equal seed.
     """
 
     def __init__(

@@ -344,7 +344,7 @@ def digest_of_described(files: Mapping[str, HasDigest], *, plain_data: object = 
     """Return a digest of files and of plain data together.
 
     Args:
-        files: entry of each file by name; an entry contains the file's digest as ``blake2b``.
+        files: description of each file by name, which contains the file's digest as ``blake2b``.
         plain_data: JSON-compatible data; None if only the files matter.
     """
     content = {name: entry["blake2b"] for name, entry in files.items()}

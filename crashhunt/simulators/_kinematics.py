@@ -44,9 +44,9 @@ _KIND_NUMBERS = {
 class Kinematics:
     """Builds observations: float32, shape (vehicles, features).
 
-    Row 0 is the controlled vehicle. Its x is the distance driven (m). Its y is the distance to the right of the
-    leftmost lane's centre (m). Its vx and vy are the speeds along and across the lane (m/s). Its heading is relative to
-    the map.
+    Row 0 is the controlled vehicle. In row 0, x is the distance driven (m), and y is the distance to the right of the
+    leftmost lane's centre (m). In row 0, vx and vy are the speeds along and across the lane (m/s). The heading in row 0
+    is relative to the map.
 
     The other rows are the nearest actors, the nearest first, relative to the controlled vehicle: x ahead (m), y to the
     right (m), velocity (m/s) and heading. Headings grow clockwise, because y points to the right. Rows without an actor

@@ -153,7 +153,7 @@ def run_all(
     Args:
         folders: folders of the runs; each contains a ``request.json``.
         parallel: number of trials at a time, of all hunts together; 0 for one per core.
-        watch: function called about once a second, and at the end, with the states of the hunts.
+        watch: function called about once a second, and at the end.
         machine: execution options for all hunts, which replace the options of each request.
         is_enough: function called after each `watch`; if it returns true, the hunts stop as after an interrupt.
         environments: environment variables of the process of each folder; by default the variables of this process.

@@ -24,8 +24,8 @@ class Collision(Serializable):
         role: The agent's role: ``collider`` (it drove into the other actor), ``victim``, or ``alone``.
         collider: Identifier of the actor that drove into the other actor.
         victim: Identifier of the actor that was hit; empty if there was none.
-        seen_by: The oracles that detected the collision, sorted by name. If one of them is missing (the simulator's
-            report, or the overlap of outlines), the two disagree.
+        seen_by: The oracles that detected the collision, sorted by name. If the simulator's report or the overlap of
+            outlines is missing here, the two oracles disagree.
         kind: The simulator's type of the collision, such as ``collision`` or ``junction``.
         x: x of the controlled vehicle's front bumper, in m.
         y: y of the controlled vehicle's front bumper, in m.

@@ -82,8 +82,8 @@ class ForcedCopy(Serializable):
 
     Args:
         cell: the model and strength of the first disturbance, as in `Forcing.ratios`.
-        onset: step in which the first disturbance begins; with a forced second disturbance, the step in which that
-            begins.
+        onset: step in which the first disturbance begins; with a forced second disturbance, the step in which the
+            second disturbance begins.
         weight: probability of the disturbances that this copy represents, given the root trial.
         branched: the step after which the copy was forked from the root trial, or from another copy.
         crash: the outcome if it counts as a crash in the hunt, else empty.

@@ -93,8 +93,8 @@ class Forcing(Serializable):
 
     Args:
         spacing: proposed probability per copy: one copy is made for each interval of this length.
-        ratios: for each cell, how many times more often a first disturbance is proposed than it occurs by its own
-            probability law; 1 if the cell is missing. A cell is a model with one strength, such as ``brake=4.0``.
+        ratios: factor by which a first disturbance is proposed more often than it occurs naturally, by cell; 1 if the
+            cell is missing. A cell is a model with one strength, such as ``brake=4.0``.
         second: cells of first disturbances whose copies also get forced second disturbances.
         second_spacing: probability per forced second disturbance; 0 for none.
         levels: with splitting, the levels at which a path of the root is copied; the copies then get other random

@@ -256,7 +256,7 @@ class _Runs:
         self._run(list(range(begun, self._times)), future)
 
     def _run(self, numbers: Sequence[int], spec: Callable[[int], TrialSpec]) -> dict[int, Run]:
-        """Run some futures; return the runs by index, and keep the runs whose number is below the requested number."""
+        """Run some futures; return all of them by index, and keep the runs with numbers up to the requested number."""
         if not numbers:
             return {}
         places: dict[int, Run] = {}

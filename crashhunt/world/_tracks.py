@@ -121,8 +121,8 @@ class Reach(NamedTuple):
     """The part of an agent's path in which other actors matter; actors that do not touch this part are irrelevant.
 
     Args:
-        ahead: length of this part ahead along the path, in m; 0 if all actors matter.
-        behind: length of this part backwards along the path, in m.
+        ahead: length of the relevant part ahead along the path, in m; 0 if all actors matter.
+        behind: length of the relevant part backwards along the path, in m.
         unknown: length by which the path is continued straight at its end, in m.
     """
 
