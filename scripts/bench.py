@@ -504,6 +504,22 @@ def bench_warmup() -> Iterator[Figure]:
         target=None,
         note="the same, with 50 steps in the copy",
     )
+    yield Figure(
+        name="fork_alone",
+        value=found["alone_ms"],
+        unit="ms",
+        better="lower",
+        target=None,
+        note="CPU time of os.fork and os._exit in that process",
+    )
+    yield Figure(
+        name="fork_100_steps",
+        value=found["hundred_ms"] - found["steps_ms"],
+        unit="ms",
+        better="lower",
+        target=8.0,
+        note=f"CPU time of a copy that runs 100 steps, less these steps ({found['steps_ms']:.1f} ms)",
+    )
 
 
 def bench_first_crash() -> Iterator[Figure]:
@@ -524,6 +540,12 @@ def child_fork() -> dict[str, float]:
     from crashhunt.simulators.sumo import SumoSimulator
     from crashhunt.trial import TrialSpec
 
+    def fork_alone() -> None:
+        pid = os.fork()
+        if pid == 0:
+            os._exit(0)
+        os.waitpid(pid, 0)
+
     scenario, copies = load_scenario("loop"), 50
     found = {}
     with folder() as stage:
@@ -538,12 +560,20 @@ def child_fork() -> dict[str, float]:
                     copy.step()
                 return {}
 
-            for name, steps in (("ms", 0), ("probe_ms", 50)):
+            before = sum(os.times()[:4])
+            for _ in range(copies):
+                fork_alone()
+            found["alone_ms"] = 1e3 * (sum(os.times()[:4]) - before) / copies
+            for name, steps in (("ms", 0), ("probe_ms", 50), ("hundred_ms", 100)):
                 before = sum(os.times()[:4])
                 for _ in range(copies):
                     if episode.fork(partial(drive, steps=steps), observed=False).answer(60.0) is None:
                         raise RuntimeError("a copy failed")
                 found[name] = 1e3 * (sum(os.times()[:4]) - before) / copies
+            before = sum(os.times()[:4])
+            for _ in range(5):
+                drive(episode, 100)
+            found["steps_ms"] = 1e3 * (sum(os.times()[:4]) - before) / 5
     return found
 
 
