@@ -52,7 +52,7 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
     if options.form:
         return _convert(options)
     if options.recorded_agent:
-        raise UsageError("--recorded-agent needs another format", fix=f"add --as {' or '.join(_FORMATS)}")
+        raise UsageError("--recorded-agent has no effect without --as", fix=f"add --as {' or '.join(_FORMATS)}")
     from crashhunt.crashes import export_crash
 
     with (

@@ -393,9 +393,9 @@ def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapp
     names += [("oracles", oracle_name(text)) for text in settings.oracles]
     for group, name in names:
         if name not in registered(group):
-            raise _refusal(f"the configuration imports {name!r}")
+            raise _refusal(f"the configuration of the scenario imports the module {name!r}")
     for module in scenario.modules():
-        raise _refusal(f"the configuration imports {module!r}")
+        raise _refusal(f"the configuration of the scenario imports the module {module!r}")
     backend = backend_of(scenario.simulator)
     if backend is None or backend.side_effect is None:
         raise _refusal(f"the side effects of the simulator {scenario.simulator!r} are unknown")
@@ -406,4 +406,6 @@ def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapp
 
 
 def _refusal(reason: str) -> UsageError:
-    return UsageError(f"the crash is a stranger's, and {reason}", fix="give --trust if you trust who made it")
+    return UsageError(
+        f"the crash was not made on this machine, and {reason}", fix="give --trust if you trust its author"
+    )

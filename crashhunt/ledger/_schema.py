@@ -347,7 +347,7 @@ def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
         if there and os.path.exists(path) and not os.access(path, os.R_OK):  # noqa: PTH110
             return HuntDirectoryError(f"it may not be read ({text})", fix="make it readable", where=where)
         reason = "is not writable" if there else "does not exist"
-        return HuntDirectoryError(f"the folder {reason} ({text})", fix="choose another", where=where)
+        return HuntDirectoryError(f"the folder {reason} ({text})", fix="choose another folder", where=where)
     if "not a database" in text:
         return HuntDirectoryError(
             f"not a ledger of crashhunt ({text})",

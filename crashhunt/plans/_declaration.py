@@ -237,7 +237,7 @@ def seconds_of(text: str) -> float:
     parts = found.groups() if found else ()
     seconds = sum(float(part or 0) * unit for part, unit in zip(parts, _UNITS_S, strict=bool(parts)))
     if not 0 < seconds < math.inf:
-        raise ValueError(f"{text!r} is not a time")
+        raise ValueError(f"{text!r} is not a time, such as 90s, 30m or 1h30m")
     return seconds
 
 
@@ -261,7 +261,7 @@ def share_of(text: str) -> float:
     """
     found = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
     if not 0 < found <= 1:
-        raise ValueError(f"{text!r} is not a share")
+        raise ValueError(f"{text!r} is not a share above 0 and up to 1")
     return found
 
 
@@ -301,10 +301,10 @@ def rate_of(text: str) -> tuple[float, RatePer]:
     """
     found = _RATE.fullmatch(text.strip())
     if found is None:
-        raise ValueError(f"{text!r} is not a rate")
+        raise ValueError(f"{text!r} is not a rate, such as 1e-3/trial")
     value, per = float(found[1]), cast(RatePer, found[2].replace(" ", ""))
     if not _MIN_BAR <= value <= _MAX_BAR or (per == "trial" and value >= 1):
-        raise ValueError(f"{text!r} is out of range")
+        raise ValueError(f"the rate {text!r} is out of range")
     return value, per
 
 

@@ -90,7 +90,9 @@ class Bets:
         self, most_events: float = 1.0, most_exposure: float = 1.0, *, fixed_exposure: bool | None = None
     ) -> None:
         if not (0 < most_events < math.inf and 0 < most_exposure < math.inf):
-            raise ValueError(f"bounds are {most_events} and {most_exposure}; must be finite and above 0")
+            raise ValueError(
+                f"most_events is {most_events} and most_exposure is {most_exposure}; both must be finite and above 0"
+            )
         self.most_events, self.most_exposure = float(most_events), float(most_exposure)
         self.fixed_exposure = most_events == most_exposure == 1.0 if fixed_exposure is None else fixed_exposure
         ratio = (_GREATEST_RATE / _LEAST_RATE) ** (1 / (_COMPONENTS - 1))

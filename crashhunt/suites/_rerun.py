@@ -235,7 +235,9 @@ def _run_copies(
                 building.rename(to)
                 sync_folder(to.absolute().parent)
     except OSError as error:
-        raise HuntDirectoryError(f"cannot be created: {error.strerror}", fix="choose another", where=str(to)) from error
+        raise HuntDirectoryError(
+            f"cannot be created: {error.strerror}", fix="choose another directory", where=str(to)
+        ) from error
     if hunt_state(to).state in ("queued", "killed", "interrupted"):
         run_all([to], parallel, watch=None if watch is None else lambda: watch([hunt_state(to)]), machine=machine)
     return [hunt_state(to)]

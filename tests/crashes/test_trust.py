@@ -79,7 +79,7 @@ def test_an_origin_is_removed_by_what_names_it_alone(tmp_path, monkeypatch):
 def refused(scenario, asked=None, values=None):
     with pytest.raises(UsageError) as caught:
         refuse_side_effects(scenario, asked or settings(), values if values is not None else {"count": 3})
-    assert caught.value.message.startswith("the crash is a stranger's, and ")
+    assert caught.value.message.startswith("the crash was not made on this machine, and ")
     assert "--trust" in caught.value.fix
     return caught.value.message
 
@@ -93,12 +93,16 @@ def test_what_only_simulates_is_let_through(sumo, tmp_path):
 
 
 def test_what_would_be_imported_is_refused(sumo, tmp_path):
-    assert "the configuration imports 'evil:Oracle'" in refused(sumo(), settings("overlap", "evil:Oracle"))
+    assert "the configuration of the scenario imports the module 'evil:Oracle'" in refused(
+        sumo(), settings("overlap", "evil:Oracle")
+    )
     for table in (
         'simulator = "gym"\n[gym]\nid = "evil:Env-v0"\n',
         'simulator = "highway"\n[highway]\nid = "evil:x-v0"\n',
     ):
-        assert "the configuration imports 'evil'" in refused(plain(tmp_path, table), values={})
+        assert "the configuration of the scenario imports the module 'evil'" in refused(
+            plain(tmp_path, table), values={}
+        )
 
 
 def test_arguments_of_an_environment_are_refused(tmp_path):
