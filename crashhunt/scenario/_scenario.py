@@ -501,7 +501,8 @@ class Backend:
             the printed output; None if the scenario is not the cause.
         side_effect: function that returns the side effects of an untrusted scenario, as a text after "the crash was not
             made on this machine, and"; empty if there are none. The function receives the values of the trial's
-            scenario arguments, and the specifications of text arguments. Without this function, untrusted scenarios are refused.
+            scenario arguments, and the specifications of text arguments. Without this function, untrusted scenarios are
+            refused.
         right_of_way: function that returns which vehicles must yield at the junctions of the map; None if this is
             unknown.
         plays_paths: whether the simulator can move other actors along recorded paths.
