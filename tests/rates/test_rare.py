@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import statistics
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from markov import Model, run_root, run_roots
 
 from crashhunt.disturbances import SECONDS_PER_COPY, first_forcing
-from crashhunt.rates import TRIALS_PER_ROOT, Root, learn_forcing, rare_estimate, root_of
-from crashhunt.trial import CRASHES, Forced, ForcedCopy, Forcing
+from crashhunt.rates import TRIALS_PER_ROOT, Root, learn_forcing, rare_estimate, root_of, with_plain
+from crashhunt.trial import CRASHES, Disturbance, Forced, ForcedCopy, Forcing, Outcome, TrialResult, TrialSpec
 
 SPARSE = {"late_action": 1e-4, "brake": 2e-4, "stop": 1e-4}
 DENSE = {"late_action": 0.05, "brake": 0.1, "stop": 0.02}
@@ -195,6 +196,17 @@ def test_interval_covers_a_skewed_rate_on_both_sides_alike():
             missed[1] += found.low > 1e-3
     assert sum(missed) < 32  # of 400 at 5 %: 20
     assert max(missed) < 14  # without the correction: 18 and 2
+
+
+def test_undisturbed_crashes_of_a_root_and_its_plain_trials_are_counted():
+    spec = TrialSpec(0, 1, {}, {}, 50, forcing=Forcing(0.01))
+    crashed = TrialResult(spec, Outcome.COLLISION, 9, forced=Forced(0.75, {}))
+    late = (Disturbance(1, "itself", "late_action", 0.5, 1.0, "ego"),)
+    for first, share in ((crashed, 0.75), (replace(crashed, disturbances=late), 0.0)):
+        root = root_of(first, CRASHES, 1e-3)
+        assert (root.counted, root.own) == (share, 0.75)
+        plain = [crashed, replace(crashed, disturbances=late), *[replace(crashed, outcome=Outcome.SURVIVED)] * 2]
+        assert with_plain(root, plain, CRASHES).counted == pytest.approx((share + 1) / 5)
 
 
 def counted(value, crashes):
