@@ -1,13 +1,19 @@
-"""What divides a crash rate into parts: disturbances, and bins of an argument."""
+"""The crash rate of a hunt, and what divides it into parts: disturbances, and bins of an argument."""
 
 from __future__ import annotations
 
+from contextlib import closing
 from types import SimpleNamespace
 
 import pytest
+from test_comparison import hunt
 
-from crashhunt.errors import UsageError
-from crashhunt.estimation._rates import _bins, _division
+from crashhunt.errors import HuntDirectoryError, UsageError
+from crashhunt.estimation import measure_rates
+from crashhunt.estimation._rates import _bins, _division, rate_of_counts, rate_of_trials
+from crashhunt.hunts import HuntResults
+from crashhunt.ledger import Ledger
+from crashhunt.training import HeldOutTraffics
 from crashhunt.trial import Choice, Range
 
 SPACE = {
@@ -86,3 +92,74 @@ def test_types_of_crashes_without_a_bundle_are_known():
     kinds, faults = division("kind"), division("fault")
     assert kinds.tag(trial(number=5)) == "rear end"
     assert kinds.tag(trial(number=6)) == faults.tag(trial(number=5)) != "rear end"
+
+
+def test_rate_per_trial_has_an_interval_and_its_parts(tmp_path):
+    (rate,) = measure_rates(hunt(tmp_path / "h", 10), per="trial", by="gap_m:2")
+    assert (rate.units, rate.trials, rate.crashes, rate.steps, rate.estimate) == (40, 40, 10, 360, 0.25)
+    assert (rate.confidence, rate.why_not, rate.dir) == (95.0, "", str(tmp_path / "h"))
+    assert rate.certain.low < 0.25 < rate.certain.high
+    low, high = rate.parts  # gap_m is 20 + number, and the range ends at 30
+    assert [(part.by, part.name, part.trials, part.crashes) for part in rate.parts] == [
+        ("gap_m", "20 to 25", 5, 5), ("gap_m", "25 to 30", 35, 5)
+    ]  # fmt: skip
+    assert low.estimate == 1.0
+    assert high.estimate == pytest.approx(1 / 7)
+    # Both intervals hold together with 95 %, so each is wider than one of the same trials alone.
+    (alone,) = measure_rates(tmp_path / "h", per="trial", by="gap_m:1")
+    (part,) = alone.parts
+    assert (part.certain.low, part.certain.high) == (rate.certain.low, rate.certain.high)
+    (surer,) = measure_rates(tmp_path / "h", per="trial", confidence=97.5)
+    (halves,) = measure_rates(hunt(tmp_path / "w", 10, gap="20.0:60.0"), per="trial", by="gap_m:2")
+    first = measure_rates(hunt(tmp_path / "f", 10, trials=20), per="trial", confidence=97.5)[0]
+    assert (halves.parts[0].certain.low, halves.parts[0].certain.high) == (first.certain.low, first.certain.high)
+    assert surer.certain.low < rate.certain.low
+
+
+def test_every_unit_of_a_rate_is_measured_by_default(tmp_path):
+    assert [rate.per for rate in measure_rates(hunt(tmp_path / "h", 10))] == ["trial", "hour", "1000km"]
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"keep_going": False}, "the hunt stops at its first crash"),
+        ({"distinct": 3}, "the hunt stops at 3 kinds of crashes"),
+        ({"seeds": 8}, ""),
+    ],
+    ids=str,
+)
+def test_estimate_is_withheld_if_crashes_decide_the_number_of_trials(tmp_path, given, why):
+    (rate,) = measure_rates(hunt(tmp_path / "h", 10, **given), per="trial")
+    assert (rate.estimate is None) == bool(why)
+    assert rate.why_not.startswith(why)
+    assert rate.certain is not None
+
+
+def test_rate_of_the_trials_up_to_the_decision_of_a_bar(tmp_path):
+    path = hunt(tmp_path / "h", 10)
+    with closing(Ledger(path / "ledger.sqlite", writable=True)) as ledger:
+        ledger.enter("rate", planned=40, hunt_seed=1, until_rate={"decided_at": 19})
+    (rate,) = measure_rates(path, per="trial")
+    assert (rate.trials, rate.crashes, rate.estimate) == (20, 10, 0.5)
+
+
+def test_counts_and_trials_give_the_measured_rate(tmp_path):
+    path = hunt(tmp_path / "h", 10)
+    (measured,) = measure_rates(path, per="trial")
+    found = HuntResults(path)
+    with closing(Ledger(path / "ledger.sqlite")) as ledger:
+        facts, trials = ledger.facts(), [*ledger.plain_results()]
+    assert rate_of_trials(path, found.settings, facts, trials, HeldOutTraffics(0)) == measured
+    counts = {"valid": 40, "invalid": 0, "crashes": 10, "steps": 360}
+    counted = rate_of_counts(path, found.settings, facts, excluded=0, **counts)
+    assert counted == measured
+    more = rate_of_counts(path, found.settings, facts, excluded=2, **counts)
+    assert more.excluded == {"after_unfinished": 2}
+
+
+def test_damaged_hunt_has_no_rate(tmp_path):
+    path = hunt(tmp_path / "h", 10)
+    (path / "ledger.sqlite").write_bytes(b"x" * 4096)
+    with pytest.raises(HuntDirectoryError):
+        measure_rates(path)
