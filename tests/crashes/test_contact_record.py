@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from test_fault import LANES, Map, rotated
 
-from crashhunt.crashes._contact import ContactRecord
+from crashhunt.crashes import find_bundle
+from crashhunt.crashes._contact import ContactRecord, _distance, contact_record, record_in
 from crashhunt.crashes._fault import fault_in
 from crashhunt.crashes._lanes import LaneMap
 from crashhunt.trial import Collision
 from crashhunt.world import Actor, Event, Roster, Scene
 
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
 ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "passenger", 5.0, 2.0)))
 PHASES = st.floats(0.02, 0.98)
 STEPS = st.sampled_from((0.1, 0.2, 0.5, 1.0))
@@ -253,3 +257,146 @@ def test_reported_collision_that_the_outlines_contradict_has_no_verdict(gap_m, r
     assert (case.manner == "rear end") is verdict
     assert (fault_in(case).verdict == "ego") is verdict
     assert bool(case.follower) is verdict
+
+
+# Distances, speeds and lanes at a contact, as numbers.
+
+
+def brakes(speed, deceleration):
+    """Drives along the x axis, brakes all the time, and has this speed at the contact."""
+    return lambda t: (speed * t - deceleration * t**2 / 2, 0.0, 0.0, speed - deceleration * t)
+
+
+def with_lanes(case, lanes_at):
+    """Give the actors the lanes that a function of the time returns."""
+    scenes = [
+        Scene(one.time_s, one.roster, one.points, one.headings, one.speeds, lanes=lanes_at(one.time_s))
+        for one in case.scenes
+    ]
+    return replace(case, scenes=scenes)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, -2.3])
+def test_distances_along_and_across_the_other_actor(angle):
+    case = rotated(record(drives(15.0), drives(8.0, x=5.0, y=1.5), step_s=0.5), angle)
+    assert case.times == pytest.approx(np.append(np.arange(4.0, 0.55, -0.1), 0.5))
+    assert (case.ahead_m("other"), case.ahead_m("ego")) == pytest.approx((8.5, -8.5))  # 0.5 s before
+    assert (case.ahead_m("other", 0), case.gap_m("other", 0)) == pytest.approx((33.0, 28.0))
+    assert (case.aside_m("other"), case.aside_m("ego", 0)) == pytest.approx((1.5, -1.5))
+    assert (case.turn, case.turned(4.0)) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_turn_of_the_last_seconds_is_the_greatest_angle_between_both():
+    case = record(drives(5.0), lambda t: (5.0 + 3 * t, 0.0, 0.5 if t < -2 else 0.1, 3.0), step_s=0.5)
+    assert (case.turned(1.0), case.turned(4.0)) == pytest.approx((0.1, 0.5))
+    around = record(lambda t: (5 * t, 0.0, 3.1, 5.0), lambda t: (5.0 + 3 * t, 0.0, -3.1, 3.0), step_s=0.5)
+    assert around.turned(4.0) == pytest.approx(math.tau - 6.2)
+
+
+def test_speeds_and_decelerations_before_a_contact():
+    case = record(brakes(15.0, 2.0), drives(8.0, x=5.0), step_s=0.5)
+    assert [case.speed_mps("ego", before_s) for before_s in (3.0, 1.0, 99.0)] == pytest.approx([21.0, 17.0, 23.0])
+    assert (case.slowed("ego", 3.0), case.slowed("other", 3.0)) == pytest.approx((2.0, 0.0))
+    assert (case.hardest_braking("ego"), case.hardest_braking("other")) == pytest.approx((2.0, 0.0))
+    assert case.slowed("ego", 0.5) == 0.0  # no time has passed
+    pressed = record(lambda t: (15 * t, 0.0, 0.0, 10.0 if t > -1.1 else 15.0), drives(8.0, x=5.0), step_s=0.5)
+    assert (pressed.hardest_braking("ego"), pressed.slowed("ego", 3.0)) == pytest.approx((10.0, 2.0))
+
+
+def test_actor_that_was_away_before_is_followed_since_it_came_back():
+    case = record(drives(15.0), drives(8.0, x=5.0), step_s=0.5)
+    alone = Roster(ROSTER.actors[:1])
+    scenes = [
+        Scene(one.time_s, alone, one.points[:1], one.headings[:1], one.speeds[:1]) if -3.1 < one.time_s < -1.9 else one
+        for one in case.scenes
+    ]
+    case = replace(case, scenes=scenes)
+    assert [scene.time_s for scene in case.before] == [-1.5, -1.0, -0.5]
+    assert case.times[0] == pytest.approx(1.5)
+
+
+def test_lanes_say_who_was_in_a_junction():
+    straight = record(drives(10.0), drives(5.0, x=5.0), step_s=0.5)
+    case = with_lanes(straight, lambda time_s: (":j_0_0" if -2.1 < time_s < -0.9 else "road_0", "road_0"))
+    assert [case.was_in_junction("ego", before_s) for before_s in (0.0, 1.0, 2.0, 2.5)] == [False, True, True, False]
+    assert not case.was_in_junction("other", 1.0)
+    assert [case.is_between_junctions(*who) for who in (("other",), ("ego",), ("ego", "other"))] == [True, False, False]
+    assert not straight.is_between_junctions("ego")  # no simulator but SUMO names its lanes
+    assert not straight.was_in_junction("ego", 0.0)
+    unknown = with_lanes(straight, lambda time_s: ("" if time_s == -1.0 else "road_0", "road_0"))
+    assert not unknown.is_between_junctions("ego")
+
+
+def test_connections_are_looked_up_by_the_lanes_and_the_last_place():
+    rights = SimpleNamespace(places=lambda lanes, x, y: (lanes, x, y))
+    case = record(drives(10.0), drives(5.0, x=5.0, y=2.0), step_s=0.5, right_of_way=rights, lane=":j_1_0", seconds=20.0)
+    case = with_lanes(case, lambda time_s: ("a_0" if time_s < -12.1 else "" if time_s < -11.1 else "b_0", "c_0"))
+    (lanes, x, y), (others, other_x, other_y) = case.links("ego"), case.links("other")
+    assert (set(lanes), lanes[-1]) == ({"b_0", ":j_1_0"}, ":j_1_0")  # those of the last 12 s
+    assert set(others) == {"c_0"}
+    assert (x, y, other_x, other_y) == pytest.approx((-5.0, 0.0, 2.5, 2.0))
+
+
+@pytest.mark.parametrize("names", [("person 1", "other"), ("ego", "person 1")])
+def test_contact_with_a_person_has_its_own_type(names):
+    roster = Roster(tuple(replace(actor, id=name) for actor, name in zip(ROSTER.actors, names, strict=True)))
+    case = record(drives(15.0), drives(8.0, x=5.0), step_s=0.5)
+    scenes = [Scene(one.time_s, roster, one.points, one.headings, one.speeds) for one in case.scenes]
+    assert replace(case, scenes=scenes, agent=names[0], other=names[1]).manner == "pedestrian"
+
+
+@pytest.mark.parametrize(("side", "words"), [(1, "crossing from the right"), (-1, "crossing from the left")])
+def test_crossing_at_an_acute_angle_names_its_side(side, words):
+    heading = side * math.radians(50)
+    c, s = math.cos(heading), math.sin(heading)
+    case = record(drives(12.0), lambda t: (4.5 + 6 * c * t, side * 1.0 + 6 * s * t, heading, 6.0), step_s=0.1)
+    assert case.manner == words
+    assert not case.same_way
+
+
+def test_both_that_jump_into_each_other_are_named_the_agent_first():
+    case = record(drives(10.0, y=-4.0, changes_s=0.0), drives(10.0, x=1.0, y=4.0, changes_s=0.0), step_s=0.5)
+    assert case.jumpers == ("ego", "other")
+    only = record(drives(10.0), drives(10.0, x=1.0, y=4.0, changes_s=0.0), step_s=0.5)
+    assert only.jumpers == ("other",)
+    assert only.meets_sideways("other")
+    assert not only.meets_sideways("ego")
+
+
+def test_lane_changes_count_from_the_given_time_on():
+    case = record(drives(15.0, y=-4.0, changes_s=-2.0), drives(8.0, x=5.0), step_s=0.5)
+    assert [case.lane_changers(within_s) for within_s in (1.0, 1.5, 3.0)] == [(), (), ("ego",)]
+    assert case.changed_s("ego") == pytest.approx(2.0)
+    assert [case.drifted(actor) for actor in ("ego", "other")] == [True, False]
+    assert [case.was_off_path("ego", back) for back in (0, 20, -1)] == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("point", "distance"), [((5.0, 3.0), 3.0), ((12.0, 0.0), 2.0), ((-3.0, -4.0), 5.0), ((13.0, 14.0), 5.0)]
+)
+def test_distance_from_a_path_is_that_of_its_nearest_point(point, distance):
+    path = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 0.0), (10.0, 10.0)])
+    assert _distance(path, np.array(point)) == pytest.approx(distance)
+
+
+def test_record_of_scenes_has_their_first_and_last_time():
+    scenes = record(drives(15.0), drives(8.0, x=5.0), step_s=0.5).scenes
+    found = record_in(scenes, collision("ego"))
+    assert (found.time_s, found.began_s, found.swept, found.agent, found.other) == (0.0, -8.0, True, "ego", "other")
+    assert record_in(scenes, replace(collision("ego"), kind="crashed")).swept is False
+    assert record_in(scenes, replace(collision("ego"), victim="gone")) is None
+    assert record_in([], collision("ego")) is None
+
+
+def test_record_of_a_bundle_has_the_time_of_the_touch():
+    bundle = find_bundle(FROZEN, "")
+    found, hit = contact_record(bundle), bundle.result.collision
+    scenes = bundle.recording().scenes()
+    assert (found.agent, found.other, found.collider) == ("ego", "leader", "ego")
+    assert found.time_s == hit.time_s < scenes[-1].time_s  # within the last step
+    assert (found.began_s, len(found.scenes), found.swept) == (scenes[0].time_s, len(scenes), True)
+    late = replace(bundle, result=replace(bundle.result, collision=replace(hit, time_s=hit.time_s + 9)))
+    assert contact_record(late).time_s == scenes[-1].time_s  # no time of the last step
+    alone = replace(bundle, result=replace(bundle.result, collision=replace(hit, victim="", role="alone")))
+    assert contact_record(alone) is None
+    assert contact_record(replace(bundle, result=replace(bundle.result, collision=None))) is None
