@@ -281,7 +281,7 @@ def test_distances_along_and_across_the_other_actor(angle):
     case = rotated(record(drives(15.0), drives(8.0, x=5.0, y=1.5), step_s=0.5), angle)
     assert case.times == pytest.approx(np.append(np.arange(4.0, 0.55, -0.1), 0.5))
     assert (case.ahead_m("other"), case.ahead_m("ego")) == pytest.approx((8.5, -8.5))  # 0.5 s before
-    assert (case.ahead_m("other", 0), case.gap_m("other", 0)) == pytest.approx((33.0, 28.0))
+    assert (case.ahead_m("other", 0), case.gap_m("other", 0), case.gap_m("other")) == pytest.approx((33.0, 28.0, 3.5))
     assert (case.aside_m("other"), case.aside_m("ego", 0)) == pytest.approx((1.5, -1.5))
     assert (case.turn, case.turned(4.0)) == pytest.approx((0.0, 0.0), abs=1e-9)
 
@@ -352,6 +352,8 @@ def test_crossing_at_an_acute_angle_names_its_side(side, words):
     case = record(drives(12.0), lambda t: (4.5 + 6 * c * t, side * 1.0 + 6 * s * t, heading, 6.0), step_s=0.1)
     assert case.manner == words
     assert not case.same_way
+    slight = side * math.radians(45.5)
+    assert not record(drives(12.0), lambda t: (4.5 + 6 * t, 0.0, slight, 6.0), step_s=0.1).same_way
 
 
 def test_both_that_jump_into_each_other_are_named_the_agent_first():
@@ -386,6 +388,8 @@ def test_record_of_scenes_has_their_first_and_last_time():
     assert record_in(scenes, replace(collision("ego"), kind="crashed")).swept is False
     assert record_in(scenes, replace(collision("ego"), victim="gone")) is None
     assert record_in([], collision("ego")) is None
+    gone = Scene(1.0, Roster(ROSTER.actors[:1]), [(0.0, 0.0)], [0.0], [1.0])
+    assert record_in([*scenes, gone], collision("ego")) is None
 
 
 def test_record_of_a_bundle_has_the_time_of_the_touch():

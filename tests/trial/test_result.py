@@ -113,3 +113,9 @@ def test_runs_are_identical_if_outcome_and_digest_are():
     assert one.is_identical_run(TrialResult(SPEC, Outcome.SURVIVED, digest="a", wall_s=9.0))
     assert not one.is_identical_run(TrialResult(SPEC, Outcome.SURVIVED, digest="b"))
     assert not one.is_identical_run(TrialResult(SPEC, Outcome.FINISHED, digest="a"))
+
+
+def test_texts_of_a_failure_can_be_written_as_utf_8():
+    failure = Failure("a\udc80", "b\udc80", "c\udc80", last_output="d\udc80")
+    for text in (failure.kind, failure.message, failure.traceback, failure.last_output):
+        assert text.encode()[1:] == b"\\udc80"

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+import json
+from typing import Annotated
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
 from crashhunt.errors import ArgumentError
 from crashhunt.space import Choice, Constant, Range, parse_spec
-from crashhunt.trial._space import kind_of
+from crashhunt.trial._space import Argument, Signature, kind_of, signature_of
 
 finite = st.floats(allow_nan=False, allow_infinity=False, width=64).filter(lambda x: abs(x) < 1e300)
 
@@ -170,6 +173,7 @@ def test_quantiles_divide_the_draws_into_equal_shares(distribution, values):
         (Range(1, 4, integer=True), {1: 0.125, 4: 0.875}),
         (Range(0.0, 1.0, step=0.25), {0.0: 0.1, 0.3: 0.3, 1.0: 0.9}),
         (Range(1.0, 16.0, log=True), {0.5: 0.0, 4.0: 0.5, 32.0: 1.0}),
+        (Range(4.0, 16.0, log=True), {8.0: 0.5, 16.0: 1.0}),
         (Range(3.0, 3.0), {3.0: 0.5}),
     ],
     ids=str,
@@ -218,3 +222,62 @@ def test_value_is_contained_if_it_is_a_number_within_the_range():
     assert [Constant("x").contains(value) for value in ("x", "y")] == [True, False]
     with pytest.raises(ValueError, match="not in tuple"):
         Choice(("a",)).share_of("b")
+
+
+# What a factory takes.
+
+
+class Follower:
+    def __init__(
+        self,
+        speed: Annotated[float, Argument("speed", distribution=Range(5.0, 9.0), unit="m/s", help="its speed")] = 7.0,
+        mode: str = "calm",
+        lanes: int | None = None,
+        *,
+        weights: str,
+        step_length_s: float = 0.1,
+        observation_space=None,
+    ): ...
+
+
+class Takes:
+    def __init__(self, *rest, **options): ...
+
+
+class Nothing:
+    pass
+
+
+def test_arguments_of_a_factory_are_read_off_its_signature():
+    found = signature_of(Follower)
+    assert list(found.arguments) == ["speed", "mode", "lanes", "weights"]
+    speed, mode, lanes, weights = found.arguments.values()
+    assert speed == Argument("speed", "float", 7.0, Range(5.0, 9.0), "m/s", "its speed")
+    assert (mode.kind, mode.default, lanes.kind, lanes.default) == ("str", "calm", "int", None)
+    assert (weights.kind, weights.default) == ("str", None)
+    assert (found.open, found.required) == (False, ("weights",))
+    assert set(found.given) == {"step_length_s", "observation_space"}
+    assert (signature_of(Takes).open, signature_of(Takes).arguments) == (True, {})
+    assert (signature_of(Nothing).open, signature_of(Nothing).arguments) == (False, {})
+
+
+def test_signature_is_rebuilt_from_its_data():
+    found = signature_of(Follower)
+    data = json.loads(json.dumps(found.to_json()))
+    assert Signature.from_json(data) == found
+    assert data["arguments"][0] == {
+        "name": "speed", "kind": "float", "default": 7.0, "unit": "m/s", "help": "its speed",
+        "distribution": "5.0:9.0",
+    }  # fmt: skip
+
+
+def test_unknown_argument_is_refused_with_the_accepted_ones():
+    signature_of(Follower).check(["speed", "mode"], where="ego")
+    signature_of(Takes).check(["anything"], where="ego")
+    with pytest.raises(ArgumentError) as caught:
+        signature_of(Follower).check(["sped"], where="ego")
+    assert "ego takes no argument 'sped'" in caught.value.message
+    assert "speed" in caught.value.fix
+    with pytest.raises(ArgumentError) as caught:
+        signature_of(Nothing).check(["x"], where="ego")
+    assert "no arguments" in caught.value.fix
