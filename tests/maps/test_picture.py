@@ -61,7 +61,7 @@ def test_colors_go_from_little_traffic_to_the_most():
     assert _color(0.25) == tuple(round((a + b) / 2) for a, b in zip(BLUE, ORANGE, strict=True))
 
 
-def test_busiest_roads_are_labelled_beside_their_middle(pixels):
+def test_busiest_roads_are_labelled_at_their_middle(pixels):
     edges = [road("long", (0.0, 0.0), (1000.0, 0.0)), road("north", (0.0, 1000.0), (1000.0, 1000.0))]
     plain = pixels(edges, {"long": 9.0})
     assert plain(505.0, 0.0) != (255, 255, 255)

@@ -114,6 +114,7 @@ def test_disturbance_is_active_for_its_duration():
     ("given", "reason"),
     [
         ({}, ""),
+        ({"how_strong": 0.0}, ""),
         ({"how_strong": -1.0}, "the strength is -1"),
         ({"how_strong": math.inf}, "the strength is inf"),
         ({"how_long": 0.0}, "the duration is 0"),
@@ -130,3 +131,50 @@ def test_invalid_disturbance_has_a_reason_and_a_fix(given, reason):
     found = why_not(one)
     assert (found is None) == (not reason)
     assert found is None or (found[0] == reason and found[1].startswith(("give ", "it is about ")))
+
+
+@pytest.mark.parametrize(
+    ("what", "unit", "words"),
+    [
+        ("brake", "m/s²", "x brakes with 0.25 m/s² for 2 s"),
+        ("stop", "m/s²", "x stops with 0.25 m/s² and stands, for 2 s in all"),
+        ("dawdle", "", "x drives 25 % slower than it did for 2 s"),
+        ("speed", "", "x wants to drive 25 % faster for 2 s"),
+        ("cut_in", "m/s²", "x cuts in on ego within 2 s and brakes with 0.25 m/s²"),
+        ("late_merge", "m", "x merges only in the last 0.25 m of its lane, for 2 s"),
+        ("step_out", "m/s", "x steps out onto the road with 0.25 m/s, and is back after 2 s"),
+        ("ignore_priority", "", "x heeds neither red lights nor priority for 2 s"),
+        ("late_observation", "s", "ego sees everything 0.25 s late for 2 s"),
+        ("noisy_observation", "", "what ego sees is up to 25 % off for 2 s"),
+        ("unseen", "", "ego does not see x for 2 s"),
+        ("late_action", "s", "what ego does takes effect 0.25 s late for 2 s"),
+    ],
+)
+def test_words_have_the_strength_in_its_unit(what, unit, words):
+    one = Disturbance(1, "ahead", what, 0.25, 2.0, "ego", "x")
+    assert (KINDS[what].unit, one.words) == (unit, words)
+
+
+def test_shares_end_at_one_and_late_merges_are_worse_if_shorter():
+    assert [name for name, kind in KINDS.items() if kind.most == 1.0] == ["dawdle", "noisy_observation"]
+    assert [name for name, kind in KINDS.items() if kind.less_is_worse] == ["late_merge"]
+    assert {"late_observation", "noisy_observation", "late_action"} == SENSOR_KINDS
+
+
+def test_delays_take_place_in_whole_steps_and_other_strengths_as_they_are():
+    delay = Disturbance(1, "itself", "late_action", 0.37, 1.04, "ego")
+    found = delay.took_place("ego", 0.37, 0.1)
+    assert (found.vehicle, found.how_strong, found.how_long) == ("ego", 0.4, 1.0)
+    assert delay.took_place("ego", 0.02, 0.1).how_strong == 0.1  # one step at least
+    assert delay.took_place("ego", 0.0, 0.1).how_strong == 0.0
+    assert delay.took_place("ego", 0.37).how_long == 1.04
+    brake = Disturbance(1, "ahead", "brake", 4.0, 1.04, "ego").took_place("x", 3.33, 0.1)
+    assert (brake.how_strong, brake.how_long) == (3.33, 1.0)
+
+
+def test_missing_disturbances_are_valid_and_other_data_are_not():
+    check_disturbances(None)
+    check_disturbances([])
+    for wrong in ({}, "brake", ["brake"]):
+        with pytest.raises(ValueError, match="disturbance"):
+            check_disturbances(wrong)

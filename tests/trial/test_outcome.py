@@ -31,6 +31,7 @@ def test_outcome_of_an_oracle_keeps_its_name_and_category_in_other_processes():
     assert outcome_of({"outcome": "too_close_b", "category": "traffic crash"}).is_traffic_crash
     assert outcome_of({"outcome": "too_close_c"}).category == "traffic event"
     assert not Outcome.COLLISION.is_own
+    assert pickle.loads(pickle.dumps(Outcome.COLLISION)) is Outcome.COLLISION
 
 
 @pytest.mark.parametrize(

@@ -199,6 +199,7 @@ def test_ends_of_log_ranges_of_whole_numbers_are_as_likely_as_the_others():
         (Range(0, 10, integer=True), 3, [0, 5, 10]),
         (Range(1, 100, log=True, integer=True), 3, [1, 10, 100]),
         (Range(1, 4, log=True, integer=True), 9, [1, 2, 3, 4]),
+        (Range(1, 9, log=True, integer=True), 9, [1, 2, 3, 4, 5, 7, 9]),
         (Range(0.0, 1.0, step=0.4), 2, [0.0, 0.4, 0.8]),
         (Choice(("a", "b")), 1, ["a", "b"]),
         (Constant(7), 3, [7]),
