@@ -15,6 +15,7 @@ Prints the tables of crashhunt/guide/reference/evaluation/rates-evaluation.md. S
 because a process with threads cannot be forked.
 usage: scripts/splitting_study.py walk [REPETITIONS] [CASE]            a random walk with a known probability (500)
        scripts/splitting_study.py loop TREES COPIES LEVEL,… SPEED SEED   on `loop`, an agent at constant SPEED in m/s
+       scripts/splitting_study.py levels SCENARIO AGENT [NAME=VALUE]…    the test of levels of `--rare splitting`
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ import numpy as np
 
 from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.base.plugins import locate
-from crashhunt.episode import Episode, seed_everything
+from crashhunt.episode import COPIES_PER_LEVEL, Episode, seed_everything
 from crashhunt.oracles import Overlap, ReportedCollision
-from crashhunt.rates import RareCounter, RateTest, Root
+from crashhunt.rates import RareCounter, RateTest, Root, choose_levels, why_unfit
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.trial import CRASHES, TrialSpec
 from crashhunt.world import closing_rate
@@ -305,6 +306,17 @@ class EpisodePath(SplitPath):
         return [Leaf(*one) for one in cast("list[tuple[float, int, bool]]", found["leaves"])]
 
 
+class _PeakPath(EpisodePath):
+    """A root, which also records the greatest level."""
+
+    peak = 0.0
+
+    def step(self) -> None:
+        """Run one step."""
+        super().step()
+        self.peak = max(self.peak, self.level)
+
+
 def loop(trees: int, copies: int, levels: Sequence[float], speed: float, first: int) -> None:
     """Grow trees on `loop`, and print how often their paths crash."""
     scenario = load_scenario("loop")
@@ -338,8 +350,45 @@ def loop(trees: int, copies: int, levels: Sequence[float], speed: float, first: 
         print(f"steps saved: {mean * (1 - mean) / variance * STEPS * trees / steps:.2f} times")
 
 
+def levels(name: str, agent: str, arguments: dict[str, float], first: int = 700_000) -> None:
+    """Choose levels by pilots and test them by trees, as `--rare splitting` does, without the plain trials."""
+    scenario = load_scenario(name)
+    simulator = locate("simulators", scenario.simulator)(scenario, Path(tempfile.mkdtemp()))
+    driver = locate("agents", agent)
+
+    def run(seed: int, of_tree: Sequence[float]) -> tuple[float, list[Leaf]] | None:
+        seed_everything(seed)
+        spec = TrialSpec(seed, seed, {EGO: dict(arguments)}, argument_values(scenario), STEPS)
+        with Episode(
+            spec, simulator=simulator, make_agent=lambda *_: driver(**arguments),
+            oracles=[ReportedCollision(), Overlap()], crash_on=CRASHES, forks=True,
+        ) as episode:  # fmt: skip
+            if episode.start() is not None:
+                return None
+            path = _PeakPath(episode)
+            leaves = grow_tree(path, of_tree, COPIES_PER_LEVEL)
+            return path.peak, leaves
+
+    pilots = list(islice(filter(None, (run(seed, ()) for seed in range(first, first + 1000))), PILOT_TREES))
+    chosen = choose_levels([peak for peak, _ in pilots])
+    trees = islice(filter(None, (run(seed, chosen) for seed in range(first + 1000, first + 2000))), PILOT_TREES)
+    found = [leaves for _, leaves in trees]
+    shares = crash_shares(found, len(chosen))
+    print(f"{name}, {agent}: levels {chosen}, crash probability of all paths and from each level {shares}")
+    print(
+        f"  crashed pilots: {sum(leaves[0].crashed for _, leaves in pilots)}; {why_unfit(shares) or 'levels are fit'}"
+    )
+    mixed = sum(0 < sum(leaf.crashed for leaf in leaves) < len(leaves) for leaves in found)
+    crashed = sum(any(leaf.crashed for leaf in leaves) for leaves in found)
+    print(f"  trees with a crash: {crashed}, in {mixed} of these some paths did not crash", flush=True)
+
+
 def main(words: list[str]) -> None:
     """Print the table that was asked for."""
+    if words[:1] == ["levels"]:
+        pairs = (word.partition("=") for word in words[3:])
+        levels(words[1], words[2], {name: float(value) for name, _, value in pairs})
+        return
     if words[:1] == ["loop"]:
         loop(
             int(words[1]), int(words[2]), [float(word) for word in words[3].split(",")], float(words[4]), int(words[5])
