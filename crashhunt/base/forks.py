@@ -153,7 +153,7 @@ class CannotForkError(CrashhuntError):
 
 
 class NoProcessError(CannotForkError):
-    """The system cannot start another process at present: there are too many, or too little memory."""
+    """The system cannot start another process at present, because of the number of processes or the memory."""
 
 
 class Watchdog:

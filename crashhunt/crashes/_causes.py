@@ -181,7 +181,7 @@ class Division:
     """The crashes of one type: runs judge some crashes, and all others get the cause of the nearest judged crash.
 
     The crashes chosen for judgement differ as much as possible. The shortest crash is chosen first, then always the
-    crash furthest from all chosen crashes (farthest-first traversal: T. F. Gonzalez, Clustering to minimize the maximum
+    crash furthest from all chosen crashes (farthest-first traversal: Gonzalez, Clustering to minimize the maximum
     intercluster distance, Theoretical Computer Science 38, 1985). Crashes may be added between two choices.
 
     Args:

@@ -64,7 +64,6 @@ def find_escape(
     after some step, and the other actors react. The result rests on two runs that differ by one step. The first run
     ends without a crash, the second in the same crash. If another vehicle drove into the agent from behind, there are
     no such runs.
-        crash, the second in the same crash. If another vehicle drove into the agent from behind, there are no runs.
 
     Args:
         result: result of the crashed trial.

@@ -162,7 +162,7 @@ def why_from(data: Any) -> Why | None:
 def wilson(found: int, of: int) -> tuple[float, float]:
     """Return the 95 % confidence interval of a proportion by Wilson's method.
 
-    Source: E. B. Wilson, *Probable inference, the law of succession, and statistical inference*, 1927.
+    Source: Wilson, *Probable inference, the law of succession, and statistical inference*, 1927.
 
     >>> low, high = wilson(3, 20)
     >>> f"{low:.3f} to {high:.3f}"

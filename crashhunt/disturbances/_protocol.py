@@ -37,8 +37,8 @@ class DisturbanceModel(Protocol):
         truck_cut_in = "mypackage.disturbances:TruckCutIn"
 
     Contract: `draw` uses only the random generator that it receives, and two models that were created in the same way
-    draw the same values. The model draws one
-        of countably many possibilities; `log_likelihood` returns the probability of each. A model keeps no state.
+    draw the same values. The model draws one of countably many possibilities, and `log_likelihood` returns the
+    probability of each. A model keeps no state.
     """
 
     @property

@@ -63,9 +63,8 @@ class Probed:
     def shares(self, step_length_s: float) -> tuple[float, ...]:
         """Return the strengths to try, as shares of the maximum, from the mildest on, in steps of a sixteenth.
 
-        For durations, only shares that differ in whole steps are tried, because with steps of 1 s no delay can be a
-        sixteenth
-            of a second late. The maximum itself counts as a sixteenth less.
+        For durations, only shares that differ in whole steps are tried. With steps of 1 s, for example, no delay can be
+        a sixteenth of a second. The maximum itself counts as a sixteenth less.
         """
         if self.grade == "whether":
             return (_HALF_STRENGTH,)

@@ -1,8 +1,8 @@
 """The crash rate of a hunt's agents, from the files in the hunt's directory.
 
 The module reads the trials of a hunt in the order of their numbers, counts them with `crashhunt.rates`, and divides the
-rate into parts. Each part of a rate has its own interval. All parts together have the requested confidence (C. E.
-Bonferroni, 1936): with 5 parts at 95 %, each interval has 99 % confidence.
+rate into parts. Each part of a rate has its own interval. All parts together have the requested confidence (Bonferroni,
+1936): with 5 parts at 95 %, each interval has 99 % confidence.
 
 Cost: a ledger is read once for all measures, at about 30,000 trials per second.
 """

@@ -24,10 +24,10 @@ to both sides, and bisection finds the rate at which the sum crosses 1 / alpha. 
 interval stays valid.
 
 Sources:
-Sources: J. Ville, Étude critique de la notion de collectif (1939). H. Robbins, Statistical methods related to the law
-of the iterated logarithm (1970), for mixtures. I. Waudby-Smith and A. Ramdas, Estimating means of bounded random
-variables by betting, JRSS B 86(1), 2024, for the bets. P. Grünwald, R. de Heide and W. Koolen, Safe testing, JRSS B
-86(5), 2024, for e-values.
+Sources: Ville, Étude critique de la notion de collectif (1939). Robbins, Statistical methods related to the law of the
+iterated logarithm (1970), for mixtures. Waudby-Smith and Ramdas, Estimating means of bounded random variables by
+betting, JRSS B 86(1), 2024, for the bets. Grünwald, de Heide and Koolen, Safe testing, JRSS B 86(5), 2024, for
+e-values.
 
 Cost: a unit increments a counter. A capital needs one logarithm for each component and each different unit. With trials
 as exposure there are two different units. Many different exposures are spread over a fixed grid. A unit between two
@@ -251,11 +251,11 @@ def discordance_evidence(only_first: int, only_second: int) -> float:
     """Return the logarithm of the evidence that events are not equally frequent in two paired runs.
 
     Only discordant pairs count, as in McNemar's test (1947): without a difference each is a fair coin. The evidence is
-    the capital of a mixture of bets on that coin. Half of the mixture has the weights of R. E. Krichevsky and V. K.
-    Trofimov (1981), which detect any bias eventually. The other half bets that one side occurs three times as often as
-    the other. Most changes of interest have such a bias, and this half detects them sooner. Each half is a martingale
-    that begins at 1, and so is the mixture. You may look at the evidence after every pair, and 1 / evidence is a
-    p-value at any time.
+    the capital of a mixture of bets on that coin. Half of the mixture has the weights of Krichevsky and Trofimov
+    (1981), which detect any bias eventually. The other half bets that one side occurs three times as often as the
+    other. Most changes of interest have such a bias, and this half detects them sooner. Each half is a martingale that
+    begins at 1, and so is the mixture. You may look at the evidence after every pair, and 1 / evidence is a p-value at
+    any time.
 
     >>> round(discordance_evidence(0, 0), 9)
     0.0

@@ -15,8 +15,8 @@ non-negative martingale that begins at 1 / 2. By Ville's inequality, the probabi
 is at most alpha / 2. Each factor grows with d for every Z. The differences that are not rejected are therefore an
 interval, and bisection finds its end. The lower end is the upper end of -Z.
 
-Sources: those of `_certain_interval`, which computes the evidence of discordant pairs. The bets on Z are those of I.
-Waudby-Smith and A. Ramdas (2024), with a mixture over fixed shares.
+Sources: those of `_certain_interval`, which computes the evidence of discordant pairs. The bets on Z are those of
+Waudby-Smith and Ramdas (2024), with a mixture over fixed shares.
 
 Cost: a pair increments a counter. An end takes 50 evaluations, each with one logarithm for every component and every
 different value of Z.

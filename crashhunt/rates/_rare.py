@@ -36,10 +36,11 @@ the whole crash probability, so its lower bound is also a lower bound of the who
 intervals together have the given confidence. The first interval has three quarters of the error probability, the second
 a quarter.
 
-Sources: Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 to 9; Kish, Survey sampling, 1965, for the
-effective sample size; P. Hall, On the removal of skewness by transformation, JRSS B 54(1), 1992; C. J. Clopper and
-E. S. Pearson, Biometrika 26(4), 1934; G. Y. Zou and A. Donner, Construction of confidence limits about effect measures,
-Statistics in Medicine 27(10), 2008, for the sum of two parts.
+Sources: Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 to 9, for the estimator. Kish, Survey
+sampling, 1965, for the effective sample size. Hall, On the removal of skewness by transformation, JRSS B 54(1), 1992,
+and Clopper and Pearson, Biometrika 26(4), 1934, for the intervals. Zou and Donner, Construction of confidence limits
+about effect measures, Statistics in Medicine 27(10), 2008, for the sum of two parts.
+
 Cost: constant for each root. The certain interval takes milliseconds for each hundred roots with different values.
 """
 

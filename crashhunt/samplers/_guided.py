@@ -209,8 +209,8 @@ class KnownCrashes:
     def see(self, trial: ScoredTrial) -> list[ScoredTrial]:
         """Add a trial without a crash; return all trials that are worth learning from since it is known.
 
-        Usually, that is the trial itself, or nothing if it is covered. Covered trials follow when they turn out to be
-        at another peak than the known crashes.
+        Usually, the result is the trial itself, or empty if the trial is covered. Covered trials follow when they turn
+        out to be at another peak than the known crashes.
         """
         self._seen.append(trial)
         self._since_basins += 1

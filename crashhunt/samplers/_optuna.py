@@ -1,4 +1,4 @@
-"""Samplers of Optuna (Akiba et al. 2019) by their names: ``optuna:TPESampler``, or ``optuna:tpe``."""
+"""Samplers of Optuna (Akiba and others, 2019) by their names: ``optuna:TPESampler``, or ``optuna:tpe``."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Descriptions of the state after a crash, for environments that do not report the types of their crashes.
 
-A cell is the set of true flags and short texts of the last ``info``. Unlike the cells of Go-Explore (Ecoffet et al.
-2021), a cell does not contain the last observation. With coarse levels of the observation, guided hunts found fewer
-planted faults on seven of nine problems, because one fault ended in several cells (`scripts/search --faults`).
+A cell is the set of true flags and short texts of the last ``info``. Unlike the cells of Go-Explore (Ecoffet and
+others, 2021), a cell does not contain the last observation. With coarse levels of the observation, guided hunts found
+fewer planted faults on seven of nine problems, because one fault ended in several cells (`scripts/search --faults`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The choice of the crash with which an episode begins: prioritized replay of crashes that the agent does not survive.
 
-The rule comes from Prioritized Level Replay (M. Jiang, E. Grefenstette, T. Rocktäschel, ICML 2021, arXiv:2010.03934):
+The rule comes from Prioritized Level Replay (Jiang, Grefenstette and Rocktäschel, ICML 2021, arXiv:2010.03934):
 
     P = (1 - rho) P_S + rho P_C,    P_S(i) ~ S(i)^(1/beta),    P_C(i) ~ c - C(i),
 

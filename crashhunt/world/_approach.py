@@ -61,9 +61,9 @@ _LEAST_GAP_M = 0.01
 class ApproachMeter:
     """Measures the closest approach over the scenes of an episode, many scenes at a time.
 
-    Time to collision: J. C. Hayward, Near-miss determination through use of a scale of danger (1972); here for outlines
-    at constant velocity. Required deceleration (DRAC): D. F. Cooper and N. Ferguson, Traffic studies at T-junctions
-    (1976): v² / (2 gap) = v / (2 TTC), v being the closing speed.
+    Time to collision: Hayward, Near-miss determination through use of a scale of danger (1972); here for outlines at
+    constant velocity. Required deceleration (DRAC): Cooper and Ferguson, Traffic studies at T-junctions (1976): v² / (2
+    gap) = v / (2 TTC), v being the closing speed.
 
     Args:
         agents: identifiers of the controlled vehicles.

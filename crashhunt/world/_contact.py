@@ -3,10 +3,10 @@
 The module computes when two moving rectangles first overlap. Scenes are one step apart (0.1 s to 1 s). A test of only
 the scenes would miss contacts between two scenes, and would report other contacts too late.
 
-Each rectangle follows a cubic curve between its poses (`_Way`). Conservative advancement repeatedly moves forward in
-time by the gap divided by a bound of the approach speed, so no contact is skipped (B. Mirtich, Impulse-based dynamic
-simulation of rigid body systems, 1996). A fixed small time step would be slower and could miss a short overlap.
-Bisection finds the time of the overlap to within 1e-9 of a step.
+Each rectangle follows a cubic curve between its poses (`_Way`). Conservative advancement (Mirtich, Impulse-based
+dynamic simulation of rigid body systems, 1996) repeatedly moves forward in time. Each move is the gap divided by a
+bound of the approach speed, so no contact is skipped. A fixed small time step would be slower and could miss a short
+overlap. Bisection finds the time of the overlap to within 1e-9 of a step.
 """
 
 from __future__ import annotations

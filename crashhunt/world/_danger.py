@@ -2,20 +2,20 @@
 
 The criticality of a step is the greater of two measures:
 
-- Post-encroachment time (PET; B. L. Allen, B. T. Shin and P. J. Cooper, Analysis of traffic conflicts and collisions,
-  1978): the time between the agent's and another actor's presence at the same place. PET is measured along the path
-  that the agent really drove, so oncoming traffic in a bend does not count. For the vehicle ahead in a queue, this is
-  the time gap. For a PET of t s, the criticality is exp(-t / 1.2 s): 0.92 for 0.1 s, 0.43 for 1 s, 0.19 for 2 s.
-- Deceleration rate to avoid a crash (DRAC; D. F. Cooper and N. Ferguson, Traffic studies at T-junctions, 1976): the
-  least constant deceleration with which the agent, on the path that it drove, touches no actor within 4 s. Actors
-  move along their real paths, not at constant velocities. The criticality is the ratio of this deceleration to
-  12 m/s², which exceeds the braking of any vehicle. As in responsibility-sensitive safety (RSS; S. Shalev-Shwartz, S.
-  Shammah and A. Shashua, On a formal model of safe and scalable self-driving cars, 2017), the agent is assumed to
-  respond late.
+- Post-encroachment time (PET; Allen, Shin and Cooper, Analysis of traffic conflicts and collisions, 1978): the time
+  between the agent's and another actor's presence at the same place. PET is measured along the path that the agent
+  really drove, so oncoming traffic in a bend does not count. For the vehicle ahead in a queue, this is the time gap.
+  For a PET of t s, the criticality is exp(-t / 1.2 s): 0.92 for 0.1 s, 0.43 for 1 s, 0.19 for 2 s.
+- Deceleration rate to avoid a crash (DRAC; Cooper and Ferguson, Traffic studies at T-junctions, 1976). DRAC is the
+  least constant deceleration with which the agent, on the path that it drove, touches no actor within 4 s. Actors move
+  along their real paths, not at constant velocities. The criticality is the ratio of this deceleration to 12 m/s²,
+  which exceeds the braking of any vehicle. The agent is assumed to respond late, as in responsibility-sensitive safety
+  (RSS; Shalev-Shwartz, Shammah and Shashua, On a formal model of safe and scalable self-driving cars, 2017).
 
-The criticality of a trial grows with the time integral over its steps, in s, like the time integrated time to collision
-(TIT; M. M. Minderhoud and P. H. L. Bovy, Extended time-to-collision measures for road traffic safety assessment, 2001):
-integral / (integral + 10 s), and 1 after a touch. If there are several agents, the maximum over the agents counts.
+The criticality of a trial is integral / (integral + 10 s), and 1 after a touch. The integral is the time integral of
+the criticality over the steps, in s. It resembles the time integrated time to collision (TIT; Minderhoud and Bovy,
+Extended time-to-collision measures for road traffic safety assessment, 2001). If there are several agents, the maximum
+over the agents counts.
 
 Reason for the integral: it ranks trials better than the maximum over steps, as measured by
 `scripts/danger`. Reason for real paths: with constant velocities, every oncoming vehicle in a bend would be

@@ -127,7 +127,7 @@ def time_to_contact(
     """Return when pairs of rectangles first touch if both move at constant velocity; infinite for never.
 
     On every separating axis, the projections overlap during one interval of time. The outlines touch while all four
-    projections overlap. Source (swept separating axis test): D. Eberly, Intersection of convex objects, the method of
+    projections overlap. Source (swept separating axis test): Eberly, Intersection of convex objects, the method of
     separating axes.
 
     Args:
@@ -275,7 +275,7 @@ def corners(scene: Scene, row: int) -> NDArray[np.float64]:
     """Return the outline of an actor: shape (4, 2), counter-clockwise from the front left, in m.
 
     For a long vehicle in a bend, the shape is (2 n, 2): along its left side to the back, and along its right side to
-        the front.
+    the front.
     """
     left_side: list[NDArray[np.float64]] = []
     right_side: list[NDArray[np.float64]] = []
