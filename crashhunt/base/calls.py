@@ -64,7 +64,8 @@ def called_with(
 ) -> Callable[[Callable[[T], R]], Callable[P, R]]:
     """Return a decorator for a function with one dataclass as its argument; its caller passes the fields as keywords.
 
-    Type checkers and editors see the fields as its arguments. Unknown keywords are refused as by `clear_calls`.
+    Type checkers and editors see the fields as the arguments of the function. Unknown keywords are
+    refused as by `clear_calls`.
 
     Args:
         shape: the dataclass; its ``Args`` section becomes that of the function.

@@ -26,10 +26,10 @@ def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Itera
 
     Args:
         path: path of the final file.
-        lasting: whether content and name are synced to the disk at the end. Set it to False for files that are useless
-            after a crash of the process or a power failure.
-        noted: whether the next command removes the temporary file if this process is killed. Set it to False inside
-            a folder that is itself temporary.
+        lasting: whether content and name are synced to the disk at the end. Set this argument to False for files that
+            are useless after a crash of the process or a power failure.
+        noted: whether the next command removes the temporary file if this process is killed. Set this argument
+            to False inside a folder that is itself temporary.
 
     Raises:
         HuntDirectoryError: the file cannot be written.

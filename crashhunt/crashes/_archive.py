@@ -48,7 +48,7 @@ class Archive:
         directory: directory of the unpacked hunt.
         made_by: name of the tool that made it, according to the file.
         made_at: time of the export, as recorded in the archive.
-        made_here: whether this user made it on this machine, which its signature proves.
+        made_here: whether this user made the archive on this machine, which its signature proves.
     """
 
     directory: Path

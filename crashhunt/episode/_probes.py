@@ -154,7 +154,7 @@ class Prober:
         return episode.steps % steps_of(self._every_s, episode.simulator.step_length_s) == 0
 
     def ask(self, episode: Episode) -> None:
-        """Find the mildest disturbance of each kind with which the episode soon crashes, if milder than before."""
+        """For each kind of disturbance, search for a milder one than before with which the episode soon crashes."""
         before = self.questions.unanswered
         self._ask(episode)
         asked = self.questions.unanswered == before

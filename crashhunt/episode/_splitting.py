@@ -16,8 +16,9 @@ of a tree, but cause no bias. Trees are independent.
 A copy always runs to the end of its trial. A tree in which a copy has no result counts as incomplete.
 
 Source: Glasserman, Heidelberger, Shahabuddin and Zajic, Multilevel splitting for estimating rare event probabilities,
-Operations Research 47(4), 1999. Cost: the steps of the copies, a fork for each, and about 20 µs for the measure of a
-scene.
+Operations Research 47(4), 1999.
+
+Cost: the steps of the copies, a fork for each copy, and about 20 µs for the measure of a scene.
 """
 
 from __future__ import annotations

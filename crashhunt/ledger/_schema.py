@@ -306,7 +306,7 @@ def checked(row: Row, what: str, path: Path) -> Row:
 
 
 def plain_trial(row: Row, path: Path, *, trusted: bool) -> JsonObject:
-    """Return the trial of a whole row as JSON data.
+    """Return the trial that a row of all columns contains, as JSON data.
 
     Raises:
         HuntDirectoryError: the row contains no valid trial, or an unprotected row contradicts its own JSON text.

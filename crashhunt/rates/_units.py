@@ -210,7 +210,7 @@ class UnitSequence:
                 yield unit
 
     def _counted(self, trials: list[TrialFacts]) -> Unit:
-        """Return those of the trials that count."""
+        """Return the trials that count."""
         origin = self._rule.plain_origin
         plain = [trial for trial in trials if not origin or trial.origin == origin]
         self.not_random += len(trials) - len(plain)

@@ -196,7 +196,7 @@ class Scenario:
             simulator's `Backend` gives the dataclass of its table.
         events: limits of traffic events that differ from the default, such as ``not_moving`` in s.
         disturbances: disturbances, which are faults of other vehicles and of the agent's sensors: rate per second by
-            name. Only hunts use them.
+            name. Only hunts use disturbances.
         schema: version of the file format.
         name: name shown to users; by default the name of the folder.
         folder: folder of the scenario's files; not part of the file.

@@ -316,7 +316,7 @@ def take_snapshot(
         settings: The settings of the hunt.
         options: The options of the snapshot.
         imported: The modules that are imported for a trial, as returned by `plan_with_code`. By default, a separate
-            process imports them now.
+            process imports the modules now.
 
     Raises:
         SnapshotError: The snapshot is too large, or a file cannot be read or written.

@@ -66,7 +66,8 @@ class Escape(Serializable):
 
     Args:
         step: Full braking after this step avoids the collision; None if no such step was found.
-        too_late: Full braking after this step does not avoid the collision. If ``step`` exists, this is the next step.
+        too_late: Full braking after this step does not avoid the collision. If ``step`` exists, ``too_late`` is the
+            next step.
         braking: The greatest deceleration in these runs, in m/s²; None if the vehicle never slowed down.
         how: A description of the braking, as in `FullBraking`.
         why_not: The reason why neither `step` nor `too_late` is known; empty if one of them is known.

@@ -242,7 +242,8 @@ class TrialResult(Serializable):
         worker: The process id of the worker.
         kept: Whether the worker left its scratch folder for the hunt to collect.
         escape: The last step at which braking avoids the crash; None if the search was not run or found no answer.
-        why_no_escape: The reason why this search did not end, if its process was killed from outside; otherwise empty.
+        why_no_escape: The reason why the search for the last braking step did not end, if its process
+            was killed from outside; otherwise empty.
         events: Number of traffic events by type; None if they were not counted.
         disturbances: The disturbances that took place, with their vehicles.
         log_likelihood: Natural logarithm of the probability, under the hunt's models, that exactly these disturbances

@@ -417,8 +417,8 @@ def _same_level(scene: Scene, pair: tuple[int, int], ways: tuple[_Way, _Way], on
 def _first_share(way: _Way, other: _Way, *, until: float, still: bool) -> float | None:
     """Return the share of the step at which two rectangles first overlap; None if they do not overlap.
 
-    The method is conservative advancement: no contact is possible during the gap divided by a bound of the approach
-    speed.
+    The method is conservative advancement: the rectangles cannot touch before the time that results from the gap
+    divided by a bound of the approach speed.
     """
     touching = separation(way.end, other.end)[0] < -_MIN_OVERLAP_M
     if still:
