@@ -126,7 +126,7 @@ class WorkerSettings(Serializable):
         if data.get("schema") != _SCHEMA or unknown:
             how = f"with {', '.join(unknown)}, which {__version__} does not support" if unknown else "in another way"
             raise CrashhuntError(
-                f"the snapshot contains crashhunt {__version__}, but the crashhunt that replays it runs trials {how}",
+                f"the snapshot has crashhunt {__version__}, but the installed crashhunt runs its trials {how}",
                 fix=f"pip install crashhunt=={__version__}, or replay with --code current",
             )
         scenario = dict(data["scenario"])

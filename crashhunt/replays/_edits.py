@@ -69,7 +69,7 @@ def edited_disturbances(
         left = tuple(one for one in planned if one not in meant)
         return left, [f"{name} was {_all(meant, agents)} and is none"]
     if not asked.field:
-        raise ArgumentError(f"{where}: {text!r} cannot be set", fix=f"write none, or {NAME}.{FORM}")
+        raise ArgumentError(f"{where}: {text!r} is not a disturbance", fix=f"write none, or {NAME}.{FORM}")
     if asked.field not in _EDITABLE_FIELDS:
         fix = one_of(asked.field, _EDITABLE_FIELDS, give="write one of")
         raise ArgumentError(f"{where}: {asked.field!r} cannot be changed", fix=fix)
@@ -158,7 +158,7 @@ def _fixed(where: str, words: Sequence[str], agents: Sequence[str]) -> tuple[Dis
     odd = next((word for word in words if not is_fixed(word)), None)
     if odd is not None:
         fix = f"write {NAME}=none, {NAME}={FORM},… or {NAME}.STEP.how_strong=2"
-        raise ArgumentError(f"{where}: {odd!r} cannot be set", fix=fix)
+        raise ArgumentError(f"{where}: {odd!r} is not a disturbance", fix=fix)
     try:
         return parse_fixed(words, agents, shown=where.partition(".")[0] + ":")
     except UsageError as error:

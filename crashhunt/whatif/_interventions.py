@@ -311,7 +311,10 @@ def interventions_of(
     step = step_before(bundle, before_s) if before_s is not None else from_step
     option = "--before" if before_s is not None else "--from-step"
     if arguments and not agent:
-        raise UsageError(f"--arg {next(iter(arguments))} is for --agent", fix="give --agent, or --set instead of --arg")
+        raise UsageError(
+            f"--arg {next(iter(arguments))} has no effect without --agent",
+            fix="give --agent, or --set instead of --arg",
+        )
     if futures and step is None:
         raise UsageError("--futures needs a step", fix="give --from-step K or --before SECONDS")
     if overrule and step is None:

@@ -138,14 +138,14 @@ def test_what_cannot_be_meant_is_one_line_before_the_hunt(toy, words, says):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ("disturbances=some", "'some' cannot be set"),
+        ("disturbances=some", "'some' is not a disturbance"),
         ("disturbances.0.how_strong=2", "no disturbance begins at step '0'"),
         ("disturbances.{step}.how=2", "'how' cannot be changed"),
         ("disturbances.{step}.how_long=0", "give seconds above 0"),
         ("disturbances.{step}.who=above", "'above' is not a place"),
         ("disturbances.{step}.who=itself", "brake is not about 'itself'"),
         ("disturbances.stop@{step}=none", "no disturbance begins at step '7'; they begin at brake@7"),
-        ("disturbances.{step}=ahead:4:2", "cannot be set; write none, or disturbances.KIND@STEP="),
+        ("disturbances.{step}=ahead:4:2", "is not a disturbance; write none, or disturbances.KIND@STEP="),
         ("disturbances.stop@{step}=ahead:4", "is not a disturbance; write KIND@STEP="),
         ("disturbances=brake@{step}=above:4:2", "'above' is not a place"),
     ],

@@ -93,7 +93,7 @@ def test_an_older_version_is_reported_of_nothing_that_it_need_not_know(settings)
 
 def test_another_schema_is_refused(settings):
     for schema in (2, 0, None):
-        with pytest.raises(CrashhuntError, match="runs trials in another way"):
+        with pytest.raises(CrashhuntError, match="runs its trials in another way"):
             WorkerSettings.from_json({**plain(settings), "schema": schema})
 
 
