@@ -17,7 +17,7 @@ __all__ = ["collide_one_by_one", "enforce", "finish"]
 
 
 def finish(road: Road, dt: float) -> None:
-    """Finish a sub-step in which the kernel has moved the vehicles; if numbers are not finite, in highway-env."""
+    """Finish a sub-step with highway-env's code, because the kernel has found a number that is not finite."""
     for vehicle in road.vehicles:
         vehicle.on_state_update()
     collide_one_by_one(road, dt)

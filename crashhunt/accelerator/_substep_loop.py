@@ -50,7 +50,7 @@ class Onlooker:
         before: Function called before each sub-step with the length of the sub-step, in s.
         after: Function called after each sub-step.
         interferes: Function that returns whether the two observers may change the road; called before and after each
-            sub-step. By default, they never do.
+            sub-step. By default, the observers never change the road.
         waits: Function that returns whether the observers act only in sub-steps in which a vehicle crashes. If so,
             ``after`` is called only after these sub-steps, and ``before`` is never called. By default, both observers
             are always called.

@@ -5,10 +5,10 @@ The kernel copies the memory for a fork. This module handles all other resources
 Invariant: a fork changes no file or pipe through a descriptor that it has inherited, and does not outlive its parent.
 Every open descriptor is therefore handled in one of four ways before the work begins (`_replacement`):
 
-- A file that is read is opened again at the same position. Parent and fork otherwise share one position, and SUMO
-  reads long route files in parts.
-- A file that is written is replaced by ``/dev/null``. A file that is both written and read is replaced by a private
-  copy in memory.
+- A file that this process reads is opened again at the same position. Parent and fork otherwise share one position, and
+  SUMO reads long route files in parts.
+- A file that this process writes is replaced by ``/dev/null`` in the fork. A file that this process both writes and
+  reads is replaced by a private copy in memory.
 - A file descriptor of crashhunt itself is closed.
 - Threads, devices, connections and shared memory cannot be copied, so the fork is refused (`CannotForkError`).
 

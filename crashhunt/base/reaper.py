@@ -1,9 +1,9 @@
 """The keeper of a process: ends the process and all its descendants when it is done, or when its owner has ended.
 
 ``python -P …/reaper.py LIFELINE MODULE ARGUMENT…`` calls ``main()`` of a module in a child. The lifeline is one end of
-a pipe, and the owner holds the other end. The kernel closes that end whenever the owner dies, even before the keeper
-has started. The keeper is run by its path and imports almost nothing, because the crashhunt that the child imports
-comes from a snapshot, which may be older than this file.
+a pipe, and the owner holds the other end. The kernel closes the owner's end whenever the owner dies, even before the
+keeper has started. The keeper is run by its path and imports almost nothing, because the crashhunt that the child
+imports comes from a snapshot, which may be older than this file.
 """
 
 from __future__ import annotations

@@ -319,7 +319,7 @@ def _copy(bundle: Bundle, case: Case, folder: Path) -> None:
 def _compact(bundle: Bundle, recording: Recording) -> Recording:
     """Return the recording with the vehicles of the crash, and in each step also the actors near an agent.
 
-    The distance is so large that crash type and fault are the same as with all actors. Criticality and the closest
+    The distance is doubled until crash type and fault are the same as with all actors. Criticality and the closest
     approach depend on actors that are farther away, so they are not reported from a compact log.
     """
     if recording.compact is not None:

@@ -224,8 +224,8 @@ class Division:
 
         Args:
             number: number of the crash.
-            cause: cause found by the crash's runs. None if the crash cannot be run again; it then gets the cause of the
-                nearest judged crash.
+            cause: cause that the runs of the crash found; None if the crash cannot be run again. A crash without its
+                own cause gets the cause of the nearest judged crash.
         """
         self._open.discard(number)
         if number not in self._chosen:

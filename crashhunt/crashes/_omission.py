@@ -45,8 +45,8 @@ class Omission(Serializable):
             lanes``.
         speed_mps: speed of the agent after that step, in m/s.
         actor_speed_mps: speed of the disregarded actor, in m/s; None if there is no such actor.
-        gap_m: gap between the agent and the actor or stop line, in m; negative if the vehicles are side by side. None
-            without an actor or a stop line.
+        gap_m: gap between the agent and the actor or stop line, in m; negative if the vehicles are side by side. The
+            gap is None if there is neither an actor nor a stop line.
         safe: the safe speed for that gap, in m/s; for a lane change, the safe gap in m; None for a missing lane.
         visible_step: the step after which an observation first contained the actor; None if the step is unknown.
     """

@@ -294,8 +294,8 @@ class FirstOnsets:
             place: place (model and agent) of the disturbance.
             cell: cell of the disturbance.
             step: the step in which the disturbance begins.
-            in_step: the other places from which a disturbance may begin in the same step. Each has the draws that are
-                excluded because they would be effective; None to draw as usual.
+            in_step: the other places from which a disturbance may begin in the same step. Each place has the draws that
+                are excluded because they would be effective; None to draw as usual.
             number: number of the disturbance in the root trial.
         """
         rng = np.random.default_rng(

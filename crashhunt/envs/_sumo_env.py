@@ -131,7 +131,8 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         Args:
             n: number of copies, at least 1.
             seed: seed from which each copy gets another seed for SUMO's random generators, so that drivers behave
-                differently. The departure times of vehicles stay as planned. None to keep the state of the generators.
+                differently. The departure times of vehicles stay as planned. If the seed is None, the generators keep
+                their state.
 
         Raises:
             UsageError: this environment runs in the user's process, or SUMO's generators cannot be re-seeded.

@@ -52,7 +52,7 @@ class Blame:
     Args:
         error: The exception itself, without its wrapper.
         party: The origin, as text: the owner of the code that raised the exception.
-        place: The purpose for which that code was called; empty if it is unknown.
+        place: The purpose for which the failed code was called; empty if it is unknown.
         is_resource: Whether memory or file handles ran out in crashhunt's own code, so that the origin is unknown.
     """
 

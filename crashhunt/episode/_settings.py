@@ -55,7 +55,8 @@ class WorkerSettings(Serializable):
         timeout_s: wall-clock limit of a trial, in s.
         keep_trials: whether the scratch folder of every trial is kept, not only of crashes.
         sealed: for an untrusted crash, the files that the process may read in addition to installed packages and its
-            scratch folder. The process may write only in the scratch folder. None for no restrictions.
+            scratch folder. The process may write only in the scratch folder. With None, the process has no
+            restrictions.
         find_escapes: whether further runs of the trial find the last step at which braking avoids a collision; only in
             a new process.
         audit: the share of trials without a crash whose scratch folder is kept, because they are run again.

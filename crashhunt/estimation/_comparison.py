@@ -62,7 +62,7 @@ class HuntFigures:
             if most trials had no collision course.
         outcomes: number of trials with each outcome, over all trials, including invalid trials.
         counted: origin of the trials that count, if the search guided all others. Only unguided trials show a crash
-            rate. Empty if all trials count.
+            rate. The origin is empty if all trials count.
         disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
         excluded: number of trials that do not count, because a trial with a lower number has not ended.
         exclusions: number of trials that do not count, by reason. Reason ``trained_on``: an agent of this hunt, or of a
@@ -109,8 +109,9 @@ class Pair:
             None without pairs.
         difference: interval of the difference in crashes per trial, second minus first; None if there is none.
         units: number of independent pairs, of trials or of traffic seeds.
-        excluded: number of trials of both hunts that do not count, for one of three reasons. A trial of a lower number
-            has not ended. A trial is invalid in one hunt. An agent was trained on that part of the traffic.
+        excluded: number of trials of both hunts that do not count. A trial does not count if a trial with a lower
+            number has not ended, or if the trial is invalid in one hunt. A trial on whose traffic an agent was trained
+            does not count either.
         answer: ``first`` or ``second``, the hunt that certainly crashes less; ``undecided``; empty if no answer is
             possible.
     """

@@ -126,8 +126,8 @@ def died(spec: TrialSpec, scratch: Path, exit_code: int, agents: Mapping[str, st
 def result_of_death(attempt: TrialAttempt, scratch: Path, exit_code: int) -> TrialResult:
     """Return the result of a trial whose process died, if the trial is not run again.
 
-    The trial is invalid if its processes were killed from outside at different steps. Otherwise, the result is that of
-    `died`.
+    The trial is invalid if its processes were killed from outside at different steps. In all other cases, `died` gives
+    the result.
 
     Args:
         attempt: the attempts to run the trial; `TrialAttempt.again` has been called for the last process.

@@ -36,7 +36,8 @@ def has_hung(
 
     Args:
         header: header of the trial's black box; None if there is none.
-        begun: whether the process of the trial itself wrote the header. If not, `START_UP_S` is added to the limit.
+        begun: whether the process of the trial itself wrote the header. If the process has not written it, `START_UP_S`
+            is added to the limit.
         given_at: time at which the process received the trial, on the clock `time.monotonic`.
         limit_s: wall-time limit of the trial from its beginning on, in s.
         has_words: function that returns whether the process has written its stack.

@@ -130,7 +130,7 @@ class Trials:
     def upcoming(self) -> int | None:
         """The number of the next trial; trials with lower numbers are running or have ended.
 
-        None if no trial is left.
+        The number is None if no trial is left.
         """
         upcoming = [one.number for one in list(self._unanswered)[:1]] + [
             one for one in (self._next,) if one is not None

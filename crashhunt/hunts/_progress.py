@@ -555,7 +555,7 @@ class PhaseClock:
     def run(
         self, function: Callable[[T], R], items: Sequence[T], *, counts: Callable[[R], bool] = lambda _: True
     ) -> list[R]:
-        """Call a function for each item in threads that wait for processes; return the results in that order.
+        """Call a function for each item in threads that wait for processes; return the results in item order.
 
         Args:
             function: function to call in a thread.

@@ -66,8 +66,8 @@ class About:
         separator: separator of a list that is written as one word on the command line; empty if the option may be
             repeated.
         named: for a table, whether every value has a name.
-        anywhere: whether ``suite run`` and ``rerun`` have the option as well, for all their hunts. An option with this
-            flag belongs to the machine and not to the hunt.
+        anywhere: whether ``suite run`` and ``rerun`` have the option as well, for all their hunts. Such an option
+            belongs to the machine that runs a hunt, and not to the hunt itself.
     """
 
     meaning: str

@@ -29,10 +29,10 @@ iterated logarithm (1970), for mixtures. Waudby-Smith and Ramdas, Estimating mea
 betting, JRSS B 86(1), 2024, for the bets. Grünwald, de Heide and Koolen, Safe testing, JRSS B 86(5), 2024, for
 e-values.
 
-Cost: a unit increments a counter. A capital needs one logarithm for each component and each different unit. With trials
-as exposure there are two different units. Many different exposures are spread over a fixed grid. A unit between two
-grid points counts partly at each of the two points, with the same sum. The logarithm of each factor is concave in the
-exposure, so the grid increases no capital, and the interval stays valid.
+Cost: a unit increments a counter. The computation of a capital needs one logarithm for each component and each kind of
+unit. With trials as exposure, there are two kinds of units. Many different exposures are spread over a fixed grid. A
+unit between two grid points counts partly at each of the two points, with the same sum. The logarithm of each factor is
+concave in the exposure, so the grid increases no capital, and the interval stays valid.
 """
 
 from __future__ import annotations

@@ -131,7 +131,8 @@ class CountingRule:
     Args:
         max_steps: maximum number of steps of a trial.
         agents: number of controlled vehicles.
-        plain_origin: the origin of the trials that were drawn independently; empty if all trials were.
+        plain_origin: the origin of the trials that were drawn independently; empty if all trials were drawn
+            independently.
         traffics: number of traffic seeds of the hunt; 0 if each trial has its own seed.
         planned: planned number of trials; 0 for no limit.
         is_held_out: function that returns whether no agent was trained on the traffic of a seed; None if no agent was

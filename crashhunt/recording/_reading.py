@@ -30,7 +30,7 @@ class AgentChannel:
         id: identifier of the agent, which is also the identifier of its vehicle.
         observation_dtype: type of the observations in NumPy's notation, such as ``<f4``.
         observation_shape: shape of one observation.
-        action_dtype: type of the actions, in the same notation.
+        action_dtype: type of the actions in NumPy's notation, such as ``<i8``.
         action_shape: shape of one action.
         action_names: names of the elements of an action.
         observation_names: names of the columns of an observation.

@@ -51,8 +51,8 @@ class Look:
         stop_at: the step in which the debugger stops in ``act`` of the crashed agent; 0 for none.
         to_stderr: whether the output of the process goes to standard error.
         panels: the first step whose panels are drawn, and the folder for the pictures.
-        window: wall time between two steps in the simulator's window, in s; the window pauses before the crash. None
-            for no window.
+        window: wall time between two steps in the simulator's window, in s; the window pauses before the crash. With
+            None, no window opens.
     """
 
     until: int
@@ -68,7 +68,7 @@ class ReplayOptions:
     """The options of a replay.
 
     Args:
-        code: which code drives: the code of the snapshot, the current code, or the recorded actions.
+        code: what controls the agents: the code of the snapshot, the current code, or the recorded actions.
         changes: new value by name of an argument: ``NAME`` or ``AGENT.NAME``.
         force: whether to replay from a damaged snapshot.
         times: number of replays.
@@ -99,7 +99,7 @@ class Rerun:
         recorded: the recording of the crash.
         spec: the trial to run, with all edits.
         worker: settings of the worker that runs the trial; its scratch folder is not set yet.
-        code: which code drives.
+        code: the code that controls the agents, as in `ReplayOptions`.
         snapshot: snapshot of the bundle.
         edits: the differences from the recorded trial, as text.
         warnings: warnings about possible causes of different results, as text.

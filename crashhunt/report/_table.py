@@ -132,8 +132,8 @@ def aligned(rows: Sequence[Sequence[str]], *, left: int = 0, width: int = 0) -> 
         rows: rows of the table, the heading first; cells beyond the columns of the heading are appended without
             alignment.
         left: number of columns that are aligned to the left; the other columns are aligned to the right.
-        width: maximum number of characters in a line; if the columns need more, they are only one space apart. 0 for no
-            limit.
+        width: maximum number of characters in a line; if the columns need more, they are only one space apart. A width
+            of 0 sets no limit.
     """
     count = len(rows[0])
     widths = [max(len(row[column]) for row in rows) for column in range(count)]

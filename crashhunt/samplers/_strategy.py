@@ -43,7 +43,7 @@ class Strategy(Protocol):
     """Learns from reported results, and derives proposals only from these; earlier proposals have no influence."""
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
-        """Return the draft at a place from 0 in the sequence of drafts; None while there are too few results."""
+        """Return the draft at an index of the sequence of drafts; None while there are too few results."""
 
     def tell(self, trial: ScoredTrial) -> None:
         """Learn from the result of a trial of any origin."""

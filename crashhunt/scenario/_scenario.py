@@ -4,10 +4,10 @@ A `Scenario` describes how to set up an episode. A scenario is plain data, so re
 simulator. A `Backend` is the descriptor of a simulator. Scenarios, plans, snapshots and replays use the descriptor for
 everything that differs between simulators.
 
-The descriptor of a simulator is optional. Without it, a scenario has no table for the simulator, and crashhunt refuses
-to replay the recorded actions of an untrusted bundle in this simulator. To give your simulator a descriptor, make a
-`Backend` in a module that does not import the simulator, because commands that only read a scenario import it. Register
-it under the simulator's name::
+The descriptor of a simulator is optional. Without a descriptor, a scenario has no table for the simulator, and
+crashhunt refuses to replay the recorded actions of an untrusted bundle in this simulator. To give your simulator a
+descriptor, make a `Backend` in a module that does not import the simulator, because commands that only read a scenario
+import it. Register it under the simulator's name::
 
     [project.entry-points."crashhunt.simulators"]
     mysim = "mypackage.simulator:MySimulator"
@@ -472,7 +472,7 @@ class Backend:
             at run time. Allowed are numbers, text, lists, tuples, tables of these, and further dataclasses.
         example: the required keys of the table, for the message about a missing table.
         keys: the optional keys of ``scenario.toml`` that this simulator uses (``warmup_s``, ``insertion_timeout_s``,
-            ``agents.route``, …). All other optional keys are refused. None if the keys are unknown.
+            ``agents.route``, …). All other optional keys are refused. ``keys`` is None if the keys are unknown.
         shows_itself: whether agents receive the simulator's own observation if the scenario has no ``[observation]``.
         check: function that raises `ScenarioError` for an invalid scenario; it also receives the path of the file for
             the message.
@@ -508,7 +508,7 @@ class Backend:
         plays_paths: whether the simulator can move other actors along recorded paths.
         one_per_process: whether a process can run only one simulation at a time.
         forkable: whether a process can safely fork after creating the simulator, because the simulator starts no
-            threads. Otherwise a trial fork determines this before the first trial.
+            threads. If this value is False, crashhunt makes a trial fork before the first trial to find out.
         survey: how crashhunt finds, before a hunt, the vehicles that an agent can replace in one of the
             ``configurations``.
     """

@@ -60,7 +60,7 @@ class Kinematics:
     Sine and cosine come from the C library, because NumPy's results differ between processors in the last bit.
 
     Args:
-        setup: Number of rows, columns, normalisation.
+        setup: Settings of the observation: the number of rows, the columns, and whether values are normalised.
 
     Attributes:
         hidden: Pairs of identifiers: an agent, and an actor that this agent does not see.

@@ -62,7 +62,8 @@ class OneLearner(gymnasium.Env[Any, Any]):
         parallel: The environment, with the interface of PettingZoo's ``ParallelEnv``.
         learner: The agent that crashhunt tests, one of ``possible_agents``; empty for the first agent.
         policy: Function that returns the action of another agent, given its name, observation, action space and random
-            generator. None for random actions, within the mask of possible actions if the environment provides a mask.
+            generator. Without this function, the other agents act at random, within the mask of possible actions if the
+            environment provides a mask.
     """
 
     def __init__(self, parallel: Any, learner: str = "", policy: Callable[..., object] | None = None) -> None:

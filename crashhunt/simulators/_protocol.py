@@ -307,7 +307,8 @@ class ReportsSurroundings(Protocol):
 class TranslatesMotion(Protocol):
     """A simulator that translates actions of acceleration and steering into speeds and lane changes.
 
-    Counterfactual runs with a reference driver need it for such actions. Contract: no method changes the simulation.
+    Counterfactual runs with a reference driver need this translation if agents act by acceleration and steering.
+    Contract: no method changes the simulation.
     """
 
     def is_steered(self, agent: str) -> bool:

@@ -165,8 +165,8 @@ class Gate:
         """Compare the two versions until the verdict is certain, the pairs or the time are used up, or an interrupt.
 
         Args:
-            directory: folder of the hunts; finished trials in this folder are not run again. None for a temporary
-                folder.
+            directory: folder of the hunts; finished trials in this folder are not run again. If the folder is None, a
+                temporary folder is used.
             watch: function called about once a second with the progress.
 
         Raises:

@@ -159,7 +159,7 @@ class Stress(Serializable):
     Args:
         margin: The robustness margin: strength of the minimal disturbance that made a probe crash, as a share of the
             strongest plausible disturbance. The margin is 1 if no probe crashed, and 0 if the trial crashed without a
-            disturbance. None if a probe has no result.
+            disturbance. The margin is None if a probe has no result.
         probes: Number of probes.
         steps: Number of simulated steps of the probes.
         left_out: Number of probes that were skipped because the budget of steps was used up.

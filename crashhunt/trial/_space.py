@@ -99,7 +99,7 @@ class Choice:
         return self.options[min(int(share * len(self.options)), len(self.options) - 1)]
 
     def share_of(self, value: Value) -> float:
-        """Return the middle of those shares whose quantile is the given option.
+        """Return the middle of the range of shares for which `quantile` returns the given option.
 
         Raises:
             ValueError: the value is not an option.
@@ -195,7 +195,7 @@ class Range:
         return min(float(self.low + (self.high - self.low) * share), float(self.high))
 
     def share_of(self, value: Value) -> float:
-        """Return a share, from 0 to 1, whose quantile is the value; for a stepped range, the middle of the shares.
+        """Return a share for which `quantile` returns the value; for a stepped range, the middle of these shares.
 
         Raises:
             ValueError: the value is not a number.

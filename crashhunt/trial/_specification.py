@@ -124,7 +124,7 @@ class TrialSpec(Serializable):
         disturbances: The planned disturbances, sorted by step.
         only: The other actors that take part; None for all actors. Minimized crashes use this field.
         script: Recorded paths along which all other actors are moved. The agents begin at the start of their paths, and
-            the scenario's traffic is excluded. None if the other actors drive themselves.
+            the scenario's traffic is excluded. ``script`` is None if the other actors drive themselves.
         handover: The agent that takes control after recorded actions, and the step; None if all agents act from the
             start.
         reseeding: The steps after which the simulator's random generators are re-seeded, and the seeds; None if they

@@ -71,7 +71,7 @@ class SetArguments:
 
     @property
     def from_step(self) -> None:
-        """None, because the change holds from the start."""
+        """Always None, because the change holds from the start of the trial."""
 
     def applied(self, rerun: Rerun) -> Rerun:
         """Return the run unchanged, because `prepare` has already made the change."""
@@ -149,7 +149,7 @@ class LeaveOut:
 
     @property
     def from_step(self) -> None:
-        """None, because the change holds from the start."""
+        """Always None, because the change holds from the start of the trial."""
 
     def applied(self, rerun: Rerun) -> Rerun:
         """Return the run unchanged, because the engine determines the remaining actors first."""

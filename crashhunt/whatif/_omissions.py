@@ -4,8 +4,8 @@ First the reference driver only watches. The run with the watching driver must b
 reports the periods in which the agent was not safe. Then the reference driver takes control of speed or lanes from the
 beginning of such a period, and from 0.5 s and 1 s before. The period is the cause if no such run ends in a crash. The
 run from its beginning is made twice, and must have the same digest. If all crashes of such runs differ from the
-recorded crash, the part of the driving that the agent kept may have caused them. Then the reference driver takes
-control of speed and lanes from the same steps, and no run may end in a crash.
+recorded crash, the part of the driving that the agent kept may have caused them. In that case, the reference driver
+takes control of both speed and lanes from the same steps in further runs, and none of these runs may end in a crash.
 
 Cost: one run in which the reference driver watches, three or six for each candidate, and one repetition; at most
 `_MAX_CANDIDATES` candidates.

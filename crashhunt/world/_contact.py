@@ -226,8 +226,8 @@ def contact_at(previous: Scene | None, present: Scene, row: int, other: int, *, 
         present: the scene of the contact.
         row: row of the first actor in the present scene.
         other: row of the second actor in the present scene.
-        swept: whether actors drive along curves, as in `Scene`. If not, they move in straight lines without jumps, and
-            the time is an estimate.
+        swept: whether actors drive along curves, as in `Scene`. If False, actors move in straight lines without jumps,
+            and the time is an estimate.
 
     Returns:
         The contact. If the outlines do not touch, as in some collisions reported by simulators, the positions at the

@@ -95,7 +95,8 @@ class RecordType:
             crashhunt that does not know the type can read the record and include it in the digest.
         read: function that adds a record, given as ``aux`` and payload, to the `Reading`.
         difference: function that returns the first difference between the records of two equal steps; for one agent if
-            the topic contains ``{agent}``. None if the record is never compared, or is compared with another type.
+            the topic contains ``{agent}``. The function is None if the record is never compared, or is compared with
+            another type.
         value: function that returns the value of the agent or actor of a divergence, or the value at an index, for the
             steps around.
     """

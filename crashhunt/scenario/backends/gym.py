@@ -32,7 +32,7 @@ class CrashRule:
         function: ``module:function``, called with observation, reward, terminated, truncated, info. A true result means
             a crash; a text as the result describes the crash.
         kind: ``module:function``, called with the same values for the step of a crash; it returns the crash type as
-            text. Without it, ``info["crash_kind"]`` is the crash type if it is a text.
+            text. Without this function, ``info["crash_kind"]`` is the crash type if the value is a text.
     """
 
     info: str = ""
@@ -52,10 +52,11 @@ class GymSetup:
         crash: rules that define a crash.
         learner: name of the tested agent in a parallel environment of PettingZoo; empty for the first agent.
         others: for a parallel environment, ``module:function``, which is called with name, observation, action space
-            and random generator of each other agent and returns its action. Empty for random actions.
+            and random generator of each other agent and returns its action. If the text is empty, the other agents act
+            at random.
         danger: the criticality of a step without a scene. ``info.KEY`` is a number of the info from 0 to 1.
             ``-info.KEY`` is a number x that falls with criticality, such as a distance, and gives 1 / (1 + x). A trial
-            has the greatest value of its steps. Empty if criticality is unknown.
+            has the greatest value of its steps. The key is empty if the criticality is unknown.
     """
 
     id: str
