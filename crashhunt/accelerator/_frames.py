@@ -101,7 +101,7 @@ class TrafficFrame:
         )
 
     def _queue(self, lane: int) -> tuple[list[float], list[RoadObject]]:
-        """Return positions and objects on a lane, in order, and on connected lanes if the road searches these."""
+        """Return positions and objects on a lane, in order; also on connected lanes if the road searches them."""
         found: dict[int, float] = {}
         for other, offset in self.network.connected_lanes(lane) if self._looks_further else [(lane, 0.0)]:
             for row, (s, r) in enumerate(zip(*self.column(other), strict=True)):

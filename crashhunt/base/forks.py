@@ -221,7 +221,7 @@ watchdog = Watchdog()
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Resources that this process held before user code ran in it. Forks need no private copy of these.
+    """Resources that this process held before user code ran in it. Forks need no private copy of such resources.
 
     Args:
         files: target of each open file descriptor.

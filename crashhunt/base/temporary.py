@@ -13,7 +13,8 @@ process calls it before the first temporary file. A leftover is removed only if 
 
 * its process has certainly ended (`has_ended`), and no process holds the lock of its folder,
 * the leftover belongs to this user, and its name contains the token of that process,
-* it is a folder or a regular file. A symbolic link that looks like a leftover is not removed, nor is its target.
+* the leftover is a folder or a regular file. A symbolic link that looks like a leftover is not removed, nor is its
+  target.
 
 After a crash of the machine, no process can distinguish its temporary files from those of other hosts. The next hunt in
 a directory removes the scratch folder of this directory, and the system clears its folder for temporary files.

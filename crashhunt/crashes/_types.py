@@ -134,7 +134,7 @@ def group_crashes(
 
 
 def _avoidable(bundle: Bundle) -> bool | None:
-    """Return the runs of a crash that show whether it was avoidable: those of `judge`, or those of its hunt."""
+    """Return whether runs of `judge` or of the hunt avoided a crash; None if no such run shows this."""
     judgement, escape = judgement_of(bundle), bundle.result.escape
     if judgement is not None and judgement.avoidable is not None:
         return judgement.avoidable

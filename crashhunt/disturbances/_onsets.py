@@ -16,8 +16,8 @@ accumulates along the root. In each interval of length `Forcing.spacing` of this
 uniformly drawn point. The weight of an onset is spacing / ratio.
 
 Invariant: the expected sum of weights over any set of first onsets is the probability of that set, given the root. The
-estimate is the sum of the weighted crashes of all copies; if the root itself crashes, S at its end is added. The
-estimate is therefore unbiased, for all ratios above 0 and for any spacing.
+estimate is the sum of the weighted crashes of all copies; if the root itself crashes, S at the end of the root is
+added. The estimate is therefore unbiased, for all ratios above 0 and for any spacing.
 
 Reason for intervals of fixed length: eight equal parts of each root would need the total probability, which is known
 only at the end of the root. A second run of the root would cost its steps again. The spacing is learned, so that a root

@@ -455,7 +455,7 @@ def _brakings(rear_mps2: float, front_mps2: float) -> dict[str, float]:
     """Return the decelerations from which a safe distance is computed.
 
     RSS compares only the stopping distances, so its formula is valid if the front vehicle brakes at least as hard as
-    the rear vehicle. Otherwise, it would allow a rear vehicle that brakes harder to drive through a slower front
+    the rear vehicle. If the rear vehicle braked harder, the formula would allow it to drive through a slower front
     vehicle.
     """
     planned = min(rear_mps2, MAX_PLANNED_BRAKING_MPS2)

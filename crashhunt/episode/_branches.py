@@ -1,9 +1,9 @@
 """Branches: forks of an episode that continue with other disturbances, when other actors are near.
 
-In every second of simulation with a near actor, the episode leaves a suspended fork. At intervals the fork runs at once
-with all possible disturbances at their greatest strength. If the fork does not crash, milder disturbances would hardly
-cause a crash either, so one branch replaces many. If the branch crashes, disturbances are removed one by one while it
-still crashes.
+In every second of simulation with a near actor, the episode leaves a suspended fork. At intervals, the fork of a step
+continues immediately, with all possible disturbances at their greatest strength. If the fork does not crash, milder
+disturbances would hardly cause a crash either, so one branch replaces many. If the branch crashes, disturbances are
+removed one by one while it still crashes.
 
 The criticality of a step is known only some seconds later. The forks of a critical step, and of some seconds before,
 then run with disturbances from the usual distributions.

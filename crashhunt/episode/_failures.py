@@ -65,7 +65,7 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str 
         agent: The agent whose code failed; empty if it was not an agent's code.
         cause: Why the exception was raised, as a clause; empty if its message contains the reason.
         party: The owner of the code that failed; empty if it is unknown.
-        place: The purpose for which that code was called; empty if it is unknown.
+        place: The purpose for which the failed code was called; empty if it is unknown.
     """
     with blocked_signals(), _deep_enough():
         # crashhunt's own messages are complete, so they need no traceback.
@@ -154,7 +154,7 @@ class Attribution:
     """The agent that caused an exception, and how.
 
     Args:
-        agent: identifier of the agent; empty if one of several agents caused it.
+        agent: identifier of the agent; empty if one of several agents caused the exception, but it is unknown which.
         cause: the action by which the agent made another part fail, as a clause; empty if the agent's own code raised
             the exception.
     """

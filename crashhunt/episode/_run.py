@@ -214,7 +214,7 @@ class Parts:
         """Import all modules that trials need, always in the same order.
 
         Modules may, for example, set constants of a simulator's classes when they are imported. All imports happen
-        before the first episode, so these constants are the same in every episode.
+        before the first episode, so the constants of the classes are the same in every episode.
 
         Args:
             report: Function called before each import with the error to show if the import does not return, such as

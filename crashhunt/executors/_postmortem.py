@@ -256,8 +256,8 @@ def _result(
 def agent_in_stack(stack: str, agents: Mapping[str, str]) -> str:
     """Return the agent whose code was running when the process died; empty if the stack does not show an agent.
 
-    The simulator may be interrupted by a signal handler of an agent. The handler's frames then lie above those of
-    crashhunt.
+    The simulator may be interrupted by a signal handler of an agent. In that case, the frames of the handler lie above
+    those of crashhunt.
 
     Args:
         stack: the stack in the format that `faulthandler` writes for a fatal signal.

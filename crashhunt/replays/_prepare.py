@@ -74,8 +74,8 @@ class ReplayOptions:
         times: number of replays.
         scenario: name or path of another scenario in which to drive; empty for the scenario of the crash.
         accelerate: whether simulators are accelerated if the results stay bit-identical.
-        trusted: whether the code of the crash may run; None to determine it. If not trusted, only recorded actions are
-            replayed, and only if the simulator runs no other code.
+        trusted: whether the code of the crash may run; None to determine it. If the code is not trusted, only recorded
+            actions are replayed, and only if the simulator runs no other code.
         look: what to examine in a process that uses this process's terminal; None to run in the background without the
             terminal.
     """

@@ -156,7 +156,7 @@ class _Study:
         self._add(scored.point.tolist(), scored.score, scored.number)
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
-        """Return the proposal of the study."""
+        """Return the next trial that the Optuna study proposes."""
         if self._kind == "QMCSampler":
             self._storage.count_from(place % _LONGEST)
         with self._seeded(int(rng.integers(2**31))), self._storage.asking():

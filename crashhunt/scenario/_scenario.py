@@ -468,8 +468,8 @@ class Backend:
 
     Args:
         title: name of the simulator for users.
-        table: the dataclass of the simulator's table in ``scenario.toml``. The types of its fields must be importable
-            at run time. Allowed are numbers, text, lists, tuples, tables of these, and further dataclasses.
+        table: the dataclass of the simulator's table in ``scenario.toml``. The types of the dataclass's fields must be
+            importable at run time. Allowed are numbers, text, lists, tuples, tables of these, and further dataclasses.
         example: the required keys of the table, for the message about a missing table.
         keys: the optional keys of ``scenario.toml`` that this simulator uses (``warmup_s``, ``insertion_timeout_s``,
             ``agents.route``, …). All other optional keys are refused. ``keys`` is None if the keys are unknown.
@@ -479,7 +479,7 @@ class Backend:
         check_names: function that refuses names which the scenario's files do not define; it receives the value of
             ``--ego``, and is not called for scenarios that have already run.
         files: function that yields the files that an episode reads; they are part of the digest and of the snapshot.
-        texts: function that yields those of ``files`` that may contain ``${NAME}`` for a scenario argument.
+        texts: function that yields the files of an episode that may contain ``${NAME}`` for a scenario argument.
         relocated: function that returns the contents of one of ``texts`` in a form that stays valid if the folder
             moves; None if the contents are already valid everywhere.
         modules: function that yields the user's modules that the simulator imports in addition to the agents, as

@@ -293,7 +293,8 @@ class SupportsFullBraking(Protocol):
 class ReportsSurroundings(Protocol):
     """A simulator that knows what a careful driver of an agent's vehicle would consider.
 
-    Counterfactual runs with a reference driver need it. Contract: `surroundings` changes nothing in the simulation.
+    Counterfactual runs with a reference driver need this knowledge. Contract: `surroundings` changes nothing in the
+    simulation.
     """
 
     def surroundings(self, agent: str) -> Surroundings:

@@ -361,8 +361,8 @@ def _advance(episode: Episode, actions: Mapping[str, NDArray[np.generic]]) -> Tr
 def _seeded(seed: int) -> Iterator[None]:
     """Return a context that seeds the process's random generators as a trial does, and later restores their state.
 
-    A scenario may use the process's random generators. The caller's training uses them as well, and must not get the
-    same numbers in each episode.
+    A scenario may use the process's random generators. The caller's training uses these generators as well, and must
+    not get the same numbers in each episode.
     """
     states = random.getstate(), np.random.get_state()  # noqa: NPY002 - scenarios may use the global generator
     random.seed(seed)

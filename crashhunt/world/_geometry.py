@@ -131,12 +131,13 @@ def time_to_contact(
     separating axes.
 
     Args:
-        offset: as in `rectangle_gap`.
+        offset: shape (n, 2), from the centre of the first rectangle to the centre of the second, in the frame of the
+            first, in m.
         velocity: shape (n, 2), velocity of the second rectangle relative to the first, in the frame of the first, in
             m/s.
-        turn: as in `rectangle_gap`.
-        half_one: as in `rectangle_gap`.
-        half_two: as in `rectangle_gap`.
+        turn: shape (n,), heading of the second rectangle in the frame of the first, in rad.
+        half_one: shape (n, 2), half length and half width of the first rectangle, in m.
+        half_two: shape (n, 2), half length and half width of the second rectangle, in m.
 
     Returns:
         The times, shape (n,), in s; 0 if the rectangles overlap already.

@@ -65,7 +65,7 @@ class Contact:
     Args:
         collider: identifier of the actor that drove into the other actor.
         victim: identifier of the actor that was hit.
-        kind: the simulator's name of the type.
+        kind: the type of the collision, by the simulator's name.
         lane: lane of the collision.
         collider_speed: speed of the collider, in m/s.
         victim_speed: speed of the victim, in m/s.

@@ -355,7 +355,8 @@ class Bridge:
     def _assign_trials(self) -> None:
         """Submit waiting trials.
 
-        A node that is called soon receives them with that call, because each call costs time.
+        If the bridge calls a node soon anyway, the node receives its trials with that call, because each call costs
+        time.
         """
         for node, trials in self._roster.assign().items():
             given = [(trial.ticket, trial.spec) for trial in trials]

@@ -86,8 +86,8 @@ def action_with(
     """Return an action with another speed, or with the steering that keeps the lane.
 
     Args:
-        kind: as in `motion_of`.
-        vehicle: as in `motion_of`.
+        kind: action type of the vehicle, as `is_steered` accepts it.
+        vehicle: the vehicle.
         action: the action that is corrected.
         step_s: step length, in s.
         speed_mps: speed after the step, at least 0, as far as the vehicle can reach it; None leaves the acceleration.
