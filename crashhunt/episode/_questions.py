@@ -120,7 +120,8 @@ class Questions:
 
         Args:
             why: the reason, as text; empty if no more forks run.
-            is_from_outside: whether another run of the trial may have a result.
+            is_from_outside: whether the reason lies outside of the trial, so that another run of the trial may return a
+                result.
         """
         if not why:
             why, is_from_outside = self.why_not or self._paused_because, not self.why_not

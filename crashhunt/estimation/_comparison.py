@@ -98,7 +98,7 @@ class Pair:
             often.
         only_second: pairs in which only the second hunt crashed; with ``--seeds``, traffic seeds in which it crashed
             more often.
-        both: pairs in which both hunts crashed, equally often.
+        both: pairs in which both hunts crashed; with ``--seeds``, traffic seeds in which both crashed equally often.
         p_value: *p* value of McNemar's or Fisher's exact test; None if the number of trials was not fixed in advance.
         caution: a warning that limits the meaning of the answer; empty if there is none.
         test: basis of the verdict: ``pairs``, the evidence of discordant pairs; ``intervals``, the certain intervals of

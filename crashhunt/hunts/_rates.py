@@ -325,7 +325,9 @@ class SplittingForcings:
 
 
 class SplittingWatch(RareWatch):
-    """Like `RareWatch`, for ``--rare splitting``. Pilots do not count for the estimate, but for the certain interval.
+    """Like `RareWatch`, for ``--rare splitting``.
+
+    Pilot trials count for the certain interval, but not for the estimate.
 
     Args:
         settings: settings of the hunt.

@@ -180,7 +180,8 @@ class RareReport:
 
     Args:
         estimate: estimate of the crash probability per trial.
-        verified: number of fork crashes, those with the greatest weights, that were run from the start.
+        verified: number of crashes found by forks that were run again from the start. The crashes with the greatest
+            weights are chosen.
         not_finished: number of these runs that did not finish.
         crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
         more: further lines for the user, such as the levels of splitting.

@@ -178,7 +178,7 @@ def calibrate(
     demand: Demand, network: RoadNetwork, tools: Tools, folder: Path, values: Mapping[str, object], *, net: str,
     scales: tuple[float, float], probes_at_s: float, bicycles: bool,
 ) -> tuple[Demand, PlainRun, PlainRun]:  # fmt: skip
-    """Return the demand at which the traffic flows with both factors, and the two runs that show this.
+    """Return the demand at which traffic flows with the usual and largest factor, and the two runs that show it.
 
     Args:
         demand: the traffic before calibration.

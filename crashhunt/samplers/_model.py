@@ -103,7 +103,7 @@ class Process:
 
 
 def _worths(scores: Floats) -> Floats:
-    """Return values that depend on the order of scores alone, and are further apart among the greatest."""
+    """Return values that depend only on the order of scores, with greater differences for greater scores."""
     order, count = np.sort(scores), len(scores)
     below = np.searchsorted(order, scores, "left")
     above = count - np.searchsorted(order, scores, "right")

@@ -309,6 +309,7 @@ class TranslatesMotion(Protocol):
     """A simulator that translates actions of acceleration and steering into speeds and lane changes.
 
     Counterfactual runs with a reference driver need this translation if agents act by acceleration and steering.
+
     Contract: no method changes the simulation.
     """
 

@@ -18,8 +18,8 @@ class Environment(TypedDict):
     """The contents of ``environment.json``: everything besides code on which a result depends.
 
     The entry ``git`` has the revision of each work tree. The entry ``core`` is whether the simulator's compiled core
-    was used, which does not change results. If results depend on an order at load, ``load_order`` is ``fixed`` or ``not
-    fixed: REASON``. Snapshots of earlier versions have no ``load_order``.
+    was used, which does not change results. If results depend on an order at load, ``load_order`` is ``fixed`` or
+    ``not fixed: REASON``. Snapshots of earlier versions have no ``load_order``.
     """
 
     schema: int

@@ -71,7 +71,7 @@ class SamplerContract:
             assert _ask(again, number) == turns[number][1], f"it was asked for trial {number}"
 
     def test_one_that_does_not_learn_proposes_the_same_whatever_it_is_reported(self, make: Make, space: Space) -> None:
-        """The hunt passes no results to such a sampler, and reported results have no effect."""
+        """The hunt passes no results to a sampler that does not learn, and reported results have no effect."""
         sampler = make(space)
         if not sampler.learns:
             fresh = make(space)

@@ -98,7 +98,7 @@ class CrashEpisodes:
 
         Returns:
             The observation, the info, and a description of where the repeated steps differ from the recording. The
-            description is empty if they are bit-identical; otherwise the episode must not be used.
+            description is empty if the repeated steps are bit-identical; otherwise the episode must not be used.
         """
         bundle = self._bundles[index]
         stage = self._enter(bundle.hunt)

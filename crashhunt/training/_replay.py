@@ -6,9 +6,9 @@ The rule comes from Prioritized Level Replay (Jiang, Grefenstette and Rocktäsch
 
 with the scores S, the number c of the episode, and the number C(i) of the last episode that began with crash i. The
 second part selects crashes whose score may be out of date, so a crash that the agent survives no longer is selected
-again. In the paper, the score is the agent's value loss. An environment does not know this loss, so the score here is
-the share of crashed episodes, as an exponential average that begins at 1. Scores are proportional, not ranked, because
-most of them are equal.
+again. In the paper on Prioritized Level Replay, the score is the agent's value loss. An environment does not know this
+loss, so the score here is the share of crashed episodes, as an exponential average that begins at 1. Scores are
+proportional, not ranked, because most of them are equal.
 """
 
 from __future__ import annotations

@@ -126,7 +126,7 @@ class Forced(Serializable):
         unanswered: number of planned copies without a result.
         why_unanswered: the reason for the first missing result; empty if no result is missing.
         may_be_asked_again: whether a reason lies outside of the trial, so that another run may return all results.
-        peak: with splitting, the greatest measure of the root trial, which is compared with the levels.
+        peak: with splitting, the greatest value in the root trial of the measure that is compared with the levels.
     """
 
     survival: float
