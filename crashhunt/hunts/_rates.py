@@ -292,7 +292,7 @@ class RareWatch:
         Args:
             now: whether the rate must be up to date; otherwise it may be some moments old.
         """
-        return self._paced(self.roots, now=now)
+        return self._paced(self._read // TRIALS_PER_ROOT, now=now)  # pilots of splitting count for no root
 
 
 class SplittingForcings:

@@ -14,7 +14,7 @@ from crashhunt.cli import _spell_out
 from crashhunt.disturbances import DisturbanceSampler, brake
 from crashhunt.errors import UsageError
 from crashhunt.hunts import _rates as rare_module, hunt_state
-from crashhunt.hunts._rates import Forcings, RareWatch
+from crashhunt.hunts._rates import Forcings, RareWatch, SplittingWatch
 from crashhunt.hunts._reports import RareReport
 from crashhunt.ledger import Ledger
 from crashhunt.rates import BLOCK, TRIALS_PER_ROOT, _splitting as splitting, is_root
@@ -179,6 +179,14 @@ def test_crashes_of_plain_trials_count_for_the_undisturbed_part_and_for_the_cert
     running = rule.running()
     assert running["certain"] == {"low": found.certain[0], "high": found.certain[1]}
     assert (running["method"], running["units"], running["crashes"]) == ("rare", 60, 5)
+
+
+def test_running_rate_of_splitting_counts_the_pilots():
+    rows = rows_of([root(number) for number in range(3)])
+    watch = SplittingWatch(settings(), rows)
+    for roots in (1, 3):
+        watch.read(roots * TRIALS_PER_ROOT)
+        assert watch.running(now=True)["why_not"] == f"{roots} of 128 pilot roots have ended"
 
 
 def test_too_many_invalid_plain_trials_leave_no_estimate():
