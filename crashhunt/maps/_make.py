@@ -213,7 +213,7 @@ def _put_in_place(building: Path, target: Path, directory: Path) -> None:
         # Another process has made it in the meantime: its folder stays as it is.
         if target.exists():
             fix = "name another folder"
-            raise HuntDirectoryError("was made by another process", fix=fix, where=str(directory)) from error
+            raise HuntDirectoryError("the folder was made by another process", fix=fix, where=str(directory)) from error
         raise
 
 

@@ -521,7 +521,7 @@ def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str]
             message = f"--rare: --disturb {name}={rate:g} has a chance of {sampler.chance(name):.2g} per step"
             raise UsageError(message, fix=f"give at most {most:g} a second, or omit --rare")
     if sys.platform != "linux":
-        raise UsageError("--rare forks processes, which needs Linux", fix="omit it")
+        raise UsageError("--rare forks processes, which needs Linux", fix="omit --rare")
 
 
 def _with_defaults(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:

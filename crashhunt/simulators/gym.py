@@ -224,7 +224,7 @@ class GymSimulator:
         for name, space in zip(("observation_space", "action_space"), spaces, strict=True):
             if not isinstance(space, gymnasium.Space):
                 fix = "set it in the environment's constructor"
-                raise self._mistake(f"its {name} is {space!r:.80}, not a gymnasium.Space", fix=fix)
+                raise self._mistake(f"the environment's {name} is {space!r:.80}, not a gymnasium.Space", fix=fix)
         self._form = ObservationForm(spaces[0])
         self.observation_spaces = {self._agent: self._form.space}
         self.shown_spaces = {self._agent: self._form.original} if self._form.structured else {}

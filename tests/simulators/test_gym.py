@@ -200,7 +200,7 @@ gymnasium.register("Spaceless-v0", entry_point=Spaceless)
     [
         ("Carpole-v1", {}, "Carpole"),
         ("Tray-v0", {"colour": "red"}, "colour"),
-        ("Spaceless-v0", {}, "its observation_space is None, not a gymnasium.Space; set it"),
+        ("Spaceless-v0", {}, "the environment's observation_space is None, not a gymnasium.Space; set it"),
         ("no_such_module:make", {}, "no_such_module"),
         (f"{__name__}:make_nested", {"config": {"friction": {"of": -1}}}, "friction is negative"),
         (f"{__name__}:make_nothing", {}, "this factory returned a str"),
