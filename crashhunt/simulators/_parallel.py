@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeGuard
 import gymnasium
 import numpy as np
 
-from crashhunt.base.capabilities import supports
+from crashhunt.base.capabilities import members, supports
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -45,7 +45,9 @@ class Parallel(Protocol):
 
 def is_parallel(made: Any) -> TypeGuard[Parallel]:
     """Return whether an object has the interface of PettingZoo's ``ParallelEnv``, whose agents do not take turns."""
-    return supports(made, Parallel) and callable(made.observation_space) and not takes_turns(made)
+    # PettingZoo sets `agents` in `reset`. Its wrapper of environments that take turns has no such attribute before.
+    needed = (getattr(made, name, None) for name in members(Parallel) if name != "agents")
+    return all(found is not None for found in needed) and callable(made.observation_space) and not takes_turns(made)
 
 
 def takes_turns(made: Any) -> bool:

@@ -14,14 +14,16 @@ from crashhunt.testing import SimulatorContract
 
 
 class Chase:
-    """Some chase each other on a line; has the interface of ``pettingzoo.ParallelEnv``."""
+    """Some chase each other on a line; has the interface of ``pettingzoo.ParallelEnv``.
+
+    As in PettingZoo's wrapper of environments whose agents take turns, there is no ``agents`` before `reset`.
+    """
 
     metadata = {"name": "chase_v0"}  # noqa: RUF012 - as PettingZoo declares it
     possible_agents = ("runner", "hunter_0", "hunter_1")
 
     def __init__(self, leaves_at=0, late=False, masked=False):
         self.leaves_at, self.late, self.masked, self.render_mode = leaves_at, late, masked, None
-        self.agents = []
         self.log = []
         self._spaces = {name: spaces.Discrete(3) for name in self.possible_agents}
 
