@@ -232,7 +232,9 @@ def _run_once(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
         except (OSError, ValueError):
             ended = f"signal {-code}" if code < 0 else f"exit code {code}"
             kind = _ReplayKilledError if is_sent_from_outside(code) else CrashhuntError
-            raise kind(f"the replay ended before its last step, with {ended}", where=rerun.bundle.id) from None
+            raise kind(
+                f"the process of the replay ended before the last step, with {ended}", where=rerun.bundle.id
+            ) from None
         if "error" in answer:
             raise CrashhuntError.from_json(answer)
         return TrialResult.from_json(answer["result"]), Recording(read_black_box(scratch / layout.BLACK_BOX))
