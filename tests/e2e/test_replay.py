@@ -228,7 +228,7 @@ def test_an_agent_that_is_not_deterministic_is_found_out(toy):
     (toy.folder / "coin.py").write_text(
         "import os\n\nclass Agent:\n    def reset(self, seed): self.step = 0\n\n"
         "    def act(self, observation):\n        self.step += 1\n        assert self.step < 20\n"
-        "        return 5 + os.urandom(1)[0] / 1000 * (self.step > 9), 0\n"
+        "        return 5 + int.from_bytes(os.urandom(6)) / 2**49 * (self.step > 9), 0\n"
     )
     toy.crashhunt("run", "h", "1", "1", "100", "--agent", "coin:Agent", "--scenario", "toy", "--json")
     done = toy.crashhunt("replay", "h", "--times", "3", "--json", expect=1).json
