@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import contextmanager
 from dataclasses import replace
 from types import MappingProxyType
@@ -412,9 +413,9 @@ def _nearest(recording: Recording, agent: str) -> list[str]:
     if not scenes or agent not in scenes[-1].roster.index:
         return []
     scene = scenes[-1]
-    x, y = scene.points[scene.roster.index[agent]]
+    here = scene.points[scene.roster.index[agent]]
     away = {
-        actor.id: (point[0] - x) ** 2 + (point[1] - y) ** 2
+        actor.id: math.dist(point, here)
         for actor, point in zip(scene.roster.actors, scene.points, strict=True)
         if actor.id != agent
     }

@@ -105,6 +105,20 @@ def test_as_many_run_at_a_time_as_is_asked_or_as_there_are_cores(crash, monkeypa
     assert (asked.value.args[0]["budget"], asked.value.args[0]["time_s"]) == (500, None)
 
 
+def test_processes_end_where_the_search_raises(crash, monkeypatch):
+    closed = []
+
+    class Fails:
+        def __init__(self, *_):
+            raise AskedError
+
+    monkeypatch.setattr(_shrink, "Runs", lambda *_, **__: SimpleNamespace(close=lambda: closed.append(True)))
+    monkeypatch.setattr(_shrink, "Minimizer", Fails)
+    with pytest.raises(AskedError):
+        shrink(crash, trusted=True)
+    assert closed == [True]
+
+
 @pytest.mark.parametrize(("confirmed", "tries"), [(True, 1), (False, 3)])
 def test_of_what_does_not_come_again_the_next_larger_is_taken(crash, tmp_path, monkeypatch, confirmed, tries):
     crash = replace(crash, confirmed=confirmed)

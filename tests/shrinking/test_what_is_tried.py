@@ -47,6 +47,18 @@ def test_what_is_likely_is_tried_first():
     assert seen == [(), (3,), (7,)]
 
 
+def test_parts_are_halves_again_after_one_that_suffices_and_as_small_after_one_that_does_not():
+    """Delta debugging as of Zeller and Hildebrandt (2002): these sizes keep the number of trials small."""
+    sizes = []
+
+    def tried(candidates):
+        sizes.append([len(one) for one in candidates])
+        return next((place for place, one in enumerate(candidates) if {3, 12} <= set(one)), None)
+
+    assert fewest(range(16), tried) == (3, 12)
+    assert sizes[:5] == [[0], [8, 8], [4] * 4 + [12] * 4, [4] * 3 + [8] * 3, [4, 4]]
+
+
 def test_where_each_is_needed_none_is_excluded_and_nothing_of_nothing():
     assert fewest("abcd", first(lambda some: len(some) == 4, [])) == ("a", "b", "c", "d")
     assert fewest((), first(lambda some: True, [])) == ()
