@@ -24,9 +24,9 @@ def test_rates_have_a_number_and_what_it_is_per(text, rate):
     assert check_rate(text) == ""
 
 
-@pytest.mark.parametrize("text", ["2", "2/day", "-1/hour", "nan/hour", "0/hour", "9e-13/hour", "1.1e12/hour", "1/trial"])
+@pytest.mark.parametrize("text", ["2", "-1/hour", "nan/hour", "0/hour", "9e-13/hour", "1.1e12/hour", "1/trial"])
 def test_texts_that_are_no_rates_have_a_fix(text):
-    with pytest.raises(ValueError, match="rate|range"):
+    with pytest.raises(ValueError, match=r"rate|range"):
         rate_of(text)
     assert check_rate(text).startswith("give a rate from 1e-12 to 1e12")
 

@@ -1,0 +1,125 @@
+"""The progress of a hunt as numbers: what is left, what came nearest, what each strategy has found."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import pytest
+
+from crashhunt.hunts._progress import HuntStatus, Progress, StrategyTally
+from crashhunt.trial import Branches, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
+
+BRAKE = Disturbance(5, "ahead", "brake", 4.0, 2.0, "ego")
+
+
+def result(number=0, outcome=Outcome.SURVIVED, *, origin="", **evidence):
+    return TrialResult(TrialSpec(number, 1, {}, {}, 9, origin=origin), outcome, 9, **evidence)
+
+
+def status(**given):
+    plain = {
+        "phase": "hunting", "planned": 40, "done": 10, "outcomes": {}, "rate_per_s": 2.0, "elapsed_s": 5.0,
+        "nearest": None, "workers": {}, "crashes": 0,
+    }  # fmt: skip
+    return HuntStatus(**plain | given)
+
+
+@pytest.mark.parametrize(
+    ("given", "left"),
+    [
+        ({}, 15.0),
+        ({"done": 50}, 0.0),
+        ({"time_left_s": 4.0}, 4.0),
+        ({"trials_left_s": 7.0}, 7.0),
+        ({"trials_left_s": 7.0, "time_left_s": 4.0}, 4.0),
+        ({"rate_per_s": 0.0}, math.inf),
+        ({"planned": 0, "time_left_s": 9.0}, 9.0),
+        ({"planned": 0}, math.inf),
+    ],
+    ids=str,
+)
+def test_time_left_ends_with_the_trials_or_the_time(given, left):
+    assert status(**given).seconds_left == left
+
+
+@pytest.mark.parametrize(
+    ("given", "share"),
+    [
+        ({}, 0.25),
+        ({"time_left_s": 5.0}, 0.5),
+        ({"time_left_s": 45.0}, 0.25),
+        ({"planned": 0}, 0.0),
+        ({"planned": 0, "time_left_s": 15.0}, 0.25),
+        ({"planned": 0, "elapsed_s": 0.0, "time_left_s": 0.0}, 1.0),
+    ],
+    ids=str,
+)
+def test_share_done_is_that_of_trials_or_of_time(given, share):
+    assert status(**given).share_done == share
+
+
+def counted(*results, crashed=()):
+    progress = Progress()
+    for one in results:
+        progress.count(one, crashed=one.spec.number in crashed, planned=9)
+    return progress
+
+
+def test_nearest_trial_is_the_most_critical_one_without_a_crash():
+    far, near, crash = result(0, danger=0.2), result(1, danger=0.7), result(2, Outcome.COLLISION, danger=1.0)
+    failed = result(3, Outcome.AGENT_ERROR, failure=Failure("E", "e"), danger=0.9)
+    progress = counted(far, near, far, crash, failed, crashed=(2, 3))
+    assert progress.nearest is near
+    assert progress.found == {2: crash, 3: failed}
+    assert dict(progress.outcomes) == {"survived": 3, "collision": 1, "agent_error": 1}
+    assert (progress.last_wanted, progress.unsaved, progress.crash_count, progress.disturbed) == (2, crash, 1, 0)
+    assert progress.is_done is False  # nothing is saved
+    status = progress.searching.status()
+    assert status.grown_trials == 3  # since the second trial
+
+
+def test_last_invalid_trial_is_kept_unless_it_counts_as_a_crash():
+    invalid = result(0, Outcome.INVALID)
+    assert counted(invalid, result(1)).last_invalid is invalid
+    assert counted(invalid, crashed=(0,)).last_invalid is None
+
+
+def test_least_robust_trial_and_crashed_branches_are_counted():
+    weak = result(1, stress=Stress(0.25, disturbance=BRAKE))
+    progress = counted(
+        result(0, stress=Stress(0.5, disturbance=BRAKE)), weak, result(2, stress=Stress(0.75, disturbance=BRAKE)),
+        result(3, stress=Stress(0.125)), result(4, branches=Branches(unanswered=1)),
+    )  # fmt: skip
+    assert progress.stressed is weak
+    assert (progress.branched, progress.not_fully_asked) == (0, 1)
+
+
+def test_disturbed_crash_that_is_not_saved_counts():
+    crash = result(2, Outcome.COLLISION, disturbances=(BRAKE,))
+    assert counted(crash, crashed=(2,)).disturbed == 1
+
+
+def test_strategies_have_their_shares_and_mean_criticality():
+    tally = StrategyTally()
+    tally.resume(4, [("random", 2, 2, 0.4, 0), ("mutation", 2, 1, 1.0, 1)])
+    for one, crashed in (
+        (result(0, origin="mutation", danger=0.5), False), (result(1, origin="mutation"), True), (result(2), False),
+        (result(3, origin="mutation"), False),
+    ):  # fmt: skip
+        tally.take(one, crashed=crashed)
+    mutation, plain = tally.status().strategies
+    assert (mutation.name, mutation.trials, mutation.share, mutation.crashes) == ("mutation", 5, 5 / 8, 2)
+    assert mutation.danger == pytest.approx((1.0 + 0.5 + 1.0) / 3)  # a crash counts as 1, an unmeasured trial not
+    assert (plain.name, plain.trials, plain.danger, plain.crashes) == ("random", 2, pytest.approx(0.2), 0)
+    assert (tally.status().grown_trials, tally.status().grown_s) == (None, None)
+    tally.grow()
+    tally.take(result(4), crashed=False)
+    grown = tally.status()
+    assert grown.grown_trials == 1
+    assert 0 <= grown.grown_s < 5
+
+
+def test_time_limit_of_a_hunt_counts_down_to_zero():
+    assert Progress(until=time.monotonic() - 1).time_left_s == 0.0
+    assert Progress().time_left_s == math.inf
