@@ -91,6 +91,14 @@ def lines_in_functions(source: str) -> set[int]:
     return inside
 
 
+class NoBrowser:
+    """A pytest plugin that leaves out tests in a browser: it needs more memory than a slip may take, and seconds."""
+
+    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+        """Keep the other tests."""
+        items[:] = [item for item in items if "chromium" not in getattr(item, "fixturenames", ())]
+
+
 class Slot:
     """A copy of the repository, in which one pytest runs at a time.
 
@@ -180,7 +188,8 @@ class Slot:
         hypothesis.settings.register_profile("slips", phases=phases, deadline=None, derandomize=True, database=None)
         if watcher is not None:
             watcher.start()
-        code = pytest.main([*PYTEST, f"--basetemp={self.tree}.tmp", *arguments], plugins=[watcher] if watcher else [])
+        plugins = [NoBrowser(), *([watcher] if watcher is not None else [])]
+        code = pytest.main([*PYTEST, f"--basetemp={self.tree}.tmp", *arguments], plugins=plugins)
         if watcher is not None:
             reached = watcher.reached()
             others = [name for name, module in [*sys.modules.items()] if self._is_installed(name, module)]

@@ -56,6 +56,16 @@ _TESTS_ELSEWHERE = {
     "cli/_whatif.py": ("e2e/test_what_if.py",),
     "corpus": ("e2e/test_corpus.py",),
     "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),
+    "estimation/_gate.py": ("e2e/test_gate.py",),
+    "replays/_debugger.py": ("e2e/test_debugger.py",),
+    "replays/_prepare.py": ("e2e/test_replay.py",),
+    "replays/_replay.py": ("e2e/test_replay.py",),
+    "suites": ("suites/test_*.py", "e2e/test_suite.py", "e2e/test_gate.py"),
+    "whatif/_avoidability.py": ("whatif/test_avoiding.py", "e2e/test_judging.py"),
+    "whatif/_causes.py": ("e2e/test_judging.py",),
+    "whatif/_engine.py": ("whatif/test_what_is_counted.py", "whatif/test_reruns.py", "e2e/test_what_if.py"),
+    "whatif/_interventions.py": ("whatif/test_what_is_counted.py", "whatif/test_instead.py", "e2e/test_what_if.py"),
+    "whatif/_types_by_cause.py": ("e2e/test_types_by_cause.py",),
 }
 """Module or package to its nearest tests, as patterns below `tests`."""
 
