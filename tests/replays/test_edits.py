@@ -26,7 +26,7 @@ def edited(name, text, planned=PLANNED):
     return edited_disturbances(planned, name, text, ("ego",))
 
 
-def test_edits_of_disturbances_are_told_from_arguments():
+def test_edits_of_disturbances_differ_from_edits_of_arguments():
     names = ["disturbances", "disturbances.20", "disturbances_max", "speed"]
     assert [is_about_disturbances(name) for name in names] == [True, True, False, False]
 
@@ -133,7 +133,7 @@ def test_trial_without_edits_is_the_recorded_one():
     assert edited_spec(RECORDED, settings(), settings(), {}) == (RECORDED, Edits())
 
 
-def test_edited_arguments_are_told_by_their_owner():
+def test_edited_arguments_are_reported_with_their_owner():
     trial, edits = edited_spec(RECORDED, settings(), settings(), {"speed": "8", "gap_m": "20"})
     assert (trial.arguments, trial.scenario_arguments) == ({"ego": {"speed": 8.0}}, {"gap_m": 20.0})
     assert edits.agents == ("ego.speed was 5.0 and is 8.0",)
@@ -142,7 +142,7 @@ def test_edited_arguments_are_told_by_their_owner():
     assert RECORDED.arguments == {"ego": {"speed": 5.0}}
 
 
-def test_edits_of_hunt_toml_apply_and_those_without_effect_are_told():
+def test_edits_of_hunt_toml_apply_or_are_reported_as_ignored():
     agents = {"ego": SimpleNamespace(agent="idm", arguments={"speed": spec("6.0", "float")})}
     now = settings(agents=agents, max_steps=50, crash_on=("hang", "collision"), seed=9)
     trial, edits = edited_spec(RECORDED, now, settings(), {})
