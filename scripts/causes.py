@@ -1,12 +1,18 @@
 """How well crash types agree with planted bugs: by signature, and divided by cause. Run it as ``scripts/causes``.
 
-Agents with two or three planted bugs are hunted. The label of a crash is the set of bugs without each of which the same
-trial has no crash with the same two actors until 5 s after it. A crash with an empty set does not count: the agent
-without any bug has it, too, or each of several bugs suffices. The adjusted Rand index (Hubert and Arabie 1985) compares
-types with the labels of the crashes that need a single bug: 1 is equal, 0 chance. A crash that needs several bugs has
-no single label: removing either one is a fix. The bug of them that acted last is compared as well. Its cause is
-consistent if it is also the cause of crashes that need one of these bugs alone, and of no crash that needs another bug
-alone.
+Agents with two or three planted bugs are hunted. Runs of the trial of each crash without some of the bugs label it:
+
+- *healthy*: the agent without any bug. It drives from the start, at its own desired speed and at both ends of the
+  range, or takes over 5 s before the crash. A crash counts only if the runs from the start have no crash at all until
+  5 s after it, and the other run does not have this crash. Otherwise the agent itself is unsafe in this traffic.
+- *alone*: the agent with one bug. The label of a crash is this bug if this run has the same crash within 1 s, and no
+  run with another bug alone does.
+- *without*: the agent without one bug. A crash without a label needs those bugs without each of which the same two
+  actors have no crash until 5 s after it.
+
+The adjusted Rand index (Hubert and Arabie 1985) compares the types with the labels: 1 is equal, 0 chance. A crash that
+needs several bugs has no single label: removing either one is a fix. Its cause is consistent if it is also
+the cause of crashes of one of these bugs alone, and of no crash of another bug.
 
     scripts/causes --folder DIR [--trials N] [--judge N] [SCENARIO|FILE.sumocfg:BUGS…]     goes on where it was
 """
@@ -29,14 +35,15 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.base import layout
 from crashhunt.crashes import group_crashes, list_bundles
 from crashhunt.replays import ReplayOptions, prepare
-from crashhunt.trial import Outcome
+from crashhunt.trial import Handover, Outcome
 from crashhunt.whatif import Reruns, divide_by_cause
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from crashhunt.crashes import Bundle
-    from crashhunt.trial import TrialResult
+    from crashhunt.replays import Rerun
+    from crashhunt.trial import TrialResult, TrialSpec
 
 AGENTS = (
     ("loop", "sign+frozen"), ("loop", "wrong_side+frozen"), ("loop", "sign+blind_behind"), ("loop", "sign+off_edge"),
@@ -44,23 +51,30 @@ AGENTS = (
     ("merge", "frozen+wrong_side+blind_behind"), ("motorway", "sign+blind_behind"), ("motorway", "frozen+index"),
     ("motorway", "sign+wrong_side"), ("motorway", "sign+frozen+off_edge"), ("highway", "late+blind_ahead"),
 )  # fmt: skip
+_SPEEDS_MPS = (18.0, 28.0)  # of the agents: the range that a hunt draws from
 _TITLES = (
-    "scenario", "bugs", "crashes", "need no bug, with an omission", "need one bug", "of bugs", "ARI types",
-    "ARI types and causes", "ARI causes alone", "ARI of all, the bug that acted last (crashes)", "need several",
-    "consistent", "contradictory", "hidden by --keep 3",
+    "scenario", "bugs", "crashes", "healthy agent crashes, too", "with an omission", "of a single bug", "of bugs",
+    "ARI types", "ARI types and causes", "ARI causes alone", "of several bugs", "consistent", "contradictory",
+    "ARI causes, the needed bug (crashes)", "hidden by --keep 3",
 )  # fmt: skip
-_AFTER_S = 5.0
+_AROUND_S = 5.0  # before and after a crash
+_REPRODUCED_S = 1.0
 _KEEP = 3
 
 
-def adjusted_rand_index(labels: Sequence[object], found: Sequence[object]) -> float:
-    """Return the adjusted Rand index of two partitions; 1 where both have a single class, or are all singletons."""
-    pairs = sum(comb(count, 2) for count in Counter(zip(labels, found, strict=True)).values())
-    of_labels = sum(comb(count, 2) for count in Counter(labels).values())
-    of_found = sum(comb(count, 2) for count in Counter(found).values())
-    expected = of_labels * of_found / max(1, comb(len(labels), 2))
-    most = (of_labels + of_found) / 2
-    return 1.0 if most == expected else (pairs - expected) / (most - expected)
+def adjusted_rand_index(*partitions: tuple[Sequence[object], Sequence[object]]) -> float:
+    """Return the adjusted Rand index of pairs of partitions; 1 where both have a single class, or are all singletons.
+
+    Several pairs are those of several hunts. Two crashes of different hunts are no pair, so the sums are over hunts.
+    """
+    above = below = 0.0
+    for labels, found in partitions:
+        pairs = sum(comb(count, 2) for count in Counter(zip(labels, found, strict=True)).values())
+        of_labels = sum(comb(count, 2) for count in Counter(labels).values())
+        of_found = sum(comb(count, 2) for count in Counter(found).values())
+        expected = of_labels * of_found / max(1, comb(len(labels), 2))
+        above, below = above + pairs - expected, below + (of_labels + of_found) / 2 - expected
+    return above / below if below else 1.0
 
 
 def main() -> int:
@@ -79,11 +93,14 @@ def main() -> int:
     print(f"| {' | '.join(_TITLES)} |")
     print(f"{'| --- ' * len(_TITLES)}|", flush=True)
     chosen = [tuple(one.rsplit(":", 1)) for one in given.only] or AGENTS
+    studies = []
     for scenario, bugs in chosen:
         store = given.folder / f"{Path(scenario).stem}-{bugs}.json"
         if not store.is_file():
             store.write_text(json.dumps(_studied(scenario, bugs, given)), encoding="utf-8")
-        print(_line(json.loads(store.read_text(encoding="utf-8"))), flush=True)
+        studies.append(json.loads(store.read_text(encoding="utf-8")))
+        print(_line(*studies[-1:]), flush=True)
+    print(_line(*studies))
     return 0
 
 
@@ -93,7 +110,14 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
     if not (hunt / "ledger.sqlite").is_file():
         command = [sys.executable, "-m", "crashhunt", "run", str(hunt), str(len(os.sched_getaffinity(0)))]
         command += [str(given.trials), str(given.steps), "--scenario", named, "--agent", "planted_bugs:Planted"]
-        command += ["--arg", f"bugs={bugs}", "--arg", "desired_speed=18:28", "--seed", str(given.seed)]
+        command += [
+            "--arg",
+            f"bugs={bugs}",
+            "--arg",
+            f"desired_speed={_SPEEDS_MPS[0]:g}:{_SPEEDS_MPS[1]:g}",
+            "--seed",
+            str(given.seed),
+        ]
         command += ["--keep-going"]
         command += ["--action", "continuous"] if scenario == "motorway" else []
         subprocess.run(command, check=True, capture_output=True, cwd=given.folder)
@@ -105,9 +129,7 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
             rows += [
                 {
                     "crash": bundle.id,
-                    "needs": [name for name in labels[bundle.id] if name] if "" in labels[bundle.id] else [],
-                    "last": _last_bug(bundle, labels[bundle.id]),
-                    "has_no_bug": "" not in labels[bundle.id],
+                    **labels[bundle.id],
                     "type": str(group.signature),
                     "cause": str(part.cause),
                     "judged": bundle in part.judged,
@@ -118,34 +140,55 @@ def _studied(scenario: str, bugs: str, given: argparse.Namespace) -> dict[str, A
     return {"scenario": Path(scenario).stem, "bugs": bugs, "rows": rows}
 
 
-def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, list[str]]:
-    """Return the bugs that each crash needs, by runs of its trial without one bug at a time; "" is all of them."""
-    found: dict[str, list[str]] = {bundle.id: [] for bundle in bundles}
+def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return what the runs without some of the bugs say of each crash.
+
+    ``healthy``: whether the agent without bugs crashes, too. ``alone``: the bugs that alone lead to this crash.
+    ``needs``: the bugs without each of which there is no such crash.
+    """
+    found: dict[str, dict[str, Any]] = {bundle.id: {"healthy": False, "alone": [], "needs": []} for bundle in bundles}
     if not bundles:
         return found
     reruns = [prepare(bundle, ReplayOptions(trusted=True)) for bundle in bundles]
-    asked = [(bundle, bug) for bundle in bundles for bug in (*bugs, "")]
-    specs = []
-    for rerun in reruns:
-        longer = rerun.bundle.result.steps + round(_AFTER_S / rerun.recorded.prologue.step_length_s)
-        for bug in (*bugs, ""):
-            given = {**rerun.spec.arguments["ego"], "bugs": "+".join(name for name in bugs if bug and name != bug)}
-            specs.append(replace(rerun.spec, arguments={"ego": given}, max_steps=longer))
+    asked = [(rerun, what, spec) for rerun in reruns for what, spec in _label_runs(rerun, bugs)]
     with TemporaryDirectory(prefix="crashhunt-causes-") as scratch:
         runs = Reruns(reruns[0], Path(scratch), parallel=2, stopped=lambda: False)
-        for ended in runs.run(specs, recorded=False):
-            bundle, bug = asked[ended.place]
-            if not _is_same(ended.result, bundle.result):
-                found[bundle.id].append(bug)
+        for ended in runs.run([spec for *_, spec in asked], recorded=False):
+            rerun, words, _ = asked[ended.place]
+            bundle = rerun.bundle
+            label, result, (what, _, bug) = found[bundle.id], ended.result, words.partition(" ")
+            same = _is_same(result, bundle.result)
+            if what == "healthy":
+                label["healthy"] |= result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED)
+            elif what == "late":
+                label["healthy"] |= same
+            elif what == "alone" and same:
+                away_s = abs(result.steps - bundle.result.steps) * rerun.recorded.prologue.step_length_s
+                label["alone"] += [bug] if away_s <= _REPRODUCED_S else []
+            elif what == "without" and not same:
+                label["needs"].append(bug)
         runs.close()
     return found
 
 
-def _last_bug(bundle: Bundle, needs: Sequence[str]) -> str:
-    """Return the needed bug that changed an action last, as the agent has printed it; empty if there is none."""
-    lines = (bundle.path / layout.RUN_LOG).read_text(encoding="utf-8").splitlines()
-    acted = [line.split()[1] for line in lines if line.startswith("PLANTED ")]
-    return next((bug for bug in reversed(acted) if bug in needs), "")
+def _label_runs(rerun: Rerun, bugs: Sequence[str]) -> Iterator[tuple[str, TrialSpec]]:
+    """Yield the runs that label a crash, each with its word and, after a blank, its bug."""
+    bundle, own = rerun.bundle, rerun.spec.arguments["ego"]
+    around = round(_AROUND_S / rerun.recorded.prologue.step_length_s)
+    longer = replace(rerun.spec, max_steps=bundle.result.steps + around)
+
+    def with_bugs(names: Iterable[str]) -> TrialSpec:
+        return replace(longer, arguments={"ego": {**own, "bugs": "+".join(names)}})
+
+    healthy = with_bugs(())
+    yield "healthy", healthy
+    for speed in _SPEEDS_MPS:
+        yield "healthy", replace(healthy, arguments={"ego": {**healthy.arguments["ego"], "desired_speed": speed}})
+    log = str((bundle.path / layout.LOG).resolve())
+    yield "late", replace(healthy, handover=Handover("ego", max(0, bundle.result.steps - around), log))
+    for bug in bugs:
+        yield f"alone {bug}", with_bugs([bug])
+        yield f"without {bug}", with_bugs(name for name in bugs if name != bug)
 
 
 def _is_same(rerun: TrialResult, result: TrialResult) -> bool:
@@ -161,35 +204,53 @@ def _is_same(rerun: TrialResult, result: TrialResult) -> bool:
     return {was.collider, was.victim} == {now.collider, now.victim}
 
 
-def _line(study: dict[str, Any]) -> str:
-    rows = [row for row in study["rows"] if row["needs"]]
-    single = [row for row in rows if len(row["needs"]) == 1]
-    labels = [row["needs"][0] for row in single]
-    types, causes = [row["type"] for row in single], [(row["type"], row["cause"]) for row in single]
-    merged = [row["cause"] for row in single]
-    of_cause: dict[str, set[str]] = {}
-    for row in single:
-        of_cause.setdefault(row["cause"], set()).add(row["needs"][0])
-    several = [(of_cause.get(row["cause"], set()), {*row["needs"]}) for row in rows if len(row["needs"]) > 1]
-    consistent = sum(bool(bugs) and bugs <= needs for bugs, needs in several)
-    contradictory = sum(not bugs <= needs for bugs, needs in several)
-    indices = [f"{adjusted_rand_index(labels, found):.2f}" for found in (types, causes, merged)]
-    last = [(row["last"], row["cause"]) for row in rows if row["last"]]
-    indices.append(f"{adjusted_rand_index(*zip(*last, strict=True)):.2f} ({len(last)})" if last else "-")
-    hidden = [", ".join(sorted({*labels} - _kept(rows, key))) or "none" for key in ("type", "cause")]
-    none = [row for row in study["rows"] if row["has_no_bug"]]
-    claimed = sum(row["judged"] and row["cause"].startswith("omission") for row in none)
-    cells = [
-        study["scenario"],
-        study["bugs"],
-        len(study["rows"]),
-        f"{len(none)}, {claimed}",
-        len(single),
-        len({*labels}),
-        *indices,
-        len(several),
+def _line(*studies: dict[str, Any]) -> str:
+    """Return a row of the table: of one study, or of all of them."""
+    sound = [[row for row in study["rows"] if not row["healthy"]] for study in studies]
+    single = [[row for row in rows if len(row["alone"]) == 1] for rows in sound]
+    several = [[row for row in rows if len(row["alone"]) != 1 and len(row["needs"]) > 1] for rows in sound]
+    needed = [[row for row in rows if len(row["needs"]) == 1] for rows in sound]
+    unsafe = [row for study in studies for row in study["rows"] if row["healthy"]]
+    cells: list[object] = [
+        studies[0]["scenario"] if len(studies) == 1 else "all",
+        studies[0]["bugs"] if len(studies) == 1 else "",
+        sum(len(study["rows"]) for study in studies),
+        len(unsafe),
+        sum(row["judged"] and row["cause"].startswith("omission") for row in unsafe),
+        sum(map(len, single)),
+        sum(len({row["alone"][0] for row in rows}) for rows in single),
     ]
-    return f"| {' | '.join(map(str, [*cells, consistent, contradictory]))} | {hidden[0]}; by cause {hidden[1]} |"
+    cells += [_index(single, "alone", keys) for keys in (("type",), ("type", "cause"), ("cause",))]
+    consistent = contradictory = 0
+    for alone, rows in zip(single, several, strict=True):
+        of_cause: dict[str, set[str]] = {}
+        for row in alone:
+            of_cause.setdefault(row["cause"], set()).update(row["alone"])
+        for row in rows:
+            bugs = of_cause.get(row["cause"], set())
+            consistent += bool(bugs) and bugs <= {*row["needs"]}
+            contradictory += not bugs <= {*row["needs"]}
+    cells += [sum(map(len, several)), consistent, contradictory]
+    cells.append(f"{_index(needed, 'needs', ('cause',))} ({sum(map(len, needed))})")
+    hidden = []
+    for key in ("type", "cause"):
+        names = {
+            bug for alone, rows in zip(single, sound, strict=True) for row in alone for bug in row["alone"]
+            if bug not in _kept(rows, key)
+        }  # fmt: skip
+        hidden.append(", ".join(sorted(names)) or "none")
+    return f"| {' | '.join(map(str, cells))} | {hidden[0]}; by cause {hidden[1]} |"
+
+
+def _index(hunts: list[list[dict[str, Any]]], label: str, keys: tuple[str, ...]) -> str:
+    """Return the adjusted Rand index of labels with types; "-" without a crash, "one bug" where all have one label."""
+    partitions = [
+        ([row[label][0] for row in rows], [tuple(row[key] for key in keys) for row in rows]) for rows in hunts
+    ]
+    if all(len({*labels}) < 2 for labels, _ in partitions):
+        same = all(len({*found}) < 2 for _, found in partitions)
+        return "-" if not any(hunts) else f"one bug, {'one class' if same else 'several classes'}"
+    return f"{adjusted_rand_index(*partitions):.2f}"
 
 
 def _kept(rows: list[dict[str, Any]], key: str) -> set[str]:
@@ -197,7 +258,7 @@ def _kept(rows: list[dict[str, Any]], key: str) -> set[str]:
     kept: set[str] = set()
     for name in {(row["type"], row[key]) for row in rows}:
         those = sorted((row for row in rows if (row["type"], row[key]) == name), key=lambda row: row["steps"])
-        kept |= {bug for row in those[:_KEEP] for bug in row["needs"]}
+        kept |= {bug for row in those[:_KEEP] for bug in {*row["alone"], *row["needs"]}}
     return kept
 
 
