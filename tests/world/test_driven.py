@@ -69,3 +69,7 @@ def test_grouping_of_scenes_changes_no_bit(speeds, data):
     assert len({meter._speeds for meter in meters}) == 1
     means = [(abs(before) + abs(after)) / 2 for before, after in pairwise(speeds)]
     assert meters[0].driven_m == pytest.approx(sum(means) * 0.1, abs=1e-3)
+
+
+def test_distance_and_time_are_rounded_to_millimetres_and_milliseconds():
+    assert measured(frames([1.23456, 1.23456]), step_s=0.12345) == (0.152, 0.123)

@@ -40,6 +40,8 @@ def test_everybody_is_where_it_was_and_who_comes_back_has_two_paths():
     assert found.others[1].spines == ((1, SPINE), (2, SPINE))
     assert found.only(["bus"]).names == ("bus",)
     assert found.driven_by(()).names == ("ego", "left.1", "bus")
+    assert found.driven_by(()).agents == ()
+    assert found.driven_by(("ego",)) == found
 
 
 def test_they_come_back_from_json_bit_by_bit():
