@@ -52,6 +52,7 @@ _WHILE_RUNNING = (
 )  # fmt: skip
 _FOR_COMMAND = {"compare": ("crashhunt.estimation", "scipy.stats")}  # the latter takes 0.8 s
 _MESSAGE = 1 << 20
+_REPOSITORY = Path(__file__).parents[1]
 
 
 class Commands:
@@ -105,6 +106,7 @@ class Commands:
         return at_start(environment) == self._at_start and not any(
             Path(place, f"{name}.py").exists() or Path(place, name).exists()
             for place in path_of(environment)
+            if Path(place) != _REPOSITORY  # as scripts/mutate has it; the forks have its crashhunt too
             for name in ("sitecustomize", "usercustomize", "crashhunt")
         )
 
