@@ -65,7 +65,7 @@ _TESTS_ELSEWHERE = {
     "whatif/_causes.py": ("e2e/test_judging.py",),
     "whatif/_engine.py": ("whatif/test_what_is_counted.py", "whatif/test_reruns.py", "e2e/test_what_if.py"),
     "whatif/_interventions.py": ("whatif/test_what_is_counted.py", "whatif/test_instead.py", "e2e/test_what_if.py"),
-    "whatif/_types_by_cause.py": ("e2e/test_types_by_cause.py",),
+    "whatif/_types_by_cause.py": ("whatif/test_division_by_cause.py", "e2e/test_types_by_cause.py"),
     "world/_tracks.py": ("world/test_tracks.py", "world/test_paths.py"),
 }
 """Module or package to its nearest tests, as patterns below `tests`."""

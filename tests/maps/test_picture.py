@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from crashhunt.maps import _picture
 from crashhunt.maps._network import Edge, NetworkLane, RoadNetwork
 from crashhunt.maps._picture import _GROUND, _MARGIN, _ROAD, _SIZE, _WAY, _color, draw_map
 from crashhunt.maps._plain_run import PlainRun
@@ -98,3 +99,12 @@ FLOWS = {
 )  # fmt: skip
 def test_traffic_that_does_not_flow_has_a_reason(given, jam):
     assert PlainRun(**FLOWS | given).jam == jam
+
+
+def test_legend_has_the_most_vehicles_of_a_road_per_hour(tmp_path, monkeypatch):
+    pytest.importorskip("PIL")
+    seen = []
+    monkeypatch.setattr(_picture, "_draw_ramp", lambda draw, width, most, letters, ink: seen.append(most))
+    found = RoadNetwork({"a": road("a", (0.0, 0.0), (1000.0, 0.0))})
+    _picture.draw_map(found, {"a": 90.0}, tmp_path / "m.png", title="", hours=0.5, busiest=[])
+    assert seen == [180.0]
