@@ -62,7 +62,7 @@ _TESTS_ELSEWHERE = {
     "replays/_replay.py": ("e2e/test_replay.py",),
     "suites": ("suites/test_*.py", "e2e/test_suite.py", "e2e/test_gate.py"),
     "whatif/_avoidability.py": ("whatif/test_avoiding.py", "e2e/test_judging.py"),
-    "whatif/_causes.py": ("e2e/test_judging.py",),
+    "whatif/_causes.py": ("whatif/test_maneuvers.py", "e2e/test_judging.py"),
     "whatif/_engine.py": ("whatif/test_what_is_counted.py", "whatif/test_reruns.py", "e2e/test_what_if.py"),
     "whatif/_interventions.py": ("whatif/test_what_is_counted.py", "whatif/test_instead.py", "e2e/test_what_if.py"),
     "whatif/_types_by_cause.py": ("whatif/test_division_by_cause.py", "e2e/test_types_by_cause.py"),
