@@ -41,6 +41,9 @@ PEERS = {
     "verifai-mab": "peers:VerifaiBandit",
     "smac": "peers:Smac",
     "turbo": "peers:Turbo",
+    "simpler": "simpler_guided:Simpler",
+    "simpler-again": "simpler_guided:SimplerAgain",
+    "simpler-peaks": "simpler_guided:SimplerPeaks",
 }
 """Name in tables to what stands for it."""
 

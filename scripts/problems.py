@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.plans import Given
     from crashhunt.trial import Kind
 
-__all__ = ["PROBLEMS", "REAL", "Problem", "Real"]
+__all__ = ["PROBLEMS", "REAL", "Danger", "Problem", "Real", "as_floats", "ball", "numbers", "radius_of"]
 
 Danger = Callable[[Any, int], float]
 """Of the values of the arguments and a trial's seed; 1 for a crash."""
@@ -62,18 +62,19 @@ class Real:
     held_out: bool = False
 
 
-def _numbers(count: int) -> dict[str, tuple[str, Kind | None]]:
+def numbers(count: int) -> dict[str, tuple[str, Kind | None]]:
+    """Return arguments from 0 to 1."""
     return {f"x{index:02d}": ("0.0:1.0", "float") for index in range(count)}
 
 
-def _radius(rate: float, dimensions: int) -> float:
-    """Of a ball of such a volume."""
+def radius_of(rate: float, dimensions: int) -> float:
+    """Return the radius of a ball of such a volume."""
     return float((rate * math.gamma(dimensions / 2 + 1) / math.pi ** (dimensions / 2)) ** (1 / dimensions))
 
 
-def _ball(seed: int, dimensions: int, rate: float, reach: float) -> Danger:
-    """A crash within a ball somewhere; danger falls from there over the reach to nothing."""
-    radius = _radius(rate, dimensions)
+def ball(seed: int, dimensions: int, rate: float, reach: float) -> Danger:
+    """Return a danger with a crash within a ball somewhere; it falls from there over the reach to nothing."""
+    radius = radius_of(rate, dimensions)
     center = np.random.default_rng(seed).uniform(radius, 1 - radius, dimensions)
 
     def danger(values: Any, _seed: int) -> float:
@@ -85,7 +86,7 @@ def _ball(seed: int, dimensions: int, rate: float, reach: float) -> Danger:
 
 def _deceptive(values: Any, _seed: int) -> float:
     """Danger rises over nearly all of the space to where nothing crashes, and near the crash in a narrow ring."""
-    away = float(np.linalg.norm(values - np.array([0.2, 0.25, 0.8]))) - _radius(1 / 200, 3)
+    away = float(np.linalg.norm(values - np.array([0.2, 0.25, 0.8]))) - radius_of(1 / 200, 3)
     if away < 0:
         return 1.0
     false = 0.97 * max(0.0, 1 - float(np.linalg.norm(values - np.array([0.85, 0.8, 0.15]))) / 1.2)
@@ -129,7 +130,7 @@ def _traffic(rate: float) -> Danger:
 
 def _seeds(rate: float) -> Danger:
     """Which arguments crash is another with every seed: with the same one, danger leads there."""
-    radius = _radius(rate, 2)
+    radius = radius_of(rate, 2)
 
     def danger(values: Any, seed: int) -> float:
         center = np.random.default_rng(seed).uniform(0.1, 0.9, 2)
@@ -141,18 +142,20 @@ def _seeds(rate: float) -> Danger:
 
 def _blind(rate: float) -> Danger:
     """Danger is drawn by the seed alone."""
-    ball = _ball(4, 2, rate, 1.0)
+    inside = ball(4, 2, rate, 1.0)
 
     def danger(values: Any, seed: int) -> float:
-        return 1.0 if ball(values, seed) == 1.0 else 0.9 * float(np.random.default_rng(seed).random())
+        return 1.0 if inside(values, seed) == 1.0 else 0.9 * float(np.random.default_rng(seed).random())
 
     return danger
 
 
-def _as_floats(danger: Danger) -> Danger:
+def as_floats(danger: Danger) -> Danger:
+    """Return a danger that gets its values as an array of floats."""
+
     def of(values: Any, seed: int) -> float:
-        numbers: NDArray[np.float64] = values.astype(float)
-        return danger(numbers, seed)
+        floats: NDArray[np.float64] = values.astype(float)
+        return danger(floats, seed)
 
     return of
 
@@ -161,22 +164,22 @@ _WORDS: dict[str, tuple[str, Kind | None]] = {f"c{index}": ("a|b|c|d|e", None) f
 
 PROBLEMS = {
     "easy": Problem(
-        about="a ball in 3 dimensions", arguments=_numbers(3), rate=1 / 50, danger=_as_floats(_ball(1, 3, 1 / 50, 1.0))
+        about="a ball in 3 dimensions", arguments=numbers(3), rate=1 / 50, danger=as_floats(ball(1, 3, 1 / 50, 1.0))
     ),
     "smooth": Problem(
         about="a ball in 5 dimensions",
-        arguments=_numbers(5),
+        arguments=numbers(5),
         rate=1 / 500,
-        danger=_as_floats(_ball(2, 5, 1 / 500, 1.0)),
+        danger=as_floats(ball(2, 5, 1 / 500, 1.0)),
     ),
     "needle": Problem(
         about="a ball in 3 dimensions, danger only near it",
-        arguments=_numbers(3),
+        arguments=numbers(3),
         rate=1 / 5000,
-        danger=_as_floats(_ball(3, 3, 1 / 5000, 0.12)),
+        danger=as_floats(ball(3, 3, 1 / 5000, 0.12)),
     ),
     "deceptive": Problem(
-        about="danger leads elsewhere", arguments=_numbers(3), rate=1 / 200, danger=_as_floats(_deceptive)
+        about="danger leads elsewhere", arguments=numbers(3), rate=1 / 200, danger=as_floats(_deceptive)
     ),
     "discrete": Problem(
         about="four words and a whole number",
@@ -185,22 +188,22 @@ PROBLEMS = {
         danger=_discrete,
     ),
     "twenty": Problem(
-        about="a sum of 20 arguments", arguments=_numbers(20), rate=1 / 1000, danger=_as_floats(_twenty(1 / 1000))
+        about="a sum of 20 arguments", arguments=numbers(20), rate=1 / 1000, danger=as_floats(_twenty(1 / 1000))
     ),
     "traffic": Problem(
         about="the seed decides more than the arguments",
-        arguments=_numbers(5),
+        arguments=numbers(5),
         rate=1 / 500,
-        danger=_as_floats(_traffic(1 / 500)),
+        danger=as_floats(_traffic(1 / 500)),
     ),
     "seeds": Problem(
         about="other arguments with every seed",
-        arguments=_numbers(4),
+        arguments=numbers(4),
         rate=1 / 1000,
-        danger=_as_floats(_seeds(1 / 1000)),
+        danger=as_floats(_seeds(1 / 1000)),
     ),
     "blind": Problem(
-        about="danger says nothing", arguments=_numbers(2), rate=1 / 300, danger=_as_floats(_blind(1 / 300)), hint=False
+        about="danger says nothing", arguments=numbers(2), rate=1 / 300, danger=as_floats(_blind(1 / 300)), hint=False
     ),
 }
 

@@ -21,11 +21,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from development_problems import DEVELOPMENT, development_problem
 from peers import PEERS
 from problems import PROBLEMS, REAL
 from search_faults import FAULTS, faults_table, write_faults
 from search_kinds import kinds_table, write_kinds
-from search_plot import GIVE_UP, table, write_plot
+from search_plot import GIVE_UP, pairs_table, table, write_plot
 from search_pool import trials_on
 from search_wall import wall_table
 
@@ -227,7 +228,7 @@ def hunted(settings: HuntSettings, place: Place, most: int, name: str, *, lag: s
 
 def synthetic_run(name: str, sampler: str, seed: int, lag: str = LAG) -> Run:
     """One hunt on a problem without a simulator."""
-    problem = PROBLEMS[name]
+    problem = development_problem(name, seed) if name in DEVELOPMENT else PROBLEMS[name]
     settings = HuntSettings(
         scenario=name, scenario_digest="", trials=0, max_steps=1, seed=seed, sampler=PEERS.get(sampler, sampler),
         agents={"ego": AgentSettings(agent="keep-lane", arguments={
@@ -321,7 +322,9 @@ def main(words: Sequence[str] | None = None) -> int:
     """Run and print."""
     parser = argparse.ArgumentParser("scripts/search", description=__doc__)
     parser.add_argument("--samplers", default=",".join((*OURS, *PEERS)))
-    parser.add_argument("--problems", default=",".join(PROBLEMS), help="some of these, and of " + ", ".join(REAL))
+    parser.add_argument(
+        "--problems", default=",".join(PROBLEMS), help="some of these, and of " + ", ".join((*REAL, *DEVELOPMENT))
+    )
     parser.add_argument("--repetitions", type=int, default=30)
     parser.add_argument("--parallel", type=int, default=2)
     parser.add_argument("--quick", action="store_true", help="a few hunts, in seconds: shows only that nothing broke")
@@ -332,6 +335,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--wall", action="store_true", help="instead, hunts of the product, for time by the clock")
     parser.add_argument("--again", action="store_true", help="hunts that are stored already, too")
     parser.add_argument("--lag", default=LAG, type=a_lag, help=f"of results, in trials, or {GROWING!r}")
+    parser.add_argument("--pairs", metavar="A,B", help="in addition, the cost of B as a share of that of A, same seeds")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument(
         "--set", action="append", default=[], type=a_constant, metavar="MODULE.NAME=VALUE",
@@ -344,6 +348,9 @@ def main(words: Sequence[str] | None = None) -> int:
         setattr(module, name, value)
     seeds = range(options.first_seed, options.first_seed + options.repetitions)
     samplers, names = options.samplers.split(","), options.problems.split(",")
+    unknown = [name for name in names if name not in (*PROBLEMS, *REAL, *DEVELOPMENT)]
+    if unknown:
+        parser.error(f"--problems: {', '.join(unknown)} is no problem; see --help")
     if options.faults:
         if options.store is None:
             parser.error("--faults needs --store FILE")
@@ -361,7 +368,7 @@ def main(words: Sequence[str] | None = None) -> int:
     runs = stored(options.store) if options.store is not None and options.store.exists() else {}
     known = () if options.again else (*runs,)
     for found in (
-        all_runs(samplers, seeds, [name for name in names if name in PROBLEMS], options.parallel, known, options.lag),
+        all_runs(samplers, seeds, [name for name in names if name not in REAL], options.parallel, known, options.lag),
         *(real_runs(name, samplers, seeds, options.parallel, known, options.lag) for name in names if name in REAL),
     ):
         for run in found:
@@ -369,6 +376,9 @@ def main(words: Sequence[str] | None = None) -> int:
             if options.store is not None:
                 store(options.store, [*runs.values()])
     print(table([*runs.values()]))
+    if options.pairs is not None:
+        base, _, other = options.pairs.partition(",")
+        print(f"\n{pairs_table([*runs.values()], base, other)}")
     if options.plot is not None:
         write_plot([*runs.values()], options.plot)
     return 0

@@ -8,6 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
+from development_problems import DEVELOPMENT
 from problems import PROBLEMS, REAL
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
     from search import Run
 
-__all__ = ["costs", "interval", "one_in", "rare", "table", "write_plot"]
+__all__ = ["costs", "interval", "one_in", "pairs_table", "rare", "table", "write_plot"]
 
 GIVE_UP = 3.0  # times what random draws need
 _LEFT, _WIDTH, _ROW, _TOP = 190, 860, 24, 74
@@ -33,6 +34,10 @@ _MARKS = {
     "verifai-mab": ("#8e24aa", "#d78bff", "cross"),
 }
 """Sampler to its colour in the light, in the dark, and its form."""
+_RATES = {name: problem.rate for name, problem in PROBLEMS.items()} | {
+    name: rate for name, (_, rate, _) in DEVELOPMENT.items()
+}
+"""Crashes per random trial of the problems without a simulator."""
 
 
 def _paid(problem: str, runs: Sequence[Run]) -> list[int]:
@@ -41,15 +46,15 @@ def _paid(problem: str, runs: Sequence[Run]) -> list[int]:
 
 def _needed(problem: str, of_random: Sequence[Run]) -> float:
     """What random draws need: by calculation without a simulator, else as measured."""
-    if problem in PROBLEMS:
-        return (1.0 - math.exp(-GIVE_UP)) / PROBLEMS[problem].rate
+    if problem in _RATES:
+        return (1.0 - math.exp(-GIVE_UP)) / _RATES[problem]
     return statistics.fmean(_paid(problem, of_random)) if of_random else math.nan
 
 
 def one_in(problem: str, runs: Sequence[Run]) -> float:
     """Return how many random trials there are to a crash: by calculation without a simulator, else as they ended."""
-    if problem in PROBLEMS:
-        return 1 / PROBLEMS[problem].rate
+    if problem in _RATES:
+        return 1 / _RATES[problem]
     drawn = [run for run in runs if (run.problem, run.sampler) == (problem, "random")]
     crashes = sum(run.found for run in drawn)
     return sum(run.trials for run in drawn) / crashes if crashes else math.nan
@@ -61,7 +66,7 @@ def costs(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
     The cost is trials without a simulator, where all take as long, and steps of everything with one.
     """
     found: dict[str, dict[str, float]] = {}
-    for problem in (*PROBLEMS, *REAL):
+    for problem in (*PROBLEMS, *REAL, *DEVELOPMENT):
         of = [run for run in runs if run.problem == problem]
         needed = _needed(problem, [run for run in of if run.sampler == "random"])
         for sampler in dict.fromkeys(run.sampler for run in of):
@@ -96,7 +101,8 @@ def rare(found: dict[str, dict[str, float]], sampler: str) -> float:
 def table(runs: Sequence[Run]) -> str:
     """Return it as Markdown."""
     found = costs(runs)
-    samplers = [name for name in ("random", "sobol", "cma-es", *_MARKS) if any(name in row for row in found.values())]
+    known = ("random", "sobol", "cma-es", *_MARKS, "simpler", "simpler-again", "simpler-peaks")
+    samplers = [name for name in known if any(name in row for row in found.values())]
     samplers.sort(key=lambda name: ["random", "guided"].index(name) if name in ("random", "guided") else 2)
     lines = [f"| problem | one in | {' | '.join(samplers)} |", f"| --- | ---: |{' ---: |' * len(samplers)}"]
     for name, row in found.items():
@@ -105,6 +111,36 @@ def table(runs: Sequence[Run]) -> str:
     means = [rare(found, sampler) for sampler in samplers]
     lines.append(f"| *rare, with a hint* | | {' | '.join('-' if math.isnan(one) else f'{one:.2f}' for one in means)} |")
     return "\n".join(lines)
+
+
+def pairs_table(runs: Sequence[Run], base: str, other: str) -> str:
+    """Return the cost of one sampler as a share of that of another in hunts with the same seeds, as Markdown."""
+    rng = np.random.default_rng(0)
+    lines = [f"| problem | hunts | {base} | {other} | ratio |", "| --- | ---: | ---: | ---: | --- |"]
+    ratios, drawn = [], []
+    for problem in dict.fromkeys(run.problem for run in runs):
+        costs_of = {
+            name: {run.seed: _paid(problem, [run])[0] for run in runs if (run.problem, run.sampler) == (problem, name)}
+            for name in (base, other)
+        }
+        seeds = sorted(costs_of[base].keys() & costs_of[other].keys())
+        if len(seeds) < 2:
+            continue
+        one, two = (np.array([costs_of[name][seed] for seed in seeds], dtype=float) for name in (base, other))
+        again = rng.integers(len(seeds), size=(4000, len(seeds)))
+        ratios.append(float(two.mean() / one.mean()))
+        drawn.append(two[again].mean(1) / one[again].mean(1))
+        cells = [problem, f"{len(seeds)}", f"{one.mean():.0f}", f"{two.mean():.0f}", _share(ratios[-1], drawn[-1])]
+        lines.append(f"| {' | '.join(cells)} |")
+    if ratios:
+        whole = np.exp(np.mean(np.log(drawn), axis=0))
+        lines.append(f"| *all {len(ratios)}* | | | | {_share(statistics.geometric_mean(ratios), whole)} |")
+    return "\n".join(lines)
+
+
+def _share(ratio: float, drawn: np.ndarray[tuple[int], np.dtype[np.float64]]) -> str:
+    low, high = np.percentile(drawn, (2.5, 97.5))
+    return f"{ratio:.2f} ({low:.2f}-{high:.2f})"
 
 
 def _cell(runs: Sequence[Run], problem: str, sampler: str, row: dict[str, float]) -> str:
