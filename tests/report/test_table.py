@@ -1,6 +1,16 @@
 """The layout of tables: a heading of several rows, and columns that fit into a terminal."""
 
-from crashhunt.report._table import aligned, stacked
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from crashhunt.crashes import find_bundle
+from crashhunt.errors import UsageError
+from crashhunt.report._table import NEAREST, aligned, check_fields, format_table, stacked, steps_table
+
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
 
 
 def test_words_of_a_heading_stand_at_its_bottom():
@@ -16,3 +26,44 @@ def test_columns_are_one_space_apart_only_if_the_line_is_too_wide_otherwise():
     assert aligned(rows, width=11) == ["step  speed", "   1   15.0  <- here"]
     assert aligned(rows, width=10) == ["step speed", "   1  15.0 <- here"]
     assert aligned(rows) == aligned(rows, width=11)
+
+
+# The steps of a recording as a table.
+
+
+@pytest.fixture(scope="module")
+def rear_end():
+    """ego drives into the back of a slower leader in step 52."""
+    return find_bundle(FROZEN, "").recording()
+
+
+def test_fields_of_a_step_are_those_of_scene_nearest_partner_action_and_observation(rear_end):
+    fields = ["speed", "x", "reward", *NEAREST, "gap_to_other_m", "closing_speed", "action", "observation[1, x]"]
+    rows = steps_table(rear_end, fields, "ego", "leader")
+    assert [row["step"] for row in rows] == list(range(53))
+    expected = {
+        "step": 46, "time_s": 4.6, "speed": 14.451, "x": 56.841, "reward": 1.445, "time_to_collision_s": 0.5116,
+        "gap_m": 3.967, "required_deceleration": 7.578, "gap_to_other_m": 3.967, "closing_speed": 7.754,
+        "target_speed": 14.451, "lane_change": 0.0, "observation[1,x]": 9.742,
+    }  # fmt: skip
+    assert rows[46] == pytest.approx(expected, abs=0.001)
+    assert list(rows[46]) == list(expected)
+    # Before the first step there is no action, and nothing closes in yet.
+    assert [rows[0][name] for name in ("target_speed", "observation[1,x]", "time_to_collision_s")] == [None] * 3
+    assert format_table(rows)[1].split()[:3] == ["0", "0", "6.69734"]
+    assert "-" in format_table(rows)[1]
+    assert format_table([]) == []
+    assert list(steps_table(rear_end, ["y"], "ego")[3]) == ["step", "time_s", "y"]
+
+
+def test_partner_has_no_values_if_it_is_not_given(rear_end):
+    assert steps_table(rear_end, ["gap_to_other_m"], "ego")[46]["gap_to_other_m"] is None
+
+
+def test_unknown_field_is_refused_with_the_known_ones(rear_end):
+    with pytest.raises(UsageError) as caught:
+        check_fields(rear_end, ["sped"], "ego")
+    assert "'sped'" in caught.value.message
+    known = ("speed", "gap_to_other_m", "target_speed", "observation[0,presence]")
+    assert all(name in caught.value.fix for name in known)
+    assert check_fields(rear_end, ["action", "x"], "ego") == ["target_speed", "lane_change", "x"]
