@@ -38,7 +38,7 @@ from crashhunt.base.plugins import locate
 from crashhunt.episode import COPIES_PER_LEVEL, Episode, seed_everything
 from crashhunt.oracles import Overlap, ReportedCollision
 from crashhunt.rates import RareCounter, RateTest, Root, choose_levels, why_unfit
-from crashhunt.scenario import argument_values, load_scenario
+from crashhunt.scenario import argument_values, load_scenario, with_action
 from crashhunt.trial import CRASHES, TrialSpec
 from crashhunt.world import closing_rate
 
@@ -352,7 +352,7 @@ def loop(trees: int, copies: int, levels: Sequence[float], speed: float, first: 
 
 def levels(name: str, agent: str, arguments: dict[str, float], first: int = 700_000) -> None:
     """Choose levels by pilots and test them by trees, as `--rare splitting` does, without the plain trials."""
-    scenario = load_scenario(name)
+    scenario = with_action(load_scenario(name), EGO, "continuous")
     simulator = locate("simulators", scenario.simulator)(scenario, Path(tempfile.mkdtemp()))
     driver = locate("agents", agent)
 
@@ -367,6 +367,8 @@ def levels(name: str, agent: str, arguments: dict[str, float], first: int = 700_
                 return None
             path = _PeakPath(episode)
             leaves = grow_tree(path, of_tree, COPIES_PER_LEVEL)
+            if episode.result is not None and episode.result.outcome.category == "software fault":
+                raise SystemExit(f"trial {seed}: {episode.result.summary}")
             return path.peak, leaves
 
     pilots = list(islice(filter(None, (run(seed, ()) for seed in range(first, first + 1000))), PILOT_TREES))
