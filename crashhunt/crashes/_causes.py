@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, Factor, Judgement, Omission, Why
     from crashhunt.recording import Recording
+    from crashhunt.world import Scene
 
 __all__ = ["Cause", "CauseGroup", "Division", "cause_of", "features_of"]
 
 _LONG_M = 7.0  # a longer actor is a truck, a bus or a trailer, which agents that assume a car's length hit
 _LOOKS_S = (0.2, 1.0, 2.0)  # before the crash
-_RELEVANT_DIFFERENCES = {"speed": 5.0, "gap": 5.0, "length": 4.0}  # m/s, m, m: a difference that matters
+_RELEVANT_DIFFERENCES = {"speed": 5.0, "gap": 5.0, "aside": 1.5, "length": 4.0}  # m/s, m: a difference that matters
+_MAX_GAP_M, _MAX_ASIDE_M = 50.0, 5.0  # further away, the distance makes no difference
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -146,7 +148,8 @@ def _length(recording: Recording, actor: str) -> float:
 def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[float, ...]:
     """Return numbers that distinguish crashes of one type without runs, each divided by a difference that matters.
 
-    The numbers are the speeds and the gap 0.2 s, 1 s and 2 s before the crash, and the length of the collision partner.
+    The numbers are the length of the collision partner, and, 0.2 s, 1 s and 2 s before the crash, the speeds, the gap
+    and the partner's lateral position. Without this position, changes to the left and to the right are alike.
 
     Args:
         bundle: the crash to describe.
@@ -161,20 +164,33 @@ def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[flo
     recording = recording or bundle.recording()
     encounter = Encounter(recording, hit.agent, hit.other)
     moments = encounter.moments
+    scenes = {step.step: step.scene for step in recording.all_steps}
     found = []
     for before_s in _LOOKS_S:
         end_s = moments[-1].time_s if moments else 0.0
         moment = next(
             (one for one in reversed(moments) if one.time_s <= end_s - before_s), moments[0] if moments else None
         )
-        values = (0.0, 0.0, 0.0) if moment is None else (moment.speed, moment.other_speed, min(moment.gap_m, 50.0))
+        scene = None if moment is None else scenes.get(moment.step)
+        if moment is None or scene is None:
+            found += [0.0] * 4
+            continue
         found += [
-            values[0] / _RELEVANT_DIFFERENCES["speed"],
-            values[1] / _RELEVANT_DIFFERENCES["speed"],
-            values[2] / _RELEVANT_DIFFERENCES["gap"],
+            moment.speed / _RELEVANT_DIFFERENCES["speed"],
+            moment.other_speed / _RELEVANT_DIFFERENCES["speed"],
+            min(moment.gap_m, _MAX_GAP_M) / _RELEVANT_DIFFERENCES["gap"],
+            _aside_m(scene, hit.agent, hit.other) / _RELEVANT_DIFFERENCES["aside"],
         ]
     found.append(_length(recording, hit.other) / _RELEVANT_DIFFERENCES["length"])
     return tuple(found)
+
+
+def _aside_m(scene: Scene, agent: str, other: str) -> float:
+    """Return how far another actor is to the left of an agent, in m, at most one lane."""
+    row, index = scene.roster.index[agent], scene.roster.index[other]
+    (dx, dy), heading = scene.centers[index] - scene.centers[row], scene.headings[row]
+    aside = float(dy * math.cos(heading) - dx * math.sin(heading))
+    return max(-_MAX_ASIDE_M, min(_MAX_ASIDE_M, aside))
 
 
 class Division:

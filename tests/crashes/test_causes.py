@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -18,9 +19,11 @@ from crashhunt.crashes import (
     ReferenceRun,
     Why,
     cause_of,
+    features_of,
 )
+from crashhunt.recording import Prologue, StepRecord
 from crashhunt.trial import Outcome
-from crashhunt.world import Actor
+from crashhunt.world import Actor, Roster, Scene
 
 
 def bundle(outcome=Outcome.COLLISION, length=5.0):
@@ -157,3 +160,26 @@ def test_length_is_no_cause_where_cars_were_hit_as_well():
     assert found.causes()[1] == long
     found.settle(2, car)
     assert found.causes() == {0: car, 1: car, 2: car}
+
+
+def features(side, turn):
+    """Return the features of a crash into a vehicle on the next lane, on a road of some direction."""
+    roster = Roster((Actor("ego", "passenger", 5.0, 1.8), Actor("x", "passenger", 5.0, 1.8)))
+    c, s = math.cos(turn), math.sin(turn)
+    steps = []
+    for number in range(40):
+        points = [
+            (number * 2.0 * c - y * s, number * 2.0 * s + y * c) for y in (0.0, side * (3.2 if number < 39 else 0))
+        ]
+        steps.append(StepRecord(number, Scene(number / 10, roster, points, [turn] * 2, [20.0] * 2)))
+    hit = SimpleNamespace(agent="ego", other="x")
+    crash = SimpleNamespace(result=SimpleNamespace(collision=hit))
+    recording = SimpleNamespace(all_steps=steps, prologue=Prologue((), 0.1), actors=roster.actors)
+    return features_of(crash, recording)
+
+
+def test_changes_to_the_left_and_to_the_right_are_far_apart():
+    """A crash that is not judged has the cause of the nearest one, and the side is a part of the cause."""
+    left, right = features(1, 0.0), features(-1, 0.0)
+    assert math.dist(left, right) > 5.0
+    assert features(1, 2.5) == pytest.approx(left)
