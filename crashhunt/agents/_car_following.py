@@ -52,7 +52,7 @@ def check_layout(space: Space[object] | None) -> None:
     """Refuse an observation space that lacks the columns which the agent reads.
 
     Raises:
-        ValueError: the observation space has other columns.
+        ValueError: the observation space does not have the columns presence, x, y, vx, vy, cos_h and sin_h.
     """
     columns = None if space is None else (space.shape or (0,))[-1]
     if columns not in (None, SIN_H + 1):

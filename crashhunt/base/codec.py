@@ -386,7 +386,7 @@ def essentials(*kinds: Any) -> frozenset[str]:
 
 
 def not_understood(needed: Iterable[str], *kinds: object) -> list[str]:
-    """Return the names under ``requires`` in JSON data that are not fields of any of some dataclasses."""
+    """Return the names under ``requires`` in JSON data that are not essential fields of the given dataclasses."""
     return sorted(set(needed) - essentials(*kinds)) if needed else []
 
 

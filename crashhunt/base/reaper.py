@@ -33,7 +33,9 @@ _END_S = 5.0  # for the keeper to end all processes
 
 
 class Kept:
-    """A Python module that runs in a separate process with a keeper.
+    """A Python module that runs in a separate process; a second process, the keeper, ends it with its descendants.
+
+    The keeper ends these processes when ``main()`` of the module has returned, or when the current process has ended.
 
     Args:
         module: module whose function ``main()`` is called.

@@ -15,9 +15,10 @@ The proposal multiplies the probability of each cell (a model with one strength)
 accumulates along the root. In each interval of length `Forcing.spacing` of this probability, one onset is placed at a
 uniformly drawn point. The weight of an onset is spacing / ratio.
 
-Invariant: the expected sum of weights over any set of first onsets is the probability of that set, given the root. The
-estimate is the sum of the weighted crashes of all copies; if the root itself crashes, S at the end of the root is
-added. The estimate is therefore unbiased, for all ratios above 0 and for any spacing.
+Invariant: let P be the probability, given the root, that the first effective onset of a trial belongs to a set of
+onsets. For any set, P is the expected sum of the weights of the proposed onsets in the set. The estimate is the sum of
+the weighted crashes of all copies; if the root itself crashes, S at the end of the root is added. The estimate is
+therefore unbiased, for all ratios above 0 and for any spacing.
 
 Reason for intervals of fixed length: eight equal parts of each root would need the total probability, which is known
 only at the end of the root. A second run of the root would cost its steps again. The spacing is learned, so that a root
@@ -31,9 +32,9 @@ Second onsets: a copy with its first onset can be treated as a root again. Eithe
 onset before its end, or it has a second onset. The same closed form applies to the models after the first onset in the
 same step, and to all models from the next step on. A copy may therefore run without later disturbances, and each of its
 own copies begins with one forced second onset. The copy itself then counts with the probability of no second onset. The
-choice of these copies does not depend on their results, so there is no bias. `Forcing` selects the first onsets that
-get second onsets. At first, all of them do, because the hunt learns from their results where second onsets are useful.
-Later, one copy of each root gets second onsets in addition.
+choice of the copies with a second onset does not depend on their results, so the estimate has no bias. `Forcing`
+selects the first onsets that get second onsets. At first, all of them do, because the hunt learns from their results
+where second onsets are useful. Later, one copy of each root gets second onsets in addition.
 
 Source: stratified importance sampling (Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 and 9). Cost:
 in each step of the root, one check of every place around the agent at which a model may find a vehicle.
@@ -171,7 +172,7 @@ class FirstOnsets:
         last: number of the last step of the root trial.
         first: the first step in which a disturbance is forced.
         after_place: in the first step, disturbances are forced only at later positions in the order than this position.
-        stream: numbers that separate these random numbers from others with the same seed.
+        stream: numbers that separate the random numbers of the onsets from other random numbers with the same seed.
         places: places of the sampler with the ratios of the forcing; None to create them.
 
     Attributes:

@@ -54,7 +54,10 @@ class DisturbanceModel(Protocol):
 
 @runtime_checkable
 class Enumerates(Protocol):
-    """A model that can list all its draws, so that draws without a target vehicle can be skipped in closed form."""
+    """A model that can list all its possible draws with their probabilities.
+
+    With this list, crashhunt calculates the probability that a draw finds a target vehicle, without drawing.
+    """
 
     def possibilities(self) -> Iterable[tuple[Drawn, float]]:
         """Return everything that `DisturbanceModel.draw` can return, each with its probability; the sum is 1."""

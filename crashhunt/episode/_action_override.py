@@ -154,7 +154,7 @@ class HandedOver:
 
     Args:
         driver: the agent that takes control.
-        handover: the vehicle, its recording and the step.
+        handover: id of the vehicle, path of its recording, and number of recorded actions to repeat.
     """
 
     def __init__(self, driver: Agent, handover: Handover) -> None:

@@ -82,8 +82,8 @@ class Probed:
 
         Args:
             share: share of the plausible maximum, from 0 to 1.
-            who: the place at which an actor is disturbed.
-            agent: Identifier of the agent around which the place is chosen.
+            who: the place of the disturbed actor relative to the agent, such as ``ahead``; ``itself`` for the agent.
+            agent: Identifier of the agent to which the place in ``who`` is relative.
             step: the step in which the disturbance begins.
         """
         strong = self.least + share * (self.most - self.least) if self.grade == "strength" else self.most

@@ -73,7 +73,7 @@ class Questions:
         attempt: Callable[[], tuple[Plain | None, NoAnswer | None]],
         can_retry: Callable[[], bool] = lambda: True,
     ) -> Plain | None:
-        """Return the result of a fork; None if no fork returns a result, which is counted.
+        """Return the result of a fork. If no fork returns a result, count the failure and return None.
 
         Args:
             attempt: function that runs one fork; it returns the result, or None and the reason.

@@ -52,8 +52,9 @@ class HuntFigures:
         state: state of the hunt.
         agents: agent of each controlled vehicle.
         trials: number of valid trials, up to the first trial that has not ended.
-        crashes: number of crashes in these trials.
-        crash_rate: crash rate of these trials, from 0 to 1; NaN if it would be biased, or if there is no trial.
+        crashes: number of crashes in the trials that ``trials`` counts.
+        crash_rate: crash rate of the trials that ``trials`` counts, from 0 to 1; NaN if the rate would be biased, or if
+            there is no trial.
         interval: interval of the crash rate with 95 % confidence, valid at any time; None if the trials do not allow an
             interval.
         why_not: reason why the interval or the rate is missing.
@@ -66,7 +67,7 @@ class HuntFigures:
         disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
         excluded: number of trials that do not count, because a trial with a lower number has not ended.
         exclusions: number of trials that do not count, by reason. Reason ``trained_on``: an agent of this hunt, or of a
-            compared hunt with the same seed, was trained on their traffic.
+            compared hunt with the same seed, was trained on the traffic of these trials.
     """
 
     dir: str

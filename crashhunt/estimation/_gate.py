@@ -63,7 +63,7 @@ class ScenarioCounts:
 
     Args:
         name: name of the hunt: its id and run in the suite, or the name of the scenario.
-        pairs: number of pairs that count.
+        pairs: number of pairs on which the verdict is based.
         only_base: number of the pairs in which only BASE crashes.
         only_head: number of pairs in which only HEAD crashes.
         both: number of pairs in which both crash.
@@ -93,7 +93,7 @@ class GateReport:
         verdict: verdict on HEAD, compared with BASE: ``better``, ``worse``, ``no_difference`` or ``undecided``.
         base: the version BASE: a commit or an agent.
         head: the version HEAD: a commit or an agent.
-        pairs: number of pairs that count.
+        pairs: number of pairs on which the verdict is based.
         only_base: number of the pairs in which only BASE crashes.
         only_head: number of pairs in which only HEAD crashes.
         both: number of pairs in which both versions crash.

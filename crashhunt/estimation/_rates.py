@@ -59,7 +59,7 @@ def measure_rates(
     Args:
         directory: directory of the hunt.
         per: the only rate to return: ``trial``, ``hour`` or ``1000km``.
-        confidence: confidence of the certain intervals, in percent.
+        confidence: confidence, in percent, of the certain intervals, which are valid after any number of trials.
         by: the property that divides the rate into parts: ``kind``, ``fault``, ``disturbance`` or an argument,
             optionally with a number of bins as in ``speed:5``.
         bar: threshold with which the rate is compared; needs `per`.
@@ -135,7 +135,7 @@ def rate_of_counts(
         crashes: number of crashes among the valid trials.
         steps: number of simulated steps of the valid trials.
         excluded: number of trials that ended after the first unfinished trial.
-        confidence: confidence of the certain interval, in percent.
+        confidence: confidence, in percent, of the certain interval, which is valid after any number of trials.
     """
     rule = counting_rule(settings, facts)
     sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")
@@ -165,7 +165,7 @@ def rate_of_trials(
         facts: facts from the hunt's ledger.
         trials: JSON data of all trials, in the order of their numbers.
         held_out: rule for the traffic that counts.
-        confidence: confidence of the certain interval, in percent.
+        confidence: confidence, in percent, of the certain interval, which is valid after any number of trials.
     """
     rule = counting_rule(settings, facts, held_out)
     sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")

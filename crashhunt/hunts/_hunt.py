@@ -567,5 +567,5 @@ def _rate_of(directory: Path, watch: BarWatch | None, stopped: StoppedBecause) -
 
 
 def _under_way(parallel: int) -> int:
-    """Return the number of submitted trials that are needed for a number of running trials."""
+    """Return the number of trials to submit so that ``parallel`` trials run and each worker has its next trial."""
     return parallel * (1 + _QUEUED_PER_WORKER)

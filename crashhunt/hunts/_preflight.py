@@ -218,6 +218,8 @@ SURVEY_OUTPUT = "output.log"
 class TrafficSurveyor:
     """Replaces the candidates from the route files by the vehicles that really enter in a simulation.
 
+    A candidate is a vehicle that the agent may replace.
+
     Args:
         directory: directory of the hunt. An existing hunt keeps its candidates.
         overwrite: whether an existing hunt is replaced.
@@ -228,7 +230,7 @@ class TrafficSurveyor:
         self._overwrite = overwrite
 
     def __call__(self, scenario: Scenario, request: Request, settings: HuntSettings) -> Scenario:
-        """Return the scenario with the surveyed candidates, or the same scenario if it needs no survey.
+        """Return the scenario with the vehicles that enter in a simulation as candidates; unchanged without a survey.
 
         Args:
             scenario: the loaded scenario.

@@ -85,15 +85,15 @@ class ProbeReport:
     Args:
         margins: the robustness margin of each trial whose probes all have a result.
         not_fully_asked: number of further trials, in which a probe has no result.
-        why_unasked: the reason for the first of these trials; empty if there is none.
+        why_unasked: why a probe has no result in the first trial of ``not_fully_asked``; empty without such a trial.
         probes: number of forks that were run.
         steps: number of simulated steps of the forks.
         skipped: number of probes that were skipped because the forks had used up their steps.
         run_again: number of crashes with the mildest disturbance that were run from the start.
-        not_finished: number of these runs that did not reach their end, for example because they were killed.
+        not_finished: number of runs from the start that did not reach their end, for example because they were killed.
         crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
-        by: the disturbance of each of these crashes with its actual values. The trial may have drawn further
-            disturbances.
+        by: the disturbance that the probe added in each trial of ``crashes``, with its actual values. The trial may
+            have drawn further disturbances.
     """
 
     margins: tuple[float, ...]
@@ -137,9 +137,10 @@ class BranchReport:
         crashed: number of branches that crashed.
         crashed_trials: number of trials with a branch that crashed.
         not_fully_asked: number of trials in which a branch has no result.
-        why_unanswered: the reason for the first of these trials; empty if there is none.
+        why_unanswered: why a branch has no result in the first trial of ``not_fully_asked``; empty if there is no such
+            trial.
         run_again: number of crashed branches that were run from the start: the likeliest branch of each trial.
-        not_finished: number of these runs that did not reach their end, for example because they were killed.
+        not_finished: number of runs from the start that did not reach their end, for example because they were killed.
         crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
     """
 
@@ -182,7 +183,7 @@ class RareReport:
         estimate: estimate of the crash probability per trial.
         verified: number of crashes found by forks that were run again from the start. The crashes with the greatest
             weights are chosen.
-        not_finished: number of these runs that did not finish.
+        not_finished: number of runs from the start, requested for ``verified``, that did not finish.
         crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
         more: further lines for the user, such as the levels of splitting.
     """

@@ -1,4 +1,4 @@
-"""The reader of a ledger. It checks every row against the digest of the row."""
+"""The reader of a ledger, which checks every row against the digest of the row."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class RunningRate(TypedDict):
         confidence: confidence of all intervals, in percent.
         units: number of independent units that count: trials, traffic seeds, or trials from which forks start.
         trials: number of plain trials that count.
-        crashes: number of crashes in these trials.
+        crashes: number of crashes in the trials that ``trials`` counts.
         origin: the origin of the trials that count; empty if all trials count.
         certain: interval that is valid whenever the user looks at it; None if there is none.
         estimate: crash probability per trial, estimated from the forks; None if there is no estimate.
@@ -118,16 +118,17 @@ class Noted(TypedDict, total=False):
         plain_origin: origin of the independent trials, if the sampler also draws some trials that it does not guide;
             else None.
         lag: maximum number of trials by which results reach a learning sampler late.
-        lag_grows: whether this delay is shorter at the beginning of the hunt; None in earlier hunts, where the delay is
-            constant.
-        sampler_version: version of the proposals of a learning sampler; None in earlier hunts, which have version 1.
+        lag_grows: whether ``lag`` is shorter at the beginning of the hunt; None in hunts of earlier versions, where it
+            is constant.
+        sampler_version: version of the proposals of a learning sampler; None in hunts of earlier versions of crashhunt,
+            which have version 1.
         origins: whether the sampler reports the origin of each trial.
         core: whether the compiled core of the simulator is used; None if the simulator has no compiled core.
         disturb: disturbances of the trials with their rates; None without disturbances.
-        copies: the types of forks that the hunt makes of its trials, of ``probes`` and ``branches``; None if it makes
-            none.
-        confirmed: for the trials whose forks crashed: how many of these crashes were run from the start, and how many
-            of the runs crashed.
+        copies: the types of forks that the hunt makes of its trials: ``probes``, ``branches`` or both; None if the hunt
+            makes no forks.
+        confirmed: for ``probes`` and ``branches``: number of crashes of forks that were run from the start to the end,
+            and number of these crashes that were confirmed.
         nodes: the machines of the last run, if there were several, each with the fields of `NodeFigures`.
         kinds: the crash types, the most frequent first, if the hunt collects all crash types.
         kinds_version: version of the rules that decide which crashes are of the same type.
@@ -139,8 +140,8 @@ class Noted(TypedDict, total=False):
         newest_kind: time at which the last new crash type was found, in s since the epoch; None if there is none, or if
             it is unknown.
         audits_left: the trials that the audit has not yet run again; None if there are none.
-        phase: phase of the hunt after its last trial, with the fields of `PhaseStatus`; None before these phases and at
-            the end.
+        phase: phase of the hunt after its last trial, with the fields of `PhaseStatus`; None before the first
+            phase and at the end.
         ends_at: time at which the last trial is expected to end, in s since the epoch; None if it is unknown.
         failed_steps: number of simulated steps of confirmations that failed.
         until_rate: ``bar`` (the threshold as the user gave it), ``decided_at`` (number of the deciding trial) and

@@ -74,7 +74,9 @@ def load_order_of(scenario: Scenario) -> str | None:
 
 
 def with_recorded_load_order(scenario: Scenario, recorded: str | None) -> Scenario:
-    """Return the scenario with the load order of a recorded crash: fixed, or the simulator's own.
+    """Return the scenario with the load order of a recorded crash: a fixed order, or the simulator's own order.
+
+    The load order is the order in which the simulator processes objects when it loads the scenario.
 
     Args:
         scenario: the scenario to run again.

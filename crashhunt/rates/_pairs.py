@@ -18,8 +18,8 @@ interval, and bisection finds its end. The lower end is the upper end of -Z.
 Sources: those of `_certain_interval`, which computes the evidence of discordant pairs. The bets on Z are those of
 Waudby-Smith and Ramdas (2024), with a mixture over fixed shares.
 
-Cost: a pair increments a counter. An end takes 50 evaluations, each with one logarithm for every component and every
-different value of Z.
+Cost: a pair increments a counter. The bisection for one end of the interval evaluates E(d) 50 times. Each evaluation
+computes one logarithm for every component j and every different value of Z.
 """
 
 from __future__ import annotations
@@ -168,13 +168,13 @@ class PairTest:
     """Counts pairs, and returns at any time the difference that is compatible with them.
 
     Attributes:
-        pairs: number of pairs that count.
+        pairs: number of added pairs with at least one trial that is valid for both agents.
         only_first: number of pairs in which the first agent crashes and the second does not. If a pair has several
             trials, number of pairs in which the first agent crashes more often.
-        only_second: number of such pairs with the two agents exchanged.
+        only_second: like ``only_first``, with the two agents exchanged.
         both: number of pairs in which both agents crash, equally often.
         crashes: number of crashes of the first agent and of the second agent.
-        trials: number of trials of each agent in these pairs.
+        trials: number of trials of each agent in the pairs that ``pairs`` counts.
     """
 
     def __init__(self, rounds: int = 1) -> None:
@@ -237,7 +237,7 @@ class PairTest:
         return self.pairs > 0 and all(self._log_evidence_below(margin, sign) >= threshold for sign in (1, -1))
 
     def _log_evidence_below(self, difference: float, sign: int) -> float:
-        """Return the logarithm of the evidence that sign * E[Z] is less than the given difference."""
+        """Return the logarithm of the evidence that ``sign`` times the mean difference of pairs is below a value."""
         values = sign * np.array(list(self._differences), float)
         times = np.array(list(self._differences.values()), float)
         stakes = _SHARES / (1 - difference)

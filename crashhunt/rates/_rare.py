@@ -100,7 +100,7 @@ class Root:
         disturbed: estimate of the probability of all other crashes.
         counted: the part of ``undisturbed`` that is a share of trials and contains no copies.
         own: the part of the sum of both estimates that comes from the root itself, from 0 to 1.
-        by: the part of ``disturbed`` that comes from copies, by cell.
+        by: the part of ``disturbed`` that comes from copies, by cell (a model of disturbances with one strength).
         steps: number of simulated steps of the root and its copies.
         own_steps: number of simulated steps of the root itself.
         bound: upper bound of the part that comes from copies, known before the root begins.
@@ -108,9 +108,9 @@ class Root:
         copies: the part of the estimates that comes from copies, from 0 to `bound`.
         plain: number of valid plain trials after the root.
         invalid: number of invalid plain trials after the root, which do not count.
-        plain_crashes: number of these plain trials that crashed.
-        plain_undisturbed: number of these plain trials that crashed undisturbed.
-        plain_steps: number of simulated steps of these plain trials.
+        plain_crashes: number of valid plain trials after the root that crashed.
+        plain_undisturbed: number of valid plain trials after the root that crashed undisturbed.
+        plain_steps: number of simulated steps of the valid plain trials after the root.
     """
 
     undisturbed: float
@@ -143,8 +143,8 @@ class Estimated:
         low: lower end of the interval.
         high: upper end of the interval.
         effective: effective sample size of the weighted part of the estimate, as a number of roots.
-        largest_share: share of the root with the greatest value in the sum of this part, 0 to 1.
-        roots_with_crash: number of roots with a value above 0 in this part.
+        largest_share: share of the root with the greatest value in the sum of the weighted part, 0 to 1.
+        roots_with_crash: number of roots with a value above 0 in the weighted part.
     """
 
     low: float
@@ -379,9 +379,9 @@ class _Learned:
 
     Attributes:
         masses: probability of the first disturbance, summed over roots.
-        copies: number of copies of these roots.
-        squares: sum of the squared values of copies. A value estimates the crash probability, given the first
-            disturbance, from one copy and the copies forked from it.
+        copies: number of copies of earlier roots.
+        squares: sum of the squared crash probabilities that the copies estimate. Each probability is conditional on the
+            first disturbance, and is estimated from one copy and the copies forked from this copy.
     """
 
     def __init__(self) -> None:

@@ -55,13 +55,13 @@ class CrashRate:
     Args:
         dir: directory of the hunt.
         per: the unit of exposure to which the rate refers, such as a trial or a kilometre.
-        confidence: confidence of the certain interval, in percent.
+        confidence: confidence, in percent, of the certain interval, which is valid after any number of trials.
         method: ``plain`` for counted trials, or ``rare`` for forks with forced disturbances.
         units: number of independent units that count: trials or traffic seeds.
-        crashes: number of crashes in these units.
-        trials: number of valid trials in these units.
-        driven_s: time that the agents drove in these trials, in s.
-        driven_m: distance that the agents drove in these trials, in m.
+        crashes: number of crashes in the units that ``units`` counts.
+        trials: number of valid trials in the units that ``units`` counts.
+        driven_s: time that the agents drove in the counted trials, in s.
+        driven_m: distance that the agents drove in the counted trials, in m.
         estimate: crashes divided by exposure; None if the number of trials was not fixed in advance.
         certain: interval that is valid whenever the user looks at it; None if there is none.
         why_not: reason why the interval or the estimate is missing; empty if both are given.

@@ -192,7 +192,7 @@ def _gap_words(gap_m: float, speed_mps: float) -> str:
 
 
 def _omission(story: CrashFacts) -> Omission | None:
-    """Return the omission found by runs, if it concerns the collision partner or no actor at all."""
+    """Return the agent's omission that runs with a reference driver found; None if it concerns a third actor."""
     reference = story.judgement.reference if story.judgement is not None else None
     found = reference.omission if reference is not None else None
     return found if found is not None and found.actor in ("", story.other) else None

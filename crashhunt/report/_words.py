@@ -118,7 +118,7 @@ def about_nearest(encounter: Encounter, nearest: DangerousMoment) -> list[str]:
 
 
 def about_danger(course: DangerCourse, *, touched: bool = False) -> str:
-    """Return the greatest own criticality, the greatest rear criticality, and their sums over the trial as text.
+    """Return as text the greatest criticality of the agent and of vehicles behind it, and the sums over the trial.
 
     Args:
         course: criticality of the trial over time.
@@ -363,7 +363,7 @@ _FACULTY_WORDS = {
 
 
 def about_reference(reference: Reference, ago: Callable[[int], str], agent: str) -> list[str]:
-    """Return sentences on what the agent failed to do; empty if no run shows it.
+    """Return sentences on what the agent failed to do; empty if no run with a reference driver shows an omission.
 
     Args:
         reference: results of the runs with a reference driver.
@@ -591,7 +591,7 @@ def describe_branches(report: HuntReport) -> list[str]:
 
 
 def _not_fully_asked(count: int, why: str) -> list[str]:
-    """Return a line on the trials with incomplete answers; an empty list if there are no such trials."""
+    """Return a line on the trials in which a fork has no result; an empty list if ``count`` is 0."""
     if not count:
         return []
     return [f"  {_count_words(count, 'trial')} {'was' if count == 1 else 'were'} not fully probed: {why}"]

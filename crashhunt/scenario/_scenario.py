@@ -192,7 +192,7 @@ class Scenario:
         observation: layout of the observations; None for the simulator's own layout, or the default.
         arguments: the arguments that shape the traffic.
         agents: setup of each controlled vehicle, by agent id.
-        tables: the tables of plugin simulators by name; in the file, they are on the same level as these keys. The
+        tables: the tables of plugin simulators by name; in ``scenario.toml``, the tables are top-level keys. The
             simulator's `Backend` gives the dataclass of its table.
         events: limits of traffic events that differ from the default, such as ``not_moving`` in s.
         disturbances: disturbances, which are faults of other vehicles and of the agent's sensors: rate per second by
@@ -232,7 +232,8 @@ class Scenario:
     def backends(self) -> dict[str, Backend]:
         """The descriptor of the scenario's simulator, by name; if it has none, the descriptors of its tables.
 
-        Because of these tables, your own class that drives a known simulator may be given as ``module:attribute``.
+        If the scenario names your own class (``module:attribute``) that drives a known simulator, the scenario's table
+        for this simulator determines the descriptor.
         """
         names = (self.simulator,) if backend_of(self.simulator) is not None else tuple(self.tables)
         return {name: found for name in names if (found := backend_of(name)) is not None}
@@ -386,8 +387,8 @@ class Configuration:
     Args:
         endings: endings of file names, such as ``.sumocfg``; messages name the first ending.
         load: function that returns the scenario for the path of a file and the value of ``--ego``, which may be empty.
-        arguments: the scenario arguments that every such scenario has, for shell completion.
-        takes_ego: whether ``--ego`` selects the controlled vehicle of such a scenario.
+        arguments: the scenario arguments that every scenario of this format has, for shell completion.
+        takes_ego: whether ``--ego`` selects the controlled vehicle of a scenario of this format.
         waiting: description of a slow step of loading; empty if loading is fast.
     """
 

@@ -7,7 +7,7 @@ Derive a test class from a suite in a test module, define the fixtures of the su
         def make(self, tmp_path):
             return lambda: MySimulator(scenario, tmp_path)
 
-The suites need the package pytest.
+The suites of tests, such as `SimulatorContract`, need the package pytest.
 """
 
 import lazy_loader

@@ -63,8 +63,8 @@ def assert_survives(
 ) -> None:
     """Run trials with an agent; if the agent crashes, fail and print the minimized crash.
 
-    The same seed runs the same trials. The printed call can be pasted into a test; it contains ``example``, with which
-    it runs only this trial.
+    The same seed runs the same trials. The error message contains a call of this function with ``example``. Paste this
+    call into a test to run only the trial that crashed.
 
     Args:
         agent: class or function in a module, or ``module:attribute``.

@@ -113,7 +113,7 @@ _CATEGORIES: dict[str, Category] = {
 
 
 def outcome_of(data: Mapping[str, Any]) -> Outcome:
-    """Return the outcome from JSON data, with the category in the data for an oracle's own outcome.
+    """Return the outcome that JSON data name; an outcome that an oracle adds has the category in the data.
 
     Raises:
         ValueError: The data contain no valid outcome.

@@ -92,8 +92,8 @@ class _Tries:
 class AvoidanceSearch:
     """Search for the last step from which a manoeuvre of the agent avoids a crash.
 
-    The search bisects. The search then runs the steps after the last step that helped, because a later step may help
-    again.
+    The search bisects. After the bisection, the search runs the manoeuvre from steps after the last step that avoided
+    the crash. The reason is that a later step may avoid the crash even if an earlier step does not.
 
     Args:
         end: number of the step of the crash.

@@ -152,7 +152,7 @@ class LeaveOut:
         """Always None, because the change holds from the start of the trial."""
 
     def applied(self, rerun: Rerun) -> Rerun:
-        """Return the run unchanged, because the engine determines the remaining actors first."""
+        """Return the run unchanged; the engine excludes the actors after it has determined which actors enter."""
         return rerun
 
     def taking_part(self, entered: tuple[str, ...]) -> tuple[str, ...]:

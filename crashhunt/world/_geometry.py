@@ -247,13 +247,14 @@ def levels(scene: Scene, row: int, *, parts: int = 0) -> list[Level]:
 def same_level(one: Rectangle, level: Level, two: Rectangle, other_level: Level, lower_m: float) -> bool:
     """Return whether two rectangles are on the same level; False if one rectangle is on a bridge above the other.
 
-    On the same road, the grades at both rectangles explain the difference of their heights.
+    If both rectangles are on the same road, the slopes of the road at the rectangles predict the difference of their
+    heights. The rectangles are on different levels if the difference deviates from this prediction.
 
     Args:
         one: the first rectangle.
-        level: height of the first rectangle, in m.
+        level: height of the first rectangle, in m, and slope of the road there.
         two: the second rectangle.
-        other_level: height of the second rectangle, in m.
+        other_level: height of the second rectangle, in m, and slope of the road there.
         lower_m: height of the lower actor itself, in m.
     """
     dx, dy = two[0] - one[0], two[1] - one[1]

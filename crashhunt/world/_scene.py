@@ -241,7 +241,7 @@ class Scene:
             headings describe. Contacts between the two scenes can then be found. A lane change of SUMO, a jump
             sideways, is at the end of the path.
         core: compiled core that computes with the scene, if there is one; results are bit-identical.
-        columns: points, headings and speeds as arrays of the core; they replace the three arguments.
+        columns: arrays of the compiled core that replace ``points``, ``headings`` and ``speeds``.
 
     Attributes:
         events: traffic events of this step.

@@ -1,9 +1,9 @@
 """Playback of recorded paths on SUMO: SUMO simulates the controlled vehicles, and scenes add the recorded actors.
 
 When SUMO moves a vehicle to a position, it maps the vehicle to a lane nearby and derives the speed from the distance.
-Therefore the recorded actors are not in SUMO. Instead, this module copies their recorded states into the scenes,
-bit-identical. Observations and contacts are computed from scenes. SUMO's own safe-speed checks do not see the recorded
-actors.
+SUMO would thus change the recorded states, so the recorded actors are not in SUMO. Instead, this module copies the
+recorded states into the scenes, bit-identical. Observations and contacts are computed from scenes. SUMO's own
+safe-speed checks do not see the recorded actors.
 """
 
 from __future__ import annotations
