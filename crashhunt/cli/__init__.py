@@ -193,7 +193,9 @@ def _check_names(words: Sequence[str]) -> None:
         try:
             word.encode()
         except UnicodeEncodeError:
-            raise UsageError(f"{word!a} is not valid UTF-8", fix="rename it") from None
+            raise UsageError(
+                f"the argument {word!a} is not valid UTF-8", fix="rename the file, or write the argument in UTF-8"
+            ) from None
 
 
 def _spell_out(words: Sequence[str]) -> list[str]:

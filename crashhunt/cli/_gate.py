@@ -66,8 +66,8 @@ def add_gate(commands: Commands) -> None:
     )
     what.add_argument(
         "--corpus", metavar="CORPUS", type=Path,
-        help="first run the cases of this corpus in HEAD; HEAD is worse if a fixed crash reproduces; default: the "
-        "folder crashes, if HEAD is a commit with this folder",
+        help="first run the cases of this corpus in HEAD; HEAD is worse if a fixed crash reproduces; default: "
+        "crashes/, if HEAD is a commit that contains this folder",
     )  # fmt: skip
     how = gate.add_argument_group("how it is compared")
     how.add_argument(

@@ -297,7 +297,8 @@ def add_replay(commands: Commands) -> None:
     )  # fmt: skip
     look.add_argument(
         "--sleep", metavar="S", type=number,
-        help="with --gui: wall time between two steps, in s; default: as long as a step simulates",
+        help="with --gui: wall time between two steps, in s; default: the length of "
+        "a simulation step, for real time",
     )  # fmt: skip
     add_film_options(replay)
     add_trust(replay)

@@ -44,7 +44,7 @@ def add_suite(commands: Commands) -> None:
     run = verbs.add_parser(
         "run",
         help="run what has not ended",
-        description="Make a folder of DIR for every run of a hunt, and run all runs that have not ended, even if some "
+        description="In DIR, make a folder for every run of a hunt, and run all runs that have not ended, even if some "
         "runs fail. The same command resumes the suite. Exits with 1 if a hunt could not run.",
     )
     run.add_argument("file", metavar="FILE", type=Path, help="the file that lists the hunts, such as suite.toml")

@@ -28,8 +28,9 @@ def add_trust_command(commands: Commands) -> None:
         help="trust the code of hunts and crashes that you did not make on this machine",
         description="Trust the code of hunts, crashes and corpora that you did not make on this machine, such as "
         "folders from your other machine or hunts of an earlier version of crashhunt. Commands then run this code "
-        "without asking. Prints for each origin the agent, the version of crashhunt, and the snapshot. If the code "
-        "changes, it is no longer trusted. Runs no code. Without DIR, lists everything that you trust.",
+        "without asking. Prints what the trusted code would run: the agent, the version of crashhunt, and the "
+        "snapshot. If the code changes, it is no longer trusted. Runs no code. Without DIR, lists everything that you "
+        "trust.",
     )
     trust.add_argument(
         "places", metavar="DIR", type=Path, nargs="*",
@@ -37,7 +38,7 @@ def add_trust_command(commands: Commands) -> None:
     )  # fmt: skip
     trust.add_argument(
         "--remove", metavar="ORIGIN", action="append", default=[],
-        help="stop trusting an origin, which is named by its fingerprint or its directory; may be repeated",
+        help="stop trusting the code with this fingerprint, or the code in this directory; may be repeated",
     )  # fmt: skip
     add_json(trust)
     trust.set_defaults(command=_trust)
@@ -64,7 +65,7 @@ def _trust(options: argparse.Namespace, _words: list[str]) -> int:
         for origin in found.values():
             say(_line(origin), as_json=options.json)
         if not found:
-            say("You trust no origin besides what you made on this machine.", as_json=options.json)
+            say("You trust no code besides what you made on this machine.", as_json=options.json)
     if options.json:
         print(json.dumps({"trusted": [_data(origin) for origin in found.values()]}))
     return 0

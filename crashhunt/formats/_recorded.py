@@ -137,8 +137,8 @@ def recorded_of(bundle: Bundle) -> RecordedCrash:
     lanes = read_lanes(bundle.path / layout.LOG)
     if not paths.agents:
         raise BundleError(
-            f"{bundle.id} has no scene with its agent, so there is nothing to export",
-            fix="export it without --as: a Gymnasium environment records no vehicles",
+            f"{bundle.id} has no scene with its agent, because a Gymnasium environment records no vehicles",
+            fix="export the crash without --as",
         )
     if not lanes:
         raise BundleError(

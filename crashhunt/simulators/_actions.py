@@ -83,7 +83,9 @@ class SpaceAction:
         with suppress(Exception):  # converting the agent's object runs the agent's code, which may raise anything
             array = cast(action, self._dtype)
         if array is None or not self._contains(array):
-            raise ActionError(f"the action {describe_action(action)} is not in {self.space}", fix="return one that is")
+            raise ActionError(
+                f"the action {describe_action(action)} is not in {self.space}", fix="return an action in this space"
+            )
         return array
 
     def _contains(self, array: NDArray[np.generic]) -> bool:

@@ -260,7 +260,9 @@ class FlatAction:
         except Exception:  # reading the agent's object runs the agent's code, which may raise anything
             inside = False
         if not inside:
-            raise ActionError(f"the action {describe_action(action)} is not in {self.space}", fix="return one that is")
+            raise ActionError(
+                f"the action {describe_action(action)} is not in {self.space}", fix="return an action in this space"
+            )
         return array
 
 
@@ -288,7 +290,9 @@ class OpaqueAction:
             given = np.array(action)
             if self._contains(self._values.restore(given)):
                 return given
-        raise ActionError(f"the action {describe_action(action)} is not in {self.space}", fix="return one that is")
+        raise ActionError(
+            f"the action {describe_action(action)} is not in {self.space}", fix="return an action in this space"
+        )
 
     def restore(self, array: NDArray[np.generic]) -> object:
         """Return the action that an array represents."""

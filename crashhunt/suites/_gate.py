@@ -382,8 +382,8 @@ class _Run:
             if modules and len(elsewhere) == len(modules):
                 module, place = elsewhere[0]
                 raise UsageError(
-                    f"{module!r} is imported from {place}, independent of the commit",
-                    fix="run it from the folder of the repository that holds the module, with --agent module:attribute",
+                    f"{module!r} is imported from {place}, and not from the commit",
+                    fix="run crashhunt gate in the folder that contains the module, with --agent module:attribute",
                 )
 
     # The corpus.

@@ -224,7 +224,7 @@ class Suite:
         if before != replace(wanted, folder=before.folder):
             raise HuntDirectoryError(
                 f"the hunt {entry.id!r} was planned in this folder with other settings",
-                fix="give another directory, or run it again with crashhunt rerun",
+                fix="give another directory, or run the hunt again with crashhunt rerun",
                 where=str(folder),
             )
         return before

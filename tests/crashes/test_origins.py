@@ -389,7 +389,7 @@ def test_command_lists_and_removes(place, capsys):
         said = capsys.readouterr()
         return left.value.code, said.out, said.err
 
-    assert "You trust no origin" in crashhunt()[1]
+    assert "You trust no code" in crashhunt()[1]
     code, out, _ = crashhunt(place / "theirs", "--json")
     (entry,) = json.loads(out)["trusted"]
     assert (code, entry["path"]) == (0, str(place / "theirs"))

@@ -325,5 +325,8 @@ def test_bad_input_prints_no_json_unless_asked(shell, words, says):
 
 def test_a_name_that_is_no_text_is_refused_before_anything_is_made(shell):
     done = shell.crashhunt("run", os.fsdecode(b"bad\xff"), "1", "1", "5", expect=2)
-    assert done.err == "crashhunt: 'bad\\udcff' is not valid UTF-8; rename it\n"
+    assert (
+        done.err
+        == "crashhunt: the argument 'bad\\udcff' is not valid UTF-8; rename the file, or write the argument in UTF-8\n"
+    )
     assert [path.name for path in shell.folder.iterdir()] == ["faulty.py"]

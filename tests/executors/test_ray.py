@@ -274,7 +274,7 @@ def test_a_cluster_that_can_run_nothing_states_why(begin, settings, cluster):
     executor = RayExecutor(lacking, argument=cluster.address)
     said = refusal(executor)
     executor.close()
-    assert "'nowhere:Agent' cannot be imported: No module named 'nowhere'; install the same packages there" in said
+    assert "'nowhere:Agent' cannot be imported: No module named 'nowhere'; install the packages of this machine" in said
     assert said.count("\n") == 0
 
     first = begin()

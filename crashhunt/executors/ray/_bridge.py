@@ -397,7 +397,7 @@ class Bridge:
         if able and all(name in self._refused for name in able):
             raise UsageError(
                 f"no node of the cluster can run the trials: {next(iter(self._refused.values()))}",
-                fix="install the same packages there, and run the same command again",
+                fix="install the packages of this machine on all nodes, and run the same command again",
             )
         if not self._ever_ready and time.monotonic() - self._began > _FREE_S:
             cpus = sum(found.cpus for found in able.values())

@@ -274,7 +274,7 @@ class Cluster:
         except Exception as error:
             raise UnreachableError(
                 f"the Ray cluster at {self.address} cannot be used: {_first_line(error)}",
-                fix="run the hunt on a machine of the cluster that has its versions of Ray and Python",
+                fix="run the hunt on a machine that has the same versions of Ray and Python as the cluster",
             ) from error
         cloudpickle.register_pickle_by_value(_node_actor)
         for method, group in _CONCURRENCY_GROUPS.items():

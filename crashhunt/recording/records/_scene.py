@@ -168,7 +168,7 @@ def _read_step(reading: Reading, _aux: int, payload: bytes) -> None:
     parts: SceneParts = {"heights": [], "grades": [], **reading.scene}
     scene = current.scene = Scene(time_s, reading.roster, points, headings, speeds, **parts)
     if len(scene.heights) not in (0, count) or any(row >= count for row in scene.spines):
-        raise ValueError(f"the scene of step {step} has more actors than the recording has named")
+        raise ValueError(f"the scene of step {step} has data of more actors than the recording lists")
     scene.events = reading.events
     scene.previous = steps[-1].scene if steps else None
     current.step = step

@@ -191,8 +191,8 @@ class SumoSimulator:
         self._off_road = []
         if _current is None or _current() is not self:
             raise SimulatorError(
-                "another simulator in this process has been reset since",
-                fix="run one simulation at a time, or each in its own process",
+                "another simulator in this process has been reset after this simulator",
+                fix="run one simulation at a time, or each simulation in its own process",
             )
         try:
             for agent, action in actions.items():

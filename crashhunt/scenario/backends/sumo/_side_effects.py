@@ -138,7 +138,7 @@ def _check_text(file: str, content: bytes, *, reads: bool) -> None:
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         if tag not in ELEMENTS:
-            raise _SideEffectError(f"{file} has <{tag}>, which has an unknown effect in SUMO")
+            raise _SideEffectError(f"{file} has the element <{tag}>, which has an unknown effect in SUMO")
         for name, value in attributes.items():
             if (tag, name) in READ:
                 if not reads or value.startswith("/") or "${" in value:
@@ -147,7 +147,9 @@ def _check_text(file: str, content: bytes, *, reads: bool) -> None:
                 raise _SideEffectError(f"{file} has <{tag} {name}=…>, which has an unknown effect in SUMO")
         key, value = attributes.get("key", ""), attributes.get("value", "")
         if tag == "param" and key not in LABELS and {"/", "\\", ":"}.intersection(value):
-            raise _SideEffectError(f"{file} has the parameter {key} = {value!r}, which might name a file")
+            raise _SideEffectError(
+                f"{file} has the parameter {key} = {value!r}, which might name a file that SUMO reads or writes"
+            )
 
     def doctype(*_: object) -> None:
         raise _SideEffectError(f"{file} has a document type, which may change its content")
