@@ -7,6 +7,7 @@ import errno
 import io
 import json
 import os
+import re
 import select
 import shutil
 import sys
@@ -199,10 +200,16 @@ def _check_names(words: Sequence[str]) -> None:
 
 
 def _spell_out(words: Sequence[str]) -> list[str]:
-    """Return the command line with ``--splitting`` instead of the second word of ``--rare splitting``.
+    """Return the command line in the form that argparse reads.
 
-    If ``--rare`` had an optional value, ``run --rare DIR`` would take DIR for this value.
+    ``--splitting`` replaces the second word of ``--rare splitting``: if ``--rare`` had an optional value, ``run --rare
+    DIR`` would take DIR for this value. ``--bbox=-122.3,…`` replaces ``--bbox -122.3,…``, whose second word argparse
+    takes for an option.
     """
+    if "--bbox" in words[:-1]:
+        at = words.index("--bbox")
+        if re.match(r"-[\d.]", words[at + 1]):
+            words = [*words[:at], f"--bbox={words[at + 1]}", *words[at + 2 :]]
     return ["--splitting" if pair == ("--rare", "splitting") else pair[1] for pair in pairwise(["", *words])]
 
 

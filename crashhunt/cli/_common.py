@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from contextlib import contextmanager
 from itertools import takewhile
@@ -92,6 +93,8 @@ class Parser(argparse.ArgumentParser):
         Raises:
             UsageError: in every case.
         """
+        if found := re.fullmatch(r"argument (\S+): ignored explicit argument (.+)", message):
+            raise UsageError(f"{found[1]} takes no value, but {found[2]} is given", fix=f"write {found[1]} alone")
         raise UsageError(message, fix=f"see {self.prog} --help")
 
 

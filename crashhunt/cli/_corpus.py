@@ -103,6 +103,7 @@ def _add_places(parser: argparse.ArgumentParser) -> None:
 
 def _add(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.corpus import add_case
+    from crashhunt.crashes import list_bundles
 
     answers = []
     for path in options.bundles:
@@ -114,6 +115,11 @@ def _add(options: argparse.Namespace, _words: list[str]) -> int:
             answers.append({**data, "new": added.new})
             log = added.case.kind_of_log()
             say(_added(data["path"], data["bytes"], log=log, new=added.new), as_json=options.json)
+            if added.changed:
+                say(in_lines([f"  expect is now {added.case.expect}{_note(added.case.note)}"]), as_json=options.json)
+            others = 0 if archive is not None or (path / layout.CRASH).is_file() else len(list_bundles(path)) - 1
+            if others > 0:
+                say(f"  one of {others + 1} crashes; to add all of them, give {path}/crashes/*", as_json=options.json)
             if bundle.confirmed is False:
                 say("  warning: it is flaky, so that it may be fixed by luck", as_json=options.json)
     if options.json:
@@ -124,6 +130,10 @@ def _add(options: argparse.Namespace, _words: list[str]) -> int:
 def _added(path: str, size: int, *, log: str, new: bool) -> str:
     said = f"{size / 1024:.0f} KiB" + {"whole": "", "compact": ", with a compact log"}.get(log, ", without a log")
     return in_lines([f"{path} {'is new' if new else 'was there already'} ({said})"])
+
+
+def _note(note: str) -> str:
+    return f", note {note!r}" if note else ""
 
 
 def _run(options: argparse.Namespace, _words: list[str]) -> int:

@@ -7,6 +7,7 @@ import sys
 from itertools import groupby
 from typing import TYPE_CHECKING
 
+from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import add_json
 
 if TYPE_CHECKING:
@@ -27,24 +28,35 @@ def add_guide(commands: Commands) -> None:
         "Without a TOPIC, list all pages.",
     )
     guide.add_argument(
-        "topic", metavar="TOPIC", nargs="?", default="", help="the page to show; default: list all pages"
+        "topic",
+        metavar="TOPIC",
+        nargs="?",
+        default="",
+        help="page to show, or a word to find; default: list all pages",
     )
     add_json(guide)
     guide.set_defaults(command=_guide)
 
 
 def _guide(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.guide import find_page, for_terminal, list_pages
+    from crashhunt.guide import find_page, for_terminal, list_pages, search_pages
 
-    if not options.topic:
-        pages = list_pages()
+    pages = list_pages()
+    is_search = False
+    if options.topic:
+        try:
+            page = find_page(options.topic)
+        except UsageError:
+            pages, is_search = search_pages(options.topic), True
+            if not pages:
+                raise
+    if is_search or not options.topic:
         if options.json:
             said = [{"topic": page.topic, "section": page.section, "title": page.title} for page in pages]
             print(json.dumps({"topics": said}))
         else:
-            print(_listing(pages))
+            print(_listing(pages, f"the pages with the word {options.topic!r}" if is_search else "one of these"))
         return 0
-    page = find_page(options.topic)
     text = page.text(options.parser)
     if options.json:
         print(json.dumps({"topic": page.topic, "section": page.section, "title": page.title, "text": text}))
@@ -55,11 +67,11 @@ def _guide(options: argparse.Namespace, _words: list[str]) -> int:
     return 0
 
 
-def _listing(pages: list[Page]) -> str:
+def _listing(pages: list[Page], which: str) -> str:
     from crashhunt.guide import SECTIONS
 
     width = max(len(page.topic) for page in pages)
-    lines = ["crashhunt guide TOPIC shows one of these:"]
+    lines = [f"crashhunt guide TOPIC shows {which}:"]
     for section, members in groupby(pages, key=lambda page: page.section):
         lines += ["", f"{SECTIONS[section]}:", *(f"  {page.topic:{width}}  {page.title}" for page in members)]
     return "\n".join(lines)

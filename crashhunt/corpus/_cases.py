@@ -197,10 +197,12 @@ class Added:
     Args:
         case: The case in the corpus.
         new: Whether the case is new in the corpus.
+        changed: Whether the expectation or the note of a present case changed.
     """
 
     case: Case
     new: bool
+    changed: bool = False
 
 
 def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None, note: str | None = None) -> Added:
@@ -243,7 +245,9 @@ def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None,
                 except OSError:
                     if not (final / layout.CASE).is_file():  # otherwise another process has added the same crash
                         raise
-        return Added(read_case(final).expecting(expect, note), new=False)
+        before = read_case(final)
+        case = before.expecting(expect, note)
+        return Added(case, new=False, changed=case != before)
     except OSError as error:
         raise cannot_write(corpus, error) from error
 

@@ -1,6 +1,15 @@
 """The guide: Markdown pages, with parts that are generated from the code when a page is read."""
 
-from crashhunt.guide._pages import SECTIONS, Page, completed, find_page, for_terminal, list_pages, pages_folder
+from crashhunt.guide._pages import (
+    SECTIONS,
+    Page,
+    completed,
+    find_page,
+    for_terminal,
+    list_pages,
+    pages_folder,
+    search_pages,
+)
 from crashhunt.guide._reference import describe_api, describe_commands, describe_keys, describe_modules
 
 __all__ = [
@@ -15,4 +24,5 @@ __all__ = [
     "for_terminal",
     "list_pages",
     "pages_folder",
+    "search_pages",
 ]

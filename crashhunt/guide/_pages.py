@@ -14,7 +14,7 @@ from crashhunt.guide._reference import describe_api, describe_commands, describe
 if TYPE_CHECKING:
     import argparse
 
-__all__ = ["SECTIONS", "Page", "completed", "find_page", "for_terminal", "list_pages", "pages_folder"]
+__all__ = ["SECTIONS", "Page", "completed", "find_page", "for_terminal", "list_pages", "pages_folder", "search_pages"]
 
 SECTIONS = {
     "start": "Start",
@@ -104,6 +104,12 @@ def find_page(topic: str) -> Page:
     if topic not in pages:
         raise UsageError(f"the guide has no topic {topic!r}", fix=one_of(topic, pages))
     return pages[topic]
+
+
+def search_pages(word: str) -> list[Page]:
+    """Return the pages that contain a whole word in upper or lower case, in reading order."""
+    whole = re.compile(rf"(?<!\w){re.escape(word)}(?!\w)", re.IGNORECASE)
+    return [page for page in list_pages() if whole.search(page.file.read_text(encoding="utf-8"))]
 
 
 def completed(text: str, parser: argparse.ArgumentParser) -> str:

@@ -27,7 +27,7 @@ __all__ = [
 
 AGENT = "agent:Driver"
 """The agent of ``agent.py``."""
-_DEFAULT_AGENT = "crashhunt.agents:CarFollowing"
+DEFAULT_AGENT = "crashhunt.agents:CarFollowing"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,14 +143,14 @@ def scenario_toml(
     lines += [
         "",
         "[agents.ego]",
-        f"agent = {_text(agent or _DEFAULT_AGENT)}",
+        f"agent = {_text(agent or DEFAULT_AGENT)}",
         'type = "ego"',
         'route = "ego-route"',
         'depart_lane = "best"',
         'depart_speed = "max"',
     ]
     text = "\n".join([*lines, ""])
-    if agent in ("", _DEFAULT_AGENT, "car-following"):
+    if agent in ("", DEFAULT_AGENT, "car-following"):
         text += _CAR_FOLLOWING.format(speed=speed_limit_mps, low=0.6 * speed_limit_mps, high=1.3 * speed_limit_mps)
     return text
 

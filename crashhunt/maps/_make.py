@@ -15,6 +15,7 @@ from crashhunt.base.temporary import temporary_beside, temporary_folder
 from crashhunt.maps._convert import NET, ConvertOptions, convert
 from crashhunt.maps._demand import ROUTES, Demand, find_demand, route_file
 from crashhunt.maps._folder import (
+    DEFAULT_AGENT,
     WORKFLOW,
     agent_module,
     arguments_of,
@@ -104,6 +105,7 @@ class MadeScenario:
         steps: maximum number of steps of a trial, derived from the longest route.
         notes: notes for the user.
         trial: the result of one trial; None if none ran.
+        agent: agent of the trial.
     """
 
     folder: Path
@@ -115,6 +117,7 @@ class MadeScenario:
     steps: int
     notes: tuple[str, ...] = ()
     trial: PlainTrial | None = None
+    agent: str = ""
     commands: list[str] = field(default_factory=list)
 
     def to_json(self) -> dict[str, object]:
@@ -184,7 +187,8 @@ def make_scenario(
             found = _build(source, options, tools, building, target, say)
             if try_out is not None:
                 say("running one trial")
-                found = replace(found, trial=try_out(building, found.steps))
+                trial = try_out(building, found.steps)
+                found = replace(found, trial=trial, notes=(*found.notes, *_trial_notes(trial, found.agent)))
             _write_texts(found, options, building, target)
             sync_tree(building)
             _put_in_place(building, target, directory)
@@ -257,17 +261,12 @@ def _build(
     text = route_file(demand, made.network, bicycles=options.bicycles)
     (building / ROUTES).write_text(text, encoding="utf-8")
     notes = list(made.notes)
-    density = plain.running / _lanes_km(made.network)
-    if density < _THIN_PER_KM:
-        notes.append(
-            f"the traffic is thin: {density:.1f} vehicles on a km of lane, because each vehicle costs time in every "
-            "trial; a part of the map has more: --bbox W,S,E,N"
-        )
+    notes += _thin_traffic(plain, _lanes_km(made.network), high)
     if options.people and not demand.walks:
         notes.append("warning: no persons walk: the map has no connected ways for pedestrians")
     found = MadeScenario(
         folder=target, source=source, network=made.network, demand=demand, plain=plain, busy=busy,
-        steps=_steps(demand), notes=tuple(notes),
+        steps=_steps(demand), notes=tuple(notes), agent=options.agent or DEFAULT_AGENT,
     )  # fmt: skip
     (building / layout.SCENARIO).write_text(
         scenario_toml(
@@ -282,6 +281,17 @@ def _build(
     if options.picture:
         _draw(found, building)
     return found
+
+
+def _thin_traffic(plain: PlainRun, lanes_km: float, high: float) -> list[str]:
+    """Return a note with the fix if few vehicles are on the road at the usual demand."""
+    density = plain.running / lanes_km
+    if density >= _THIN_PER_KM:
+        return []
+    thin = f"the traffic is thin: {density:.2g} vehicles on a km of lane"
+    if density / plain.demand >= _THIN_PER_KM:
+        return [f"{thin}, because --demand ends at {high:g}; raise it, such as --demand 0.2:1.5"]
+    return [f"{thin}, because each vehicle costs time in every trial; a part of the map has more: --bbox=W,S,E,N"]
 
 
 def _draw(found: MadeScenario, folder: Path) -> None:
@@ -381,17 +391,28 @@ def describe_place(found: MadeScenario) -> list[str]:
         + "".join(f", {words}" for words in others[:3])
         + f"; {network.crossings} pedestrian crossings",
         f"traffic: {len(demand.routes)} routes, {demand.vehicles_per_hour:,.0f} vehicles/h at demand 1{walkers}",
-        f"at demand {plain.demand:g}: {_run_in_words(plain)}",
-        f"at demand {busy.demand:g}: {_run_in_words(busy)}",
+        # With --demand 3, the usual and the largest factor are equal.
+        *dict.fromkeys(f"at demand {run.demand:g}: {_run_in_words(run)}" for run in (plain, busy)),
         f"busiest: {busiest or 'no road'}",
         f"agent: {len(demand.ego_routes)} routes; it enters within {max(waits):.1f} s at demand {busy.demand:g}",
     ]
     if found.trial is not None:
         lines.append(
-            f"one trial: {found.trial.outcome} after {found.trial.steps} steps ({found.trial.wall_s:.1f} s, "
-            "with the start of its processes)"
+            f"one trial of {found.agent}: {found.trial.outcome} after {found.trial.steps} steps "
+            f"({found.trial.wall_s:.1f} s, with the start of its processes)"
         )
     return [*lines, *(f"note: {note}" for note in found.notes)]
+
+
+def _trial_notes(trial: PlainTrial, agent: str) -> list[str]:
+    """Return a note with the fix if the trial ended by a software fault."""
+    fix = {
+        "hang": "the trial took too long; hunt with a larger --timeout, or choose a smaller map with --bbox=W,S,E,N",
+        "agent_error": f"the agent {agent} failed; crashhunt show describes its error after a hunt with this agent",
+        "process_died": f"the process of the agent {agent} died; crashhunt show describes its end after a hunt",
+        "simulator_error": "the simulator failed; crashhunt show describes its error after a hunt",
+    }.get(trial.outcome)
+    return [f"warning: {fix}"] if fix else []
 
 
 def _is_plain(kind: str) -> bool:
@@ -405,7 +426,7 @@ def _span(values: list[int] | list[float], form: str) -> str:
 
 def _run_in_words(run: PlainRun) -> str:
     teleports = f"{run.teleports} stood for 300 s" if run.teleports else "no jam"
-    collisions = f", {run.collisions} collisions among them" if run.collisions else ""
+    collisions = f", {run.collisions} collision{'s' * (run.collisions != 1)} among them" if run.collisions else ""
     return (
         f"{run.entered} of {run.wanted} vehicles entered in {RUN_S} s, {run.arrived} arrived at "
         f"{run.mean_speed_mps:.1f} m/s on average, {teleports}{collisions}"

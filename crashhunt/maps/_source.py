@@ -163,6 +163,9 @@ def check_source(source: MapSource) -> None:
             fix = "download the map again, or give it the ending of its format"
             raise ScenarioError("the file is not an OpenStreetMap PBF", fix=fix, where=where)
         return
+    if b"OSMHeader" in head:
+        fix = f"rename it to {source.name}.osm.pbf"
+        raise ScenarioError("the file is an OpenStreetMap PBF, not XML", fix=fix, where=where)
     _check_root(source, head)
     if head.startswith(_GZIP):
         _check_unpacked(source, path)

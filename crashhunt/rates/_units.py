@@ -244,6 +244,8 @@ class UnitSequence:
                 f"an agent was trained on the traffic of all {self.trained_on} trials; run another --seed, or train "
                 "with a test share"
             )
+        if self._waiting:
+            return f"trial {self._next} has not ended, and trials count in the order of their numbers"
         return "no valid trial has finished"
 
     @property

@@ -52,7 +52,8 @@ class Watcher:
         self._console = console
         self._notes = notes
         self._title = one_line(title)
-        self._last_line, self._last_phase = -math.inf, ""
+        self._last_line = -math.inf
+        self._last_progress: tuple[str, int, int] | None = None
         # Rich's own refresh needs a thread, and with a thread this process could not be forked (`base/apart.py`).
         self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
 
@@ -72,13 +73,18 @@ class Watcher:
         self.tell_notes()
         if self._live is not None:
             self._live.update(self._screen(status), refresh=True)
-        elif time.monotonic() - self._last_line >= _LINE_EVERY_S or self._is_new_phase(status):
-            self._last_line, self._last_phase = time.monotonic(), status.phase
+        elif self._is_line_due(status):
+            self._last_line, self._last_progress = time.monotonic(), _progress(status)
             self._console.print(_line(status), soft_wrap=True, highlight=False)
 
-    def _is_new_phase(self, status: HuntStatus) -> bool:
-        """Return whether a phase with its own progress begins."""
-        return status.progress is not None and status.phase != self._last_phase
+    def _is_line_due(self, status: HuntStatus) -> bool:
+        """Return whether a plain line is printed now; a phase with its own progress prints no count twice."""
+        if status.progress is not None:
+            if _progress(status) == self._last_progress:
+                return False
+            if self._last_progress is None or status.progress.name != self._last_progress[0]:
+                return True
+        return time.monotonic() - self._last_line >= _LINE_EVERY_S
 
     def tell_notes(self) -> None:
         """Print the notes, only once."""
@@ -299,6 +305,11 @@ def describe_kinds(status: HuntStatus) -> str:
 
 def _disturbed(status: HuntStatus) -> str:
     return f"{status.disturbed} of {status.crashes} {'crash' if status.crashes == 1 else 'crashes'} with disturbances"
+
+
+def _progress(status: HuntStatus) -> tuple[str, int, int] | None:
+    now = status.progress
+    return None if now is None else (now.name, now.done, now.total)
 
 
 def _line(status: HuntStatus) -> str:

@@ -24,6 +24,7 @@ from crashhunt.guide import (
     find_page,
     for_terminal,
     list_pages,
+    search_pages,
 )
 
 TOPICS = [page.topic for page in list_pages()]
@@ -81,7 +82,13 @@ def test_an_unknown_topic_is_one_line(shell):
     done = shell.crashhunt("guide", "determinsm", expect=2)
     assert done.err.startswith("crashhunt: the guide has no topic 'determinsm'; did you mean 'determinism'?")
     assert len(done.err.splitlines()) == 1
-    assert shell.crashhunt("guide", "nothing", "--json", expect=2).json["error"]["fix"]
+    assert shell.crashhunt("guide", "xyzzy", "--json", expect=2).json["error"]["fix"]
+
+
+def test_a_word_that_is_no_topic_lists_the_pages_with_this_word():
+    found = {page.topic for page in search_pages("openstreetmap")}
+    assert {"from-a-map", "map"} <= found < {page.topic for page in list_pages()}
+    assert search_pages("no such word at all") == []
 
 
 def test_former_topic_shows_the_page_that_replaced_it():

@@ -72,6 +72,14 @@ def test_rare_mode_keeps_going_so_it_may_keep_a_few_bundles_of_each_type(tmp_pat
     assert (hunt.settings.run.keep, hunt.settings.run.keep_going) == (2, True)
 
 
+def test_a_box_of_western_longitudes_is_the_value_of_its_option():
+    assert _spell_out(["init", "d", "--bbox", "-122.3,37.8,-122.2,37.9"]) == [
+        "init", "d", "--bbox=-122.3,37.8,-122.2,37.9",
+    ]  # fmt: skip
+    for words in (["init", "d", "--bbox"], ["init", "--bbox", "--json"], ["init", "d", "--bbox", "2,48,3,49"]):
+        assert _spell_out(words) == words
+
+
 def test_splitting_needs_no_disturbance_and_is_written_as_the_second_word_of_rare(tmp_path):
     assert crashhunt.prepare(tmp_path / "h", 1, 8, 20, **OPTIONS, splitting=True).settings.splitting
     assert _spell_out(["run", "--rare", "splitting", "h"]) == ["run", "--rare", "--splitting", "h"]

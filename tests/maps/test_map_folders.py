@@ -20,6 +20,7 @@ from crashhunt.maps import MapSource, read_network
 from crashhunt.maps._convert import ConvertOptions, convert
 from crashhunt.maps._demand import Demand, Route, _ego_routes, _entry_capacity, route_file
 from crashhunt.maps._folder import agent_module, arguments_of, next_commands, readme, scenario_toml, workflow
+from crashhunt.maps._make import _thin_traffic
 from crashhunt.maps._network import Edge, NetworkLane, RoadNetwork
 from crashhunt.maps._picture import draw_map, drawable
 from crashhunt.maps._plain_run import PlainRun
@@ -45,6 +46,16 @@ def route(name, *edges, weight=1, length=400.0):
 
 def demand(*routes, per_hour=600.0, walks=()):
     return Demand(routes=routes, vehicles_per_hour=per_hour, walks=walks, ego_routes=tuple(one.id for one in routes))
+
+
+@pytest.mark.parametrize(
+    ("running", "demand", "words"),
+    [(10, 1.0, []), (2, 0.1, ["0.2 vehicles", "--demand ends at 0.1"]), (0, 1.0, ["--bbox="])],
+)
+def test_thin_traffic_is_noted_with_its_cause(running, demand, words):
+    notes = _thin_traffic(SimpleNamespace(running=running, demand=demand), 10.0, demand)
+    assert len(notes) == bool(words)
+    assert all(word in notes[0] for word in words)
 
 
 # The network.

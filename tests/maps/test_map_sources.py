@@ -137,6 +137,14 @@ def test_map_of_another_kind_is_refused_with_its_option(tmp_path):
     assert "--opendrive" in refusal(tmp_path / "a.xodr").fix
 
 
+def test_pbf_with_the_ending_of_xml_is_refused_with_its_name(tmp_path):
+    path = tmp_path / "town.osm"
+    path.write_bytes(b"\x00\x00\x00\x0d\x0a\x09OSMHeader\x18")
+    with pytest.raises(ScenarioError, match="is an OpenStreetMap PBF") as caught:
+        check_source(MapSource(kind="osm", path=path))
+    assert caught.value.fix == "rename it to town.osm.pbf"
+
+
 def test_huge_map_is_refused_unread(tmp_path):
     with (tmp_path / "a.osm").open("wb") as file:
         file.truncate(_MAX_BYTES + 1)

@@ -58,6 +58,11 @@ def test_trials_after_one_that_has_not_ended_do_not_count():
     assert (found.trials, found.crashes, found.excluded) == (2, 0, {"after_unfinished": 2})
 
 
+def test_missing_rate_names_the_earlier_trial_that_has_not_ended():
+    found = counted([trial(1, crashed=True)])
+    assert found.why_not == "trial 0 has not ended, and trials count in the order of their numbers"
+
+
 def test_trial_that_was_killed_from_outside_has_not_ended():
     found = counted([trial(0), trial(1, valid=False, has_ended=False), trial(2)])
     assert (found.trials, found.excluded) == (1, {"after_unfinished": 1})

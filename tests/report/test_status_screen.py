@@ -67,6 +67,16 @@ def test_what_the_search_tries_and_when_danger_last_grew_is_shown_where_there_is
         assert "nearest miss (1 trial / 1:05 ago): trial 123" in seen.get()
 
 
+def test_plain_lines_of_a_phase_are_printed_on_change_only(monkeypatch):
+    now = iter(range(0, 1000, 10))
+    monkeypatch.setattr("crashhunt.report._status_screen.time.monotonic", lambda: next(now))
+    out = io.StringIO()
+    watch = Watcher(Console(file=out, width=100), TITLE)
+    for done in (3, 4, 4, 4, 5):
+        watch(replace(status(0), phase="confirming", progress=PhaseStatus("confirming", done, 5, None)))
+    assert out.getvalue().splitlines() == [f"confirming {done} of 5" for done in (3, 4, 5)]
+
+
 def test_the_least_stress_margin_is_shown_where_there_is_room():
     found = status(2)
     brake = Disturbance(80, "ahead", "brake", 2.25, 3.0, "ego")
