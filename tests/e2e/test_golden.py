@@ -241,7 +241,7 @@ SESSIONS: dict[str, list[str | Callable[[Path], None]]] = {
         "status h --json", "replay h --json", "show h --json", "check h --json", "crashes h --json", "judge h --json",
         "shrink h --json", "report h --json", "export h x.zip --json", "suite run nowhere.toml s --json",
         "corpus run nowhere --json", "corpus list nowhere --json", "compare h h --json", "rerun h --json", "trials h",
-        "logs h", "bisect h --good HEAD --json", "trust h --json", "guide nothing --json", "completion nothing",
+        "logs h", "bisect h --good HEAD --json", "trust h --json", "guide xyzzy --json", "completion nothing",
     ],
     "files": [
         f"run h 1 2 60 {CRASHES} --json",
