@@ -102,6 +102,7 @@ def test_estimate_is_unbiased_and_its_interval_covers(scale):
     assert statistics.fmean(covering) >= 0.88
 
 
+@pytest.mark.nightly
 def test_estimate_with_a_hidden_mode_leaves_it_to_the_certain_bound():
     model = Model(SPARSE, hidden=1e-4)
     undisturbed, disturbed = model.truth()
@@ -117,6 +118,7 @@ def test_estimate_with_a_hidden_mode_leaves_it_to_the_certain_bound():
     assert missed  # trials without a crash: the estimate leaves out most of the truth
 
 
+@pytest.mark.nightly
 def test_certain_bounds_close_in_on_the_rate():
     model = Model(DENSE)
     few, many = (rare_estimate(run_roots(model, n, 3), least_bound=least_bound(model)).certain for n in (32, 192))
