@@ -19,9 +19,12 @@ from ._bundle import (
 from ._causes import (
     Cause as Cause,
     CauseGroup as CauseGroup,
+    CauseType as CauseType,
     Division as Division,
     cause_of as cause_of,
     features_of as features_of,
+    join_causes as join_causes,
+    without_chance_lengths as without_chance_lengths,
 )
 from ._contact import ContactRecord as ContactRecord, contact_record as contact_record
 from ._encounter import (

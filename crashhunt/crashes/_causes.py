@@ -10,16 +10,19 @@ from crashhunt.base.codec import Serializable
 from crashhunt.crashes import Encounter
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.crashes import Bundle, Factor, Judgement, Omission, Why
+    from crashhunt.crashes import Bundle, Factor, Group, Judgement, Omission, Why
     from crashhunt.recording import Recording
     from crashhunt.world import Scene
 
-__all__ = ["Cause", "CauseGroup", "Division", "cause_of", "features_of"]
+__all__ = [
+    "Cause", "CauseGroup", "CauseType", "Division", "cause_of", "features_of", "join_causes", "without_chance_lengths",
+]  # fmt: skip
 
 _LONG_M = 7.0  # a longer actor is a truck, a bus or a trailer, which agents that assume a car's length hit
+_DEFECTS = ("omission", "decision", "disturbance", "argument")  # the kinds of causes that name what to fix
 _LOOKS_S = (0.2, 1.0, 2.0)  # before the crash
 _RELEVANT_DIFFERENCES = {"speed": 5.0, "gap": 5.0, "aside": 1.5, "length": 4.0}  # m/s, m: a difference that matters
 _MAX_GAP_M, _MAX_ASIDE_M = 50.0, 5.0  # further away, the distance makes no difference
@@ -44,6 +47,15 @@ class Cause(Serializable):
     what: str = ""
     instead: str = ""
     actor: str = ""
+
+    @property
+    def is_defect(self) -> bool:
+        """Whether the cause names what to fix, so that crashes of different types with this cause are one defect.
+
+        The causes ``traffic``, ``software fault`` and ``unknown`` name nothing. Their crashes may have different
+        defects, so the crash type has to distinguish them.
+        """
+        return self.kind in _DEFECTS
 
     def __str__(self) -> str:
         actor = "a long vehicle" if self.actor == "long" else "a vehicle"
@@ -88,6 +100,78 @@ class CauseGroup:
             "members": [str(bundle.path) for bundle in self.members],
             "judged": [str(bundle.path) for bundle in self.judged],
         }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CauseType:
+    """Crashes with the same cause, of one crash type or several: what a user would report as one defect.
+
+    Args:
+        cause: the common cause of the crashes.
+        variants: the crash types of the crashes, each with the crashes that have this cause, the most frequent first.
+    """
+
+    cause: Cause
+    variants: tuple[tuple[Group, CauseGroup], ...]
+
+    @property
+    def count(self) -> int:
+        """The number of crashes that have a bundle."""
+        return sum(len(part.members) for _, part in self.variants)
+
+    @property
+    def shortest(self) -> Bundle:
+        """The crash with the fewest steps."""
+        return min((part.shortest for _, part in self.variants), key=lambda bundle: bundle.result.steps)
+
+    def to_json(self) -> JsonObject:
+        """Return the crashes in the form that ``crashes --by-cause --json`` prints."""
+        return {
+            "cause": self.cause.to_json(),
+            "words": str(self.cause),
+            "count": self.count,
+            "shortest": str(self.shortest.path),
+            "types": [
+                {"words": str(group.signature), "count": len(part.members), "judged": len(part.judged)}
+                for group, part in self.variants
+            ],
+        }
+
+
+def join_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGroup]]) -> tuple[CauseType, ...]:
+    """Return the crashes by cause across crash types, the most frequent first.
+
+    Crashes of different types with the same defect are one entry. If the cause names no defect, each crash type is an
+    entry.
+
+    Args:
+        groups: the groups of crashes, one for each crash type.
+        causes: the crashes of each type, divided by cause.
+    """
+    lengths = without_chance_lengths({part.cause for parts in causes for part in parts})
+    found: dict[object, list[tuple[Group, CauseGroup]]] = {}
+    for group, parts in zip(groups, causes, strict=True):
+        for part in parts:
+            cause = lengths[part.cause]
+            found.setdefault(cause if cause.is_defect else (cause, group.signature), []).append((group, part))
+    joined = [
+        CauseType(
+            cause=lengths[variants[0][1].cause],
+            variants=tuple(sorted(variants, key=lambda variant: -len(variant[1].members))),
+        )
+        for variants in found.values()
+    ]
+    return tuple(sorted(joined, key=lambda one: -one.count))
+
+
+def without_chance_lengths(causes: Collection[Cause]) -> dict[Cause, Cause]:
+    """Return each cause, without the length of the actor if another of these causes differs only in this length.
+
+    A long actor belongs to the cause only if all disregarded actors were long. If the agent disregarded cars in the
+    same way, the length is chance.
+    """
+    cars = {cause for cause in causes if not cause.actor}
+    return {cause: bare if (bare := replace(cause, actor="")) in cars else cause for cause in causes}
 
 
 def cause_of(bundle: Bundle, judgement: Judgement | None) -> Cause:
@@ -273,13 +357,8 @@ class Division:
         """Return the cause of each crash, by the number of the crash."""
         if not self._known:
             return dict.fromkeys(self._features, Cause("unknown"))
-        # That an actor was long counts only where all of them were: where cars were hit as well, length is no cause.
-        cars = {cause for cause in self._known.values() if not cause.actor}
-        known = {
-            number: replace(cause, actor="") if replace(cause, actor="") in cars else cause
-            for number, cause in self._known.items()
-        }
-        return {number: known[self._nearest(number)] for number in self._features}
+        lengths = without_chance_lengths({*self._known.values()})
+        return {number: lengths[self._known[self._nearest(number)]] for number in self._features}
 
     def _nearest(self, number: int) -> int:
         if number in self._known:
