@@ -127,20 +127,18 @@ def film_options(options: argparse.Namespace) -> FilmOptions | None:
     )
 
 
-def look_at_all(bundle: Bundle, *, to_stderr: bool = False) -> Look | None:
+def look_at_all(bundle: Bundle, *, quiet: bool = False) -> Look | None:
     """Return the options to examine a whole crash; None if no part of it can be examined."""
     from crashhunt.replays import Look
 
     # The process that is looked at is not watched over: it stops before what ended the one of the hunt.
     fatal = bundle.result.outcome in {Outcome.PROCESS_DIED, Outcome.HANG}
     until = bundle.result.steps if fatal else bundle.result.spec.max_steps
-    return Look(until=until, to_stderr=to_stderr) if until else None
+    return Look(until=until, quiet=quiet) if until else None
 
 
 @contextmanager
-def filmed(
-    chosen: ReplayOptions, bundle: Bundle, film: FilmOptions | None, *, to_stderr: bool
-) -> Iterator[ReplayOptions]:
+def filmed(chosen: ReplayOptions, bundle: Bundle, film: FilmOptions | None) -> Iterator[ReplayOptions]:
     """Yield the replay options with which the agent's panels are drawn, and the folder of their pictures."""
     if film is None or not film.panels:
         yield chosen
@@ -154,7 +152,7 @@ def filmed(
             recording = bundle.recording()
             near = most_dangerous(recording) if bundle.is_near_miss else None
             first = max(0, shown_steps(recording, film.last_s, near.step if near is not None else -1)[0] - 1)
-        look = chosen.look or look_at_all(bundle, to_stderr=to_stderr)
+        look = chosen.look or look_at_all(bundle, quiet=True)
         yield replace(chosen, look=look and replace(look, panels=(first, folder)))
 
 
@@ -337,7 +335,7 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
             one = replace(chosen, look=_view_of(options, bundle))
 
             def run(trusted: bool | None, bundle: Bundle = bundle, one: ReplayOptions = one) -> tuple[Any, ...]:
-                with filmed(replace(one, trusted=trusted), bundle, film, to_stderr=options.json) as asked:
+                with filmed(replace(one, trusted=trusted), bundle, film) as asked:
                     report, answer = _replay_one(options, bundle, asked)
                     return report, answer, replayed_shot(report, asked) if film is not None else None
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.files import cannot_write, whole_file
@@ -261,7 +261,7 @@ def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watc
 
 
 def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:
-    """Write an animated GIF; return the number of its pictures.
+    """Write an animated GIF; return the number of its pictures, among which equal ones in a row are one.
 
     Raises:
         HuntDirectoryError: the file cannot be written.
@@ -278,7 +278,9 @@ def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watch:
             duration=max(20, round(1000 / _frame_rate(shots, options))),  # players slow down what is faster
             loop=0,
         )
-    return len(pictures)
+        with Image.open(temporary) as written:
+            count = sum(1 for _ in ImageSequence.Iterator(written))
+    return count
 
 
 def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:

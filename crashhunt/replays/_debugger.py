@@ -210,13 +210,15 @@ def _run_once(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
             "pause_before": min(look.until, max(1, rerun.bundle.result.steps)),
         }
         (scratch / layout.JOB).write_text(json.dumps(job), encoding="utf-8")
-        kept = Kept(
-            _module_in(settings.code),
-            [str(scratch)],
-            environment=snapshot_environment(settings),
-            apart=False,
-            stdout=2 if look.to_stderr else None,
-        )
+        with (scratch / "log").open("wb") as log:
+            kept = Kept(
+                _module_in(settings.code),
+                [str(scratch)],
+                environment=snapshot_environment(settings),
+                apart=False,
+                stdout=log if look.quiet else 2 if look.to_stderr else None,
+                stderr=log if look.quiet else None,
+            )
         try:
             code = kept.process.wait()
         finally:
@@ -231,9 +233,11 @@ def _run_once(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
             answer: ErrorData | _Done = json.loads((scratch / layout.ANSWER).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             ended = f"signal {-code}" if code < 0 else f"exit code {code}"
+            last = (scratch / "log").read_text(encoding="utf-8", errors="replace").strip().rpartition("\n")[2]
             kind = _ReplayKilledError if is_sent_from_outside(code) else CrashhuntError
             raise kind(
-                f"the process of the replay ended before the last step, with {ended}", where=rerun.bundle.id
+                f"the process of the replay ended before the last step, with {ended}{last and f': {last}'}",
+                where=rerun.bundle.id,
             ) from None
         if "error" in answer:
             raise CrashhuntError.from_json(answer)

@@ -30,6 +30,7 @@ def ended(process) -> None:
     process.communicate(timeout=120)
 
 
+@pytest.mark.nightly  # by day, test_control.py starts commands from the page
 def test_a_hunt_that_is_started_while_the_page_is_open_appears_and_its_crash_plays(shell, page):
     root = shell.folder / "empty"
     root.mkdir()

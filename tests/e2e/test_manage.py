@@ -267,6 +267,7 @@ def rate_of_none(trials):
     return test.interval().high
 
 
+@pytest.mark.nightly  # by day, estimation/test_comparison.py and test_gate.py
 def test_which_of_two_agents_crashes_less(toy):
     for name, speed in (("fast", "14"), ("slow", "4")):
         words = (*KEEP, "--keep", "1", "--arg", f"speed={speed}", "--set", "gap_m=20:30")

@@ -175,6 +175,9 @@ def test_a_gif_plays_in_real_time(tmp_path):
         assert image.n_frames == 21
         assert image.info["duration"] == 100
         assert image.info["loop"] == 0
+    again = FilmOptions(size=(320, 200), last_step_repeats=5)
+    with Image.open(path) as image:
+        assert write_gif(path, [shot(20)], again) == image.n_frames  # what repeats the last picture prolongs it
 
 
 def test_frames_are_files(tmp_path):
@@ -223,8 +226,8 @@ def test_interrupted_frames_leave_nothing_behind(tmp_path, there):
 def test_how_many_pictures_there_will_be_is_known_before(tmp_path, options):
     seen = []
     shots = [shot(4), shot(7)]
-    made = write_gif(
-        tmp_path / "f.gif", shots, FilmOptions(size=(64, 64), **options), watch=lambda *now: seen.append(now)
+    made = write_frames(
+        tmp_path / "f", shots, FilmOptions(size=(64, 64), **options), watch=lambda *now: seen.append(now)
     )
     assert seen == [(done, made) for done in range(1, made + 1)]
 

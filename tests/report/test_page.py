@@ -241,6 +241,7 @@ def contrast_part(color) -> float:
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
+@pytest.mark.nightly  # by day, the report of a hunt with collisions is read
 def test_software_faults_exports_and_hunts_without_crashes(toy, browser):
     shell = toy
     shell.crashhunt("run", "h", "1", "1", "100", "--scenario", "toy", "--agent", "faulty:Raises")
