@@ -85,10 +85,10 @@ def add_rerun(commands: Commands) -> None:
                        "a new number for trials, max_steps or seed")  # fmt: skip
     rerun.add_argument(
         "--to",
-        metavar="DIR",
+        metavar="NEW",
         type=Path,
-        help="keep DIR as it is, and run the hunt in this new directory; a directory in which the same command was "
-        "interrupted or killed is also possible",
+        help="keep DIR as it is, and run the hunt in the new directory NEW; if the same command was interrupted or "
+        "killed in NEW, it continues",
     )
     rerun.add_argument("--parallel", metavar="N", type=integer, default=0,
                        help="number of trials of all hunts together that "

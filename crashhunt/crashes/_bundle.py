@@ -702,9 +702,10 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
         if not directory.is_dir():
             fix = f"{near_path(directory, '.zip')}give the directory of a hunt"
             raise BundleError(f"{str(directory)!r} does not exist", fix=fix)
-        raise BundleError(
-            "no crash was saved here", fix="give the directory of a hunt that found one", where=str(directory)
-        )
+        # The directory of a gate or a suite has those of its hunts.
+        hunts = [str(path.parent) for path in sorted(directory.glob(f"*/{layout.HUNT}"))]
+        fix = f"give the directory of a hunt that found one{f': {listed(hunts)}' if hunts else ''}"
+        raise BundleError("no crash was saved here", fix=fix, where=str(directory))
     if not crash:
         return min(bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
     return _named(bundles, crash, directory)

@@ -151,7 +151,8 @@ class Pair:
                 f"{self.only_second} only in {self.second}, {self.both} in both"
             )
         exact = "" if self.p_value is None else f"; McNemar's exact test: p = {self.p_value:.2g}"
-        return f"{self._answer}: {what} (evidence {self.evidence:.3g}{exact}){self._difference}"
+        decides = f"; {1 / _ALPHA:g} decides" if self.answer == "undecided" else ""
+        return f"{self._answer}: {what} (evidence {self.evidence:.3g}{decides}{exact}){self._difference}"
 
     @property
     def _answer(self) -> str:

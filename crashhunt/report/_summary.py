@@ -248,7 +248,7 @@ def _verdict(report: ReplayReport) -> list[str]:
     if report.verdict == "fixed":
         return [f"fixed: no crash; {now.summary}", f"  it was: {was.summary}"]
     if report.verdict == "changed":
-        what = "it crashes now" if report.bundle.is_near_miss else "another crash"
+        what = "it crashes now" if report.bundle.is_near_miss else "it still crashes, in a run that differs"
         return [f"changed: {what}", f"  it was: {was.summary}", f"  it is:  {now.summary}"]
     if report.verdict == "not_comparable":
         ended = [f"  it was: {was.summary}", f"  it is:  {now.summary}"] if report.rerun.other_traffic else []

@@ -259,6 +259,12 @@ def test_a_crash_is_found_by_what_people_call_it(tmp_path):
     assert find_bundle(folder).result.spec.number == 7
     with pytest.raises(BundleError, match="no crash was saved here"):
         find_bundle(tmp_path / "scratch")
+    for hunt in ("base", "head"):  # as in the directory of a gate
+        (tmp_path / "kept" / hunt).mkdir(parents=True)
+        (tmp_path / "kept" / hunt / "hunt.toml").touch()
+    with pytest.raises(BundleError, match="no crash was saved here") as caught:
+        find_bundle(tmp_path / "kept")
+    assert caught.value.fix.endswith(f": {tmp_path}/kept/base, {tmp_path}/kept/head")
     with pytest.raises(BundleError, match="does not exist"):
         find_bundle(tmp_path / "gone", "1")
 
