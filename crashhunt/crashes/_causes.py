@@ -349,6 +349,11 @@ class Division:
         return frozenset(self._known)
 
     @property
+    def is_answered(self) -> bool:
+        """Whether a crash has been judged, with or without a cause as the result."""
+        return len(self._chosen) > len(self._open)
+
+    @property
     def is_complete(self) -> bool:
         """Whether enough crashes have been judged."""
         return not self._open and len(self._chosen) >= self._most

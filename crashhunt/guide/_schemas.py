@@ -313,6 +313,7 @@ class CrashesData(TypedDict):
     """``crashhunt crashes``."""
 
     groups: list[CrashGroup]
+    by_cause: NotRequired[list[JsonObject]]
     left_out: list[str]
 
 

@@ -26,6 +26,7 @@ from crashhunt.crashes import (
     list_bundles,
     read_bundle,
     signature_of,
+    without_chance_lengths,
 )
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
@@ -241,7 +242,7 @@ class Kinds:
         only_at_fault: whether only crashes that are the agent's fault count towards the number of wanted crash types.
         dropped: trials of each crash type (as text) whose bundles were deleted in earlier runs of the hunt.
         dropped_at_fault: those of the trials in `dropped` whose crashes are the agent's fault.
-        by_cause: number of crashes of each type to judge, so that each cause of a type counts; 0 if types count.
+        by_cause: number of crashes of each type to judge, so that causes count; 0 if types count.
     """
 
     def __init__(
@@ -263,6 +264,7 @@ class Kinds:
         self._signed: dict[int, tuple[Signature, Bundle]] = {}  # by the number of the trial
         self._seen: set[Signature] = set()
         self._first: dict[tuple[Signature, Cause | None], int] = {}  # of what counts, its trial of the least number
+        self._until: int | None = None
         self._groups: tuple[Group, ...] | None = None
         self._listed_crashes: tuple[Group, ...] = ()
         self._due = 0.0
@@ -373,7 +375,10 @@ class Kinds:
 
     @property
     def types_by_cause(self) -> int | None:
-        """The number of causes, counted for each type separately; None if the hunt counts types."""
+        """The number of crash types by cause; None if the hunt counts types.
+
+        A cause that names a defect counts once over all types, and a type without a known cause counts once.
+        """
         return len(self._counted()) if self._by_cause else None
 
     def _count(self, number: int, signature: Signature, cause: Cause | None) -> None:
@@ -381,12 +386,26 @@ class Kinds:
             known = None if cause is None or cause.kind == "unknown" else cause
             self._first[signature, known] = min(number, self._first.get((signature, known), number))
 
-    def _counted(self) -> list[int]:
-        """Return the first trial of each type or cause that counts; a type without a known cause counts once."""
+    def _counted(self, *, answered: bool = False) -> list[int]:
+        """Return the first trial of each type or cause that counts; a type without a known cause counts once.
+
+        Args:
+            answered: whether to exclude types for which no crash has been judged yet. Their crashes may have a cause
+                that another type has, too.
+        """
         caused = {signature for signature, cause in self._first if cause is not None}
-        return sorted(
-            number for (signature, cause), number in self._first.items() if cause is not None or signature not in caused
-        )
+        lengths = without_chance_lengths({cause for _, cause in self._first if cause is not None})
+        found: dict[object, int] = {}
+        for (signature, cause), number in self._first.items():
+            if cause is None and (signature in caused or (answered and self._is_pending(signature))):
+                continue
+            known = None if cause is None else lengths[cause]
+            key = known if known is not None and known.is_defect else (signature, known)
+            found[key] = min(number, found.get(key, number))
+        return sorted(found.values())
+
+    def _is_pending(self, signature: Signature) -> bool:
+        return signature in self._divisions and not self._divisions[signature].is_answered
 
     def _priority(self, bundle: Bundle) -> tuple[bool, int, int]:
         """Return the sort key of crashes to keep: wanted crashes first, and shorter crashes before longer ones."""
@@ -396,8 +415,11 @@ class Kinds:
     @property
     def until(self) -> int | None:
         """The least trial number up to which enough crash types were found; None if there are not enough."""
-        firsts = self._counted()
-        return firsts[self._wanted - 1] if 0 < self._wanted <= len(firsts) else None
+        firsts = self._counted(answered=True)
+        if 0 < self._wanted <= len(firsts):
+            self._until = firsts[self._wanted - 1]
+        # A type without a cause may turn out to have a cause that already counts. A hunt that has ended stays so.
+        return self._until
 
     @property
     def at_fault(self) -> tuple[int, ...] | None:

@@ -169,7 +169,7 @@ class HuntStatus:
         kinds: crash types, the most frequent first; None if the hunt ends at its first crash.
         newest_kind_s: time since the last new crash type, in s; None if unknown.
         newest_kind_trials: number of trials since the last new crash type; None if an earlier run of the hunt found it.
-        types_by_cause: number of causes, counted separately for each crash type; None if the hunt counts types.
+        types_by_cause: number of crash types by cause; None if the hunt counts types.
         time_left_s: time until no more trials begin, in s of wall time; infinite without a limit.
         disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
         stressed: the trial with the least robustness margin; None if there were no probes, or if no probe crashed.

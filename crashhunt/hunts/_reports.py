@@ -289,7 +289,7 @@ class HuntReport:
             events.
         audit: the result of the audit; None without ``--audit``.
         kinds: crash types, the most frequent first; None if the first crash ended the hunt.
-        types_by_cause: number of causes, counted for each crash type on its own; None without ``--by-cause``.
+        types_by_cause: number of crash types by cause; None without ``--by-cause``.
         near_misses: the near misses that were kept, the most critical first.
         probes: the result of the probes; None without ``--probe``.
         at_fault: numbers of the trials whose crash is the agent's fault; None without ``--only-at-fault``.

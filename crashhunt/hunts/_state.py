@@ -213,7 +213,7 @@ class HuntState(Serializable):
         kinds: crash types, the most frequent first, with the fields of `KindData`; None if the hunt ends at its first
             crash.
         newest_kind_s: time since the last new crash type was found, in s; None if it is unknown.
-        types_by_cause: number of causes, counted separately for each crash type; None without ``--by-cause``.
+        types_by_cause: number of crash types by cause; None without ``--by-cause``.
     """
 
     dir: str

@@ -132,7 +132,7 @@ class Noted(TypedDict, total=False):
         nodes: the machines of the last run, if there were several, each with the fields of `NodeFigures`.
         kinds: the crash types, the most frequent first, if the hunt collects all crash types.
         kinds_version: version of the rules that decide which crashes are of the same type.
-        types_by_cause: number of causes, counted separately for each crash type, if the hunt counts causes.
+        types_by_cause: number of crash types by cause, if the hunt counts causes.
         crash_on: the outcomes that count as a crash.
         dropped: trials of each crash type (in words) whose bundles were not kept because shorter crashes were kept.
         dropped_at_fault: those of the trials in `dropped` whose crashes are the agent's fault, if the hunt determines

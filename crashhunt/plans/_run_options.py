@@ -232,7 +232,7 @@ class RunOptions(_Options):
     by_cause: int = option(
         0, "with ``distinct`` or ``keep``, number of crashes of each type to judge, so that each cause counts; 0: "
            "none",
-        help="with --distinct or --keep: count crashes of one type with different causes as different types. To find "
+        help="--distinct counts causes instead of types, and --keep keeps crashes of each cause of a type. To find "
         "the causes, up to N crashes of each type run again; 0: do not search for causes",
         flag="--by-cause", group="search", metavar="N", check=at_least(0, zero="count types"),
     )  # fmt: skip

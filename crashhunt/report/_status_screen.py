@@ -285,7 +285,7 @@ def describe_types(count: int, by_cause: int | None, noun: str = "type") -> str:
 
     Args:
         count: number of crash types.
-        by_cause: number of causes, counted separately for each crash type; None if the hunt counts types.
+        by_cause: number of crash types by cause; None if the hunt counts types.
         noun: word for a crash type in the text.
     """
     words = f"{count} {noun}{'' if count == 1 else 's'}"

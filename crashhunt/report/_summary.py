@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.text import in_lines, out_of
+from crashhunt.crashes import join_causes
 from crashhunt.report._rate import describe_rates
 from crashhunt.report._status_screen import describe_types, format_arguments, format_inputs, format_seconds
 from crashhunt.report._words import (
@@ -43,7 +44,7 @@ def describe_groups(
     Args:
         groups: the groups of crashes, one for each crash type.
         known: name of the corpus case for each known crash type; None if no corpus was given.
-        by_cause: number of causes, counted separately for each crash type; None if the hunt does not count causes.
+        by_cause: number of crash types by cause; None if the hunt does not count causes.
     """
     if not groups:
         return "No crash was saved."
@@ -73,25 +74,24 @@ def describe_groups(
 
 
 def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGroup]]) -> str:
-    """Return the causes of each crash type, one line each.
+    """Return the crashes by cause, each cause with a line for each crash type in which it appears.
 
     Args:
         groups: the groups of crashes, one for each crash type.
         causes: the crashes of each type, divided by cause.
     """
-    rows = [["crashes", "type and cause", "judged", "shortest", "steps"]]
-    for group, parts in zip(groups, causes, strict=True):
-        rows.append([str(group.count), str(group.signature), "", "", ""])
-        for part in parts:
+    joined = join_causes(groups, causes)
+    rows = [["crashes", "cause and types", "judged", "shortest", "steps"]]
+    for one in joined:
+        rows.append([str(one.count), str(one.cause), "", "", ""])
+        for group, part in one.variants:
             shortest = part.shortest
-            cells = [f"  {part.cause}", str(len(part.judged)), shortest.id, str(shortest.result.steps)]
+            cells = [f"  {group.signature}", str(len(part.judged)), shortest.id, str(shortest.result.steps)]
             rows.append([str(len(part.members)), *cells])
-        if group.dropped:
-            rows.append([str(group.dropped), "  not judged: their bundles were deleted (--keep)", "", "", ""])
-    count = len({part.cause for parts in causes for part in parts})
-    of_types = sum(map(len, causes))
-    words = f"{count} {'cause' if count == 1 else 'causes'}"
-    words += f" ({of_types} if each type counts its own)" if of_types != count else ""
+    dropped = sum(group.dropped for group in groups)
+    if dropped:
+        rows.append([str(dropped), "not judged: their bundles were deleted (--keep)", "", "", ""])
+    words = f"{describe_types(len(joined), None)} by cause"
     return "\n".join(["", f"{words}:", "", *_lines(rows)])
 
 

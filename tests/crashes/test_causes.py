@@ -10,16 +10,20 @@ from hypothesis import given, strategies as st
 
 from crashhunt.crashes import (
     Cause,
+    CauseGroup,
     Division,
     Factor,
+    Group,
     Judgement,
     LeftOut,
     Omission,
     Reference,
     ReferenceRun,
+    Signature,
     Why,
     cause_of,
     features_of,
+    join_causes,
 )
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.trial import Outcome
@@ -183,3 +187,50 @@ def test_changes_to_the_left_and_to_the_right_are_far_apart():
     left, right = features(1, 0.0), features(-1, 0.0)
     assert math.dist(left, right) > 5.0
     assert features(1, 2.5) == pytest.approx(left)
+
+
+LEFT = Cause("omission", "gap left", "changed lanes")
+REAR_END, SWIPE = (Signature(outcome="collision", role="collider", manner=each) for each in ("rear end", "side swipe"))
+
+
+def group_of(signature, *parts):
+    """A crash type, and its crashes by cause, each with the steps of its crashes."""
+    made = [
+        CauseGroup(cause=cause, members=crashes, judged=crashes[:1])
+        for cause, steps in parts
+        for crashes in [tuple(SimpleNamespace(path=f"c{n}", result=SimpleNamespace(steps=n)) for n in steps)]
+    ]
+    return Group(signature, tuple(one for part in made for one in part.members)), made
+
+
+def join(*typed):
+    return join_causes([group for group, _ in typed], [parts for _, parts in typed])
+
+
+def test_one_defect_is_one_entry_over_all_crash_types():
+    found = join(group_of(REAR_END, (LEFT, [9, 7]), (Cause("decision", "braked"), [3])), group_of(SWIPE, (LEFT, [5])))
+    assert [(one.cause.kind, one.count, one.shortest.path) for one in found] == [
+        ("omission", 3, "c5"), ("decision", 1, "c3")
+    ]  # fmt: skip
+    assert found[0].to_json() == {
+        "cause": LEFT.to_json(), "words": str(LEFT), "count": 3, "shortest": "c5",
+        "types": [
+            {"words": str(REAR_END), "count": 2, "judged": 1}, {"words": str(SWIPE), "count": 1, "judged": 1}
+        ],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("kind", "entries"),
+    [("omission", 1), ("decision", 1), ("disturbance", 1), ("argument", 1), ("traffic", 2), ("unknown", 2),
+     ("software fault", 2)],
+)  # fmt: skip
+def test_only_a_cause_that_names_a_defect_joins_crash_types(kind, entries):
+    assert len(join(group_of(REAR_END, (Cause(kind), [4])), group_of(SWIPE, (Cause(kind), [5])))) == entries
+
+
+def test_length_is_no_cause_where_cars_were_hit_in_crashes_of_another_type():
+    long, car = (Cause("omission", "vehicle", "sped up", actor) for actor in ("long", ""))
+    (both,) = join(group_of(REAR_END, (long, [4])), group_of(SWIPE, (car, [5])))
+    assert (both.cause, both.count) == (car, 2)
+    assert [one.cause for one in join(group_of(REAR_END, (long, [4])))] == [long]

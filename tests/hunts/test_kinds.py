@@ -168,6 +168,65 @@ def test_each_cause_of_a_type_counts_where_causes_count(one_type):
     assert Kinds(2, crashes).types_by_cause is None
 
 
+@pytest.fixture
+def three_types(monkeypatch):
+    """The number of a crash decides its crash type: 0, 1 or 2."""
+    monkeypatch.setattr(_crashes, "signature_of", lambda bundle, _: bundle.result.spec.number % 3)
+    monkeypatch.setattr(_crashes, "features_of", lambda bundle, _: (0.0,))
+
+
+def test_a_cause_of_several_types_counts_once_and_types_without_an_answer_do_not_end_a_hunt(three_types):
+    kinds = Kinds(2, by_cause=3)
+    crashes = [collision(number) for number in (3, 4, 5)]
+    for bundle in crashes:
+        kinds.add(bundle, 1)
+    assert (kinds.until, kinds.types_by_cause) == (None, 3)  # three types, and none is judged
+    assert [kinds.next_to_judge() for _ in crashes] == crashes
+    settle(kinds, crashes[0], "vehicle")
+    settle(kinds, crashes[1], "vehicle")
+    assert (kinds.until, kinds.types_by_cause) == (None, 2)  # one cause, and a type without an answer
+    settle(kinds, crashes[2], None)  # it cannot be run again
+    assert (kinds.until, kinds.types_by_cause) == (5, 2)
+
+
+@pytest.mark.parametrize("kind", ["traffic", "software fault"])
+def test_causes_that_name_no_defect_count_for_each_type(three_types, kind):
+    kinds = Kinds(2, by_cause=3)
+    for bundle in [collision(3), collision(4)]:
+        kinds.add(bundle, 1)
+        kinds.settle(Judged(kinds.next_to_judge(), Cause(kind)))
+    assert (kinds.until, kinds.types_by_cause) == (4, 2)
+
+
+def test_length_of_the_other_counts_only_where_no_car_was_disregarded(three_types):
+    kinds = Kinds(2, by_cause=3)
+    for bundle, actor in ((collision(3), "long"), (collision(4), "")):
+        kinds.add(bundle, 1)
+        kinds.settle(Judged(kinds.next_to_judge(), Cause("omission", "vehicle", "sped up", actor)))
+    assert (kinds.until, kinds.types_by_cause) == (None, 1)
+
+
+def test_hunt_that_has_found_enough_stays_so(three_types):
+    """A crash of a type without a cause may later have a cause that counts already."""
+    kinds = Kinds(2, by_cause=3)
+    for number, what in ((3, "vehicle"), (4, None)):
+        kinds.add(collision(number), 1)
+        settle(kinds, kinds.next_to_judge(), what)
+    assert kinds.until == 4
+    kinds.add(collision(7), 2)
+    settle(kinds, kinds.next_to_judge(), "vehicle")
+    assert (kinds.until, kinds.types_by_cause) == (4, 1)
+
+
+def test_keep_retains_each_cause_of_each_type(three_types):
+    kinds = Kinds(0, by_cause=2)
+    for number, steps in ((3, 5), (6, 9), (9, 7), (4, 8), (7, 6), (10, 9)):
+        kinds.add(collision(number, steps), 1)
+    while (chosen := kinds.next_to_judge()) is not None:
+        settle(kinds, chosen, "vehicle")
+    assert {bundle.id for bundle in kinds.drop_excess(1)} == {"c6", "c9", "c4", "c10"}
+
+
 def test_keep_retains_each_cause_once_it_is_known(one_type):
     kinds = Kinds(0, by_cause=2)
     for number, steps in enumerate([9, 8, 7, 6, 5, 4]):
