@@ -1,9 +1,9 @@
 """Which plausible slips the nearest tests do not notice. Run it as ``scripts/mutate``.
 
 A slip is put into a copy of the repository, and of the tests nearest to its module those run that reach its line, the
-fastest first, up to the first that fails. Nearest are the tests that lie as the module does: those of
-``crashhunt/world/_scene.py`` are ``tests/world/test_scene*.py``, and where there are none all of ``tests/world``.
-`_TESTS_ELSEWHERE` lists the modules whose tests lie in another folder.
+fastest first, and then those that start processes, which may reach it unseen, up to the first that fails. Nearest are
+the tests that lie as the module does: those of ``crashhunt/world/_scene.py`` are ``tests/world/test_scene*.py``, and
+where there are none all of ``tests/world``. `_TESTS_ELSEWHERE` lists the modules whose tests lie otherwise.
 
 Each run is a fork of this process, which has imported everything that is not crashhunt: about a second a slip, where a
 process of its own would take four. mutmut and cosmic-ray were looked at: the former chooses among all tests by what it
@@ -55,11 +55,33 @@ _TESTS_ELSEWHERE = {
     "cli/_trust.py": ("e2e/test_foreign_hunts.py",),
     "cli/_whatif.py": ("e2e/test_what_if.py",),
     "corpus": ("e2e/test_corpus.py",),
+    "crashes/_trust.py": ("crashes/test_trust.py", "e2e/test_foreign_hunts.py"),
     "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),
     "estimation/_gate.py": ("e2e/test_gate.py",),
+    # What a hunt does is seen by whole hunts.
+    "hunts/_check.py": ("hunts/test_check_parts.py", "e2e/test_check.py"),
+    "hunts/_crashes.py": ("hunts/test_kinds.py", "hunts/test_tally.py", "hunts/test_whole_hunts.py"),
+    "hunts/_fork_results.py": ("hunts/test_from_the_start.py", "hunts/test_whole_hunts.py", "e2e/test_branches.py"),
+    "hunts/_hunt.py": ("hunts/test_states_and_reports.py", "hunts/test_whole_hunts.py", "e2e/test_hunt.py"),
+    "hunts/_next_trials.py": ("hunts/test_next_trials.py", "hunts/test_whole_hunts.py"),
+    "hunts/_preflight.py": ("hunts/test_preflight.py", "hunts/test_traffic_survey.py"),
+    "hunts/_progress.py": (
+        "hunts/test_from_the_start.py",
+        "hunts/test_hunt_status.py",
+        "hunts/test_phases.py",
+        "hunts/test_searching.py",
+        "hunts/test_tally.py",
+        "hunts/test_whole_hunts.py",
+    ),
+    "hunts/_rates.py": ("hunts/test_rare_hunts.py", "e2e/test_crash_rates.py"),
+    "hunts/_reports.py": ("hunts/test_rare_hunts.py", "hunts/test_states_and_reports.py", "hunts/test_whole_hunts.py"),
+    "hunts/_results.py": ("hunts/test_results.py", "hunts/test_trial_rows.py"),
+    "hunts/_state.py": ("hunts/test_directory.py", "hunts/test_phases.py", "hunts/test_states_and_reports.py"),
+    "hunts/_verification.py": ("hunts/test_from_the_start.py", "hunts/test_whole_hunts.py", "e2e/test_audit.py"),
     "replays/_debugger.py": ("e2e/test_debugger.py",),
     "replays/_prepare.py": ("e2e/test_replay.py",),
     "replays/_replay.py": ("e2e/test_replay.py",),
+    "snapshots": ("snapshots/test_*.py", "e2e/test_snapshot.py"),
     "suites": ("suites/test_*.py", "e2e/test_suite.py", "e2e/test_gate.py"),
     "whatif/_avoidability.py": ("whatif/test_avoiding.py", "e2e/test_judging.py"),
     "whatif/_causes.py": ("whatif/test_maneuvers.py", "e2e/test_judging.py"),
@@ -82,7 +104,7 @@ class Target:
         tests: the nearest test files, likewise.
         reached: test to the lines that it runs; those that run at import have no test.
         seconds: test to how long it takes.
-        forked: tests that start processes, which may reach any line.
+        forked: tests that start processes, which may reach any line: a slip survives only if these pass too.
     """
 
     package: str
@@ -94,14 +116,14 @@ class Target:
     forked: set[str] = field(default_factory=set)
 
     def tests_of(self, slip: Slip) -> list[str]:
-        """Return the tests that reach a slip, or that may, where none is seen to; the fastest first."""
+        """Return the tests that reach a slip, the fastest first, and then those that may, as they start processes."""
         lines = range(slip.span[0], slip.span[1] + 1)
         imported = not self.reached.get("", set()).isdisjoint(lines)
         found = [test for test, reached in self.reached.items() if test and not reached.isdisjoint(lines)]
         if imported and not found:
             found = [test for test, reached in self.reached.items() if test and reached] or [*self.seconds]
-        found = found or [*self.forked]
-        return sorted(found, key=lambda test: (self.seconds[test], test))
+        last = self.forked.difference(found)
+        return sorted((*found, *last), key=lambda test: (test in last, self.seconds[test], test))
 
 
 @dataclass(frozen=True, slots=True)

@@ -259,8 +259,8 @@ class _Finder(ast.NodeVisitor):
             self._swap(node.args, "arguments")
         self.visit(node.func)
         self._each(node.args if name not in _ORDER_DOES_NOT_MATTER - set(_TWINS) else node.args[:1])
-        # `strict` guards against a mistake of our own, which is not there.
-        self._each([keyword.value for keyword in node.keywords if keyword.arg != "strict"])
+        # `strict` guards against a mistake of our own, which is not there; by its `indent` JSON says the same.
+        self._each([keyword.value for keyword in node.keywords if keyword.arg not in ("strict", "indent")])
 
     # How they are made.
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -266,3 +268,156 @@ def test_what_is_not_installed_or_not_there_is_said(kind, tmp_path, monkeypatch)
 def test_an_algorithm_that_no_one_knows_is_refused():
     with pytest.raises(ValueError, match="'POP' is unknown"):
         StableBaselines3("x.zip", algorithm="POP")
+
+
+def test_it_remembers_nothing_of_the_episode_before():
+    policy = NumpyPolicy(str(WEIGHTS), step_length_s=0.2, action_space=MetaAction().space)
+    shown = scenes(1)[0]
+    policy.act(shown)
+    policy.reset(0)
+    assert not policy.values.any()
+    policy.act(shown)
+    assert policy.values.any()
+
+
+def test_a_network_sees_its_columns_scaled_and_not_how_far_the_vehicle_has_driven():
+    shown = scenes(1)[0][:3]
+    shown[1:3, 1] = -170.0, 170.0
+    seen = NumpyPolicy.features(shown, 4, np.array([1, 3]), np.array([100.0, 20.0], np.float32)).reshape(4, 2)
+    assert seen[0, 0] == 0.0
+    assert seen[0, 1] == pytest.approx(min(1.0, shown[0, 3] / 20))
+    assert seen[1:3] == pytest.approx(np.stack(([-1.0, 1.0], shown[1:3, 3] / 20), axis=1))
+    assert not seen[3].any()  # there is no such row
+
+
+@pytest.fixture
+def five(tmp_path):
+    """A network whose five values are the speeds of the first five vehicles."""
+    path = tmp_path / "five.npz"
+    np.savez(path, weight_0=np.eye(5, dtype=np.float32), bias_0=np.zeros(5, np.float32), rows=5, columns=[3],
+             scale=[10.0], target_speeds=[20.0, 25.0, 30.0], period_s=1.0)  # fmt: skip
+    return str(path)
+
+
+LEFT, IDLE, RIGHT, FASTER, SLOWER = range(5)
+
+
+def test_by_target_speed_faster_and_slower_are_the_next_of_its_speeds_and_idle_keeps_it(five):
+    policy = NumpyPolicy(five, action_space=SpeedAndLaneChange().space)
+    policy.evaluate = lambda features: np.eye(5, dtype=np.float32)[policy.next]
+
+    def act(decision, speed, y=4.0):
+        policy.next = decision
+        shown = np.zeros((8, 7), np.float32)
+        shown[0, 2:4] = y, speed
+        return policy.act(shown)
+
+    assert act(IDLE, 24.0) == (25.0, 0)  # the nearest to begin with
+    assert act(IDLE, 29.0) == (25.0, 0)
+    assert act(FASTER, 21.0) == (25.0, 0)
+    assert act(FASTER, 24.0) == (30.0, 0)
+    assert act(FASTER, 33.0) == (30.0, 0)
+    assert act(SLOWER, 29.0) == (25.0, 0)
+    assert act(SLOWER, 21.0) == (20.0, 0)
+    assert act(LEFT, 21.0) == (20.0, 1)
+    assert act(LEFT, 21.0, y=0.5) == (20.0, 0)
+    assert act(RIGHT, 21.0, y=0.5) == (20.0, -1)
+    policy.reset(0)
+    assert act(IDLE, 29.0) == (30.0, 0)
+
+
+def test_layers_but_the_last_are_rectified(tmp_path, five):
+    with np.load(five) as file:
+        data = dict(file)
+    flipped = np.diag([-1.0] * 5).astype(np.float32)
+    np.savez(tmp_path / "two.npz", **{**data, "weight_1": flipped, "bias_1": np.arange(5.0, dtype=np.float32)})
+    policy = NumpyPolicy(str(tmp_path / "two.npz"))
+    assert policy.evaluate(np.array([-1, 1, -2, 2, 0], np.float32)).tolist() == [0, 0, 2, 1, 4]
+
+
+def test_steering_is_clipped_to_its_space_and_has_its_shape(linear):
+    space = spaces.Box(np.array([[-0.5], [-0.2]], np.float32), np.array([[0.5], [0.1]], np.float32))
+    policy = OnnxPolicy(linear[2], action_space=space)
+    for seen in scenes(5):
+        wanted = (seen.ravel() @ (linear[0][:, :2] * 9)).reshape(2, 1)
+        assert policy.act(seen) == pytest.approx(np.clip(wanted, space.low, space.high))
+        assert space.contains(policy.act(seen))
+
+
+class _Model:
+    """What Stable-Baselines3 would have loaded."""
+
+    observation_space = spaces.Box(-1.0, 1.0, (8, 7), np.float32)
+    action_space = spaces.Discrete(5)
+
+    def __init__(self):
+        self.calls = []
+
+    @classmethod
+    def load(cls, path, device):
+        return cls()
+
+    def set_random_seed(self, seed):
+        self.calls.append(seed)
+
+    def predict(self, observation, state, episode_start, deterministic):
+        self.calls.append((state, bool(episode_start[0]), deterministic))
+        return 3, (state or 0) + 1
+
+
+def test_a_recurrent_model_receives_its_state_and_where_an_episode_begins(tmp_path, monkeypatch):
+    library = ModuleType("stable_baselines3")
+    library.PPO = library.DQN = _Model
+    library.Recurrent, library.Broken = _Model, SimpleNamespace(load=lambda path, device: {}[path])
+    monkeypatch.setitem(sys.modules, "stable_baselines3", library)
+    (tmp_path / "model.zip").touch()
+    path = str(tmp_path / "model.zip")
+    agent = StableBaselines3(path, deterministic=False, action_space=spaces.Discrete(5))
+    for seed in (7, 8):
+        agent.reset(seed)
+        assert [agent.act(None), agent.act(None)] == [3, 3]
+    episode = [(None, True, False), (1, False, False)]
+    assert agent._model.calls == [7, *episode, 8, *episode]
+    StableBaselines3(path, algorithm="stable_baselines3:Recurrent", observation_space=_Model.observation_space)
+    with pytest.raises(ValueError, match="has no class"):
+        StableBaselines3(path, algorithm="stable_baselines3:Other")
+    with pytest.raises(ValueError, match=r"is not a model of Broken.*KeyError"):
+        StableBaselines3(path, algorithm="stable_baselines3:Broken")
+    for wrong in ({"observation_space": BOX}, {"action_space": spaces.Discrete(4)}, {"action_space": BOX}):
+        with pytest.raises(ValueError, match="was trained"):
+            StableBaselines3(path, **wrong)
+
+
+def test_a_module_that_remembers_is_loaded_again_after_it_was_tried(tmp_path, monkeypatch):
+    """Whether it fits is tried with a blank observation, which a module with buffers would remember."""
+    loads, seeds = [], []
+
+    class Module:
+        def __init__(self, path):
+            loads.append(path)
+            self.calls = 0
+
+        def module(self):
+            return self
+
+        def buffers(self):
+            return iter([self.calls] if loads[-1].stem == "remembers" else [])
+
+        def __call__(self, batch):
+            self.calls += 1
+            values = np.eye(1, 5, min(self.calls, 4), dtype=np.float32)  # another action at each call
+            return SimpleNamespace(numpy=lambda: values)
+
+    library = SimpleNamespace(
+        export=SimpleNamespace(load=Module), from_numpy=np.asarray, inference_mode=nullcontext, manual_seed=seeds.append
+    )
+    monkeypatch.setitem(sys.modules, "torch", library)
+    shown = spaces.Box(-1.0, 1.0, (8, 7), np.float32)
+    for name, number, first in (("remembers.pt2", 2, 1), ("plain.pt2", 1, 2)):
+        (tmp_path / name).touch()
+        loads.clear()
+        agent = TorchPolicy(str(tmp_path / name), action_space=spaces.Discrete(5), observation_space=shown)
+        agent.reset(9)
+        assert agent.act(scenes(1)[0]) == first
+        assert len(loads) == number
+    assert seeds == [9, 9]
