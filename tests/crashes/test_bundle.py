@@ -18,6 +18,7 @@ from crashhunt.crashes import (
     files_of,
     find_bundle,
     list_bundles,
+    list_near_misses,
     read_bundle,
     read_params,
     write_bundle,
@@ -267,6 +268,32 @@ def test_a_crash_is_found_by_what_people_call_it(tmp_path):
     assert caught.value.fix.endswith(f": {tmp_path}/kept/base, {tmp_path}/kept/head")
     with pytest.raises(BundleError, match="does not exist"):
         find_bundle(tmp_path / "gone", "1")
+
+
+def test_what_copies_found_is_found_by_id_or_number_where_no_crash_is_called_so(tmp_path):
+    for number, steps, place in (
+        (2, 7, layout.PROBES), (1, 8, layout.PROBES), (2, 6, layout.BRANCHES), (30, 5, layout.BRANCHES),
+        (40, 4, layout.NEAR_MISSES), (1, 9, layout.CRASHES),
+    ):  # fmt: skip
+        bundle = made(tmp_path, numbered(number, steps))
+        (tmp_path / place).mkdir(exist_ok=True)
+        bundle.path.rename(tmp_path / place / bundle.id)
+    for word, steps in (("1", 9), ("2", 7), ("000002-", 7), ("30", 5), ("00003", 5), ("40", 4)):
+        assert find_bundle(tmp_path, word).result.steps == steps, word
+    with pytest.raises(BundleError, match="there is no crash '3'"):
+        find_bundle(tmp_path, "3")
+    for place, steps in ((layout.CRASHES, 9), (layout.NEAR_MISSES, 4), (layout.BRANCHES, 5), (layout.PROBES, 7)):
+        assert find_bundle(tmp_path).result.steps == steps
+        shutil.rmtree(tmp_path / place)
+
+
+def test_the_most_dangerous_near_miss_comes_first(tmp_path):
+    for number, danger in ((1, 0.5), (2, 0.9), (3, 0.9)):
+        bundle = made(tmp_path, dataclasses.replace(numbered(number), danger=danger))
+        (tmp_path / layout.NEAR_MISSES).mkdir(exist_ok=True)
+        bundle.path.rename(tmp_path / layout.NEAR_MISSES / bundle.id)
+    assert [bundle.result.spec.number for bundle in list_near_misses(tmp_path)] == [2, 3, 1]
+    assert find_bundle(tmp_path).result.spec.number == 2
 
 
 def test_a_damaged_crash_is_in_the_way_of_no_one_who_means_another(tmp_path):

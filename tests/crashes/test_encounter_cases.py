@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.crashes import Encounter, Position, last_escape
+from crashhunt.crashes._encounter import _Path
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.world import Actor, Roster, Scene
 
@@ -214,3 +215,17 @@ def test_a_bent_one_is_measured_by_its_parts():
     third = {**step, "tram": (99.0, 99.0, 0.0, 0.0)}
     (unbent,) = Encounter(recording(third, sizes=sizes, spines={2: spine}), "ego", "other").moments
     assert unbent.gap_m == pytest.approx(28.75)
+
+
+def test_a_driven_path_is_found_by_its_length_and_continues_straight():
+    """Three sides of a square, at another speed each, and a turn across the heading of 180 degrees."""
+    poses = [(0, 0, 0), (4, 0, 0), (4, 0, 1.5), (4, 3, 3.0), (2, 3, -3.0)]
+    path = _Path(poses)
+    assert path.distances == [0, 4, 4, 7, 9]
+    for distance, (x, y, heading) in ((0, poses[0]), (1, (1, 0, 0)), (4, poses[1]), (7, poses[3])):
+        assert path.at(distance) == pytest.approx((x, y, heading))
+    assert path.at(5.5) == pytest.approx((4, 1.5, 2.25))
+    assert path.at(8)[:2] == pytest.approx((3, 3))
+    assert math.cos(path.at(8)[2]) == pytest.approx(-1)
+    assert path.at(11) == pytest.approx((2 + 2 * math.cos(3), 3 - 2 * math.sin(3), -3))
+    assert path.between(0, 0.25) == pytest.approx((1, 0, 0))
