@@ -58,11 +58,31 @@ _TESTS_ELSEWHERE = {
     "crashes/_trust.py": ("crashes/test_trust.py", "e2e/test_foreign_hunts.py"),
     "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),
     "estimation/_gate.py": ("e2e/test_gate.py",),
+    # Processes of trials are seen by what is left of trials that harm them.
+    "executors/_fork_server.py": ("executors/test_lost_processes.py", "executors/test_warm_traffics.py"),
+    "executors/_fresh.py": ("executors/test_last_words.py", "executors/test_harm.py"),
+    "executors/_pool.py": ("executors/test_pool_of_trials.py", "executors/test_lost_processes.py"),
+    "executors/_postmortem.py": ("executors/test_evidence.py", "executors/test_what_is_left.py"),
+    "executors/_protocol.py": ("executors/test_what_is_left.py", "executors/test_pool_of_trials.py"),
+    "executors/_supervisor.py": (
+        "executors/test_killed_trials.py",
+        "executors/test_maps_of_trials.py",
+        "executors/test_warm_traffics.py",
+    ),
+    "executors/_time_limits.py": ("executors/test_last_words.py", "executors/test_what_is_left.py"),
+    "executors/_trial_process.py": ("executors/test_harm.py", "executors/test_warm_traffics.py"),
+    "executors/_zygote.py": ("executors/test_harm.py", "executors/test_warm_traffics.py"),
+    "executors/ray": ("executors/test_ray_address.py", "executors/test_ray_bridge.py", "executors/test_ray_store.py"),
     # What a hunt does is seen by whole hunts.
     "hunts/_check.py": ("hunts/test_check_parts.py", "e2e/test_check.py"),
     "hunts/_crashes.py": ("hunts/test_kinds.py", "hunts/test_tally.py", "hunts/test_whole_hunts.py"),
     "hunts/_fork_results.py": ("hunts/test_from_the_start.py", "hunts/test_whole_hunts.py", "e2e/test_branches.py"),
-    "hunts/_hunt.py": ("hunts/test_states_and_reports.py", "hunts/test_whole_hunts.py", "e2e/test_hunt.py"),
+    "hunts/_hunt.py": (
+        "hunts/test_rare_hunts.py",
+        "hunts/test_states_and_reports.py",
+        "hunts/test_whole_hunts.py",
+        "e2e/test_hunt.py",
+    ),
     "hunts/_next_trials.py": ("hunts/test_next_trials.py", "hunts/test_whole_hunts.py"),
     "hunts/_preflight.py": ("hunts/test_preflight.py", "hunts/test_traffic_survey.py"),
     "hunts/_progress.py": (
@@ -78,6 +98,7 @@ _TESTS_ELSEWHERE = {
     "hunts/_results.py": ("hunts/test_results.py", "hunts/test_trial_rows.py"),
     "hunts/_state.py": ("hunts/test_directory.py", "hunts/test_phases.py", "hunts/test_states_and_reports.py"),
     "hunts/_verification.py": ("hunts/test_from_the_start.py", "hunts/test_whole_hunts.py", "e2e/test_audit.py"),
+    "recording": ("recording/test_*.py",),
     "replays/_debugger.py": ("e2e/test_debugger.py",),
     "replays/_prepare.py": ("e2e/test_replay.py",),
     "replays/_replay.py": ("e2e/test_replay.py",),
@@ -88,7 +109,7 @@ _TESTS_ELSEWHERE = {
     "whatif/_engine.py": ("whatif/test_what_is_counted.py", "whatif/test_reruns.py", "e2e/test_what_if.py"),
     "whatif/_interventions.py": ("whatif/test_what_is_counted.py", "whatif/test_instead.py", "e2e/test_what_if.py"),
     "whatif/_types_by_cause.py": ("whatif/test_division_by_cause.py", "e2e/test_types_by_cause.py"),
-    "world/_tracks.py": ("world/test_tracks.py", "world/test_paths.py"),
+    "world": ("world/test_*.py",),
 }
 """Module or package to its nearest tests, as patterns below `tests`."""
 
@@ -201,7 +222,7 @@ def modules_of(name: str) -> list[Path]:
 def nearest_tests(file: Path) -> tuple[Path, ...]:
     """Return the test files that lie as a module does: of its name, or of its folder, or of the folder above that."""
     inside = file.relative_to("crashhunt")
-    for name in (str(inside), inside.parts[0]):
+    for name in (str(inside), *map(str, [*inside.parents][:-1])):
         found = [path for pattern in _TESTS_ELSEWHERE.get(name, ()) for path in sorted((ROOT / "tests").glob(pattern))]
         if found:
             return tuple(path.relative_to(ROOT) for path in found)

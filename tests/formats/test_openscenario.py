@@ -103,6 +103,40 @@ def test_each_lane_is_a_road_along_its_centre_line(tmp_path):
     assert [float(road.find(".//width").get("a")) for road in roads] == pytest.approx([3.0, 3.5, 3.5, 3.0, 3.5])
     links = {road.get("id"): {end.tag: end.get("elementId") for end in road.find("link")} for road in roads}
     assert links == {"1": {}, "2": {"successor": "5"}, "3": {}, "4": {}, "5": {"predecessor": "2"}}
+    lanes_of = {road.get("id"): [(end.tag, end.get("id")) for end in road.find(".//lane/link")] for road in roads}
+    assert lanes_of == {number: [(tag, "-1") for tag in ends] for number, ends in links.items()}
+
+
+def test_an_actor_begins_where_and_as_fast_as_it_was_first_seen(tmp_path):
+    bundle = crash(tmp_path, seed=1)
+    names = write_openscenario(bundle, tmp_path / "one.xosc")
+    root = ET.parse(tmp_path / "one.xosc").getroot()
+    recorded = recorded_paths(bundle)
+    starts = {private.get("entityRef"): private for private in root.iter("Private")}
+    comes = {event.get("name"): event for event in root.iter("Event")}
+    left = {actor: iter(found) for actor, found in names.items()}
+    for path in (*recorded.agents, *recorded.others):
+        name, first = next(left[path.actor.id], None), path.states[0]
+        if name is None:  # an agent that is seen again: another program drives it by then
+            continue
+        moves = starts.get(name, comes.get(f"{name} moves"))
+        if path.first == 0:
+            place = starts[name].find(".//TeleportAction/Position/WorldPosition")
+            assert math.remainder(float(place.get("h")) - first.heading, math.tau) == pytest.approx(0)
+        else:
+            assert name not in starts
+            place = comes[f"{name} comes"].find(".//AddEntityAction/Position/WorldPosition")
+        assert (float(place.get("x")), float(place.get("y"))) == next(iter(middles(path).values()))
+        # Where a trajectory gives the speeds, none is set.
+        assert (moves is None) == (path.first > 0 and len(path.states) > 1)
+        if moves is not None:
+            assert float(moves.find(".//AbsoluteTargetSpeed").get("value")) == pytest.approx(first.speed)
+    assert [child.tag for child in root][:4] == [
+        "FileHeader",
+        "ParameterDeclarations",
+        "CatalogLocations",
+        "RoadNetwork",
+    ]
 
 
 @readers

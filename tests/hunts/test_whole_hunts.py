@@ -151,6 +151,16 @@ def test_only_an_error_of_the_disk_is_blamed_on_the_disk(tmp_path, monkeypatch, 
         assert "in fail" in caught.value.traceback
 
 
+def test_a_hunt_whose_watcher_fails_records_why_it_ended(tmp_path):
+    def watch(status):
+        raise RuntimeError("the screen is gone")
+
+    with pytest.raises(RuntimeError, match="the screen is gone"):
+        crashhunt.run(tmp_path / "h", 1, 3, 60, watch=watch, **OPTIONS)
+    state = hunt_state(tmp_path / "h")
+    assert (state.state, state.detail, state.damaged) == ("error", "RuntimeError: the screen is gone", False)
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize(
     "options",
