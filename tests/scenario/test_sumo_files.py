@@ -14,6 +14,7 @@ from crashhunt.errors import InvalidEpisodeError, ScenarioError, UsageError
 from crashhunt.plans import Request, plan, with_settings
 from crashhunt.scenario import as_plain_data, load_scenario, shipped_folder
 from crashhunt.scenario.backends.sumo import StagedFiles, canonical, is_true, references, rewritten
+from crashhunt.scenario.backends.sumo._check import check_options
 
 ROUTES = (
     '<routes><route id="way" edges="south east north west"/>{}'
@@ -223,6 +224,17 @@ def test_options_under_any_name(town, text, says):
     with pytest.raises(ScenarioError) as caught:
         load_scenario(town)
     assert says in str(caught.value) or "does not exist" in str(caught.value)
+
+
+def test_an_option_that_every_trial_has_is_refused_with_the_fix_and_an_output_is_disabled(town):
+    (town / "scenario.toml").write_text(
+        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
+        "[sumo.options]\nseed = 3\n"
+    )
+    with pytest.raises(ScenarioError, match=r"'seed'.*is an option that crashhunt sets itself") as caught:
+        load_scenario(town)
+    assert caught.value.fix == "remove it"
+    check_options({"device.ssm.file": "ssm.xml", "device.toc.file": "toc.xml"}, "here")
 
 
 @pytest.mark.parametrize(

@@ -113,6 +113,20 @@ def test_names_in_a_scenario_are_looked_up(tmp_path, line, wrong, says):
     load_scenario(file, kept=True)  # a snapshot's has been run
 
 
+def test_the_default_of_the_vehicle_that_is_replaced_is_looked_up(town):
+    (town / "scenario.toml").write_text(
+        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[arguments.who]\ndefault = "left.1"\n'
+        '[agents.ego]\nreplaces = "who"\n'
+    )
+    load_scenario(town)
+    file = town / "scenario.toml"
+    file.write_text(file.read_text().replace("left.1", "lft.1"))
+    with pytest.raises(
+        ScenarioError, match=r"arguments.who.default: the files of the scenario have no vehicle 'lft.1'"
+    ):
+        load_scenario(town)
+
+
 @pytest.fixture
 def own(tmp_path):
     """A scenario whose mistakes only SUMO finds."""

@@ -8,7 +8,7 @@ import pytest
 
 from crashhunt.base.errors import NoValidTrialError, ScenarioError
 from crashhunt.scenario import load_scenario, shipped_folder
-from crashhunt.scenario.backends.sumo._ego import refine, restore
+from crashhunt.scenario.backends.sumo._ego import _departure_of, _departures, refine, restore
 
 TRIPS = "".join(f'<trip id="t{at}" depart="{at}" from="south" to="east"/>' for at in range(0, 1000, 50))
 
@@ -170,3 +170,21 @@ def test_an_earlier_hunt_keeps_its_candidates(town):
     assert "3 candidates of this hunt" in restored.notes[0]
     assert restore(town(), town(ego="t50")) is None
     assert restore(town(), town('<route id="way" edges="south east"/>')) is None
+
+
+@pytest.mark.parametrize(
+    ("rate", "interval_s"),
+    [
+        ('vehsPerHour="360"', 10.0), ('perHour="720"', 5.0), ('probability="0.25"', 4.0), ('number="4"', 15.0),
+        ('period="7"', 7.0), ('period="exp(0.125)"', 8.0),
+    ],
+)  # fmt: skip
+def test_vehicles_of_a_flow_depart_as_often_as_it_is_written(tmp_path, rate, interval_s):
+    file = tmp_path / "r.rou.xml"
+    file.write_text(f'<routes><flow id="a.b" begin="20" end="80" {rate}/><vehicle id="alone" depart="5"/></routes>')
+    found = {found.vehicle: found.depart_s for found in _departures([file])}
+    assert found.pop("alone") == 5
+    assert found == pytest.approx({f"a.b.{place}": 20 + place * interval_s for place in range(int(60 / interval_s))})
+    assert _departure_of("a.b.2", [file]) == pytest.approx(20 + 2 * interval_s)
+    assert _departure_of("alone", [file]) == 5
+    assert _departure_of("a.b", [file]) == _departure_of("gone.1", [file]) == 0.0
