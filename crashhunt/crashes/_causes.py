@@ -67,7 +67,11 @@ class Cause(Serializable):
         if self.instead == "changed lanes":
             return f"omission: changes to the {side} lane into a gap that is not safe"
         known = {"red light": "stop for a red light", "crossing": "yield"}
-        return f"omission: does not {known.get(self.what, f'brake for {actor}')}, {self.instead}"
+        what = known.get(self.what, f"brake for {actor}")
+        if self.instead == "braked too little":
+            return f"omission: brakes too little {f'for {actor}' if self.what == 'vehicle' else f'to {what}'}"
+        # Whether an agent kept its speed before the last 2 s is not a part of the cause.
+        return f"omission: does not {what}{', and speeds up' if self.instead == 'sped up' else ''}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

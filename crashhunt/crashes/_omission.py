@@ -42,13 +42,16 @@ class Omission(Serializable):
         actor: identifier of the disregarded actor; empty for a red light and for a missing lane.
         step: the step after which the omission began.
         instead: what the agent did instead: ``sped up``, ``kept its speed``, ``braked too little`` or ``changed
-            lanes``.
+            lanes``. Whether it sped up is decided over the last 2 s before the crash.
         speed_mps: speed of the agent after that step, in m/s.
         actor_speed_mps: speed of the disregarded actor, in m/s; None if there is no such actor.
         gap_m: gap between the agent and the actor or stop line, in m; negative if the vehicles are side by side. The
             gap is None if there is neither an actor nor a stop line.
         safe: the safe speed for that gap, in m/s; for a lane change, the safe gap in m; None for a missing lane.
         visible_step: the step after which an observation first contained the actor; None if the step is unknown.
+        last_speed_mps: speed of the agent just before the crash, in m/s; None for a lane change, or if it is unknown.
+        kept_s: time until the crash over which the agent's speed stayed within 0.5 m/s of the last speed, in s, at most
+            the time since the omission began; None for a lane change, or if it is unknown.
     """
 
     faculty: str
@@ -61,6 +64,8 @@ class Omission(Serializable):
     gap_m: float | None = None
     safe: float | None = None
     visible_step: int | None = None
+    last_speed_mps: float | None = None
+    kept_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

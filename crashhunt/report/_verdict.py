@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from crashhunt.report._words import describe_instead
 from crashhunt.world import is_person, lane_jump
 
 if TYPE_CHECKING:
@@ -238,4 +239,5 @@ def _omitted(agent: str, omission: Omission) -> str:
     if omission.instead == "braked too little":
         return f"{agent} braked too little; "
     verb = "yield" if omission.kind == "crossing" else "brake"
-    return f"{agent} did not {verb} and {omission.instead}; "
+    instead = describe_instead(omission)
+    return f"{agent} did not {verb}{f' and {instead}' if instead else ''}; "

@@ -362,6 +362,9 @@ _FACULTY_WORDS = {
 }
 
 
+_MIN_KEPT_S = 1.0  # over a shorter time, every driver keeps its speed
+
+
 def about_reference(reference: Reference, ago: Callable[[int], str], agent: str) -> list[str]:
     """Return sentences on what the agent failed to do; empty if no run with a reference driver shows an omission.
 
@@ -413,7 +416,23 @@ def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
     if omission.instead == "braked too little":
         how = f"for {actor}" if kind == "vehicle" else f"to {what}"
         return f"{agent} braked too little {how} ({gap}{safe}){seen}"
-    return f"{agent} did not {what} ({gap}{safe}){seen}, and {omission.instead}"
+    instead = describe_instead(omission)
+    return f"{agent} did not {what} ({gap}{safe}){seen}{f', and {instead}' if instead else ''}"
+
+
+def describe_instead(omission: Omission) -> str:
+    """Return what an agent did with its speed in place of braking; empty if it is unknown or ambiguous.
+
+    An agent may have sped up before it kept its speed, so the text contains the time over which it kept it.
+    """
+    last = omission.last_speed_mps
+    if omission.instead == "sped up" and last is None:  # an earlier version judged the crash
+        return "sped up"
+    if omission.instead == "sped up" and last is not None and last > omission.speed_mps:
+        return f"sped up to {last:.1f} m/s"
+    if omission.instead == "kept its speed" and omission.kept_s is not None and omission.kept_s >= _MIN_KEPT_S:
+        return f"kept its speed for the last {omission.kept_s:.1f} s"
+    return ""
 
 
 def about_changes(changed: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ Cost: one run in which the reference driver watches, three or six for each candi
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
@@ -218,29 +218,39 @@ class _Search:
     def _omission(self, candidate: JsonObject, faculty: str) -> Omission:
         actor, first = str(candidate["actor"]), int(candidate["first"])
         lateral = candidate["faculty"] == "lateral"
+        speeds = [] if lateral else self._speeds(first)
         return Omission(
             faculty=faculty,
             kind=str(candidate["kind"]),
             actor=actor,
             step=first,
-            instead="changed lanes" if lateral else self._instead(first),
+            instead="changed lanes" if lateral else self._instead(speeds),
             speed_mps=float(candidate["speed_mps"]),
             actor_speed_mps=candidate.get("actor_speed_mps") if actor else None,
             gap_m=candidate.get("gap_m"),
             safe=candidate.get("safe"),
             visible_step=visible_from(self._recording, self._agent, actor) if actor else None,
+            last_speed_mps=speeds[-1] if speeds else None,
+            kept_s=self._kept_s(speeds) if speeds else None,
         )
 
-    def _instead(self, first: int) -> str:
-        """Return the agent's behaviour from a step to the crash, without the change of speed in the crash itself."""
+    def _speeds(self, first: int) -> list[float]:
+        """Return the agent's speeds from a step to the crash, without the change of speed in the crash itself."""
         scenes = [scene for scene in self._recording.scenes()[first:-1] if self._agent in scene.roster.index]
-        speeds = [scene.speeds[scene.roster.index[self._agent]] for scene in scenes]
-        if speeds and speeds[-1] <= speeds[0] - _SPEED_CHANGED_MPS:
-            return "braked too little"
+        return [float(scene.speeds[scene.roster.index[self._agent]]) for scene in scenes]
+
+    def _instead(self, speeds: list[float]) -> str:
         # A period begins long before a crash, when many a driver still speeds up. The last seconds tell bugs apart.
         last = speeds[-1 - round(_INSTEAD_S / self._dt) :]
+        if speeds and speeds[-1] <= max(speeds[0], last[0]) - _SPEED_CHANGED_MPS:
+            return "braked too little"
         faster = sum(after - before > _SPEEDS_UP_MPS2 * self._dt for before, after in pairwise(last))
         return "sped up" if 2 * faster > len(last) - 1 else "kept its speed"
+
+    def _kept_s(self, speeds: list[float]) -> float:
+        """Return for how long before the crash the agent kept the speed that it had in the end."""
+        kept = list(takewhile(lambda speed: abs(speed - speeds[-1]) < _SPEED_CHANGED_MPS, reversed(speeds)))
+        return (len(kept) - 1) * self._dt
 
 
 def _last_place(recording: Recording, agent: str) -> tuple[float, float]:

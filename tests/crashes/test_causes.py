@@ -56,7 +56,20 @@ def test_an_omission_wins_over_a_decision_and_names_long_vehicles(length, actor,
     why = Why((factor("agent", "sped up", "none", "none"),))
     found = cause_of(bundle(length=length), Judgement(why=why, reference=Reference(omission=omission())))
     assert found == Cause("omission", "vehicle", "sped up", actor)
-    assert str(found) == f"omission: does not brake for {words}, sped up"
+    assert str(found) == f"omission: does not brake for {words}, and speeds up"
+
+
+@pytest.mark.parametrize(
+    ("what", "instead", "words"),
+    [
+        ("vehicle", "kept its speed", "does not brake for a vehicle"),
+        ("vehicle", "braked too little", "brakes too little for a vehicle"),
+        ("red light", "braked too little", "brakes too little to stop for a red light"),
+        ("crossing", "sped up", "does not yield, and speeds up"),
+    ],
+)
+def test_words_of_an_omission_do_not_contradict_themselves(what, instead, words):
+    assert str(Cause("omission", what, instead)) == f"omission: {words}"
 
 
 @pytest.mark.parametrize("relation", ["ahead", "behind", "alongside"])

@@ -37,8 +37,11 @@ def said(faculty="longitudinal", endings=("none", "none", "none"), changed=(), *
             ),
         ),
         (
-            {"kind": "red light", "actor": "", "visible_step": None, "instead": "kept its speed"},
-            "ego did not stop for a red light (12.2 m ahead, 20.0 m/s where 19.0 m/s are safe), and kept its speed",
+            {"kind": "red light", "actor": "", "visible_step": None, "instead": "kept its speed", "kept_s": 3.44},
+            (
+                "ego did not stop for a red light (12.2 m ahead, 20.0 m/s where 19.0 m/s are safe), and kept its speed "
+                "for the last 3.4 s"
+            ),
         ),
         (
             {"speed_mps": 18.9, "visible_step": None},
@@ -62,6 +65,27 @@ def said(faculty="longitudinal", endings=("none", "none", "none"), changed=(), *
 )
 def test_the_first_sentence_is_the_cause(more, cause):
     assert said(**more)[0] == f"Cause: {cause}."
+
+
+@pytest.mark.parametrize(
+    ("more", "end"),
+    [
+        ({"last_speed_mps": 31.04}, "), and sped up to 31.0 m/s."),
+        ({"last_speed_mps": 20.0}, ")."),  # it is not faster than at the beginning
+        ({}, "), and sped up."),  # of an earlier version, which has not recorded the last speed
+        (
+            {"instead": "kept its speed", "kept_s": 1.0, "last_speed_mps": 40.0},
+            "and kept its speed for the last 1.0 s.",
+        ),
+        ({"instead": "kept its speed", "kept_s": 0.9}, ")."),
+        (
+            {"instead": "kept its speed"},
+            ").",
+        ),  # of an earlier version: whether it did so before the last 2 s is unknown
+    ],
+)
+def test_what_it_did_instead_is_reported_with_its_time_or_not_at_all(more, end):
+    assert said(visible_step=None, **more)[0].endswith(end)
 
 
 def test_only_clear_runs_count_and_other_changes_are_reported():

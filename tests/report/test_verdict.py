@@ -163,6 +163,17 @@ def omitted(**more):
             {"judgement": omitted()},
             f"{TOUCHED}; ego did not brake and sped up; with a reference driver there is no crash.",
         ),
+        (
+            {"judgement": omitted(instead="kept its speed", kept_s=2.04)},
+            (
+                f"{TOUCHED}; ego did not brake and kept its speed for the last 2.0 s; with a reference driver there is no "
+                "crash."
+            ),
+        ),
+        (
+            {"judgement": omitted(instead="kept its speed", kept_s=0.2)},
+            f"{TOUCHED}; ego did not brake; with a reference driver there is no crash.",
+        ),
         ({"judgement": omitted(actor="y")}, f"{TOUCHED}."),  # about another actor than the page
         (
             {"judgement": omitted(kind="red light", actor="")},
