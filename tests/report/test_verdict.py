@@ -166,8 +166,8 @@ def omitted(**more):
         (
             {"judgement": omitted(instead="kept its speed", kept_s=2.04)},
             (
-                f"{TOUCHED}; ego did not brake and kept its speed for the last 2.0 s; with a reference driver there is no "
-                "crash."
+                f"{TOUCHED}; ego did not brake and kept its speed for the last 2.0 s; "
+                "with a reference driver there is no crash."
             ),
         ),
         (
