@@ -50,8 +50,8 @@ class Omission(Serializable):
         safe: the safe speed for that gap, in m/s; for a lane change, the safe gap in m; None for a missing lane.
         visible_step: the step after which an observation first contained the actor; None if the step is unknown.
         last_speed_mps: speed of the agent just before the crash, in m/s; None for a lane change, or if it is unknown.
-        kept_s: time until the crash over which the agent's speed stayed within 0.5 m/s of the last speed, in s, at most
-            the time since the omission began; None for a lane change, or if it is unknown.
+        kept_s: time until the crash over which the agent's speed stayed within 0.5 m/s of the last speed, in s. It does
+            not exceed the time since the omission began. None for a lane change, or if it is unknown.
     """
 
     faculty: str
