@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.maps._network import BICYCLE, CAR, PERSON, RoadNetwork, read_network
+from crashhunt.maps._source import fix_of_bbox
 from crashhunt.maps._tools import first_error
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ _RAIL = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "
 _LEFT_HAND = re.compile(rb"""\brule\s*=\s*["']LHT["']""")
 _LENGTH = re.compile(rb"""<(road|geometry)\b[^>]*?\slength\s*=\s*["']([^"']*)["']""")
 _LANELET = re.compile(rb"""\bv\s*=\s*["']lanelet["']""")
+_BOUNDARY = re.compile(rb'<location [^>]*origBoundary="(?P<boundary>[^"]*)" projParameter="(?P<projection>[^"]*)"')
 _AT_LINE = re.compile(r"^\s*At line/column", re.MULTILINE)
 """What the programs add to an error of the XML itself, in contrast to one of its content."""
 _COMMENT = re.compile(r"<!--.*?-->\s*", re.DOTALL)
@@ -220,6 +222,21 @@ def _run_converter(source: MapSource, options: ConvertOptions, tools: Tools, fol
     raise ScenarioError(f"{program} cannot read the map: {error}", fix=fix, where=_place_in_error(source))
 
 
+def _bounds(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> BBox | None:
+    """Return the bounding box of a map in degrees; None if the map is not known to have one."""
+    words = _command_arguments(source, options, tools, everything=True)
+    words += [*_IGNORE_ERROR_OPTIONS, "--xml-validation", "never", "--output-file", NET]
+    tools.run("netconvert", words, folder)
+    if not (folder / NET).is_file():
+        return None
+    with (folder / NET).open("rb") as file:
+        found = _BOUNDARY.search(file.read(_HEAD_BYTES))
+    if found is None or found["projection"] == b"!":
+        return None
+    west, south, east, north = (float(number) for number in found["boundary"].split(b","))
+    return west, south, east, north
+
+
 def _place_in_error(source: MapSource) -> str:
     return str(source.path) if source.path is not None else f"--{source.kind}"
 
@@ -301,6 +318,8 @@ def _no_road(source: MapSource, options: ConvertOptions, tools: Tools, folder: P
         fix = "export it as OpenDRIVE, or as a network of SUMO"
     elif not lanes:
         what = "the map has no road in this --bbox" if options.bbox else "the map has no road"
+        if options.bbox is not None:
+            fix = fix_of_bbox(options.bbox, _bounds(source, replace(options, bbox=None), tools, folder)) or fix
     elif all(any(map(lane.admits, _RAIL)) and not lane.admits(PERSON) for lane in lanes):
         what = f"the map has rails only (tracks: {len(held.edges)})"
     elif all(lane.admits(PERSON) or lane.admits(BICYCLE) or lane.allowed == frozenset() for lane in lanes):

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import BinaryIO
 
-__all__ = ["ENDINGS", "BBox", "MapSource", "check_source", "kind_of_file", "parse_bbox", "parse_shape"]
+__all__ = ["ENDINGS", "BBox", "MapSource", "check_source", "fix_of_bbox", "kind_of_file", "parse_bbox", "parse_shape"]
 
 BBox: TypeAlias = tuple[float, float, float, float]
 """West, south, east, north, in degrees."""
@@ -121,6 +121,31 @@ def parse_bbox(text: str) -> BBox:
     if west >= east or south >= north:
         raise UsageError(f"--bbox {text!r} is empty: west must be below east, and south below north", fix=fix)
     return west, south, east, north
+
+
+def fix_of_bbox(bbox: BBox, bounds: BBox | None) -> str:
+    """Return the fix for a bounding box without roads: the bounding box of the map; empty if it is unknown.
+
+    If the box would overlap the map with latitude and longitude exchanged, the fix is that box.
+    """
+    if bounds is None:
+        return ""
+    south, west, north, east = bbox
+    exchanged = west, south, east, north
+    if _overlaps(exchanged, bounds) and not _overlaps(bbox, bounds):
+        return (
+            f"give --bbox={_in_degrees(exchanged)}, since the order is west,south,east,north; the map spans "
+            f"{_in_degrees(bounds)}"
+        )
+    return f"choose a --bbox with streets; the map spans {_in_degrees(bounds)}"
+
+
+def _overlaps(one: BBox, other: BBox) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def _in_degrees(bounds: BBox) -> str:
+    return ",".join(f"{number:.6g}" for number in bounds)
 
 
 def check_source(source: MapSource) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -46,6 +47,17 @@ def test_map_becomes_a_network_without_traces_of_this_machine(tmp_path):
     assert "generated on" not in text
     assert str(tmp_path) not in text
     assert made.notes == ()
+
+
+def test_bbox_without_roads_is_refused_with_the_extent_of_the_map(tmp_path):
+    for bbox, fix in (
+        ((0.0, 0.0, 1.0, 1.0), "choose a --bbox with streets; the map spans 11.499,48.1,11.503,48.103"),
+        ((48.1, 11.4, 48.2, 11.6), "give --bbox=11.4,48.1,11.6,48.2, since the order is west,south,east,north"),
+    ):
+        with pytest.raises(ScenarioError, match="the map has no road in this --bbox") as refused:
+            converted(osm(tmp_path), tmp_path, bbox=bbox)
+        assert refused.value.fix.startswith(fix)
+        shutil.rmtree(tmp_path / "work")
 
 
 @pytest.mark.parametrize("name", ["a,b $x 'y'.osm", "ä ö.osm", "-o.osm"])

@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 
 from crashhunt.errors import CrashhuntError, ScenarioError, UsageError
 from crashhunt.maps import MapSource, _source, check_source, parse_bbox, parse_shape
-from crashhunt.maps._source import _MAX_BYTES, kind_of_file
+from crashhunt.maps._source import _MAX_BYTES, fix_of_bbox, kind_of_file
 
 OSM = b'<?xml version="1.0"?><osm version="0.6"></osm>'
 
@@ -70,6 +70,20 @@ def test_bbox_is_read_as_written(numbers):
 def test_bbox_of_other_form_is_refused(text):
     with pytest.raises(UsageError):
         parse_bbox(text)
+
+
+@pytest.mark.parametrize(
+    ("bbox", "fix"),
+    [
+        ((2.0, 2.0, 3.0, 3.0), "choose a --bbox with streets; the map spans 11.4,48.1,11.6,48.2"),
+        ((11.45, 48.11, 11.46, 48.12), "choose a --bbox with streets; the map spans 11.4,48.1,11.6,48.2"),
+        ((48.15, 11.5, 48.16, 11.55), "give --bbox=11.5,48.15,11.55,48.16, since the order is west,south,east,north; "),
+    ],
+)
+def test_bbox_without_roads_is_compared_with_that_of_the_map(bbox, fix):
+    bounds = (11.4, 48.1, 11.6, 48.2)
+    assert fix_of_bbox(bbox, bounds).startswith(fix)
+    assert fix_of_bbox(bbox, None) == ""
 
 
 @given(st.integers(0, 10_000), st.integers(0, 10_000))
