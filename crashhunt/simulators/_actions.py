@@ -110,9 +110,13 @@ class MetaAction(SpaceAction):
 
         super().__init__(spaces.Discrete(len(meanings)))
         self.space.meanings = meanings  # type: ignore[attr-defined]
+        self._count = len(meanings)
 
     def encode(self, action: object) -> NDArray[np.generic]:
         """Return the action as an int64 array of shape (1,)."""
+        # Most agents return an integer in every step, so check for an integer first.
+        if (type(action) is int or type(action) is np.int64) and 0 <= action < self._count:
+            return np.array((action,), np.int64)
         if isinstance(action, np.ndarray) and action.size == 1:
             action = action.reshape(())
         return super().encode(action).reshape(1)
