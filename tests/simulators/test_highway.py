@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 import subprocess
 import sys
 
@@ -24,6 +25,10 @@ from crashhunt.scenario import (
 from crashhunt.scenario.backends.highway import HighwaySetup
 from crashhunt.simulators.highway import HighwaySimulator
 from crashhunt.testing import SimulatorContract
+
+# isort: split
+
+from highway_env.envs.highway_env import HighwayEnvFast
 
 IDS = sorted(name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("highway_env"))
 
@@ -350,3 +355,30 @@ def test_outlines_and_highway_env_agree_on_most_crashes(tmp_path):
         if seen["reported"] >= 3:
             break
     assert seen["reported"] >= 3
+
+
+def test_prepared_process_has_the_episodes_of_any_other(tmp_path):
+    prepared, fresh = (simulator_of(tmp_path, "highway-fast-v0", config={"vehicles_count": 5}) for _ in range(2))
+    prepared.ready_process()
+    made = prepared._spare
+    assert made is not None
+    for seed in (4, 5):
+        seen = [
+            [(observed["agent-0"].tobytes(), rewards) for observed, rewards, *_ in drive(simulator, "SLOWER", 3, seed)]
+            for simulator in (prepared, fresh)
+        ]
+        assert seen[0] == seen[1]
+        assert (prepared._env is made) == (seed == 4)
+
+
+@pytest.mark.parametrize("how", ["class", "generator"])
+def test_environment_of_a_users_is_constructed_in_each_episode(how, tmp_path, monkeypatch):
+    simulator = simulator_of(tmp_path, "highway-fast-v0", config={"vehicles_count": 2})
+    if how == "class":
+        made = type("Own", (HighwayEnvFast,), {})
+        monkeypatch.setattr(gymnasium, "make", lambda *_, **__: made())
+    else:  # a user's code may draw from the process's generators, which each trial seeds
+        create = HighwayEnvFast._create_vehicles
+        monkeypatch.setattr(HighwayEnvFast, "_create_vehicles", lambda env: (random.random(), create(env)))
+    simulator.ready_process()
+    assert simulator._spare is None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+import random
 import warnings
 from collections import Counter
 from contextlib import nullcontext
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HighwaySimulator"]
 
+_PACKAGES = frozenset(("highway_env", "gymnasium", "typing", "builtins"))
 _LANE_INTERVAL_STEPS = 10  # steps between two scenes that contain the lane of each vehicle
 
 assert highway_env  # importing it registers its environments
@@ -90,6 +92,7 @@ class HighwaySimulator:
         self._compiled = kernel() if self._setup.accelerate and not reason else None
         self.agents: list[str] = []
         self._lane_names: dict[tuple[str, str, int], str] = {}
+        self._spare: AbstractEnv | None = None
         try:
             self.reset(seed=0, options={"arguments": argument_values(scenario)})  # to read its spaces
         except InvalidEpisodeError as error:
@@ -253,6 +256,14 @@ class HighwaySimulator:
         """Whether the other actors of this episode follow recorded paths."""
         return self._puppets is not None
 
+    def ready_process(self) -> None:
+        """Construct the environment of the next episode, so that each fork of this process only resets it."""
+        before = _generator_states()
+        spare = self._construct()
+        # A user's code may draw from the generators of the process, which each trial seeds before it constructs.
+        if _is_highway_envs_own(type(spare)) and _generator_states() == before:
+            self._spare = spare
+
     def tidy(self) -> None:
         """Restore class attributes that the environment has changed."""
         restore_classes()
@@ -263,6 +274,11 @@ class HighwaySimulator:
 
     def _make(self, arguments: Mapping[str, Value]) -> AbstractEnv:
         """Create the environment and set its configuration, which the next reset applies."""
+        env, self._spare = self._spare or self._construct(), None
+        env.config = configured(env.config, self._scenario, arguments)
+        return env
+
+    def _construct(self) -> AbstractEnv:
         restore_classes()
         try:
             with warnings.catch_warnings():
@@ -277,7 +293,6 @@ class HighwaySimulator:
         if not isinstance(env, AbstractEnv):
             fix = 'write simulator = "gym"'
             raise mistake(self._scenario, "id", self._setup.id, "is not an environment of highway-env", fix)
-        env.config = configured(env.config, self._scenario, arguments)
         return env
 
     def _adopt(self, env: AbstractEnv) -> None:
@@ -440,6 +455,16 @@ class HighwaySimulator:
         if found is None:
             found = self._lane_names[index] = "_".join(map(str, index))
         return found
+
+
+def _is_highway_envs_own(kind: type) -> bool:
+    return all(base.__module__.partition(".")[0] in _PACKAGES for base in kind.__mro__)
+
+
+def _generator_states() -> tuple[object, ...]:
+    """Return the states of the random generators of the process."""
+    numpy: Any = np.random.get_state()  # noqa: NPY002 - a user's code may use the global generator
+    return random.getstate(), numpy[0], numpy[1].tobytes(), numpy[2:]
 
 
 def _form(kind: ActionType) -> ActionForm:
