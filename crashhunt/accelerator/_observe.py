@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
@@ -107,13 +108,14 @@ def observe_in_kernel(kinematic: KinematicObservation, state: RoadState) -> NDAr
         ranges = ranges or _default_ranges(kinematic)
         if type(ranges) is not dict:
             return None
-    scales = np.zeros((len(features), 2))
+    scales = array("d", bytes(16 * len(features)))
     for name, limits in ranges.items() if kinematic.normalize else ():
         if name in features:
             low, high = limits[0], limits[1]
-            if not are_numbers((low, high)) or not np.isfinite(high - low) or high == low:
+            if not are_numbers((low, high)) or not math.isfinite(high - low) or high == low:
                 return None
-            scales[features.index(name)] = low, high - low
+            column = 2 * features.index(name)
+            scales[column], scales[column + 1] = low, high - low
     shown = np.zeros((rows, len(features)))
     found = state.traffic.observe(
         shown,

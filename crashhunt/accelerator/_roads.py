@@ -11,7 +11,7 @@ from highway_env.road.road import Road
 from crashhunt.accelerator._frames import TrafficFrame
 from crashhunt.accelerator._network import Network
 from crashhunt.accelerator._roster import KernelRoster
-from crashhunt.accelerator._versions import Own, Watch, is_plain
+from crashhunt.accelerator._versions import Own, Watch, is_plain, kinds_of
 
 if TYPE_CHECKING:
     from crashhunt.accelerator._kernel import Traffic
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Prepared",
     "RoadState",
+    "cached",
     "forget",
     "frame_of",
     "is_known",
@@ -28,6 +29,7 @@ __all__ = [
     "network_of",
     "prepared",
     "take",
+    "take_for_observation",
     "watches",
 ]
 
@@ -45,6 +47,8 @@ class Prepared:
         network: The lanes of the road.
         frame: The positions when they were last read.
         alone: Whether no foreign code runs between the sub-steps of the road, so that the state stays valid.
+        in_step: Whether a step of the environment runs, in which the observation follows the last sub-step.
+        checked: Whether road and vehicles have been compared with the kernel's since foreign code last ran.
     """
 
     def __init__(self, road: Road) -> None:
@@ -52,6 +56,8 @@ class Prepared:
         self.network = Network(road.network)
         self.frame: TrafficFrame | None = None
         self.alone = False
+        self.in_step = False
+        self.checked = False
         self._roster: KernelRoster | None = None
         self._kept: RoadState | None = None
 
@@ -60,10 +66,18 @@ class Prepared:
         road = self.road
         if road.record_history:
             return None
-        if self._roster is None or not self._roster.is_of(road):
+        if self._roster is None or not (self.checked or self._roster.is_of(road)):
             self._roster = KernelRoster(road, self.network)
         traffic = self._roster.traffic
         return self._roster if traffic is not None and traffic.read() else None
+
+    def drives_all(self) -> bool:
+        """Return whether the kernel knows how all vehicles of the road make decisions and move."""
+        road, roster = self.road, self._roster
+        if roster is not None and roster.is_of(road):
+            self.checked = roster.traffic is not None
+            return roster.decides and roster.moves
+        return all(kind.drives and kind.moves for kind in kinds_of(road.vehicles))
 
     def keep(self, state: RoadState) -> None:
         """Keep the state of all vehicles in the kernel until foreign code runs."""
@@ -75,8 +89,9 @@ class Prepared:
         return kept
 
     def distrust(self) -> None:
-        """Discard the kept state, because foreign code runs next."""
+        """Discard the kept state and the last check, because foreign code runs next."""
         self._kept = None
+        self.checked = False
 
 
 class RoadState(NamedTuple):
@@ -87,15 +102,33 @@ class RoadState(NamedTuple):
     traffic: Traffic
 
 
+def cached(road: Road | None) -> Prepared | None:
+    """Return the cached data of a road without any check; None if there is no cached data."""
+    found = _roads.get(id(road))
+    return found if found is not None and found.road is road else None
+
+
 def take(road: Road) -> RoadState | None:
     """Return the kept state of a road; None if foreign code may have run in the meantime."""
-    found = _roads.get(id(road))
-    return found.trusted() if found is not None and found.road is road else None
+    found = cached(road)
+    return found.trusted() if found is not None and found.alone else None
+
+
+def take_for_observation(road: Road) -> RoadState | None:
+    """Return the kept state of a road like `take`; foreign code may run after the observation."""
+    found = cached(road)
+    if found is None:
+        return None
+    kept = found.trusted()
+    found.distrust()
+    return kept
 
 
 def look(road: Road) -> RoadState | None:
     """Return the current state of a road; None if the kernel cannot be used for the road."""
-    found = prepared(road) if is_known(road) else None
+    found = cached(road)
+    if found is None or not found.checked:
+        found = prepared(road) if is_known(road) else None
     roster = found.roster() if found is not None else None
     if found is None or roster is None or roster.traffic is None:
         return None

@@ -23,7 +23,8 @@ from highway_env.envs.parking_env import ParkingEnv
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from crashhunt.accelerator._roads import is_known, look, methods_of, prepared, watches
+from crashhunt.accelerator._agent_steps import choose
+from crashhunt.accelerator._roads import cached, is_known, look, methods_of, prepared, watches
 from crashhunt.accelerator._rules import finish
 from crashhunt.accelerator._versions import Own, is_genuine, kinds_of, originals
 
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
     from crashhunt.accelerator._roads import Prepared
 
-__all__ = ["Onlooker", "SkippedObservation", "can_run_alone", "simulate"]
+__all__ = ["Onlooker", "SkippedObservation", "can_run_alone", "run_step", "simulate"]
 
 
 # A wrapper of a road's `step` that declares whether it changes the road.
@@ -88,9 +89,38 @@ class Onlooker:
         self.look()
 
 
-_CALLED_METHODS = ("_simulate", "_automatic_rendering")
-_READ_ATTRIBUTES = ("steps", "config", "viewer", "enable_auto_render", "road", "action_type")
-_kinds: dict[type, Own] = {}
+_CALLED_METHODS = ("step", "_simulate", "_automatic_rendering")
+_READ_ATTRIBUTES = ("steps", "config", "viewer", "enable_auto_render", "road", "action_type", "observation_type")
+
+
+class _EnvironmentKind:
+    """Properties of a class of environments.
+
+    Attributes:
+        is_plain: Whether only code of highway-env runs between sub-steps, except for the agents' actions.
+        inherits: The names of those methods that the class inherits from `AbstractEnv`.
+    """
+
+    def __init__(self, kind: type[AbstractEnv]) -> None:
+        self.own = Own(kind, AbstractEnv, _READ_ATTRIBUTES)
+        self.is_plain = self.own.plain and not self.own.has("_automatic_rendering")
+        self.inherits = frozenset(name for name in ("_simulate", "vehicle") if not self.own.has(name))
+
+
+_kinds: dict[type, _EnvironmentKind] = {}
+
+
+def run_step(env: AbstractEnv, action: object) -> object:
+    """Run `AbstractEnv.step`, in which the environment observes directly after its last sub-step."""
+    found = cached(env.road)
+    if found is None or found.in_step or "_simulate" in vars(env):
+        return originals["AbstractEnv.step"](env, action)
+    found.in_step = True
+    try:
+        return originals["AbstractEnv.step"](env, action)
+    finally:
+        found.in_step = False
+        found.distrust()
 
 
 def can_run_alone() -> bool:
@@ -110,17 +140,21 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[object, 
             replacement.
     """
     road = env.road
-    found = prepared(road) if _runs_alone(env) and _are_in_place(replaced) and is_known(road) else None
-    if found is None:
+    kind = _kind_of(env)
+    found = prepared(road) if _runs_alone(env, kind) and _are_in_place(replaced) and is_known(road) else None
+    if found is None or not found.drives_all():
         originals["AbstractEnv._simulate"](env, action)
         return
     frames = _frames(env)
     can_fuse = type(road) is Road
+    can_act = "vehicle" in kind.inherits
+    observes = False
     found.alone = True
     frame = -1
     try:
         while (frame := frame + 1) < frames:
-            if action is not None and not env.config["manual_control"] and env.steps % _frames(env) == 0:
+            acts = action is not None and not env.config["manual_control"] and env.steps % _frames(env) == 0
+            if acts and not (can_act and frame == 0 and found.checked and choose(env, action)):
                 found.distrust()
                 env.action_type.act(action)
                 found.distrust()
@@ -139,9 +173,11 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[object, 
             env.steps += 1
             if frame < frames - 1:
                 env._automatic_rendering()
+        observes = found.in_step and "_simulate" in kind.inherits and _observes_plainly(env)
     finally:
         found.alone = False
-        found.distrust()
+        if not observes:
+            found.distrust()
     env.enable_auto_render = False
 
 
@@ -163,8 +199,12 @@ def _run(env: AbstractEnv, found: Prepared, count: int) -> int:
         finish(road, dt)
         done += 1
     env.steps += done
+    if done and not unfinished:
+        found.keep(state)
     if done and "step" in vars(road):
         vars(road)["step"].look()
+        if _interferes(road):
+            found.distrust()
     return done
 
 
@@ -172,21 +212,30 @@ def _frames(env: AbstractEnv) -> int:
     return int(env.config["simulation_frequency"] // env.config["policy_frequency"])
 
 
-def _runs_alone(env: AbstractEnv) -> bool:
-    """Return whether only the agents' actions and an `Onlooker` run between the sub-steps of an environment."""
-    road, kind = env.road, type(env)
+def _kind_of(env: AbstractEnv) -> _EnvironmentKind:
+    kind = type(env)
+    found = _kinds.get(kind)
+    if found is None or not found.own.current:
+        found = _kinds[kind] = _EnvironmentKind(kind)
+    return found
+
+
+def _runs_alone(env: AbstractEnv, kind: _EnvironmentKind) -> bool:
+    """Return whether only agents, vehicles and an `Onlooker` run between the sub-steps of an environment."""
+    road = env.road
     if type(road) not in (Road, RegulatedRoad) or env.viewer is not None:
         return False
     if "_automatic_rendering" in vars(env) or "act" in vars(road):
         return False
     if "step" in vars(road) and type(vars(road)["step"]) is not Onlooker:
         return False
-    if not all(known.drives and known.moves for known in kinds_of(road.vehicles)):
-        return False
-    own = _kinds.get(kind)
-    if own is None or not own.current:
-        own = _kinds[kind] = Own(kind, AbstractEnv, _READ_ATTRIBUTES)
-    return own.plain and not own.has("_automatic_rendering") and type(env.config) is dict
+    return kind.is_plain and type(env.config) is dict
+
+
+def _observes_plainly(env: AbstractEnv) -> bool:
+    """Return whether an environment observes with a method that reads the road before other code can change it."""
+    observing = vars(env).get("observation_type")
+    return type(observing) is KinematicObservation and "observe" not in vars(observing)
 
 
 def _are_in_place(replaced: Iterable[tuple[object, str, object]]) -> bool:

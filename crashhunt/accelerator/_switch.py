@@ -16,9 +16,11 @@ from highway_env.envs.common.observation import (
     KinematicsGoalObservation,
     OccupancyGridObservation,
 )
+from highway_env.envs.highway_env import HighwayEnv
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
+from crashhunt.accelerator._agent_steps import rewards
 from crashhunt.accelerator._observe import (
     close_objects,
     fill_lanes,
@@ -36,10 +38,11 @@ from crashhunt.accelerator._roads import (
     methods_of,
     network_of,
     take,
+    take_for_observation,
     watches,
 )
 from crashhunt.accelerator._rules import collide_one_by_one, enforce, finish
-from crashhunt.accelerator._substep_loop import can_run_alone, simulate
+from crashhunt.accelerator._substep_loop import can_run_alone, run_step, simulate
 from crashhunt.accelerator._versions import Watch, kind_of, left_alone, originals, reason_against
 
 if TYPE_CHECKING:
@@ -158,6 +161,15 @@ def _simulate(self: AbstractEnv, action: object = None) -> None:
         simulate(self, action, _ROAD_REPLACEMENTS)
 
 
+def _step_env(self: AbstractEnv, action: object) -> object:
+    return run_step(self, action)
+
+
+def _rewards(self: HighwayEnv, action: object) -> dict[str, float]:
+    del action  # highway-env's rewards do not depend on it
+    return rewards(self)
+
+
 def _neighbour_vehicles(self: Road, vehicle: Vehicle, lane_index: LaneIndex | None = None) -> object:
     frame = frame_of(self)
     row = frame.row.get(id(vehicle)) if frame is not None else None
@@ -200,7 +212,7 @@ def _enforce_road_rules(self: RegulatedRoad) -> None:
 def _observe(self: KinematicObservation) -> object:
     if _is_plain(self, KinematicObservation):
         road = self.env.road
-        state = look(road) if type(road).close_objects_to is _close_objects_to else None
+        state = (take_for_observation(road) or look(road)) if type(road).close_objects_to is _close_objects_to else None
         found = observe_in_kernel(self, state) if state is not None else None
         if found is None:
             found = observe(self, frame_of(road))
@@ -272,6 +284,8 @@ _REPLACEMENTS: tuple[tuple[type | ModuleType, str, Callable[..., object]], ...] 
     (Road, "close_objects_to", _close_objects_to),
     (RegulatedRoad, "enforce_road_rules", _enforce_road_rules),
     (AbstractEnv, "_simulate", _simulate),
+    (AbstractEnv, "step", _step_env),
+    (HighwayEnv, "_rewards", _rewards),
     (KinematicObservation, "observe", _observe),
     (ExitObservation, "observe", _observe_exit),
     (KinematicsGoalObservation, "observe", _observe_goal),

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import highway_env
 import numpy as np
 from highway_env import utils
-from highway_env.envs.common import abstract, finite_mdp, observation
+from highway_env.envs import highway_env as highways
+from highway_env.envs.common import abstract, action, finite_mdp, observation
 from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, dynamics, kinematics, objects
 
@@ -185,6 +186,7 @@ def _is_method(owner: str, name: str) -> bool:
 
 
 _MODULES = (*MODULES, observation)
+_SOURCES = (*_MODULES, abstract, finite_mdp, action, highways)  # of the last four, only a few functions matter
 
 _COLLISION_METHODS = (
     "handle_collisions",
@@ -414,7 +416,7 @@ def reason_against() -> str:
     if version not in ACCELERATED:
         return f"highway-env {version} is not supported (supported: {', '.join(ACCELERATED)})"
     digest = hashlib.blake2b(digest_size=8)
-    for module in (*_MODULES, abstract, finite_mdp):  # the accelerator replaces one function of the last two
+    for module in _SOURCES:
         digest.update(Path(str(module.__file__)).read_bytes())
     if digest.hexdigest() != ACCELERATED[version]:
         return f"the installed highway-env {version} is not the published one"
@@ -427,7 +429,7 @@ def reason_against() -> str:
     return f"the compiled kernel is not used: {why_not()}" if kernel() is None else ""
 
 
-_FILES = {str(module.__file__) for module in (*_MODULES, abstract, finite_mdp)}
+_FILES = {str(module.__file__) for module in _SOURCES}
 
 
 def is_genuine(name: str, function: Callable[..., object]) -> bool:

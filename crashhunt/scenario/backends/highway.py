@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ACCELERATED", "BACKEND", "HighwaySetup"]
 
-ACCELERATED = {"1.12.1": "dee681ce9465e0ef"}
+ACCELERATED = {"1.12.1": "c2c34aaddeb8f4c7"}
 """The versions of highway-env that the accelerator knows, and the digest of the modules in which it replaces
 something."""
 _KERNEL = "_crashhunt_highway"  # the compiled module of the accelerator
