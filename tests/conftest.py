@@ -122,6 +122,7 @@ class Shell:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.environment = _usual_environment()
+        self._begun: list[Begun | subprocess.Popen[str]] = []
 
     @property
     def unmeasured(self) -> dict[str, str]:
@@ -155,11 +156,15 @@ class Shell:
         """Begin a command, in a fork where that is the same; the caller ends it."""
         if not typed and not _commands().fits(self.environment):
             return self.start(*words, start_new_session=start_new_session)
-        return _commands().begin(words, self.folder, self.environment, start_new_session=start_new_session, typed=typed)
+        begun = _commands().begin(
+            words, self.folder, self.environment, start_new_session=start_new_session, typed=typed
+        )
+        self._begun.append(begun)
+        return begun
 
     def start(self, *words: str, **options: Any) -> subprocess.Popen[str]:
         """Start a command as a shell does it, with nobody between it and its keepers; the caller ends it."""
-        return subprocess.Popen(
+        begun = subprocess.Popen(
             [str(CRASHHUNT), *words],
             cwd=self.folder,
             env=self.environment,
@@ -168,6 +173,13 @@ class Shell:
             text=True,
             **options,
         )
+        self._begun.append(begun)
+        return begun
+
+    def end(self) -> None:
+        """Kill what has begun and not ended: of a test that failed before it did so itself."""
+        for begun in self._begun:
+            begun.kill()
 
 
 def _ended(words: tuple[str, ...], done: Done, expect: int | None) -> Done:
@@ -348,10 +360,12 @@ def mostly_nightly(cases: Iterable[Any], always: Container[Any]) -> list[Any]:
 
 
 @pytest.fixture
-def shell(tmp_path: Path) -> Shell:
+def shell(tmp_path: Path) -> Iterator[Shell]:
     """An empty folder with a module `faulty` of agents that go wrong."""
     shutil.copy(FAULTY, tmp_path / "faulty.py")
-    return Shell(tmp_path)
+    shell = Shell(tmp_path)
+    yield shell
+    shell.end()
 
 
 @pytest.fixture(scope="session")
