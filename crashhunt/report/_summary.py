@@ -102,7 +102,7 @@ def _lines(rows: list[list[str]]) -> list[str]:
         "  ".join(
             cell.rjust(width) if place in (0, len(row) - 1) else cell.ljust(width)
             for place, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
+        ).rstrip()
         for row in rows
     ]
 
