@@ -130,7 +130,12 @@ def can_run_alone() -> bool:
     return all(is_genuine(name, function) for name, function in found.items())
 
 
-def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[object, str, object]]) -> None:
+def simulate(
+    env: AbstractEnv,
+    action: object,
+    replaced: Iterable[tuple[object, str, object]],
+    observe: Callable[[KinematicObservation], object],
+) -> None:
     """Compute the result of `AbstractEnv._simulate`.
 
     Args:
@@ -138,6 +143,7 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[object, 
         action: The action of the environment's agents, or None.
         replaced: The replacements that must be in place: for each, the owner of the method, its name and the
             replacement.
+        observe: The replacement of `KinematicObservation.observe`.
     """
     road = env.road
     kind = _kind_of(env)
@@ -173,7 +179,7 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[object, 
             env.steps += 1
             if frame < frames - 1:
                 env._automatic_rendering()
-        observes = found.in_step and "_simulate" in kind.inherits and _observes_plainly(env)
+        observes = found.in_step and "_simulate" in kind.inherits and _observes_with(env, observe)
     finally:
         found.alone = False
         if not observes:
@@ -232,10 +238,11 @@ def _runs_alone(env: AbstractEnv, kind: _EnvironmentKind) -> bool:
     return kind.is_plain and type(env.config) is dict
 
 
-def _observes_plainly(env: AbstractEnv) -> bool:
-    """Return whether an environment observes with a method that reads the road before other code can change it."""
+def _observes_with(env: AbstractEnv, observe: Callable[[KinematicObservation], object]) -> bool:
+    """Return whether an environment's observation is made by a function, before other code can change the road."""
     observing = vars(env).get("observation_type")
-    return type(observing) is KinematicObservation and "observe" not in vars(observing)
+    in_place = vars(KinematicObservation).get("observe") is observe
+    return in_place and type(observing) is KinematicObservation and "observe" not in vars(observing)
 
 
 def _are_in_place(replaced: Iterable[tuple[object, str, object]]) -> bool:

@@ -158,7 +158,7 @@ def _simulate(self: AbstractEnv, action: object = None) -> None:
     if self.road is None or len(self.road.vehicles) < 2:
         originals["AbstractEnv._simulate"](self, action)
     else:
-        simulate(self, action, _ROAD_REPLACEMENTS)
+        simulate(self, action, _ROAD_REPLACEMENTS, _observe)
 
 
 def _step_env(self: AbstractEnv, action: object) -> object:

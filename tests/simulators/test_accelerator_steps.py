@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from compiled import needs_kernel
 from highway_env.envs.common.action import ActionType, DiscreteMetaAction
+from highway_env.envs.common.observation import KinematicObservation
 from highway_env.envs.highway_env import HighwayEnv, HighwayEnvFast
 from highway_env.envs.merge_env import MergeEnv
 from highway_env.vehicle.controller import MDPVehicle
@@ -176,6 +177,28 @@ def test_change_between_sub_steps_and_observation_is_observed(kind, change):
     assert slow == fast
     assert slow != trace(made, lambda env: None, ACTIONS)  # it matters
     assert not isinstance(slow[-1], str)
+
+
+def test_replaced_observation_sees_what_it_changes(monkeypatch):
+    def observe(observation):
+        road = observation.env.road
+        road.vehicles.pop()
+        road.act()  # of the vehicles that are left
+        return original(observation)
+
+    slow, fast = [], []
+    for found in (slow, fast):
+        switch_off()
+        monkeypatch.undo()
+        if found is fast:
+            switch_on()
+        env = made()
+        env.step(1)
+        original = KinematicObservation.observe
+        monkeypatch.setattr(KinematicObservation, "observe", observe)
+        for _ in range(2):
+            found += [exact(env.step(1)), [exact(vars(vehicle)) for vehicle in env.road.vehicles]]
+    assert slow == fast
 
 
 def test_observation_does_not_read_the_road_again(monkeypatch):
