@@ -14,7 +14,7 @@ Cost: one run in which the reference driver watches, three or six for each candi
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise, takewhile
+from itertools import takewhile
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
@@ -53,8 +53,8 @@ _EARLIER_S = (0.0, 0.5, 1.0)  # the reference driver takes over from these times
 _LONGER_S = 5.0  # simulation time past the crash: a reference driver may only postpone it
 _MAX_CANDIDATES = 4
 _SPEED_CHANGED_MPS = 0.5  # less is no braking
-_INSTEAD_S = 2.0  # before the crash: whether the agent then sped up for most of the time
-_SPEEDS_UP_MPS2 = 0.3  # less is a kept speed
+_INSTEAD_S = 2.0  # before the crash: whether the agent then sped up
+_SPEEDS_UP_MPS2 = 0.3  # on average over this time; less is a kept speed
 _INCONCLUSIVE_OUTCOMES = (Outcome.INVALID, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
 _NOT_IDENTICAL_REASON = "the trial was not bit-identical when it was run again"
 _OLD_SNAPSHOT_REASON = (
@@ -244,8 +244,9 @@ class _Search:
         last = speeds[-1 - round(_INSTEAD_S / self._dt) :]
         if speeds and speeds[-1] <= max(speeds[0], last[0]) - _SPEED_CHANGED_MPS:
             return "braked too little"
-        faster = sum(after - before > _SPEEDS_UP_MPS2 * self._dt for before, after in pairwise(last))
-        return "sped up" if 2 * faster > len(last) - 1 else "kept its speed"
+        # The average, because a vehicle that reaches its top speed stops to accelerate, whatever its agent asks for.
+        gained = last[-1] - last[0] if last else 0.0
+        return "sped up" if gained > _SPEEDS_UP_MPS2 * (len(last) - 1) * self._dt else "kept its speed"
 
     def _kept_s(self, speeds: list[float]) -> float:
         """Return for how long before the crash the agent kept the speed that it had in the end."""
