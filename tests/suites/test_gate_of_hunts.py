@@ -1,0 +1,143 @@
+"""A gate of several hunts whose trials are made up: how pairs are shared, what ends it, and what it reports."""
+
+from __future__ import annotations
+
+import math
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from crashhunt.base import layout
+from crashhunt.base.errors import NoValidTrialError, UsageError
+from crashhunt.ledger import Ledger
+from crashhunt.plans import HuntSettings, Request, RunSettings, write_settings
+from crashhunt.suites import Gate, GateVersion, RunRequest, _gate
+from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
+
+SEED = 4
+
+
+def gate(tmp_path, names=("a", "b", "c"), *, most=10, **more):
+    hunts = {
+        name: RunRequest(Request(scenario="loop", trials=1, max_steps=9, seed=SEED, run=RunSettings()), str(tmp_path))
+        for name in names
+    }
+    versions = {"base": GateVersion("m:Old", {"": "m:Old"}), "head": GateVersion("m:New", {"": "m:New"})}
+    return Gate(**versions, hunts=hunts, folder=tmp_path, most=most, is_suite=len(names) > 1, **more)
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """Hunts run at once: BASE crashes in the trials in `crashes[0]`, HEAD in those in `crashes[1]`."""
+    calls, crashes = [], [set(), set()]
+
+    def run_all(folders, slots, *, watch, machine, is_enough, environments):
+        for folder in folders:
+            asked = RunRequest.read(folder / layout.REQUEST).request
+            calls.append((folder, slots, machine, asked))
+            settings = HuntSettings(scenario="loop", scenario_digest="0", trials=asked.trials, max_steps=9, seed=SEED,
+                                    run=asked.run)  # fmt: skip
+            write_settings(folder / layout.HUNT, settings, ["crashhunt", "gate"])
+            with closing(Ledger(folder / layout.LEDGER, writable=True)) as ledger:
+                for number in range(asked.trials):
+                    outcome = Outcome.COLLISION if number in crashes[folder.name == "head"] else Outcome.SURVIVED
+                    failure = Failure("invalid", "it does not fit") if "invalid" in crashes else None
+                    outcome = Outcome.INVALID if failure else outcome
+                    result = TrialResult(TrialSpec(number, number, {}, {}, 9), outcome, steps=5, failure=failure)
+                    ledger.record(result, snapshot="0")
+                ledger.enter("no_valid_trial" if "invalid" in crashes else "all_trials", "it does not fit")
+        watch()
+        is_enough()
+
+    monkeypatch.setattr(_gate, "run_all", run_all)
+    return calls, crashes
+
+
+def test_pairs_are_shared_by_all_hunts_and_both_versions_run_with_equal_seeds(tmp_path, ran):
+    calls, crashes = ran
+    crashes[1].update((1, 2))
+    seen = []
+    report = gate(tmp_path).run(tmp_path / "g", seen.append)
+    assert [(folder.relative_to(tmp_path / "g").as_posix(), asked.trials) for folder, *_, asked in calls] == [
+        ("a/base", 4), ("a/head", 4), ("b/base", 3), ("b/head", 3), ("c/base", 3), ("c/head", 3),
+    ]  # fmt: skip
+    assert [asked.agents for *_, asked in calls] == [{"": "m:Old"}, {"": "m:New"}] * 3
+    assert all(asked.run.keep_going and asked.seed == SEED for *_, asked in calls)
+    assert all(slots >= 2 for _, slots, *_ in calls)
+    assert [machine["trials"] for _, _, machine, _ in calls] == [4, 4, 3, 3, 3, 3]
+    assert [(one.name, one.pairs, one.only_base, one.only_head) for one in report.scenarios] == [
+        ("a", 4, 0, 2), ("b", 3, 0, 2), ("c", 3, 0, 2),
+    ]  # fmt: skip
+    assert (report.pairs, report.only_base, report.only_head, report.both) == (10, 0, 6, 0)
+    assert report.evidence > 1
+    assert seen[-1].name == "c"
+    assert (seen[-1].done, seen[-1].most, seen[-1].only_base, seen[-1].only_head) == (10, 10, 0, 6)
+    assert seen[-1].evidence == pytest.approx(report.evidence)
+    assert [one.done for one in seen] == sorted(one.done for one in seen)
+    # A gate with the same command continues, and one with other versions is refused.
+    calls.clear()
+    assert gate(tmp_path).run(tmp_path / "g").to_json() == report.to_json()
+    assert calls == []
+
+
+@pytest.mark.parametrize(("worse", "hunts"), [(True, 1), (False, 3)])
+def test_only_worse_ends_a_suite_before_its_last_hunt(tmp_path, ran, worse, hunts):
+    calls, crashes = ran
+    crashes[worse].update(range(100))
+    report = gate(tmp_path, most=90).run(tmp_path / "g")
+    assert report.verdict == ("worse" if worse else "better")
+    assert len(calls) == 2 * hunts
+
+
+def test_a_gate_ends_in_the_middle_once_the_difference_is_within_the_margin(tmp_path, ran):
+    report = gate(tmp_path, ["loop"], most=400, margin=0.05).run(tmp_path / "g")
+    assert report.verdict == "no_difference"
+    assert 0 < report.pairs < 400
+    assert report.scenarios[0].pairs == report.pairs
+    assert -0.05 <= report.difference.low <= 0 <= report.difference.high <= 0.05
+
+
+def test_equal_hunts_without_a_margin_are_undecided_for_a_reason(tmp_path, ran):
+    report = gate(tmp_path, ["loop"], most=20).run(tmp_path / "g")
+    assert (report.verdict, report.pairs, report.evidence) == ("undecided", 20, pytest.approx(1.0))
+    assert report.why
+    assert not report.is_interrupted
+    report = gate(tmp_path, ["loop"], most=20, duration_s=-1.0).run(tmp_path / "late")
+    assert "the time is up" in report.why
+
+
+def test_an_interrupt_reports_what_there_is(tmp_path, ran, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_gate, "run_all", interrupted)
+    report = gate(tmp_path).run(tmp_path / "g")
+    assert (report.verdict, report.is_interrupted, report.why) == ("undecided", True, "interrupted")
+
+
+def test_a_hunt_without_a_valid_trial_is_an_error_of_its_version(tmp_path, ran):
+    ran[1].append("invalid")
+    with pytest.raises(NoValidTrialError, match="no trial can be set up: it does not fit") as caught:
+        gate(tmp_path, ["loop"]).run(tmp_path / "g")
+    assert caught.value.where == "BASE (m:Old)"
+
+
+def test_hunts_of_a_suite_have_their_own_seeds_that_come_from_the_gates(tmp_path, ran):
+    calls, _ = ran
+    asked = gate(tmp_path)
+    for name, run in asked.hunts.items():
+        asked.hunts[name] = RunRequest(Request(scenario="loop", trials=1, max_steps=9, run=RunSettings()), run.folder)
+    report = asked.run(tmp_path / "g")
+    wanted = [int(np.random.SeedSequence(report.seed, spawn_key=(n,)).generate_state(1)[0]) for n in range(3)]
+    assert [one.seed for *_, one in calls] == [seed for seed in wanted for _ in range(2)]
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"most": 0}, {"most": 2}, {"margin": 1.0}, {"margin": -0.1}, {"confidence": 100.0}, {"parallel": -1}]
+)
+def test_limits_out_of_range_are_refused_before_anything_is_written(tmp_path, wrong):
+    with pytest.raises(UsageError):
+        gate(tmp_path, **wrong).run(tmp_path / "g")
+    assert not (tmp_path / "g").exists()
+    assert math.isinf(gate(tmp_path).duration_s)

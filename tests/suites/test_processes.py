@@ -1,0 +1,169 @@
+"""How the hunts of a suite share the machine, and what becomes of those that cannot run; the processes are made up."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+
+import pytest
+
+from crashhunt.base import layout
+from crashhunt.base.errors import HuntDirectoryError, UsageError
+from crashhunt.hunts import hunt_state
+from crashhunt.plans import Request, RunSettings, SnapshotChoices
+from crashhunt.suites import RunRequest, _processes, rerun, run_all
+from crashhunt.suites._processes import REQUEST, check_machine, set_aside, write_request
+
+ASKED = RunRequest(
+    Request(scenario="loop", trials=7, max_steps=9, seed=3, arguments={"speed": "4"}, run=RunSettings(keep_going=True)),
+    "/somewhere",
+    SnapshotChoices(snapshot_limit_mb=7.0),
+)
+
+
+@pytest.fixture
+def folders(tmp_path):
+    found = [tmp_path / name for name in "abc"]
+    for folder in found:
+        folder.mkdir()
+        write_request(folder, ASKED)
+    return found
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """Which hunts were started with which options; each takes as long as `sleeps` has for its name, or an instant."""
+    calls, sleeps = [], {}
+
+    def start(folder, run, environment):
+        if isinstance(error := sleeps.get(folder.name, 0), Exception):
+            raise error
+        process = subprocess.Popen(["sleep", str(error)])
+        calls.append((folder.name, run, environment, process))
+        return process
+
+    monkeypatch.setattr(_processes, "_start", start)
+    monkeypatch.setattr(_processes, "_LOOK_EVERY_S", 0.01)
+    monkeypatch.setattr(_processes, "_WATCH_EVERY_S", 0.01)
+    return calls, sleeps
+
+
+def test_a_request_is_read_as_it_was_written(tmp_path):
+    write_request(tmp_path, ASKED)
+    assert RunRequest.read(tmp_path / REQUEST) == ASKED
+    (tmp_path / REQUEST).write_text(json.dumps({"request": {}}))
+    with pytest.raises(HuntDirectoryError, match=r"no request\.json"):
+        RunRequest.read(tmp_path / REQUEST)
+
+
+def test_the_last_hunts_share_the_slots_and_have_the_options_of_the_machine(folders, started):
+    calls, sleeps = started
+    sleeps.update(a=0.05)
+    run_all(folders, 2, machine={"executor": "fresh"}, environments={folders[1]: {"WHO": "b"}})
+    assert [(name, run["parallel"]) for name, run, *_ in calls] == [("a", 1), ("b", 1), ("c", 1)]
+    assert all(run["executor"] == "fresh" for _, run, *_ in calls)
+    assert [environment for *_, environment, _ in calls] == [None, {"WHO": "b"}, None]
+    calls.clear()
+    run_all(folders, 8)
+    assert [(name, run["parallel"]) for name, run, *_ in calls] == [("a", 2), ("b", 3), ("c", 3)]
+
+
+def test_a_hunt_that_cannot_be_started_is_an_error_and_the_others_run(folders, started):
+    calls, sleeps = started
+    sleeps.update(a=HuntDirectoryError("no request.json", fix="plan it again"))
+    looks = []
+    run_all(folders, 1, watch=lambda: looks.append(hunt_state(folders[0]).state))
+    assert [name for name, *_ in calls] == ["b", "c"]
+    state = hunt_state(folders[0])
+    assert (state.state, state.detail) == ("error", "no request.json; plan it again")
+    assert looks[-1] == "error"
+
+
+def test_where_it_is_enough_running_hunts_are_stopped_and_no_more_are_started(folders, started):
+    calls, sleeps = started
+    sleeps.update(a=60, b=60)
+    run_all(folders, 2, watch=lambda: None, is_enough=lambda: True)
+    assert [(name, process.returncode) for name, *_, process in calls] == [("a", -signal.SIGINT), ("b", -signal.SIGINT)]
+
+
+@pytest.mark.parametrize(
+    ("error", "detail", "trace"),
+    [
+        (KeyError("gone"), "KeyError: 'gone'", True),
+        (UsageError("no such agent", fix="name it"), "no such agent; name it", False),
+    ],
+)
+def test_the_process_of_a_hunt_records_why_it_could_not_run(folders, monkeypatch, error, detail, trace):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(_processes, "_planned", fail)
+    monkeypatch.setattr(_processes.sys, "platform", "other")  # this process must not end with its parent
+    _processes._main(folders[0], {}, os.getppid())
+    state = hunt_state(folders[0])
+    assert (state.state, state.detail) == ("error", detail)
+    log = (folders[0] / layout.ERROR_LOG).read_text()
+    assert log.startswith(detail)
+    assert ("Traceback" in log) == trace
+
+
+def test_results_that_are_replaced_are_moved_next_to_the_hunt_each_time(folders):
+    folder, asked = folders[0], []
+    for number in range(2):
+        (folder / "result").write_text(f"{number}")
+
+        def planned(aside):
+            asked.append(aside)
+            return ASKED
+
+        aside = set_aside(folder, planned)
+        assert aside.parent == folder.parent
+        assert (aside / "result").read_text() == f"{number}"
+        assert asked[-1] == aside
+        assert [path.name for path in folder.iterdir()] == [REQUEST]
+    assert len({*asked}) == 2
+
+
+def test_a_changed_copy_runs_elsewhere_and_the_hunt_stays(folders, started, tmp_path):
+    calls, _ = started
+    before = (folders[0] / REQUEST).read_bytes()
+    changes = {"trials": "11", "seed": "5", "speed": "6"}
+    states, replaced = rerun([folders[0]], changes=changes, to=tmp_path / "copy", trusted=True, parallel=1)
+    assert ([state.dir for state in states], replaced) == ([str(tmp_path / "copy")], [])
+    assert [(name, run) for name, run, *_ in calls] == [("copy", {"parallel": 1})]
+    assert (folders[0] / REQUEST).read_bytes() == before
+    asked = RunRequest.read(tmp_path / "copy" / REQUEST).request
+    assert (asked.trials, asked.seed, asked.max_steps) == (11, 5, 9)
+    assert [*asked.arguments.values()] == ["6"]
+    rerun([folders[0]], changes=changes, to=tmp_path / "copy", trusted=True)  # the same command resumes
+    with pytest.raises(HuntDirectoryError, match="exists already"):
+        rerun([folders[0]], changes={"seed": "6"}, to=tmp_path / "copy", trusted=True)
+    with pytest.raises(UsageError, match="takes one hunt, but there are 2"):
+        rerun(folders[:2], changes=changes, to=tmp_path / "other", trusted=True)
+
+
+def test_only_hunts_that_need_it_run_again_unless_all_are_asked_for(folders, started):
+    calls, sleeps = started
+    sleeps.update(a=HuntDirectoryError("damaged", fix="plan it again"))
+    run_all(folders[:1], 1)
+    sleeps.clear()
+    states, replaced = rerun(folders[:2], trusted=True, parallel=1)
+    assert [name for name, *_ in calls] == ["a", "b"]  # one failed, the other never ran
+    assert [path.name for path in replaced] == [f"a{layout.REPLACED}0"]
+    assert [state.state for state in states] == ["queued", "queued"]  # the made-up processes do nothing
+    with pytest.raises(UsageError, match="--set seed: a hunt cannot change its settings"):
+        rerun(folders[:1], changes={"seed": "4"}, trusted=True)
+    _, replaced = rerun(folders[:1], everything=True, changes={"seed": "4"}, trusted=True)
+    assert [path.name for path in replaced] == [f"a{layout.REPLACED}1"]
+    assert RunRequest.read(folders[0] / REQUEST).request.seed == 4
+    assert RunRequest.read(replaced[0] / REQUEST) == ASKED
+
+
+@pytest.mark.parametrize(("parallel", "machine"), [(-1, None), (1, {"executor": "gone"}), (1, {"recycle_after": -1})])
+def test_options_of_the_machine_are_checked_before_any_hunt_runs(parallel, machine):
+    check_machine(1, {"executor": "fresh"})
+    with pytest.raises(Exception, match=r".+") as caught:
+        check_machine(parallel, machine)
+    assert "\n" not in str(caught.value)
