@@ -18,6 +18,7 @@ import importlib
 import json
 import os
 import random
+import shutil
 import signal
 import sys
 import tempfile
@@ -30,7 +31,7 @@ from copies import ROOT, Slot, Watcher
 from slips import Slip, find_slips
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
 ENOUGH = 0.2  # the share of survivors that is tolerated
 EQUIVALENT = ROOT / "scripts" / "equivalent_slips.json"
@@ -98,7 +99,11 @@ _TESTS_ELSEWHERE = {
     "hunts/_results.py": ("hunts/test_results.py", "hunts/test_trial_rows.py"),
     "hunts/_state.py": ("hunts/test_directory.py", "hunts/test_phases.py", "hunts/test_states_and_reports.py"),
     "hunts/_verification.py": ("hunts/test_from_the_start.py", "hunts/test_whole_hunts.py", "e2e/test_audit.py"),
+    # These are fast, and their tests lie by what a user does, not by module.
+    "maps": ("maps/test_*.py",),
     "recording": ("recording/test_*.py",),
+    "report": ("report/test_*.py",),
+    "scenario": ("scenario/test_*.py",),
     "replays/_debugger.py": ("e2e/test_debugger.py",),
     "replays/_prepare.py": ("replays/test_prepare.py", "e2e/test_replay.py"),
     "replays/_replay.py": ("replays/test_killed_replays.py", "e2e/test_replay.py"),
@@ -382,6 +387,16 @@ def _part(text: str) -> tuple[int, int]:
     return part, parts
 
 
+@contextlib.contextmanager
+def _folder() -> Iterator[Path]:
+    """Make a folder that only this process removes: a test may fork, and a fork may end as a whole Python does."""
+    folder = Path(tempfile.mkdtemp(prefix="crashhunt-mutate-"))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def main() -> int:
     """Run, and return 1 where too many slips of a package survive."""
     options = parsed()
@@ -394,8 +409,8 @@ def main() -> int:
     failed: list[str] = []
     listed = equivalents()
     everything = {name: targets_of(name, options.tests) for name in asked}
-    with tempfile.TemporaryDirectory(prefix="crashhunt-mutate-") as folder:
-        slots = [Slot(Path(folder) / str(number)) for number in range(options.parallel)]
+    with _folder() as folder:
+        slots = [Slot(folder / str(number)) for number in range(options.parallel)]
         try:
             for name, targets in everything.items():
                 slips = [(target, slip) for target in targets for slip in find_slips(target.source)]

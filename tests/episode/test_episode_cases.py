@@ -427,7 +427,8 @@ class Failing:
 def test_failure_of_an_oracle_of_a_users_ends_it(run, error, outcome):
     log = []
     result = run(drivers={"ego": Driver(log=log)}, oracles=(Failing(error),))
-    assert (result.outcome, result.steps, result.failure.message) == (outcome, 1, str(error))
+    assert (result.outcome, result.steps) == (outcome, 1)
+    assert result.failure.message.startswith(str(error))  # a limit on memory is named with it
     assert (result.failure.party, result.failure.place) == ("oracle", "check")
     assert result.digest == run.recording().digest
     assert log[-1] == "closed"

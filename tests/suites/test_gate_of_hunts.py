@@ -131,6 +131,8 @@ def test_hunts_of_a_suite_have_their_own_seeds_that_come_from_the_gates(tmp_path
     report = asked.run(tmp_path / "g")
     wanted = [int(np.random.SeedSequence(report.seed, spawn_key=(n,)).generate_state(1)[0]) for n in range(3)]
     assert [one.seed for *_, one in calls] == [seed for seed in wanted for _ in range(2)]
+    assert asked.run(tmp_path / "g").seed == report.seed
+    assert asked.run(tmp_path / "h").seed != report.seed
 
 
 @pytest.mark.parametrize(

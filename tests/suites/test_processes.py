@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 
 import pytest
 
@@ -107,6 +108,15 @@ def test_the_process_of_a_hunt_records_why_it_could_not_run(folders, monkeypatch
     log = (folders[0] / layout.ERROR_LOG).read_text()
     assert log.startswith(detail)
     assert ("Traceback" in log) == trace
+
+
+def test_a_process_of_its_own_begins_with_the_folder_the_options_and_its_parent(folders):
+    """Other tests fork it, which leaves out how Python starts."""
+    (folders[0] / REQUEST).write_text("{}")
+    command = [sys.executable, "-P", "-m", "crashhunt.suites._processes", str(folders[0]), "{}", str(os.getpid())]
+    subprocess.run(command, check=True, timeout=60)
+    assert hunt_state(folders[0]).state == "error"
+    assert REQUEST in hunt_state(folders[0]).detail
 
 
 def test_results_that_are_replaced_are_moved_next_to_the_hunt_each_time(folders):
