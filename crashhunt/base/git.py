@@ -72,7 +72,7 @@ def _tracked_files(top: Path, _index: tuple[int, int, int]) -> frozenset[str]:
     The list is cached until git's index changes, because a corpus may have hundreds of cases.
     """
     found = _run_git(top, "ls-files", "-z") or b""
-    return frozenset(map(os.fsdecode, found.split(b"\0")))
+    return frozenset(map(os.fsdecode, filter(None, found.split(b"\0"))))
 
 
 def _run_git(folder: Path, *words: str) -> bytes | None:

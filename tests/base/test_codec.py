@@ -12,7 +12,17 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.base.codec import OMIT_DEFAULT, Serializable, null_is, plain_types, prepare, written_if
+from crashhunt.base.codec import (
+    ESSENTIAL,
+    OMIT_DEFAULT,
+    Serializable,
+    essentials,
+    not_understood,
+    null_is,
+    plain_types,
+    prepare,
+    written_if,
+)
 
 
 class Colour(StrEnum):
@@ -112,3 +122,25 @@ def test_types_of_plain_data_are_those_of_the_annotations():
         "file": str | None, "note": str, "count": int,
     }  # fmt: skip
     assert plain_types(Part) == ({"name": str}, {"name": str, "gap_m": float | None})
+
+
+@dataclass(frozen=True)
+class _Inner:
+    deep: int = field(default=0, metadata=ESSENTIAL)
+    light: int = 0
+
+
+@dataclass(frozen=True)
+class _Outer:
+    parts: tuple[_Inner, ...] = ()
+    by_name: Mapping[str, _Inner] | None = None
+    kind: str = field(default="", metadata=ESSENTIAL)
+    words: str = ""
+
+
+def test_a_reader_that_lacks_an_essential_field_knows_that_it_does_not_understand():
+    assert essentials(_Outer) == {"deep", "kind"}
+    assert essentials(_Inner, str) == {"deep"}
+    assert not_understood(["kind", "deep"], _Outer) == []
+    assert not_understood(["kind", "deep", "later"], _Inner) == ["kind", "later"]
+    assert not_understood([], _Inner) == []

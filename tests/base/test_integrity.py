@@ -1,0 +1,65 @@
+"""Types of JSON data, and whether files are as they were described."""
+
+from __future__ import annotations
+
+import pytest
+
+from crashhunt.base.integrity import (
+    changed_file,
+    describe_files,
+    digest_of_content,
+    digest_of_data,
+    digest_of_file,
+    typed,
+)
+
+FITS = [
+    (3, int), (3, float), (3.5, float), ("x", str), (True, bool), (None, int | None), (4, int | None),
+    ([], list[int]), ([1, 2], list[int]), ({}, dict[str, int]), ({"a": 1}, dict[str, int]),
+    ({"a": {"b": "c"}}, dict[str, dict[str, int | str]]),
+]  # fmt: skip
+FAILS = [
+    (True, int), (True, float), (3.5, int), (1 << 63, int), ("3", int), (3, str), ("x", int | None),
+    ([1, "2"], list[int]), (["2", 1], list[int]), ("ab", list[str]), ({"a": 1}, list[int]), ([1], dict[str, int]),
+    ({"a": 1, "b": "c"}, dict[str, int]), ({"a": {"b": None}}, dict[str, dict[str, int | str]]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("value", "kind"), FITS)
+def test_a_value_of_its_type_is_accepted(value, kind):
+    typed({"key": value, "other": object()}, {"key": kind})
+
+
+@pytest.mark.parametrize(("value", "kind"), FAILS)
+def test_a_value_of_another_type_is_named_with_its_key(value, kind):
+    with pytest.raises(ValueError, match=r"key is .*, not ") as caught:
+        typed({"key": value}, {"key": kind})
+    assert "\n" not in str(caught.value)
+
+
+def test_a_key_that_is_missing_is_named():
+    with pytest.raises(ValueError, match="'other' is missing"):
+        typed({"key": 1}, {"key": int, "other": int})
+
+
+def test_files_are_described_with_those_in_folders_and_any_change_is_seen(tmp_path):
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "a" / "b" / "inner").write_bytes(b"12345")
+    (tmp_path / "top").write_bytes(b"")
+    found = describe_files(tmp_path / "a" / "b")
+    entry = found["inner"]
+    assert entry["size"] == 5
+    assert entry["blake2b"] == digest_of_file(tmp_path / "a" / "b" / "inner") == digest_of_content(b"12345")
+    file = tmp_path / "a" / "b" / "inner"
+    assert not changed_file(file, entry)
+    file.write_bytes(b"12346")
+    assert "changed" in changed_file(file, entry)
+    file.write_bytes(b"1234")
+    assert changed_file(file, entry)
+    file.unlink()
+    assert "missing" in changed_file(file, entry)
+
+
+def test_the_digest_of_data_does_not_depend_on_the_order_of_keys():
+    assert digest_of_data({"a": 1, "b": [1, 2]}) == digest_of_data({"b": [1, 2], "a": 1})
+    assert digest_of_data({"a": 1, "b": [1, 2]}) != digest_of_data({"a": 1, "b": [2, 1]})
