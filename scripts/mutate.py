@@ -43,7 +43,8 @@ _TESTS_ELSEWHERE = {
     "base/forks.py": ("base/test_reaper.py", "episode/test_fork.py", "episode/test_questions.py"),
     "base/git.py": ("base/test_git.py",),
     "base/integrity.py": ("base/test_integrity.py", "base/test_authentication.py"),
-    "panels": ("render/test_panels.py",),
+    "panels": ("render/test_panels.py", "render/test_panels_drawn.py"),
+    "rates/_rare.py": ("rates/test_rare.py", "rates/test_splitting.py", "hunts/test_rare_hunts.py"),
     # These are tested as users run them: as commands.
     "cli/_compare.py": ("e2e/test_manage.py",),
     "cli/_crashes.py": ("e2e/test_types_by_cause.py",),
