@@ -1,0 +1,207 @@
+"""What a picture of a scene shows: where vehicles are, which way they face, persons, trails, scale and marks."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("PIL")
+
+from crashhunt.panels import Action, Curve
+from crashhunt.recording import Prologue, StepRecord
+from crashhunt.render import FilmOptions, Shot
+from crashhunt.render._film import _Builtin, _steps, save_panels, shown_steps
+from crashhunt.render._scene import SceneView
+from crashhunt.world import PERSON, Actor, Roster, Scene
+
+EGO, CRASH, AGENT, OTHER, MARK = (224, 138, 0), (198, 40, 40), (46, 158, 91), (125, 139, 156), (170, 180, 192)
+WIDTH, HEIGHT, SCALE = 400, 300, 8.0
+MIDDLE = np.array([WIDTH / 2, HEIGHT / 2])
+
+
+def recording(*steps, actors, dt=0.1, agents=("ego",), actions=None, disturbances=()):
+    """Each step has x, y, heading and speed of each actor by name; the place is that of the front."""
+    records = []
+    for number, places in enumerate(steps):
+        roster = Roster(tuple(actor for actor in actors if actor.id in places))
+        found = [places[actor.id] for actor in roster.actors]
+        scene = Scene(number * dt, roster, [(x, y) for x, y, *_ in found], [float(one[2]) for one in found],
+                      [float(one[3]) for one in found])  # fmt: skip
+        records.append(StepRecord(number, scene, actions=(actions or {}).get(number, {})))
+    return SimpleNamespace(
+        all_steps=records, prologue=Prologue((), dt), steps=len(steps) - 1, agents=[*agents], actors=[*actors],
+        disturbances=disturbances, scenes=lambda: [record.scene for record in records],
+        scene=lambda n: records[n].scene,
+    )  # fmt: skip
+
+
+CAR, TRUCK = Actor("ego", "passenger", 5.0, 2.0), Actor("other", "truck", 12.0, 2.5)
+
+
+def view(found, **more):
+    return SceneView(found, [], **{"agent": "ego", "width": WIDTH, "height": HEIGHT, "scale": SCALE, **more})
+
+
+def box(picture, color, tolerance=0):
+    """Where a colour is, as middle and size in pixels."""
+    near = np.abs(picture.astype(int) - color).max(axis=2) <= tolerance
+    near[:110, :150] = False  # the legend
+    rows, columns = np.nonzero(near)
+    low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()])
+    return (low + high + 1) / 2, high - low + 1
+
+
+@pytest.mark.parametrize("heading", [0.0, math.pi / 2, math.pi])
+def test_the_agent_is_in_the_middle_and_its_windscreen_in_its_front_half(heading):
+    picture = view(recording({"ego": (70.0, -9.0, heading, 5.0)}, actors=[CAR])).draw(0)
+    at, size = box(picture, EGO)
+    assert at == pytest.approx(MIDDLE, abs=1)
+    along, across = (0, 1) if abs(math.cos(heading)) > 0.5 else (1, 0)
+    assert size[along] == pytest.approx(5.0 * SCALE, abs=2)
+    assert size[across] == pytest.approx(2.0 * SCALE, abs=2)
+    ahead = np.array([math.cos(heading), -math.sin(heading)])  # rows grow downwards
+    inner = np.abs(picture.astype(int) - [part // 2 for part in EGO]).max(axis=2) == 0
+    rows, columns = np.nonzero(inner)
+    inside = (
+        np.abs(columns - MIDDLE[0]) < 2.3 * SCALE if along == 0 else np.abs(columns - MIDDLE[0]) < 0.8 * SCALE
+    ) & (np.abs(rows - MIDDLE[1]) < (0.8 * SCALE if along == 0 else 2.3 * SCALE))
+    place = np.array([columns[inside].mean() + 0.5, rows[inside].mean() + 0.5]) - MIDDLE
+    assert place @ ahead == pytest.approx((2.5 - 0.28 * 5.0) * SCALE, abs=1.5)
+    assert abs(place @ ahead[::-1]) < 1.5
+
+
+def test_others_are_where_they_are_relative_to_the_agent_north_up():
+    places = {"ego": (2.5, 0.0, 0.0, 5.0), "other": (16.0, 8.0, 0.0, 5.0), "b": (-9.5, -6.0, 0.0, 5.0)}
+    found = recording(places, actors=[CAR, TRUCK, Actor("b", "passenger", 5.0, 2.0)], agents=("ego", "b"))
+    picture = view(found, other="other").draw(0)
+    for color, middle, size in ((CRASH, (10.0, 8.0), (12.0, 2.5)), (AGENT, (-12.0, -6.0), (5.0, 2.0))):
+        at, extent = box(picture, color)
+        assert (at - MIDDLE) / SCALE == pytest.approx((middle[0], -middle[1]), abs=0.2)
+        assert extent / SCALE == pytest.approx(size, abs=0.3)
+
+
+@pytest.mark.parametrize(("scale", "radius"), [(8.0, 4.0), (40.0, 10.0)])
+def test_a_person_is_a_disc_that_can_be_seen(scale, radius):
+    person = Actor(f"{PERSON}a", "pedestrian", 0.5, 0.5)
+    places = {"ego": (0.0, 0.0, 0.0, 0.0), person.id: (2.25, -2.0, 0.0, 1.0)}
+    picture = view(recording(places, actors=[CAR, person]), scale=scale).draw(0)
+    at, size = box(picture, OTHER)
+    assert at == pytest.approx(MIDDLE + np.array([2.0 + 2.5, 2.0]) * scale, abs=1.5)
+    assert size == pytest.approx([2 * radius] * 2, abs=2)
+
+
+def test_the_trail_shows_where_the_agent_was_in_the_last_4_seconds():
+    steps = [{"ego": (0.5 * number, 0.0, 0.0, 5.0)} for number in range(101)]
+    picture = view(recording(*steps, actors=[CAR])).draw(100)
+    pale = tuple((part + 255) // 2 for part in EGO)
+    at, size = box(picture, pale)
+    left = at[0] - size[0] / 2
+    assert (MIDDLE[0] - left) / SCALE == pytest.approx(20.0 - 2.5, abs=0.4)  # 4 s at 5 m/s, from the front
+
+
+@pytest.mark.parametrize(("scale", "meters"), [(8.0, 10), (2.0, 50), (20.0, 5), (0.5, 200)])
+def test_the_scale_is_a_line_of_a_round_length(scale, meters):
+    picture = view(recording({"ego": (0.0, 0.0, 0.0, 0.0)}, actors=[CAR]), scale=scale).draw(0)
+    row = (np.abs(picture[HEIGHT - 12].astype(int) - (93, 107, 125)).max(axis=1) < 3).nonzero()[0]
+    assert (row.min(), row.max()) == (14, pytest.approx(14 + meters * scale, abs=1))
+
+
+def test_lanes_in_sight_are_drawn_between_their_borders():
+    x = np.linspace(-100, 100, 20)
+    lane = (np.stack((x, np.full(20, -5.0)), 1), np.stack((x, np.full(20, -2.0)), 1))
+    far = (lane[0] + [0, 500], lane[1] + [0, 500])
+    found = recording({"ego": (2.5, 0.0, 0.0, 0.0)}, actors=[CAR])
+    picture = view(found, scale=8.0).draw(0)
+    with_lanes = SceneView(found, [lane, far], agent="ego", width=WIDTH, height=HEIGHT, scale=8.0).draw(0)
+    column = (with_lanes[:, 300] != picture[:, 300]).any(axis=1).nonzero()[0]
+    assert (column.min(), column.max()) == (pytest.approx(150 + 16, abs=1), pytest.approx(150 + 40, abs=1))
+    assert tuple(with_lanes[150 + 28, 300]) == (228, 232, 237)
+
+
+def test_a_crash_is_marked_in_its_step_and_a_near_miss_for_a_second():
+    steps = [{"ego": (2.5, 0.0, 0.0, 0.0)} for _ in range(14)]
+    found = recording(*steps, actors=[CAR], dt=0.25)
+
+    def marked(**more):
+        pictures = view(found, width=200, height=160, **more)
+        return [step for step in range(14) if (pictures.draw(step)[:110] == CRASH).all(axis=2).any()]
+
+    assert marked() == []
+    assert marked(crash_step=7) == [7]
+    assert marked(nearest_step=5) == [5, 6, 7, 8, 9]
+
+
+# The panels of every film.
+
+
+def following(dt=0.1, steps=40, other="other"):
+    """Ego comes closer to a standing truck by 1 m in each step, beginning 90 m behind it."""
+    places = [{"ego": (float(n), 0.0, 0.0, 1.0 / dt), "other": (102.0, 0.0, 0.0, 0.0)} for n in range(steps + 1)]
+    actions = {n: {"ego": np.array([3.0 - n, 0.5])} for n in range(1, steps + 1)}
+    found = recording(*places, actors=[CAR, TRUCK], dt=dt, actions=actions)
+    return Shot(found, [], "ego", other, -1, {})
+
+
+@pytest.mark.parametrize("other", ["other", ""])
+def test_panels_show_time_to_collision_gap_and_speed_of_the_last_seconds(other):
+    shot = following(other=other, steps=120)
+    for step in (60, 75):
+        panels = dict(_Builtin(shot).panels(step))
+        times, gaps, speeds = [panel for panel in panels.values() if isinstance(panel, Curve)]
+        shown = len(times.x)
+        assert times.x[-1] == pytest.approx(step / 10)
+        assert np.diff(times.x) == pytest.approx(0.1)
+        assert shown == len(times.series) == len(gaps.series) == len(speeds.series)
+        assert shown <= step + 1
+        assert gaps.series[-1] == pytest.approx(90.0 - step)
+        assert times.series[-1] == pytest.approx((90.0 - step) / 10)
+        assert speeds.series[-1] == pytest.approx(10.0)
+        (action,) = [panel for panel in panels.values() if isinstance(panel, Action)]
+        assert action.value == pytest.approx([3.0 - step, 0.5])
+        assert action.low == pytest.approx([-117.0, 0.0])
+        assert action.high == pytest.approx([2.0, 1.0])
+    assert len(dict(_Builtin(shot).panels(0))) == 3  # nothing has been decided yet
+    beginning = dict(_Builtin(following(other=other, steps=5)).panels(2))
+    assert max(next(iter(beginning.values())).series) <= 10.0
+
+
+def test_far_gaps_are_cut_so_that_near_ones_can_be_read():
+    places = [{"ego": (float(n), 0.0, 0.0, 10.0), "other": (400.0, 0.0, 0.0, 10.0)} for n in range(4)]
+    shot = Shot(recording(*places, actors=[CAR, TRUCK]), [], "ego", "other", -1, {})
+    curves = [panel for _, panel in _Builtin(shot).panels(3) if isinstance(panel, Curve)]
+    assert curves[1].series.tolist() == [100.0] * 4
+
+
+def test_a_film_shows_the_last_seconds_or_those_around_a_near_miss():
+    found = following(steps=100).recording
+    assert shown_steps(found, 0.0, -1) == (0, 100)
+    assert shown_steps(found, 3.0, -1) == (70, 100)
+    assert shown_steps(found, 4.0, 50) == (30, 70)
+    assert shown_steps(found, 4.0, 95) == (75, 100)
+    assert shown_steps(found, 4.0, 5) == (0, 25)
+    shot = Shot(found, [], "ego", "other", -1, {})
+    assert _steps(shot, FilmOptions(fps=5.0, last_s=2.0)) == list(range(80, 101, 2))
+    assert _steps(shot, FilmOptions(fps=20.0, last_s=0.5)) == [95, 95, 96, 96, 97, 97, 98, 98, 99, 99, 100]
+
+
+def test_a_drawn_panel_of_another_size_is_replaced_by_the_reason(tmp_path):
+    from PIL import Image
+
+    small = SimpleNamespace(draw=lambda label: np.zeros((9, 9, 3), np.uint8))
+    save_panels(tmp_path, 4, [("good", Curve([1.0, 2.0])), ("bad", small)])
+    for path, shown in zip(sorted(tmp_path.glob("*.png")), (Curve([1.0, 2.0]), None), strict=True):
+        with Image.open(path) as image:
+            pixels = np.asarray(image)
+        assert pixels.shape == (160, 240, 3)
+        assert shown is None or np.array_equal(pixels, shown.draw(label="good"))
+        assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 2  # the reason, in letters
+
+
+def test_a_film_is_at_most_8192_wide_and_high():
+    FilmOptions(size=(8192, 64))
+    for size in ((8193, 64), (64, 8193), (63, 64)):
+        with pytest.raises(Exception, match=r"size"):
+            FilmOptions(size=size)
