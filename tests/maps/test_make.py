@@ -154,7 +154,7 @@ def flowing(**more):
     return replace(RUN, **more)
 
 
-def test_traffic_is_thinned_until_it_flows_and_routes_without_room_are_left_out(monkeypatch):
+def test_traffic_is_thinned_until_it_flows_and_routes_without_room_are_excluded(monkeypatch):
     runs = []
 
     def run(demand, *_, scale, step_s=0.1, **__):
