@@ -43,7 +43,7 @@ _TESTS_ELSEWHERE = {
     "base/forks.py": ("base/test_reaper.py", "episode/test_fork.py", "episode/test_questions.py"),
     "base/git.py": ("base/test_git.py",),
     "base/integrity.py": ("base/test_integrity.py", "base/test_authentication.py"),
-    "panels": ("render/test_panels.py", "render/test_panels_drawn.py"),
+    "panels": ("render/test_panels*.py", "render/test_pictures.py"),
     "rates/_rare.py": ("rates/test_rare.py", "rates/test_splitting.py", "hunts/test_rare_hunts.py"),
     # These are tested as users run them: as commands.
     "cli/_compare.py": ("e2e/test_manage.py",),
@@ -107,6 +107,7 @@ _TESTS_ELSEWHERE = {
     # These are fast, and their tests lie by what a user does, not by module.
     "maps": ("maps/test_*.py",),
     "recording": ("recording/test_*.py",),
+    "render": ("render/test_*.py",),
     "report": ("report/test_*.py",),
     "scenario": ("scenario/test_*.py",),
     "replays/_debugger.py": ("e2e/test_debugger.py",),
