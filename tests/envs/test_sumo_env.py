@@ -80,6 +80,22 @@ def test_a_picture_of_the_scene(own):
     assert own.metadata["render_fps"] == 10
 
 
+def test_only_the_last_step_of_an_episode_has_an_outcome(own):
+    _, info = own.reset(seed=1)
+    times, ended = [info["sim_time_s"]], False
+    while not ended and len(times) < 600:
+        _, _, ended, truncated, info = own.step((14.0, 0))
+        times.append(info["sim_time_s"])
+        assert not truncated
+        assert ("outcome" in info) == ended
+    assert np.diff(times) == pytest.approx(0.1)
+    assert info["outcome"] in ("collision", "finished")
+    with pytest.raises(SimulatorError, match="the episode has ended"):
+        own.step((14.0, 0))
+    own.reset(seed=1)
+    assert "outcome" not in own.step((14.0, 0))[4]
+
+
 def test_errors_come_through(own):
     own.reset(seed=1)
     with pytest.raises(ActionError, match="is not") as caught:

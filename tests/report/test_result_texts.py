@@ -1,0 +1,164 @@
+"""What is printed at the end of a hunt and of a replay, and of the agents and scenarios that there are."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from rich.console import Console
+
+from crashhunt.hunts import AuditReport, HuntReport
+from crashhunt.plans import HuntSettings, RunSettings
+from crashhunt.recording import Phase
+from crashhunt.report import describe_hunt, describe_replay
+from crashhunt.report._listing import describe
+from crashhunt.report._status_screen import _workers
+from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
+
+SETTINGS = HuntSettings(scenario="loop", scenario_digest="0", trials=30, max_steps=90, seed=7, run=RunSettings())
+REPORT = HuntReport(
+    directory=Path("my hunt"), settings=SETTINGS, stopped_because="all_trials", outcomes={"survived": 28, "invalid": 2},
+    trial_steps=1200, steps_total=1200, wall_s=12.0, crashes=(),
+)  # fmt: skip
+
+
+def lines(report, **more):
+    return describe_hunt(replace(report, **more)).splitlines()
+
+
+@pytest.mark.parametrize(
+    ("because", "says"),
+    [
+        ("all_trials", "No crash was found."), ("time", "No crash was found within the time limit."),
+        ("interrupted", "Interrupted. Run the same command to resume."),
+        ("no_valid_trial", "No trial was valid: it does not fit"),
+    ],
+)  # fmt: skip
+def test_a_hunt_without_a_crash_states_why_it_ended(because, says):
+    found = lines(REPORT, stopped_because=because, reason="it does not fit")
+    assert found[0].startswith("30 of 30 trials, 1200 steps, 0:12 ")
+    assert found[0].endswith(" (survived 28, invalid 2); hunt seed 7")
+    assert says in found
+    others = {"No crash was found.", "Interrupted. Run the same command to resume."} - {says}
+    assert others.isdisjoint(found)
+    assert not any("Replay it" in line for line in found)
+
+
+def test_an_audit_counts_what_it_replayed_and_names_what_differs():
+    audit = AuditReport(trials=10, not_finished=3, differences=("trial 4: a", "trial 5: b"))
+    found = lines(REPORT, audit=audit)
+    assert "Audit: 10 replayed in new processes, 8 bit-identical." in found
+    assert [line for line in found if "trial 4: a" in line or "trial 5: b" in line] == ["  trial 4: a", "  trial 5: b"]
+    assert any(line.startswith("  3 more did not finish") for line in found)
+    none = lines(REPORT, audit=AuditReport(trials=0, not_finished=0, differences=()))
+    assert "Audit: no trial without a crash belonged to the sample." in none
+
+
+def test_events_that_are_no_crashes_come_with_the_option_that_makes_them_crashes():
+    found = lines(REPORT, events={"red_light": (5, 1), "collision": (9, 9)}, steps_total=3000)
+    (line,) = [line for line in found if line.startswith("Traffic events:")]
+    assert line.endswith("in 1 trial. To hunt for them: --crash-on red_light")
+    assert "(3000 simulated in all)" in found[0]
+    incomplete = lines(REPORT, unanswered=1, stopped_because="interrupted")
+    assert any(
+        line.startswith("1 trial has incomplete answers") and line.endswith("run it again.") for line in incomplete
+    )
+    assert any(line.startswith("2 trials have") for line in lines(REPORT, unanswered=2))
+
+
+HIT = Collision("ego", "collider", "ego", "x", ("overlap",), "overlap", 1.0, 2.0, "a_0", 9.0, 3.0)
+CRASH = TrialResult(
+    TrialSpec(4, 1, {"ego": {"speed": 8.5}}, {"gap": 3}, 90), Outcome.COLLISION, steps=30, collision=HIT
+)
+FINE = replace(CRASH, outcome=Outcome.SURVIVED, steps=90, collision=None)
+
+
+def replayed(verdict, now, *, code="current", **more):
+    rerun = SimpleNamespace(
+        code=code, snapshot=SimpleNamespace(path="here"), warnings=["numpy differs"], edits=["speed 9"],
+        elsewhere=False, recorded=SimpleNamespace(steps=30), other_traffic=more.pop("other_traffic", False),
+    )  # fmt: skip
+    bundle = SimpleNamespace(id="000004-collision", result=CRASH, is_near_miss=False)
+    given = {
+        "divergence": None,
+        "verdicts": {verdict: 1},
+        "reason": "other traffic",
+        "around": [],
+        "steps_replayed": 29,
+    }
+    return describe_replay(SimpleNamespace(bundle=bundle, rerun=rerun, verdict=verdict, replayed=now, **given | more))
+
+
+@pytest.mark.parametrize(
+    ("verdict", "now", "says"),
+    [
+        ("reproduced", CRASH, ["reproduced: 29 of 30 steps", "is bit-identical"]),
+        ("fixed", FINE, ["fixed: no crash; ", f"it was: {CRASH.summary}"]),
+        ("changed", CRASH, ["changed: it still crashes", f"it is:  {CRASH.summary}"]),
+        ("diverged", FINE, ["diverged: 29 of 30", f"now: {FINE.summary}"]),
+        ("not_comparable", FINE, ["not comparable: other traffic"]),
+    ],
+)
+def test_a_replay_states_its_verdict_with_what_was_and_what_is(verdict, now, says):
+    text = replayed(verdict, now)
+    assert text.startswith(f"000004-collision: {CRASH.summary}\n")
+    assert "speed=8.5 gap=3" in text
+    assert "driven by today's code" in text
+    assert "warning: numpy differs" in text
+    assert "no longer the recorded trial: speed 9" in text
+    assert [one for one in says if one not in text] == []
+    assert "runs:" not in text
+    several = replayed(verdict, now, verdicts={verdict: 2, "cannot_run": 1})
+    assert f"of 3 runs: 2 {verdict.replace('_', ' ')}, 1 cannot run" in several
+
+
+def test_where_a_replay_first_differs_the_steps_around_are_shown():
+    text = replayed(
+        "diverged", FINE, divergence=SimpleNamespace(step=5), around=[(4, 1.0, 1.0), (5, 2.0, 2.5), (6, None, 3.0)]
+    )
+    table = [line.strip() for line in text.splitlines()[-4:]]
+    assert [row.split() for row in table] == [
+        ["step", "recorded", "replayed"], ["4", "1.0", "1.0"], ["5", "2.0", "2.5", "<-", "first", "difference"],
+        ["6", "-", "3.0"],
+    ]  # fmt: skip
+    comparable = replayed("not_comparable", FINE, divergence=SimpleNamespace(step=5), around=[(5, 1, 2)])
+    assert "first difference" not in comparable
+
+
+def test_a_list_has_the_arguments_of_a_scenario_and_of_its_agents():
+    argument = {"name": "speed", "default": 3, "range": "1:9", "unit": "m/s", "help": "held"}
+    entry = {
+        "name": "loop", "locator": "ego driven by m:A", "title": "A ring", "arguments": [argument | {"name": "gap"}],
+        "agents": {"ego": [argument], "second": []},
+    }  # fmt: skip
+    text = describe([entry, {"name": "m:A", "locator": "here", "title": "An agent", "arguments": []}])
+    assert text.startswith("loop  (ego driven by m:A)\n    A ring\n")
+    assert re.search(r"^    \S*gap\b", text, re.MULTILINE)
+    assert "    arguments of ego, as they are hunted here:\n" in text
+    assert "arguments of second" not in text
+    assert text.endswith("m:A  (here)\n    An agent")
+
+
+@pytest.mark.parametrize(("count", "width", "rows"), [(3, 80, 3), (9, 80, 3), (60, 80, 4)])
+def test_states_of_workers_fit_into_the_lines_that_there_are(count, width, rows):
+    workers = {
+        number: SimpleNamespace(pid=1000 + number, step=number * 7, phase=Phase.SETUP if number == 2 else Phase.ACT)
+        for number in range(count)
+    }
+    console = Console(width=width, record=True, file=None, force_terminal=False)
+    with console.capture() as captured:
+        console.print(_workers(SimpleNamespace(workers=workers), width, rows))
+    shown = captured.get().splitlines()
+    assert len(shown) <= 4
+    assert all(len(line) <= width for line in shown)
+    text = " ".join(captured.get().split())
+    if count == 3:
+        assert text == "worker 1000 trial 0 step 0 worker 1001 trial 1 step 7 worker 1002 trial 2 setting up"
+    else:
+        there = [number for number in range(count) if f"{number}: " in text]
+        hidden = re.search(r"and (\d+) more", text)
+        assert len(there) + (int(hidden[1]) if hidden else 0) == count
+        assert bool(hidden) == (count == 60)
