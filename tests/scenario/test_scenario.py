@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import gzip
+import math
 import shutil
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,15 @@ import tomli_w
 from hypothesis import given, strategies as st
 
 from crashhunt.errors import ScenarioError
-from crashhunt.scenario import load_scenario, scenario_from_dict, shipped_folder, shipped_scenarios
+from crashhunt.scenario import (
+    AgentSetup,
+    Scenario,
+    load_scenario,
+    scenario_from_dict,
+    shipped_folder,
+    shipped_scenarios,
+)
+from crashhunt.scenario._load import check
 from crashhunt.scenario.backends.sumo import SumoSetup
 
 LOOP = shipped_folder() / "loop"
@@ -318,3 +328,25 @@ def test_a_file_that_exists_outside_of_the_folder_is_refused(loop, tmp_path, out
 def test_a_way_out_and_in_again_is_inside(loop):
     change(loop, "sumo", "net", value="../own/loop.net.xml")
     assert load_scenario(loop).tables["sumo"].net == "../own/loop.net.xml"
+
+
+@pytest.mark.parametrize(
+    ("changes", "where", "says", "fix"),
+    [
+        ({"step_length_s": 0.0}, "step_length_s = 0.0", "is not a time above 0", "give seconds, such as 0.1"),
+        ({"insertion_timeout_s": math.inf}, "insertion_timeout_s = inf", "is not a time above 0", "give seconds"),
+        ({"warmup_s": -1.0}, "warmup_s = -1.0", "is not a time", "give seconds, such as 20.0"),
+        ({"agents": {}}, "agents = {}", "names no controlled vehicle", "add a table [agents.ego]"),
+        ({"events": {"odd": 1.0}}, "events = 'odd'", "has no limit", "give some of "),
+        ({"events": {"not_moving": 0.0}}, "events.not_moving = 0.0", "is not a limit", "above 0"),
+        ({"simulator": "sumo"}, "sumo = None", "is missing", "add a table [sumo] with "),
+    ],
+)  # fmt: skip
+def test_a_wrong_value_is_named_with_its_key_and_the_fix(changes, where, says, fix):
+    scenario = replace(Scenario(simulator="toy", agents={"ego": AgentSetup()}), **changes)
+    with pytest.raises(ScenarioError) as caught:
+        check(scenario, "file", kept=False)
+    assert caught.value.message == f"{where} {says}"
+    assert fix in caught.value.fix
+    assert caught.value.where == "file"
+    check(Scenario(simulator="toy", agents={"ego": AgentSetup()}, events={"not_moving": 3.0}), "file", kept=False)
