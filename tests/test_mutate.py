@@ -39,3 +39,29 @@ def test_listed_equivalent_slips_can_be_made(mutate):
 def test_equivalent_slip_of_changed_code_is_stale(mutate):
     gone = {("crashhunt/no_such_module.py", "-a\n+b"): "reason", ("crashhunt/errors.py", "-a\n+b"): "reason"}
     assert mutate.stale_equivalents(gone) == ["crashhunt/errors.py", "crashhunt/no_such_module.py"]
+
+
+def test_tests_that_start_processes_run_after_those_that_reach_the_line(mutate):
+    source = "def double(x):\n    return 2 * x\n"
+    target = mutate.Target(package="p", file=Path("crashhunt/p.py"), source=source, tests=())
+    target.reached = {"slow": {2}, "fast": {2}, "other": {1}}
+    target.seconds = {"slow": 9.0, "fast": 1.0, "other": 0.5, "starts": 0.1, "starts too": 5.0}
+    target.forked = {"starts", "starts too"}
+    slips = mutate.find_slips(source)
+    assert slips
+    assert {tuple(target.tests_of(slip)) for slip in slips} == {("fast", "slow", "starts", "starts too")}
+    target.reached = {"fast": {2}, "starts": {2}}  # of which one is seen to reach it
+    assert target.tests_of(slips[0]) == ["starts", "fast", "starts too"]
+
+
+def test_what_no_test_should_notice_is_no_slip(mutate):
+    source = 'import json\nTEXT = json.dumps({}, indent=1)\nPAIRS = list(zip((), (), strict=True))\n"""1 + 2"""\n'
+    assert [slip.what for slip in mutate.find_slips(source) if "becomes" in slip.what] == []
+
+
+def test_a_module_has_the_tests_of_the_innermost_folder_that_is_listed(mutate):
+    ray = {path.name for path in mutate.nearest_tests(Path("crashhunt/executors/ray/_bridge.py"))}
+    assert "test_ray_bridge.py" in ray
+    assert "test_harm.py" not in ray
+    (own,) = mutate.nearest_tests(Path("crashhunt/cli/_show.py"))
+    assert own == Path("tests/e2e/test_show.py")
