@@ -323,6 +323,8 @@ def test_trials_take_turns_in_so_many_traffics():
     traffic = [(one.seed, one.scenario_arguments["gap_m"]) for one in shared]
     assert traffic == traffic[:3] * 3
     assert len(set(traffic)) == 3
+    # A hunt that a later version resumes or repeats has the traffic that it had.
+    assert [one.seed for one in shared[:3]] == [1961267201, 58124482, 1084902911]
     assert [one.arguments for one in shared] == [one.arguments for one in alone]
     more = replace(chosen, seeds=3, trials=1000)
     assert shared == [spec_of(number, more, sampler) for number in range(9)]

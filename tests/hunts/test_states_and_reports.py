@@ -22,7 +22,7 @@ from crashhunt.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.hunts import HuntStatus, _hunt as hunt_module, check, find_hunts, hunt_state, is_hunt, load, salvage
 from crashhunt.hunts._next_trials import Unanswered, find_unanswered
 from crashhunt.hunts._progress import Progress
-from crashhunt.hunts._state import draws_independently, ledger_owner
+from crashhunt.hunts._state import draws_independently, ledger_owner, sums_of_branches, sums_of_probes
 from crashhunt.hunts._verification import Audit
 from crashhunt.ledger import Ledger
 from crashhunt.plans import RunSettings
@@ -236,6 +236,23 @@ def test_the_trial_with_the_least_margin_is_kept_and_open_ones_are_counted():
         progress.count(result(number, stress=stress), crashed=False, planned=9)
     assert progress.stressed.spec.number == 1
     assert progress.not_fully_asked == 1
+
+
+def test_a_status_sums_up_probes_and_how_many_of_their_crashes_were_confirmed(tmp_path):
+    brake = Disturbance(20, "ahead", "brake", 4.0, 2.0, "ego")
+    with closing(Ledger(tmp_path / "l.sqlite", writable=True)) as ledger:
+        for number, margin, disturbance in ((0, 0.8, brake), (1, 0.3, brake), (2, 1.0, None), (3, None, None)):
+            stress = Stress(margin=margin, probes=2, steps=9, left_out=1, disturbance=disturbance)
+            ledger.record(result(number, stress=stress), snapshot="0")
+        facts = {"copies": ["probes"], "state": "finished", "confirmed": {"probes": [3, 2]}}
+        assert sums_of_probes(ledger, facts) == {
+            "trials": 3, "not_fully_asked": 1, "least": 0.3, "trial": 1, "probes": 8, "steps": 36, "left_out": 4,
+            "crashed_trials": 2, "run_again": 3, "confirmed": 2,
+        }  # fmt: skip
+        running = sums_of_probes(ledger, facts | {"state": "running"})
+        assert (running["run_again"], running["confirmed"]) == (None, None)  # those are of an earlier run
+        assert sums_of_probes(ledger, facts | {"copies": ["branches"]}) is None
+        assert sums_of_branches(ledger, facts) is None
 
 
 def saved(number):
