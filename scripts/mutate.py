@@ -77,7 +77,11 @@ _TESTS_ELSEWHERE = {
     ),
     "executors/_time_limits.py": ("executors/test_last_words.py", "executors/test_what_is_left.py"),
     "executors/_trial_process.py": ("executors/test_harm.py", "executors/test_warm_traffics.py"),
-    "executors/_zygote.py": ("executors/test_harm.py", "executors/test_warm_traffics.py"),
+    "executors/_zygote.py": (
+        "executors/test_harm.py",
+        "executors/test_warm_traffics.py",
+        "executors/test_what_is_left.py",
+    ),
     "executors/ray": ("executors/test_ray_address.py", "executors/test_ray_bridge.py", "executors/test_ray_store.py"),
     # What a hunt does is seen by whole hunts.
     "hunts/_check.py": ("hunts/test_check_parts.py", "e2e/test_check.py"),

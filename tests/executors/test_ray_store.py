@@ -272,6 +272,33 @@ def submissions(*numbers):
     return [(100 + number, TrialSpec(number, number, {}, {}, max_steps=3).to_json()) for number in numbers]
 
 
+def test_a_node_asks_for_code_once_and_keeps_what_is_whole(settings, tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")
+    monkeypatch.setattr(
+        "crashhunt.executors.ray._node_worker.PoolExecutor", lambda given, **more: made.append((given, more)) or Pool()
+    )
+    parcel = CodeArchive.of(settings)
+    job = {"settings": settings.to_json(), "recycle_after": 9, "digest": parcel.digest(), "folders": parcel.folders,
+           "home": "", "slots": 4}  # fmt: skip
+    first, second, third = (Work(job) for _ in range(3))
+    assert first.begin() == "lacks"
+    assert first.deliver(parcel.packed()[:-30]) == "the parcel was damaged on its way"
+    assert made == []
+    assert first.deliver(parcel.packed()) == "ready"
+    assert second.begin() == "ready"
+    (given, more), _ = made
+    assert more == {"parallel": 4, "recycle_after": 9}
+    assert (Path(given.code[0]) / "mine" / "agent.py").read_text() == "x = 1"
+    assert given.scratch != settings.scratch
+    first._store.keep(parcel.digest(), b"damaged later")
+    assert third.begin() == "lacks"
+    assert third._store.find(parcel.digest()) is None
+    for one in (first, second, third):
+        one.close()
+
+
 def test_what_ends_together_goes_back_together_as_long_as_no_one_waits_for_more(work):
     node = work(*((number, False) for number in range(8)))
     assert [ended.number for ended in node.take(0.0, submissions(*range(8))).ended] == [0, 1, 2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import threading
 import time
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ from episodes import Episode, write
 from crashhunt.base import layout
 from crashhunt.episode import scratch_of
 from crashhunt.errors import PluginError, UsageError
-from crashhunt.executors import _postmortem, _protocol, _time_limits
+from crashhunt.executors import _postmortem, _protocol, _time_limits, _zygote
 from crashhunt.executors._postmortem import TrialAttempt
 from crashhunt.executors._protocol import Notes
 from crashhunt.recording import Phase
@@ -234,3 +235,17 @@ def test_time_of_a_trial_begins_when_its_process_has_it_and_has_begun(began_ago_
     assert is_over(80, header=None)
     assert not is_over(11, SimpleNamespace(started=now - 11), has_words=False)  # it may be writing down where it is
     assert is_over(14, SimpleNamespace(started=now - 14), has_words=False)
+
+
+def test_a_simulator_that_starts_threads_is_not_forked_once_it_is_there(monkeypatch):
+    monkeypatch.setattr(_zygote, "end_descendants", lambda: None)  # the children of a zygote, and not of this process
+
+    def with_threads():
+        threading.Thread(target=time.sleep, args=(30,), daemon=True).start()
+
+    def fails():
+        raise OSError("no window")
+
+    assert _zygote._is_forkable_with(SimpleNamespace(simulator=lambda: None))
+    assert not _zygote._is_forkable_with(SimpleNamespace(simulator=with_threads))
+    assert not _zygote._is_forkable_with(SimpleNamespace(simulator=fails))
