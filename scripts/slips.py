@@ -172,7 +172,8 @@ class _Finder(ast.NodeVisitor):
     def visit_Return(self, node: ast.Return) -> None:
         """Return nothing."""
         if node.value is not None:
-            if not (isinstance(node.value, ast.Constant) and node.value.value is None):
+            # None is as false as False, and callers ask whether it is true.
+            if not (isinstance(node.value, ast.Constant) and (node.value.value is None or node.value.value is False)):
                 self._put(node.value, "None", "None is returned")
             self.visit(node.value)
 

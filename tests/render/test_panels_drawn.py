@@ -53,6 +53,22 @@ def test_each_bar_is_in_the_middle_of_its_room_with_its_number_above(count, widt
         assert ink[1].mean() == pytest.approx(room / 2, abs=4)
 
 
+def test_names_are_below_their_bars_and_legends_at_the_right_in_their_colours():
+    plain, named = (Bar({name: 1.0}).draw() for name in ("", "name"))
+    rows, columns = np.nonzero((plain != named).any(axis=2))
+    bar = np.nonzero(where(named, BLUE))[0].max()
+    assert bar < rows.min() <= bar + 8
+    assert columns.mean() == pytest.approx(120, abs=2)
+    legend = Curve({"speed": [0, 0], "limit": [1, 1]}, low=-9, high=9).draw()
+    for place, color in enumerate(COLORS[:2]):
+        rows, columns = np.nonzero((np.abs(legend[:70, 150:].astype(int) - color) < 60).all(axis=2))
+        assert rows.mean() == pytest.approx(32 + 12 * place, abs=8)
+        assert 225 <= 150 + columns.max() <= 238
+    nothing = Heatmap([[np.nan, np.nan]]).draw()
+    unit = Heatmap([[np.nan, np.nan]], low=0.0, high=1.0).draw()
+    assert np.array_equal(nothing, unit)  # without values, the scale is from 0 to 1
+
+
 def test_limits_of_bars_cut_them_and_numbers_that_are_none_have_no_bar():
     picture = Bar({"a": 5.0, "b": math.nan, "c": 2.0}, low=0.0, high=4.0).draw()
     heights = where(picture, BLUE).sum(axis=0)

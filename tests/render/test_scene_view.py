@@ -12,7 +12,7 @@ pytest.importorskip("PIL")
 
 from crashhunt.panels import Action, Curve
 from crashhunt.recording import Prologue, StepRecord
-from crashhunt.render import FilmOptions, Shot
+from crashhunt.render import FilmOptions, Shot, frames
 from crashhunt.render._film import _Builtin, _steps, save_panels, shown_steps
 from crashhunt.render._scene import SceneView
 from crashhunt.world import PERSON, Actor, Roster, Scene
@@ -173,6 +173,22 @@ def test_panels_show_time_to_collision_gap_and_speed_of_the_last_seconds(other):
     assert len(dict(_Builtin(shot).panels(0))) == 3  # nothing has been decided yet
     beginning = dict(_Builtin(following(other=other, steps=5)).panels(2))
     assert max(next(iter(beginning.values())).series) <= 10.0
+
+
+def test_a_film_has_its_panels_next_to_the_scene_in_every_picture():
+    shot = following(steps=4)
+    plain, with_panels = (
+        list(frames([shot], FilmOptions(size=(320, 200), panels=panels, last_step_repeats=0)))
+        for panels in (False, True)
+    )
+    assert len(plain) == len(with_panels) == 5
+    assert plain[0].shape == (200, 320, 3)
+    assert with_panels[0].shape[0] * with_panels[0].shape[1] >= 320 * 200 + 4 * 240 * 160
+    for scene, picture in zip(plain, with_panels, strict=True):
+        assert np.array_equal(picture[:200, :320], scene)
+        outside = picture.copy()
+        outside[:200, :320] = 255
+        assert (outside != 255).any(axis=2).sum() > 1000
 
 
 def test_far_gaps_are_cut_so_that_near_ones_can_be_read():
