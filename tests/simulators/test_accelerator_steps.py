@@ -101,6 +101,8 @@ class Looking(HighwayEnvFast):
 
     def _reward(self, action):
         reward = super()._reward(action)
+        if not vars(self).get("looks"):
+            return reward
         push(self.road)
         for vehicle in self.road.vehicles[1:]:
             vehicle.to_dict = partial(_described_elsewhere, vehicle)
@@ -162,7 +164,7 @@ def planning(env):
     [
         (Simulating, lambda env: None),
         (Showing, lambda env: None),
-        (Looking, lambda env: None),
+        (Looking, lambda env: setattr(env, "looks", True)),
         (Planning, lambda env: None),
         (HighwayEnvFast, simulating),
         (HighwayEnvFast, observing),
@@ -173,9 +175,9 @@ def planning(env):
     ],
 )
 def test_change_between_sub_steps_and_observation_is_observed(kind, change):
-    slow, fast = both(lambda: made(kind), change)
+    slow, fast = both(lambda: made(kind), change, ACTIONS[:3])
     assert slow == fast
-    assert slow != trace(made, lambda env: None, ACTIONS)  # it matters
+    assert slow != trace(made, lambda env: None, ACTIONS[:3])  # it matters
     assert not isinstance(slow[-1], str)
 
 
