@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.agents import KeepLaneWithSpeed
-from crashhunt.base.errors import SimulatorError, UsageError
+from crashhunt.base.errors import ArgumentError, SimulatorError, UsageError
 from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.base.text import one_of
 from crashhunt.episode import Episode, Observer
@@ -68,7 +68,7 @@ class Episodes:
         self.agent = agent or next(iter(chosen.agents))
         if action:
             chosen = with_action(chosen, self.agent, action)
-        self._arguments = argument_values(chosen)
+        self._arguments, self._known = argument_values(chosen), tuple(chosen.scenario_arguments())
         self._disturber = _disturber(chosen, self.agent, disturb, max_steps)
         self._stage = TemporaryFolder("environment")
         self._simulator = SumoSimulator(chosen, self._stage.path)
@@ -84,7 +84,16 @@ class Episodes:
         self._borders: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] | None = None
 
     def reset(self, seed: int, arguments: Mapping[str, Value]) -> tuple[NDArray[np.generic], dict[str, object]]:
-        """Begin an episode; return the observation and the info."""
+        """Begin an episode; return the observation and the info.
+
+        Raises:
+            ArgumentError: the scenario has no argument of that name.
+        """
+        for name in arguments:
+            if name not in self._known:
+                raise ArgumentError(
+                    f"options: the scenario has no argument {name!r}", fix=one_of(name, self._known, give="it has")
+                )
         if self._episode is not None:
             self._episode.close()
         given = {**self._arguments, **arguments}

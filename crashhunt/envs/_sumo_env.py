@@ -99,6 +99,9 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         Args:
             seed: Seed of the environment's random generator, which draws the seeds of this and of all later episodes.
             options: ``{"arguments": {name: value}}``: scenario arguments that differ from their defaults.
+
+        Raises:
+            ArgumentError: The scenario has no argument of that name.
         """
         if self._is_copy:
             raise UsageError(

@@ -1,0 +1,167 @@
+"""The Gymnasium environment in the process of its caller: how episodes begin and end, and what their info has."""
+
+from __future__ import annotations
+
+import weakref
+
+import numpy as np
+import pytest
+
+from crashhunt.envs import SumoEnv
+from crashhunt.errors import ActionError, ArgumentError, SimulatorError, UsageError
+
+RED = (198, 40, 40)
+
+
+@pytest.fixture
+def make():
+    """Make environments in this process, which are closed with the test."""
+    made = []
+
+    def make(*arguments, **options):
+        made.append(SumoEnv(*arguments, process=False, **options))
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()
+
+
+def drive(env, action, most=600):
+    """Take an action until the episode ends, and return what each step gave."""
+    steps = []
+    while len(steps) < most:
+        steps.append(env.step(action))
+        if steps[-1][2] or steps[-1][3]:
+            break
+    return steps
+
+
+@pytest.mark.parametrize(
+    ("scenario", "action", "outcome"),
+    [("loop", (40.0, 0), "collision"), ("loop", (40.0, -1), "off_road"), ("intersection", (13.0, 0), "finished")],
+)
+def test_last_step_alone_has_the_outcome(make, scenario, action, outcome):
+    env = make(scenario)
+    _, info = env.reset(seed=3)
+    steps = drive(env, action)
+    assert [step[2] for step in steps] == [False] * (len(steps) - 1) + [True]
+    assert [step[4].get("outcome") for step in steps] == [None] * (len(steps) - 1) + [outcome]
+    times = [info["sim_time_s"], *(step[4]["sim_time_s"] for step in steps)]
+    assert np.diff(times) == pytest.approx(env._episodes.step_length_s)
+    with pytest.raises(SimulatorError, match="the episode has ended; call reset"):
+        env.step(action)
+
+
+def test_crash_is_marked_in_the_picture_of_its_step_only(make):
+    env = make("loop", render_mode="rgb_array")
+    env.reset(seed=3)
+    before = 0
+    for _ in range(600):
+        terminated = env.step((40.0, 0))[2]
+        if terminated:
+            break
+        before = red(env.render()) if env._steps > 110 else 0
+    assert terminated
+    assert red(env.render()) > before == 0
+    env.reset(seed=3)
+    assert red(env.render()) == 0
+
+
+def red(picture):
+    return int((picture == RED).all(axis=2).sum())
+
+
+def test_path_of_the_last_4_s_is_in_the_picture(make):
+    env = make("loop", render_mode="rgb_array")
+    env.reset(seed=3)
+    for _ in range(60):
+        env.step((5.0, 0))
+    pale = tuple((part + 255) // 2 for part in (224, 138, 0))
+    columns = np.nonzero((env.render() == pale).all(axis=2))[1]
+    # 20 m at 8 pixels per metre, of which the rear half of a car of 5 m covers some.
+    assert np.ptp(columns) == pytest.approx(20 * 8 - 40, abs=12)
+    assert len(env._episodes._trail.scenes) == 41
+
+
+def test_episode_is_truncated_at_its_longest(make):
+    env = make("loop", max_steps=4)
+    for _ in range(2):
+        env.reset(seed=3)
+        steps = drive(env, (5.0, 0))
+        assert [step[2:4] for step in steps] == [(False, False)] * 3 + [(False, True)]
+        assert "outcome" not in steps[-1][4]
+
+
+def test_reward_is_the_distance_of_the_step(make):
+    env = make("loop")
+    env.reset(seed=3)
+    rewards = [step[1] for step in drive(env, (5.0, 0), 80)]
+    assert rewards[-1] == pytest.approx(0.5)
+
+
+def test_reset_repeats_an_episode_by_its_seed(make):
+    env = make("loop")
+    first, again, other = (
+        (env.reset(seed=seed)[0], *(step[0] for step in drive(env, (9.0, 0), 30))) for seed in (3, 3, 4)
+    )
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_arguments_of_an_episode_are_those_of_its_reset(make):
+    env = make("loop")
+    actors = []
+    for arguments in ({}, {"vehicles": 10}, {}):
+        env.reset(seed=3, options={"arguments": arguments})
+        actors.append(len(env._episodes._trail.scenes[-1].roster))
+    assert actors[1] < actors[0] == actors[2]
+    with pytest.raises(
+        ArgumentError, match=r"^options: the scenario has no argument 'vehicle'; did you mean 'vehicles'"
+    ):
+        env.reset(seed=3, options={"arguments": {"vehicle": 10}})
+    env.step((5.0, 0))  # the episode continues
+
+
+def test_wrong_use_is_answered_with_what_to_do(make):
+    env = make("loop", render_mode="rgb_array")
+    with pytest.raises(SimulatorError, match="no episode has begun; call reset"):
+        env.step((5.0, 0))
+    with pytest.raises(UsageError, match="there is nothing to render yet; call reset first"):
+        env.render()
+    env.reset(seed=3)
+    with pytest.raises(ActionError):
+        env.step((5.0, 7))
+    assert env.step((5.0, 0))[2] is False
+    with pytest.raises(UsageError, match="seed is -1; give 0 or more"):
+        env.branch(1, seed=-1)
+    with pytest.raises(UsageError, match="there is no controlled vehicle 'egon'; did you mean 'ego'"):
+        SumoEnv("loop", agent="egon")
+    assert make("loop").render() is None
+
+
+def test_only_the_first_environment_of_a_process_has_its_simulation(make, monkeypatch):
+    asked = []
+    monkeypatch.setattr("crashhunt.envs._sumo_env._here", weakref.WeakSet())
+    monkeypatch.setattr("crashhunt.envs._sumo_env.RemoteEpisodes", lambda *words: asked.append(words) or Ended())
+    first = SumoEnv("loop")
+    assert SumoEnv("loop", action="meta", disturb="brake=1, stop=2,", max_steps=5).agent == "of another process"
+    assert asked == [("loop", "", "meta", ("brake=1", "stop=2"), 5)]
+    first.close()
+    first.close()
+    third = SumoEnv("loop")
+    third.close()
+    assert third.agent == "ego"
+    assert len(asked) == 1
+
+
+class Ended:
+    """Stands for the episodes of another process."""
+
+    agent, observation_space, action_space, step_length_s = "of another process", None, None, 0.3
+
+
+def test_render_rate_is_that_of_the_steps(make, monkeypatch):
+    monkeypatch.setattr("crashhunt.envs._sumo_env.RemoteEpisodes", lambda *_: Ended())
+    assert SumoEnv("loop", process=True).metadata["render_fps"] == 3
+    assert SumoEnv.metadata["render_fps"] == 10
