@@ -201,13 +201,13 @@ def hunted(settings: HuntSettings, place: Place, most: int, name: str, *, lag: s
             continue
         for result in place.ended():
             results[result.spec.number] = result
-            steps += result.steps + (result.setup_steps or 0)
+            steps += result.steps + (result.setup_steps or 0) + (result.stress.steps if result.stress else 0)
             if result.outcome in settings.crash_on:
                 first = min(first, result.spec.number)
         began = time.process_time()
         while told in results and told <= asked - lag_of(asked, lag):
             if sampler.learns:
-                sampler.tell(results[told])
+                sampler.tell(_with_margin(results[told]))
             told += 1
         spent += time.process_time() - began
     found = first < most
@@ -224,6 +224,11 @@ def hunted(settings: HuntSettings, place: Place, most: int, name: str, *, lag: s
         steps=steps,
         cpu_s=spent,
     )
+
+
+def _with_margin(result: TrialResult) -> TrialResult:
+    """Return the result with 1 - robustness margin as its danger, if the trial had probes."""
+    return result if result.stress is None else replace(result, danger=1.0 - result.stress.least)
 
 
 def synthetic_run(name: str, sampler: str, seed: int, lag: str = LAG) -> Run:
@@ -254,13 +259,14 @@ def real_runs(
     parallel: int,
     known: Collection[Hunt],
     lag: str = LAG,
+    probe_s: float = 0.0,
 ) -> Iterator[Run]:
     """All hunts on a problem with a simulator that are not known, on the same warm workers."""
     problem: Real = REAL[name]
     if all((name, sampler, seed) in known for sampler in samplers for seed in seeds):
         return
     most = math.ceil(GIVE_UP / problem.rate)
-    with trials_on(problem, parallel) as trials:
+    with trials_on(problem, parallel, probe_s) as trials:
         place = Workers(trials)
         for seed in seeds:
             for sampler in samplers:
@@ -335,6 +341,10 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--wall", action="store_true", help="instead, hunts of the product, for time by the clock")
     parser.add_argument("--again", action="store_true", help="hunts that are stored already, too")
     parser.add_argument("--lag", default=LAG, type=a_lag, help=f"of results, in trials, or {GROWING!r}")
+    parser.add_argument(
+        "--probe", type=float, default=0.0, metavar="SECONDS",
+        help="robustness probes in trials on a simulator; samplers receive 1 - margin as the danger",
+    )  # fmt: skip
     parser.add_argument("--pairs", metavar="A,B", help="in addition, the cost of B as a share of that of A, same seeds")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument(
@@ -369,7 +379,11 @@ def main(words: Sequence[str] | None = None) -> int:
     known = () if options.again else (*runs,)
     for found in (
         all_runs(samplers, seeds, [name for name in names if name not in REAL], options.parallel, known, options.lag),
-        *(real_runs(name, samplers, seeds, options.parallel, known, options.lag) for name in names if name in REAL),
+        *(
+            real_runs(name, samplers, seeds, options.parallel, known, options.lag, options.probe)
+            for name in names
+            if name in REAL
+        ),
     ):
         for run in found:
             runs[run.problem, run.sampler, run.seed] = run

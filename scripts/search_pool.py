@@ -55,7 +55,7 @@ class Trials:
 
 
 @contextmanager
-def trials_on(problem: Real, parallel: int) -> Iterator[Trials]:
+def trials_on(problem: Real, parallel: int, probe_s: float = 0.0) -> Iterator[Trials]:
     """Start workers for a problem, and end them."""
     with tempfile.TemporaryDirectory(prefix="crashhunt-search-") as folder:
         scenario, settings = plan(Request(trials=1, seed=1, **problem.request))
@@ -63,7 +63,7 @@ def trials_on(problem: Real, parallel: int) -> Iterator[Trials]:
             scenario = replace(scenario, warmup_s=problem.warmup_s)
         working = WorkerSettings(
             scenario=with_settings(scenario, settings), oracles=settings.oracles, crash_on=settings.crash_on,
-            scratch=Path(folder),
+            scratch=Path(folder), probe_s=probe_s,
         )  # fmt: skip
         pool = PoolExecutor(working, parallel=parallel)
         try:
