@@ -41,9 +41,7 @@ PEERS = {
     "verifai-mab": "peers:VerifaiBandit",
     "smac": "peers:Smac",
     "turbo": "peers:Turbo",
-    "simpler": "simpler_guided:Simpler",
-    "simpler-again": "simpler_guided:SimplerAgain",
-    "simpler-peaks": "simpler_guided:SimplerPeaks",
+    "eight-constants": "eight_constants:EightConstants",
 }
 """Name in tables to what stands for it."""
 

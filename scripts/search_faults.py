@@ -160,6 +160,7 @@ def faults_table(path: Path) -> str:
     """Return it as Markdown: the mean numbers of faults and of crashes in a hunt, and ratios to random draws."""
     stored = json.loads(path.read_text(encoding="utf-8"))
     columns = ["random", *(f"guided {evidence}" for evidence in EVIDENCE)]
+    columns = [column for column in columns if all(column in row for row in stored.values())]
     lines = [f"| problem | {' | '.join(columns)} |", f"| --- |{' ---: |' * len(columns)}"]
     means = {
         name: [statistics.fmean(len({*of}) for of in row[column].values()) for column in columns]

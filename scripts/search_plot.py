@@ -101,7 +101,7 @@ def rare(found: dict[str, dict[str, float]], sampler: str) -> float:
 def table(runs: Sequence[Run]) -> str:
     """Return it as Markdown."""
     found = costs(runs)
-    known = ("random", "sobol", "cma-es", *_MARKS, "simpler", "simpler-again", "simpler-peaks")
+    known = ("random", "guided-2", "sobol", "cma-es", *_MARKS, "eight-constants")
     samplers = [name for name in known if any(name in row for row in found.values())]
     samplers.sort(key=lambda name: ["random", "guided"].index(name) if name in ("random", "guided") else 2)
     lines = [f"| problem | one in | {' | '.join(samplers)} |", f"| --- | ---: |{' ---: |' * len(samplers)}"]
@@ -146,7 +146,7 @@ def _share(ratio: float, drawn: np.ndarray[tuple[int], np.dtype[np.float64]]) ->
 def _cell(runs: Sequence[Run], problem: str, sampler: str, row: dict[str, float]) -> str:
     if sampler not in row:
         return "-"
-    if sampler != "guided" or (problem in REAL and "random" not in row):
+    if not sampler.startswith("guided") or (problem in REAL and "random" not in row):
         return f"{row[sampler]:.2f}"
     low, high = interval(runs, problem, sampler)
     return f"{row[sampler]:.2f} ({low:.2f}-{high:.2f})"

@@ -1,19 +1,19 @@
-"""The portfolio behind the sampler `guided`: distributes trials between a model, mutation and an even search.
+"""The portfolio behind the sampler `guided`: distributes trials between a model and an even search.
 
-Computes shares of trials by payoff. A trial that is more critical than a share of 1 - q of the unguided trials has
-payoff -log q. The mean payoff is 1 where a strategy learns nothing, so only ranks matter for payoffs. Two thresholds
-read the scale of criticality, namely the progress of strategies, and the criticality of 0.5 that caps their share.
+Computes the share of the model by payoff. A trial that is more critical than a share of 1 - q of the unguided trials
+has payoff -log q. The mean payoff is 1 where the model learns nothing, so only ranks matter for payoffs. Two thresholds
+read the scale of criticality, namely the progress of the model, and the criticality of 0.5 that caps its share.
 
-Invariant: a strategy keeps at least 2 % of the trials (probes), and the even search gets everything that strategies
-do not earn. A hunt with a misleading criticality is therefore never much worse than an even search.
+Invariant: the model keeps at least 2 % of the trials (probes), and the even search gets everything that the model does
+not earn. A hunt with a misleading criticality is therefore never much worse than an even search.
 
-Reason against using only the best strategy: rising criticality does not imply a crash, and before the first crash this
-is unknown. Two signs show that criticality misleads. Either strategies are far ahead of the unguided trials and make no
-progress, or they never exceed a criticality of 0.5. In both cases their share is capped, and a part of it explores
-other peaks (`Niches`).
+Reason against using only the model: rising criticality does not imply a crash, and before the first crash this is
+unknown. Two signs show that criticality misleads. Either the model is far ahead of the unguided trials and makes no
+progress, or it never exceeds a criticality of 0.5. In both cases its share is capped, and a part of it explores other
+peaks (`Niches`).
 
-After the first crash, new crash types count. Before each proposal, the rate of new types that strategies find is drawn
-from its posterior, and so is that of unguided trials (Thompson 1933). Strategies do not search in basins of crashes
+After the first crash, new crash types count. Before each proposal, the rate of new types that the model finds is drawn
+from its posterior, and so is that of unguided trials (Thompson 1933). The model does not search in basins of crashes
 that yield known types only.
 
 Sources: nearest-better distance (Preuss 2010), Thompson sampling (1933), Halton's sequence (1960); payoffs and shares
@@ -29,11 +29,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.base.draws import one_of
 from crashhunt.samplers._model import Model
 from crashhunt.samplers._space_filling import HaltonSampler
-from crashhunt.samplers._strategies import Mutation
-from crashhunt.samplers._strategy import CRASHED, Draft, Elites, reflected
+from crashhunt.samplers._strategy import CRASHED, PLAIN_EVERY, Draft, Elites, reflected
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,10 +40,13 @@ if TYPE_CHECKING:
 
     from crashhunt.samplers._protocol import HuntFacts, Space
     from crashhunt.samplers._space_filling import Cube
-    from crashhunt.samplers._strategy import ScoredTrial, Strategy
+    from crashhunt.samplers._strategy import ScoredTrial
 
 
 __all__ = ["KnownCrashes", "Niches", "Portfolio"]
+
+
+_MEMORY = 256  # latest trials, and most critical ones, in memory: distances between all take some milliseconds
 
 
 # Niches: other peaks of criticality, explored when trials around the most critical one make no more progress.
@@ -54,7 +55,6 @@ __all__ = ["KnownCrashes", "Niches", "Portfolio"]
 # one is at the foot of another peak (nearest-better distance; Preuss 2010). A separate model searches the ball around
 # the foot whose radius is that distance.
 
-_LAST, _BEST = 256, 64  # trials among which feet of peaks are searched
 _LEAST = 12  # trials before the search for feet
 _RETRY_AFTER = 32  # trials between two searches without success
 _FAR_FOOT = 2.0  # times the mean distance to the next more critical trial: beyond that it is the foot of another peak
@@ -75,18 +75,13 @@ class Niches:
     def __init__(self, cube: Cube, like: Model) -> None:
         self._cube, self._like = cube, like
         self._patience = _NICHE_PATIENCE + _NICHE_PATIENCE_PER_ARGUMENT * cube.dimensions
-        self._last: deque[ScoredTrial] = deque(maxlen=_LAST)
-        self._best = Elites(_BEST)
+        self._last: deque[ScoredTrial] = deque(maxlen=_MEMORY)
+        self._best = Elites(_MEMORY)
         self._tried: deque[ScoredTrial] = deque(maxlen=_TRIED)
         self._foot: ScoredTrial | None = None
         self._model = like
         self._reach = self._record = 0.0
         self._without_record = self._told = self._not_before = 0
-
-    @property
-    def climbs(self) -> bool:
-        """Whether a trial is nearer to a crash than the foot of the peak."""
-        return self._foot is not None and self._record > self._foot.score
 
     def tell(self, trial: ScoredTrial) -> None:
         """Add a trial; abandon the peak where no more progress is made."""
@@ -150,12 +145,10 @@ class Niches:
 # away (nearest-better clustering; Preuss 2010). A basin is excluded if its crash yields known types only.
 
 _MOST = 32  # crashes whose neighbourhood is excluded
-_MAX_KINDS = 256  # crash types in memory
 _SEEDS = 1024  # seeds of crashes in memory
 _AROUND = 0.1  # radius of an excluded neighbourhood, times the square root of the dimensions
 _JUST_THERE = 0.02  # the same, while the next crash there may be of another type
 _REPEATS = 3  # consecutive crashes of known types in a neighbourhood: the next is new in at most one of five cases
-_SEEN = 256  # last trials of which basins are made
 _BASINS_EVERY = 16  # trials without a crash, after which basins are made again
 
 
@@ -180,8 +173,8 @@ class KnownCrashes:
         self._kinds: dict[str, None] = {}
         self._seeds: dict[int, None] = {}
         self._again: list[NDArray[np.float64]] = []  # last crashes of known types that no new type has followed nearby
-        self._seen: deque[ScoredTrial] = deque(maxlen=_SEEN)
-        self._covered_trials: deque[ScoredTrial] = deque(maxlen=_SEEN)
+        self._seen: deque[ScoredTrial] = deque(maxlen=_MEMORY)
+        self._covered_trials: deque[ScoredTrial] = deque(maxlen=_MEMORY)
         self._since_basins = 0
         self._ground = np.empty((0, dimensions))  # points of trials, and of excluded crashes
         self._in_basin = np.empty(0, dtype=bool)  # of these, which are in an excluded basin
@@ -232,7 +225,7 @@ class KnownCrashes:
         """Add a crash; return whether the excluded region has changed."""
         new = bool(trial.kind) and trial.kind not in self._kinds
         self._kinds[trial.kind] = None
-        if len(self._kinds) > _MAX_KINDS:
+        if len(self._kinds) > _MEMORY:
             del self._kinds[next(iter(self._kinds))]
         self._seeds[trial.seed] = None
         if len(self._seeds) > _SEEDS:
@@ -298,26 +291,24 @@ def nearest_better(
     return away.min(axis=1), away.argmin(axis=1)
 
 
-_EVEN, _MODEL, _MUTATION, _NICHE = "halton", "model", "mutation", "niche"
-_FIRST = 10  # unguided trials before payoffs are computed
-_OF_OURS = 0.8  # share of a hunt's trials that the portfolio proposes; the shares below are of all trials
-_CLIMBING, _STUCK = 0.7, 0.05  # maximum share of strategies, with and without progress
+_EVEN, _MODEL, _NICHE = "halton", "model", "niche"
+_OF_OURS = 1.0 - 1.0 / PLAIN_EVERY  # share of a hunt's trials that the portfolio proposes; shares are of all trials
+_CLIMBING, _STUCK = 0.7, 0.05  # maximum share of the model, with and without progress
 _FAR, _NEAR = 0.35, 0.5  # maximum share while no criticality has exceeded the second number
-_PROBING = 0.02  # minimum share of each strategy: its payoff may have changed
-_OTHER_PEAKS, _CLIMBING_THERE = 0.08, 0.15  # share of niches where strategies are stuck, and while a niche climbs
-_PATIENCE, _PATIENCE_PER_ARGUMENT = 8, 3  # trials of strategies without progress before they may be stuck
-_AHEAD = 0.4  # recent share of strategy trials above all unguided ones, beyond which strategies are stuck
-_FAR_AHEAD = 2.5  # mean payoff of a strategy, beyond which strategies are stuck
+_PROBING = 0.02  # minimum share of the model: its payoff may have changed
+_OTHER_PEAKS = 0.08  # share of niches where the model is stuck
+_PATIENCE, _PATIENCE_PER_ARGUMENT = 8, 3  # trials of the model without progress before it may be stuck
+_AHEAD = 0.4  # recent share of the model's trials above all unguided ones, beyond which it is stuck
+_FAR_AHEAD = 2.5  # mean payoff of the model, beyond which it is stuck
 _LATELY = 0.1  # weight of the last trial in that recent share
-_CREDIT = 3.0  # initial trials of each strategy, with a payoff of 2, so that each one is tried
-_FORGET = 0.96  # decay of a strategy's payoff per trial
+_CREDIT = 3.0  # initial trials of the model, with a payoff of 2, so that it is tried
+_FORGET = 0.96  # decay of the model's payoff per trial
 _INHERITED = 0.3  # weight of a trial whose criticality may come from the seed of its parent
 _KINDS = 0.5  # Jeffreys' prior of the number of new crash types
-_REMEMBERED = 200  # trials from which strategies restart after a crash
 
 
 class Portfolio:
-    """A model of criticality and mutation, in addition to Halton's sequence.
+    """A model of criticality, in addition to Halton's sequence.
 
     Args:
         cube: cube of the arguments.
@@ -330,38 +321,36 @@ class Portfolio:
         self._even = HaltonSampler(space, hunt=hunt)
         self._patience = _PATIENCE + _PATIENCE_PER_ARGUMENT * cube.dimensions
         self._unguided: list[float] = []  # scores, in order
-        self._best = Elites(_REMEMBERED)
+        self._best = Elites(_MEMORY)
         self._known = KnownCrashes(cube.dimensions)
-        self._earned = dict.fromkeys((_MODEL, _MUTATION), (2.0 * _CREDIT, _CREDIT))  # decaying sum and count of payoffs
+        self._earned, self._counted = 2.0 * _CREDIT, _CREDIT  # decaying sum and count of payoffs
         self._kinds = {True: (_KINDS, 1.0), False: (_KINDS, 1.0)}  # new types and trials: guided, unguided
         self._model = Model(cube)
         self._begin()
 
     def _begin(self) -> None:
-        """Restart the strategies from the trials that are not near a known crash."""
-        best, self._best = sorted(self._best, key=lambda trial: trial.number), Elites(_REMEMBERED)
+        """Restart the model from the trials that are not near a known crash."""
+        best, self._best = sorted(self._best, key=lambda trial: trial.number), Elites(_MEMORY)
         kept = self._known.sift(best)
-        self._model, mutation = Model(self._cube, like=self._model), Mutation(self._cube)
+        self._model = Model(self._cube, like=self._model)
         self._model.remember(kept)
-        self._strategies: dict[str, Strategy] = {_MODEL: self._model, _MUTATION: mutation}
         self._niches = Niches(self._cube, self._model)
         self._record, self._without_record = -1.0, 0  # greatest criticality, and trials since then
         self._rival = 0.0  # greatest criticality of an unguided trial
-        self._ahead = 0.0  # recent share of strategy trials above all unguided ones
+        self._ahead = 0.0  # recent share of the model's trials above all unguided ones
         for trial in kept:
             self._best.add(trial)
-            mutation.tell(trial)
             self._measure(trial)
 
     def tell(self, trial: ScoredTrial) -> None:
-        """Update payoffs and strategies with a trial."""
-        if trial.origin in self._strategies:
-            total, count = self._earned[trial.origin]
+        """Update payoffs and the model with a trial."""
+        is_guided = trial.origin in (_MODEL, _NICHE)
+        if trial.origin == _MODEL:
             payoff, weight = (1.0, _INHERITED) if self._is_inherited(trial) else (self._payoff(trial.score), 1.0)
-            self._earned[trial.origin] = (total * _FORGET + payoff * weight, count * _FORGET + weight)
-        elif trial.origin != _NICHE:
+            self._earned = self._earned * _FORGET + payoff * weight
+            self._counted = self._counted * _FORGET + weight
+        elif not is_guided:
             insort(self._unguided, trial.score)
-        is_guided = trial.origin in self._strategies or trial.origin == _NICHE
         kinds, trials = self._kinds[is_guided]
         self._kinds[is_guided] = (kinds + (trial.crashed and self._known.is_new(trial)), trials + 1.0)
         if trial.crashed:
@@ -370,49 +359,44 @@ class Portfolio:
             return
         for known in self._known.see(trial):
             self._best.add(known)
-            for strategy in self._strategies.values():
-                strategy.tell(known)
+            self._model.tell(known)
             self._measure(known)
             self._niches.tell(known)
         if self._is_stuck:
             self._niches.begin()
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft:
-        """Return a proposal of one of the strategies, or the next point of the even search."""
-        if len(self._unguided) >= _FIRST:
-            for name in self._drawn(rng):
-                for _ in range(_TRIES):
-                    strategy = self._niches if name == _NICHE else self._strategies[name]
-                    draft = strategy.propose(place, rng)
-                    if draft is not None and not self._known.cover(draft.point, draft.seed):
-                        return Draft(draft.point, draft.seed, draft.parent, origin=name)
+        """Return a proposal of the model of the highest or of another peak, or the next point of the even search."""
+        for name in self._drawn(rng):
+            strategy = self._niches if name == _NICHE else self._model
+            for _ in range(_TRIES):
+                draft = strategy.propose(place, rng)
+                if draft is not None and not self._known.cover(draft.point, draft.seed):
+                    return Draft(draft.point, draft.seed, draft.parent, origin=name)
         return Draft(self._even.point(place), origin=_EVEN)
 
     def _drawn(self, rng: np.random.Generator) -> list[str]:
-        """Return the strategies in the order in which they are called; empty if it is the even search's turn."""
+        """Return the origins to try in their order; empty if it is the even search's turn."""
         names = []
-        elsewhere = _CLIMBING_THERE if self._niches.climbs else _OTHER_PEAKS
-        if self._is_stuck and rng.random() < elsewhere / _OF_OURS:
+        if self._is_stuck and rng.random() < _OTHER_PEAKS / _OF_OURS:
             names.append(_NICHE)
-        shares = self._shares()
-        if self._known and not self._finds_more(rng):
-            shares = dict.fromkeys(shares, _PROBING)
-        if rng.random() < sum(shares.values()) / _OF_OURS:
-            names.append(one_of(shares, rng))
+        share = _PROBING if self._known and not self._finds_more(rng) else self._share()
+        if rng.random() < share / _OF_OURS:
+            names.append(_MODEL)
         return names
 
     def _finds_more(self, rng: np.random.Generator) -> bool:
-        """Draw whether strategies find more new types per trial than unguided trials (Thompson 1933)."""
+        """Draw whether guided trials find more new types per trial than unguided trials (Thompson 1933)."""
         guided, unguided = (rng.standard_gamma(kinds) / trials for kinds, trials in self._kinds.values())
         return bool(guided >= unguided)
 
     def _measure(self, trial: ScoredTrial) -> None:
-        """Update the greatest criticality and the progress of strategies."""
+        """Update the greatest criticality and the progress of the model."""
         if 1.0 - trial.score < _NEARER * (1.0 - self._record):
             self._record, self._without_record = trial.score, 0
-        elif trial.origin in self._strategies:
+        elif trial.origin == _MODEL:
             self._without_record += 1
-        if trial.origin in self._strategies:
+        if trial.origin == _MODEL:
             self._ahead += _LATELY * ((trial.score > self._rival) - self._ahead)
         elif trial.origin != _NICHE:
             self._rival = max(self._rival, trial.score)
@@ -427,15 +411,14 @@ class Portfolio:
         above = len(self._unguided) - at_most + 0.5 * (at_most - below)
         return math.log((len(self._unguided) + 1.0) / (above + 0.5))
 
-    def _shares(self) -> dict[str, float]:
-        """Return the share of each strategy in all trials of the hunt."""
-        gains = {name: max(total / count - 1.0, 0.05) ** 2 for name, (total, count) in self._earned.items()}
+    def _share(self) -> float:
+        """Return the share of the model in all trials of the hunt."""
+        gain = max(self._earned / self._counted - 1.0, 0.0) ** 2
         most = _STUCK if self._is_stuck else _CLIMBING if self._record > _NEAR else _FAR
-        whole = most * min(1.0, max(gains.values()))
-        return {name: max(whole * gain / sum(gains.values()), _PROBING) for name, gain in gains.items()}
+        return max(most * min(1.0, gain), _PROBING)
 
     @property
     def _is_stuck(self) -> bool:
         if self._without_record < self._patience:
             return False
-        return self._ahead > _AHEAD or max(total / count for total, count in self._earned.values()) > _FAR_AHEAD
+        return self._ahead > _AHEAD or self._earned / self._counted > _FAR_AHEAD

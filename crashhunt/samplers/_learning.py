@@ -8,7 +8,7 @@ from crashhunt.samplers._guided import Portfolio
 from crashhunt.samplers._protocol import HuntFacts, Proposal
 from crashhunt.samplers._space_filling import Cube, RandomSampler
 from crashhunt.samplers._strategies import CmaEs, CrossEntropy, Mutation
-from crashhunt.samplers._strategy import scored_trial
+from crashhunt.samplers._strategy import PLAIN_EVERY, scored_trial
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["CmaEsSampler", "CrossEntropySampler", "GuidedSampler", "Learning", "MutationSampler"]
 
-_PLAIN_EVERY = 5  # trials: one of five is plain random, for an unbiased crash rate
 _PLAIN, _START = "random", "start"
 
 
@@ -50,10 +49,10 @@ class Learning:
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
         """Return a plain random trial, or the proposal of the strategy."""
-        if number % _PLAIN_EVERY == 0:
+        if number % PLAIN_EVERY == 0:
             return Proposal(self._random.ask(number, rng).arguments, origin=_PLAIN)
         # Count the strategy's trials alone: without every fifth point, Halton's sequence in base 5 has a hole.
-        place = number - number // _PLAIN_EVERY - 1
+        place = number - number // PLAIN_EVERY - 1
         draft = self._strategy.propose(place, rng) if self._cube.dimensions else None
         if draft is None:  # too few results yet, or no argument varies
             return Proposal(self._random.ask(number, rng).arguments, origin=_START)
@@ -95,10 +94,10 @@ class CmaEsSampler(Learning):
 
 
 class GuidedSampler(Learning):
-    """Gives each strategy a share of the trials by its success (`Portfolio`)."""
+    """Gives a model of criticality a share of the trials by its success (`Portfolio`)."""
 
     origin = "guided"
-    version = 2  # 1 excluded neighbourhoods of known crashes, 2 excludes their basins
+    version = 3  # 1 excluded neighbourhoods of known crashes, 2 excluded their basins, 3 does without mutation
 
     def _make(self, space: Space) -> Strategy:
         return Portfolio(self._cube, space, self._hunt)

@@ -40,8 +40,6 @@ __all__ = ["Model", "Process"]
 # A Gaussian process over arguments and seeds (Rasmussen and Williams 2006, algorithm 2.1).
 
 _CATEGORY_DISTANCE_SQUARED = 0.5  # squared distance between two different values of a choice
-_WIDER = 1.5  # ratio of the length scale with the same seed to that without
-_JITTER = 1e-6  # added to the diagonal, so that the matrix stays positive definite
 
 
 class Process:
@@ -63,7 +61,7 @@ class Process:
     ) -> None:  # fmt: skip
         self._points, self._seeds = points, seeds
         self._categorical, self._scales = categorical, scales
-        self._noise, self._seeded = noise / (1.0 - noise) + _JITTER, seeded
+        self._noise, self._seeded = noise / (1.0 - noise), seeded
         worths = _worths(scores)
         self._target = (worths - worths.mean()) / (float(worths.std()) or 1.0)
         kernel = self._kernel(points, seeds)
@@ -83,7 +81,7 @@ class Process:
             ambition: by how much the target exceeds the best score, in standard deviations of all scores.
         """
         half = np.linalg.solve(self._lower, self._kernel(points, seeds).T)
-        spread = self._amplitude * np.maximum(1.0 + self._noise - (half**2).sum(axis=0), _JITTER)
+        spread = self._amplitude * np.maximum(1.0 + self._noise - (half**2).sum(axis=0), self._noise)
         worth: Floats = (half.T @ self._half - float(self._target.max()) - ambition) / np.sqrt(spread)
         return worth
 
@@ -95,10 +93,9 @@ class Process:
         for place in np.flatnonzero(self._categorical):
             differ = points[:, place, None] != self._points[:, place]
             squared += _CATEGORY_DISTANCE_SQUARED * self._scales[place] ** 2 * differ
-        kernel: Floats = (1.0 - self._seeded) * np.exp(-0.5 * squared)
+        kernel: Floats = np.exp(-0.5 * squared)
         if self._seeded:
-            same = seeds[:, None] == self._seeds
-            kernel += self._seeded * same * np.exp(-0.5 / _WIDER**2 * squared)
+            kernel *= 1.0 - self._seeded + self._seeded * (seeds[:, None] == self._seeds)
         return kernel
 
 
@@ -111,18 +108,14 @@ def _worths(scores: Floats) -> Floats:
     return worths
 
 
-_LEAST = 6  # trials before the model proposes
 _BEST, _LAST = 48, 48  # trials in the process: a solution of 96 takes about a millisecond
-_OFTEN = 64  # trials up to which a parameter is fitted after each one; later the fits become rarer in proportion
 _CANDIDATES = 64  # per proposal
 _ANYWHERE, _FITTED = 0.15, 0.25  # shares of candidates; the others are neighbours of one trial
 _PARENTS = 12  # best trials whose neighbours are candidates
 _KEEP_SEED = 0.5  # probability that a neighbour keeps the seed of its parent
-_LARGEST, _SMALLEST = 0.3, 0.005  # standard deviation of a step, drawn log-uniformly between these
-_NARROWEST = 0.02  # lower bound of the standard deviation of draws around all parents
+_FINEST = 0.005  # least standard deviation of a step, and of draws around all parents, in widths of an argument
+_WIDEST = 1.0 / math.sqrt(12.0)  # greatest one: that of a uniform draw; steps are log-uniform between both
 _OTHER = 0.3  # probability that a selected categorical argument changes
-_LENGTH = 0.4  # initial length scale, times the square root of the dimensions
-_UNLIKELY = 0.25  # weight of the prior against length scales far from the initial one
 _NOISE = (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)  # candidates for the noise share
 _SEEDED = (0.0, 0.2, 0.5, 0.8, 0.95)  # candidates for the share that counts only with the same seed
 _AMBITION = 0.5  # mean of the drawn ambition, in standard deviations
@@ -162,12 +155,12 @@ class Model:
     def tell(self, trial: ScoredTrial) -> None:
         """Add a trial; at growing intervals, fit one of the parameters again."""
         self.remember((trial,))
-        if self._count >= _LEAST and self._count % max(1, self._count // _OFTEN) == 0:
+        if self._is_ready and self._count % (1 + self._count // (_BEST + _LAST)) == 0:
             self._tune()
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
         """Return the best of many candidates; None while there are too few trials."""
-        if self._count < _LEAST:
+        if not self._is_ready:
             return None
         if self._process is None:
             self._process = self._with(self._parameters)
@@ -182,6 +175,10 @@ class Model:
             seed = None  # the same point and seed would repeat the trial
         return Draft(point, seed=seed, parent=parent.number)
 
+    @property
+    def _is_ready(self) -> bool:
+        return self._count > self._cube.dimensions  # fewer trials do not even determine a plane
+
     def _with(self, parameters: _Parameters) -> Process:
         known = {trial.number: trial for trial in self._last} | {trial.number: trial for trial in self._best}
         trials = [known[number] for number in sorted(known)]
@@ -190,15 +187,19 @@ class Model:
             np.array([trial.seed for trial in trials]),
             np.array([trial.score for trial in trials]),
             categorical=self._cube.categorical,
-            scales=2.0**-parameters.lengths / (_LENGTH * math.sqrt(self._cube.dimensions)),
+            scales=2.0**-parameters.lengths / math.sqrt(self._cube.dimensions / 6.0),  # a mean distance of two draws
             noise=_NOISE[parameters.noise],
             seeded=_SEEDED[parameters.seeded],
         )
 
     def _tune(self) -> None:
-        """Compare one parameter with its two neighbours, and keep the value with the greatest likelihood."""
+        """Compare one parameter with its two neighbours, and keep the value with the greatest likelihood.
+
+        The natural logarithm of each length scale has a standard normal prior.
+        """
         tried = [self._parameters, *(self._stepped(by) for by in (-1, 1))]
-        likely = [self._with(one).likelihood - _UNLIKELY * float(one.lengths @ one.lengths) for one in tried]
+        weight = 0.5 * math.log(2.0) ** 2
+        likely = [self._with(one).likelihood - weight * float(one.lengths @ one.lengths) for one in tried]
         self._parameters = tried[int(np.argmax(likely))]
         self._turn += 1
 
@@ -227,14 +228,14 @@ class Model:
         places = np.searchsorted(energy / energy[-1], rng.random(_CANDIDATES))
         places = np.minimum(places, len(best) - 1)
         centers, drawn = known[places], rng.random(shape)
-        scale = _LARGEST * (_SMALLEST / _LARGEST) ** rng.random((_CANDIDATES, 1))
+        scale = _WIDEST * (_FINEST / _WIDEST) ** rng.random((_CANDIDATES, 1))
         points = reflected(centers + scale * rng.standard_normal(shape))
         points = np.where(self._cube.categorical & (rng.random(shape) >= _OTHER), centers, points)
         points = np.where(self._cube.categorical & (points != centers), drawn, points)
         touched = rng.random(shape) < 2.0 ** -rng.integers(0, max(1, shape[1].bit_length()), (_CANDIDATES, 1))
         touched[np.arange(_CANDIDATES), rng.integers(shape[1], size=_CANDIDATES)] = True
         points = np.where(touched, points, centers)
-        around = known.mean(axis=0) + np.maximum(known.std(axis=0), _NARROWEST) * rng.standard_normal(shape)
+        around = known.mean(axis=0) + np.maximum(known.std(axis=0), _FINEST) * rng.standard_normal(shape)
         others = known[rng.integers(len(known), size=shape), np.arange(shape[1])]
         around = np.where(self._cube.categorical, others, reflected(around))
         how = rng.random(_CANDIDATES)

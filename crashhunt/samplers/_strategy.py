@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from bisect import insort
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["CRASHED", "Draft", "Elites", "ScoredTrial", "Strategy", "reflected", "scored_trial"]
+__all__ = ["CRASHED", "PLAIN_EVERY", "Draft", "Elites", "ScoredTrial", "Strategy", "reflected", "scored_trial"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +59,9 @@ def reflected(point: NDArray[np.float64]) -> NDArray[np.float64]:
 # Results as a sampler that learns sees them: a point, and a score that says how near it came to a crash.
 
 CRASHED = 1.0
-_NEAREST = 0.999  # upper bound of the score of a trial without a crash
+PLAIN_EVERY = 5
+"""Of the trials of a hunt that learns, one of so many is plain random, for an unbiased crash rate."""
+_NEAREST = math.nextafter(CRASHED, 0.0)  # upper bound of the score of a trial without a crash
 _NUMBER_AT_END = re.compile(r"[\W_]*\d+\W*$")  # of a lane id: the lane's index on its road
 
 

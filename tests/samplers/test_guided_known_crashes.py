@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -205,7 +206,7 @@ def test_kinds_are_reported_by_manner_and_road_and_by_what_was_raised():
 def test_a_danger_is_never_a_crash_and_a_crash_is_the_greatest_danger():
     spec = spec_of(0, ask(RandomSampler(UNIT), 0))
     for outcome, danger, score in (
-        (Outcome.SURVIVED, 1.0, 0.999),
+        (Outcome.SURVIVED, 1.0, math.nextafter(1.0, 0.0)),
         (Outcome.FINISHED, -0.5, 0.0),
         (Outcome.COLLISION, None, 1.0),
         (Outcome.HANG, 0.2, 1.0),

@@ -43,7 +43,7 @@ def test_only_the_order_of_scores_counts():
 def test_the_seed_of_a_dangerous_trial_is_worth_more_than_that_of_a_harmless_one():
     known = process([[0.0], [0.3], [0.5]], [0.1, 0.9, 0.2], seeds=[7, 8, 9], seeded=0.8)
     kept, other = known.worth(np.array([[0.33]] * 2), np.array([8, 7]), 0.3)
-    assert kept > other + 1
+    assert kept > other + 0.5
     told_nothing = process([[0.0], [0.3], [0.5]], [0.1, 0.9, 0.2], seeds=[7, 8, 9])
     assert len({*told_nothing.worth(np.array([[0.33]] * 2), np.array([8, 7]), 0.3).tolist()}) == 1
 
@@ -84,6 +84,14 @@ def test_fit_moves_parameters_by_one_step_at_a_time():
     assert steps == {-1, 0, 1}
 
 
+def test_a_model_proposes_as_soon_as_there_are_more_trials_than_arguments():
+    model, few = Model(PLANE), [*trials(lambda *_: 0.5, 3)]
+    for trial in few:
+        assert model.propose(0, np.random.default_rng(1)) is None
+        model.tell(trial)
+    assert model.propose(0, np.random.default_rng(1)) is not None
+
+
 def test_a_model_proposes_what_leads_uphill():
     model = Model(PLANE)
     for told in trials(lambda point, _: float(1 - np.linalg.norm(point - 0.8)), 25):
@@ -115,11 +123,11 @@ def test_another_peak_is_climbed_where_the_highest_leads_nowhere():
     drafts = [niches.propose(number, np.random.default_rng(number)) for number in range(20)]
     away = [np.linalg.norm(draft.point - 0.2) for draft in drafts if draft is not None]
     assert np.median(away) < 0.25
-    assert not niches.climbs
     niches.tell(ScoredTrial(59, np.array([0.8, 0.81]), 59, 0.95, "model"))
-    assert not niches.climbs  # that is another peak
+    foot = niches._foot.score
+    assert niches._record == foot  # that is another peak
     niches.tell(ScoredTrial(60, np.array([0.2, 0.21]), 60, 0.7, "niche"))
-    assert niches.climbs
+    assert niches._record == 0.7 > foot
     for number in range(61, 70):
         niches.tell(ScoredTrial(number, np.array([0.21, 0.2]), number, 0.5, "niche"))
     assert niches.propose(70, np.random.default_rng(0)) is None  # it came no nearer, and so it was left

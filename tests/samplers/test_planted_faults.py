@@ -23,9 +23,9 @@ def study():
 
 
 def test_guided_hunts_find_rare_faults_after_a_common_one(study):
-    hunts = [study.faults_found("rare", "guided", "name", seed) for seed in (3001, 3002)]
+    hunts = [study.faults_found("rare", "guided", "name", seed) for seed in range(3000, 3004)]
     assert all(hunt.count("0") > 1 for hunt in hunts)
-    assert all(len({*hunt}) > 1 for hunt in hunts)
+    assert sum(len({*hunt}) for hunt in hunts) >= 8  # of 12; random draws find 6
 
 
 def test_planted_faults_are_as_rare_as_they_are_said_to_be(study):
