@@ -1,0 +1,450 @@
+"""The contract suites fail for what breaks a contract: each case here breaks one promise, and one test finds it."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+import random
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from crashhunt.disturbances import Drawn
+from crashhunt.oracles import Finding, Overlap, ReportedCollision
+from crashhunt.samplers import Proposal, RandomSampler
+from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.simulators import SpeedAndLaneChange
+from crashhunt.simulators.toy import ToySimulator
+from crashhunt.space import Choice, Range
+from crashhunt.testing import AgentContract, OracleContract, SamplerContract, SimulatorContract, drive
+from crashhunt.testing._disturbances import DisturbanceContract
+from crashhunt.testing._escapes import EscapeCheck, RecordedThenBrakes
+from crashhunt.world import Event
+
+
+def failing(suite, fixtures):
+    """Return the tests of a contract suite that fail with what a function returns as their fixtures."""
+    found = set()
+    for name in dir(suite):
+        if not name.startswith("test_"):
+            continue
+        method = getattr(suite(), name)
+        code = method.__func__.__code__
+        wanted = code.co_varnames[1 : code.co_argcount]
+        try:
+            method(**{key: value for key, value in fixtures().items() if key in wanted})
+        except (AssertionError, pytest.fail.Exception):
+            found.add(name)
+    return found
+
+
+class Model:
+    """A disturbance model whose two draws have probability 0.3 and 0.7."""
+
+    what = "brake"
+    known = (0.3, 0.7)
+
+    def draw(self, rng):
+        return Drawn("ahead", 2.0 if rng.random() < 0.3 else 4.0, 1.0)
+
+    def log_likelihood(self, drawn):
+        return math.log(self.known[drawn.how_strong > 3])
+
+
+class Unlikely(Model):
+    known = (0.2, 0.6)
+
+
+class TooLikely(Model):
+    known = (0.35, 0.7)
+
+
+class Certain(Model):
+    known = (0.0, 1.0)
+
+    def draw(self, rng):
+        return Drawn("ahead", 4.0, 1.0)
+
+
+class Endless(Model):
+    def draw(self, rng):
+        return Drawn("ahead", super().draw(rng).how_strong, math.inf)
+
+
+class Global(Model):
+    def draw(self, rng):
+        return Drawn("ahead", 2.0 if random.random() < 0.3 else 4.0, 1.0)
+
+
+LIKELY, DRAWN, ALONE = (
+    "test_the_likelihood_is_that_of_the_draws",
+    "test_what_is_drawn_is_a_disturbance",
+    "test_the_generator_alone_decides",
+)
+
+
+@pytest.mark.parametrize(
+    ("model", "fails"),
+    [
+        (Model, set()),
+        (Certain, set()),
+        (Unlikely, {LIKELY}),
+        (TooLikely, {LIKELY}),
+        (Endless, {DRAWN}),
+        (Global, {ALONE}),
+    ],
+)
+def test_disturbance_contract_finds_what_is_broken(model, fails):
+    assert failing(DisturbanceContract, lambda: {"make": model}) == fails
+
+
+def test_scenes_of_the_oracle_contract_have_what_their_description_states():
+    scenes = []
+    for number, scene in enumerate(drive()):
+        scenes.append(scene)
+        rows = scene.roster.index
+        assert [*rows] == ["ego", "second", "other", "near"]
+        ego, second, other, near = (scene.points[rows[name]] for name in rows)
+        assert scene.speeds[rows["second"]] == 0.0
+        assert tuple(second) == (-30.0, 0.0)
+        assert (bool(scene.contacts)) == (abs(other[0] - ego[0]) < 4.5)
+        assert all((contact.collider, contact.victim) == ("ego", "other") for contact in scene.contacts)
+        assert (scene.off_road == ("ego",)) == (number > 55)
+        assert [event.kind for event in scene.events] == (["red_light"] if number == 20 else [])
+        assert scene.previous is (scenes[number - 1] if number else None)
+        if number:
+            moved = np.array(scene.points) - scenes[number - 1].points
+            assert moved[:, 0] == pytest.approx(np.array(scene.speeds) * 0.1)
+        assert near[1] - ego[1] == pytest.approx(2.2)
+    assert [scene.time_s for scene in scenes] == pytest.approx([n / 10 for n in range(60)])
+    assert any(scene.contacts for scene in scenes)
+    assert any(abs(scene.points[0][0] - scene.points[3][0]) < 1 for scene in scenes)
+
+
+class Forgetful(ReportedCollision):
+    """Changes the scene."""
+
+    def check(self, scene, agents):
+        found = super().check(scene, agents)
+        scene.contacts = ()
+        return found
+
+
+class Moody(ReportedCollision):
+    """Uses a global random generator."""
+
+    def check(self, scene, agents):
+        return super().check(scene, agents) if random.random() < 0.5 else []
+
+
+class Loud(ReportedCollision):
+    """Finds what no agent does."""
+
+    def check(self, scene, agents):
+        return [Finding("red_light", event=Event("red_light", "nobody", ""))]
+
+
+class Unnamed(Overlap):
+    name = ""
+
+
+SAME, LEFT, EVIDENCE, BEARS, NAMED = (
+    "test_the_same_scenes_give_the_same_findings",
+    "test_it_leaves_scenes_as_they_are",
+    "test_it_finds_what_agents_do_and_gives_the_evidence",
+    "test_it_bears_agents_that_are_not_there_and_empty_roads",
+    "test_it_has_a_name_and_states_which_outcomes_it_brings",
+)
+
+
+@pytest.mark.parametrize(
+    ("oracle", "fails"),
+    [(ReportedCollision, set()), (Forgetful, {LEFT}), (Moody, {SAME}), (Loud, {EVIDENCE, BEARS}), (Unnamed, {NAMED})],
+)
+def test_oracle_contract_finds_what_is_broken(oracle, fails):
+    assert failing(OracleContract, lambda: {"make": oracle}) == fails
+
+
+SPACE = {("ego", "speed"): Range(5.0, 30.0), ("", "mode"): Choice(("a", "b"))}
+
+
+class Outside(RandomSampler):
+    def ask(self, number, rng):
+        return Proposal({**super().ask(number, rng).arguments, ("ego", "speed"): 31.0})
+
+
+class Counts(RandomSampler):
+    """Keeps a state."""
+
+    calls = 0
+
+    def ask(self, number, rng):
+        self.calls += 1
+        return Proposal({**super().ask(number, rng).arguments, ("ego", "speed"): 5.0 + self.calls % 20})
+
+
+class Learns(RandomSampler):
+    """Learns, but states that it does not."""
+
+    seen = 0
+
+    def tell(self, result):
+        self.seen += 1
+
+    def ask(self, number, rng):
+        return Proposal({**super().ask(number, rng).arguments, ("ego", "speed"): 5.0 + self.seen % 20})
+
+
+class SecretOrder(RandomSampler):
+    """States that it learns, and proposes by the last result alone: by the order in which results arrive."""
+
+    learns, independent = True, False
+    last = 0
+
+    def tell(self, result):
+        self.last = result.spec.number
+
+    def ask(self, number, rng):
+        return Proposal({**super().ask(number, rng).arguments, ("ego", "speed"): 5.0 + self.last % 20})
+
+
+COMPLETE, NUMBER, AGAIN, WHATEVER, DRAWS = (
+    "test_every_proposal_is_complete_and_inside_the_space",
+    "test_a_proposal_depends_on_number_and_generator_alone",
+    "test_one_that_is_made_again_and_reported_the_same_proposes_the_same",
+    "test_one_that_does_not_learn_proposes_the_same_whatever_it_is_reported",
+    "test_independent_draws_of_the_scenario_do_not_depend_on_who_drives",
+)
+
+
+@pytest.mark.parametrize(
+    ("sampler", "fails"),
+    [
+        (RandomSampler, set()),
+        (Outside, {COMPLETE}),
+        (Counts, {NUMBER, AGAIN}),
+        (Learns, {WHATEVER}),
+        (SecretOrder, set()),  # results arrive in the same order
+    ],
+)
+def test_sampler_contract_finds_what_is_broken(sampler, fails):
+    assert failing(SamplerContract, lambda: {"make": sampler, "space": SPACE}) == fails
+
+
+class Agent:
+    """Keeps a speed."""
+
+    def reset(self, seed):
+        self.speed = 5.0
+
+    def act(self, observation):
+        return (self.speed, 0)
+
+
+class Drifts(Agent):
+    """Does not begin again at a reset."""
+
+    speed = 1.0
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        self.speed += 0.5
+        return (self.speed, 0)
+
+
+class Scribbles(Agent):
+    def act(self, observation):
+        observation[:] = 0
+        return super().act(observation)
+
+
+class Paints(Agent):
+    """Its panels change what it does."""
+
+    def panels(self):
+        self.speed += 1
+        return {}
+
+
+class OneText(Agent):
+    libraries = "numpy"
+
+
+ACTS, SHOWN, PANELS, LIBRARIES = (
+    "test_it_acts_inside_its_space_and_by_its_seed_alone",
+    "test_it_leaves_what_it_is_shown_alone",
+    "test_panels_are_pictures_and_change_nothing",
+    "test_the_libraries_that_it_needs_are_names",
+)
+
+
+@pytest.mark.parametrize(
+    ("agent", "fails"),
+    [(Agent, set()), (Drifts, {ACTS}), (Scribbles, {SHOWN}), (Paints, {PANELS}), (OneText, {LIBRARIES})],
+)
+def test_agent_contract_finds_what_is_broken(agent, fails):
+    def fixtures():
+        observations = [np.full((2, 2), 1.0 + n) for n in range(4)]
+        return {"make": agent, "form": SpeedAndLaneChange(), "observations": observations}
+
+    assert failing(AgentContract, fixtures) == fails
+
+
+class SameTraffic(ToySimulator):
+    def reset(self, *, seed, options=None):
+        return super().reset(seed=1, options=options)
+
+
+class Remembers(ToySimulator):
+    """An episode depends on the number of episodes before it."""
+
+    episodes = 0
+
+    def reset(self, *, seed, options=None):
+        self.episodes += 1
+        return super().reset(seed=seed + self.episodes, options=options)
+
+
+class OwnInstance(ToySimulator):
+    """An episode depends on the instance."""
+
+    numbers = itertools.count()
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.mine = next(self.numbers)
+
+    def reset(self, *, seed, options=None):
+        return super().reset(seed=seed + self.mine, options=options)
+
+
+class Errs(ToySimulator):
+    """A vehicle that is disturbed at the end of an episode is disturbed in the next."""
+
+    def reset(self, *, seed, options=None):
+        disturbed = getattr(self, "_disturbed", {})
+        found = super().reset(seed=seed, options=options)
+        self._disturbed = disturbed
+        return found
+
+    def disturb(self, vehicle, disturbance):
+        return SimpleNamespace(how_strong=1.0, keep=lambda: self._disturbed.update({vehicle: 0.0}), end=lambda: None)
+
+
+class Slow(ToySimulator):
+    """Its scenes are later than its step length states."""
+
+    def scene(self):
+        found = copy.copy(super().scene())
+        found.time_s *= 1.01
+        return found
+
+
+class Partial(ToySimulator):
+    """Offers half of a faculty."""
+
+    resolve_target = None
+
+
+class Half(ToySimulator):
+    """Has a lane twice."""
+
+    def lanes(self):
+        return [*super().lanes(), *super().lanes()]
+
+
+class Accelerates(ToySimulator):
+    """Its braking is no braking."""
+
+    def full_braking(self, agent):
+        found = super().full_braking(agent)
+        return (
+            found if agent != "ego" else type(found)(action=(40.0, 0), how=found.how, deceleration=found.deceleration)
+        )
+
+
+class Untold(ToySimulator):
+    """Has events that it does not announce."""
+
+    def scene(self):
+        found = super().scene()
+        found.events = (Event("red_light", "ego", "ego ran the red light"),)
+        return found
+
+
+class Leaves(ToySimulator):
+    """Reports an agent that takes no part any more."""
+
+    def step(self, actions):
+        observations, rewards, *more = super().step(actions)
+        return (observations, {**rewards, "gone": 0.0}, *more)
+
+
+ONLY_SEED, INSTANCE, TIME, RESEEDED = (
+    "test_an_episode_depends_on_its_seed_alone",
+    "test_a_second_instance_does_the_same",
+    "test_time_grows_by_the_step_length",
+    "test_another_seed_within_an_episode_changes_only_what_follows",
+)
+ERRS = "test_others_err_and_the_next_episode_knows_nothing_of_it"
+
+
+@pytest.mark.parametrize(
+    ("simulator", "fails"),
+    [
+        (ToySimulator, set()),
+        (SameTraffic, {ONLY_SEED}),
+        (Remembers, {ONLY_SEED, RESEEDED}),
+        (Errs, {ERRS}),
+        (OwnInstance, {INSTANCE}),
+        (Slow, {TIME}),
+        (Partial, {"test_it_offers_faculties_as_a_whole"}),
+        (Half, {"test_the_map_has_every_lane_once"}),
+        (Accelerates, {"test_braking_as_hard_as_it_can_is_an_action_that_does_not_speed_up"}),
+        (Untold, {"test_only_events_that_it_looks_for_happen"}),
+        (Leaves, {ONLY_SEED, INSTANCE, TIME, RESEEDED, ERRS}),
+    ],
+)
+def test_simulator_contract_finds_what_is_broken(simulator, fails, tmp_path):
+    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(), "second": AgentSetup(action="meta")})
+    if simulator is Errs:
+        scenario = replace(scenario, agents={"ego": AgentSetup()})  # which follows the leader, the only one to disturb
+    assert failing(SimulatorContract, lambda: {"make": lambda: simulator(scenario, tmp_path)}) == fails
+
+
+@pytest.mark.parametrize(
+    ("found", "verdict"),
+    [
+        ({}, "silent"),
+        ({"step": 3, "avoided": True}, "right"),
+        ({"step": 3, "avoided": False}, "wrong"),
+        ({"too_late": 4, "avoided_later": False}, "right"),
+        ({"too_late": 4, "avoided_later": True}, "wrong"),
+        ({"step": 3, "too_late": 4, "avoided": True, "avoided_later": False}, "right"),
+        ({"step": 3, "too_late": 4, "avoided": True, "avoided_later": True}, "wrong"),
+    ],
+)
+def test_verdict_on_an_escape_needs_both_runs(found, verdict):
+    assert EscapeCheck("c", **found).verdict == verdict
+
+
+def test_driver_repeats_the_log_and_brakes_after_its_step(monkeypatch):
+    log = SimpleNamespace(actions=lambda agent: [f"{agent} {n}" for n in range(4)])
+    monkeypatch.setattr("crashhunt.testing._escapes.read_log", lambda path: log)
+    found = []
+    for after in (2, 9):
+        agent = RecordedThenBrakes("log.mcap", "ego", after, None)
+        for _ in range(2):  # a reset begins again
+            agent.reset(1)
+            found.append([agent.act(None) for _ in range(6)])
+    first = ["ego 0", "ego 1", (0.0, 0), (0.0, 0), (0.0, 0), (0.0, 0)]
+    second = ["ego 0", "ego 1", "ego 2", "ego 3", "ego 3", "ego 3"]
+    assert found == [first, first, second, second]
+    meta = RecordedThenBrakes("log.mcap", "ego", 0, SimpleNamespace(meanings=("FASTER", "IDLE", "SLOWER")))
+    meta.reset(1)
+    assert meta.act(None) == 2
