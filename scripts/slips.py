@@ -259,7 +259,11 @@ class _Finder(ast.NodeVisitor):
         if name not in _ORDER_DOES_NOT_MATTER:
             self._swap(node.args, "arguments")
         self.visit(node.func)
-        self._each(node.args if name not in _ORDER_DOES_NOT_MATTER - set(_TWINS) else node.args[:1])
+        for argument in node.args if name not in _ORDER_DOES_NOT_MATTER - set(_TWINS) else node.args[:1]:
+            if name in _ORDER_DOES_NOT_MATTER and isinstance(argument, ast.Tuple):  # as of the ends of a text
+                self._each(argument.elts)
+            else:
+                self.visit(argument)
         # `strict` guards against a mistake of our own, which is not there; by its `indent` JSON says the same.
         self._each([keyword.value for keyword in node.keywords if keyword.arg not in ("strict", "indent")])
 

@@ -57,6 +57,9 @@ def test_tests_that_start_processes_run_after_those_that_reach_the_line(mutate):
 def test_what_no_test_should_notice_is_no_slip(mutate):
     source = 'import json\nTEXT = json.dumps({}, indent=1)\nPAIRS = list(zip((), (), strict=True))\n"""1 + 2"""\n'
     assert [slip.what for slip in mutate.find_slips(source) if "becomes" in slip.what] == []
+    assert [slip.what for slip in mutate.find_slips('END = name.endswith((".a", ".b"))\n')] == [
+        "endswith becomes startswith"
+    ]
     for value, found in (("False", ["False becomes True"]), ("0", ["0 becomes 1", "None is returned"]), ("None", [])):
         slips = mutate.find_slips(f"def f():\n    return {value}\n")
         assert sorted(slip.what for slip in slips) == found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -140,6 +141,14 @@ def test_edited_arguments_are_reported_with_their_owner():
     assert edits.others == ("gap_m was 21.5 and is 20.0",)
     assert edits.all == (*edits.agents, *edits.others)
     assert RECORDED.arguments == {"ego": {"speed": 5.0}}
+
+
+def test_edited_disturbances_are_other_traffic():
+    recorded = replace(RECORDED, disturbances=PLANNED)
+    trial, edits = edited_spec(recorded, settings(), settings(), {"disturbances.40": "none", "speed": "8"})
+    assert trial.disturbances == (BRAKE, STOP)
+    assert edits.others == ("disturbances.40 was late_action@40=itself:0.5:1.0 and is none",)
+    assert edits.agents == ("ego.speed was 5.0 and is 8.0",)
 
 
 def test_edits_of_hunt_toml_apply_or_are_reported_as_ignored():

@@ -15,6 +15,7 @@ from crashhunt.plans import Request, plan, with_settings
 from crashhunt.scenario import as_plain_data, load_scenario, shipped_folder
 from crashhunt.scenario.backends.sumo import StagedFiles, canonical, is_true, references, rewritten
 from crashhunt.scenario.backends.sumo._check import check_options
+from crashhunt.scenario.backends.sumo._side_effects import side_effect
 
 ROUTES = (
     '<routes><route id="way" edges="south east north west"/>{}'
@@ -224,6 +225,22 @@ def test_options_under_any_name(town, text, says):
     with pytest.raises(ScenarioError) as caught:
         load_scenario(town)
     assert says in str(caught.value) or "does not exist" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        ("begin = 5", ""), ("scale = 1.5", ""),
+        ("tripinfo-output = 'out.xml'", "it sets SUMO's option 'tripinfo-output'"),
+        ("remote-port = 8813", "it sets SUMO's option 'remote-port'"),
+    ],
+)  # fmt: skip
+def test_an_option_with_a_side_effect_is_named_and_a_harmless_one_is_not(town, options, found):
+    (town / "scenario.toml").write_text(
+        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
+        f"[sumo.options]\n{options}\n"
+    )
+    assert side_effect(load_scenario(town), {"scale": 1.0}, ()) == found
 
 
 def test_an_option_that_every_trial_has_is_refused_with_the_fix_and_an_output_is_disabled(town):

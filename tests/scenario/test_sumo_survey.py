@@ -188,3 +188,10 @@ def test_vehicles_of_a_flow_depart_as_often_as_it_is_written(tmp_path, rate, int
     assert _departure_of("a.b.2", [file]) == pytest.approx(20 + 2 * interval_s)
     assert _departure_of("alone", [file]) == 5
     assert _departure_of("a.b", [file]) == _departure_of("gone.1", [file]) == 0.0
+
+
+def test_vehicles_of_a_file_that_is_no_xml_are_not_passed_over(tmp_path):
+    (tmp_path / "r.rou.xml").write_text('<routes><vehicle id="a" depart="5"/>')
+    with pytest.raises(ScenarioError, match="not valid XML") as caught:
+        _departures([tmp_path / "r.rou.xml"])
+    assert caught.value.where == str(tmp_path / "r.rou.xml")
