@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, strategies as st
+from hypothesis import example, given, strategies as st
 
 from crashhunt.errors import ScenarioError
 from crashhunt.maps import MapSource, read_network
@@ -164,6 +164,18 @@ def test_agent_gets_no_short_route_where_there_are_long_ones():
     assert set(_ego_routes([*short, *long])) == {one.id for one in long}
 
 
+def test_routes_of_at_least_250_m_are_long_enough_for_an_agent():
+    routes = [route(f"r{number}", f"s{number}", length=260.0 + number, weight=1 + number % 3) for number in range(20)]
+    routes += [route(f"k{number}", f"t{number}", length=240.0, weight=99) for number in range(5)]
+    chosen = _ego_routes(routes)
+    assert len(chosen) == 12
+    assert {name[0] for name in chosen} == {"r"}
+    weights = {one.id: one.weight for one in routes}
+    assert [weights[name] for name in chosen] == sorted(
+        (one.weight for one in routes if one.id[0] == "r"), reverse=True
+    )[:12]
+
+
 def filled(text, **values):
     names = string.Template(text).get_identifiers()
     given = {"imperfection": 0.5, "speed_spread": 0.1, "ego_route": "a", **values}
@@ -228,6 +240,7 @@ def test_traffic_that_flows_is_no_jam(values):
 # The texts.
 
 
+@example(title="delete \x7f and \x85", agent="")
 @given(title=st.text(max_size=80), agent=st.sampled_from(["", "mine:Driver"]))
 def test_scenario_of_any_title_is_valid(title, agent):
     arguments = arguments_of(demand(route("a", "x"), route("b", "y")), (0.2, 1.5), bicycles=True)
