@@ -62,6 +62,13 @@ _TESTS_ELSEWHERE = {
     "cli/_whatif.py": ("e2e/test_what_if.py",),
     "corpus": ("e2e/test_corpus.py",),
     "crashes/_trust.py": ("crashes/test_trust.py", "e2e/test_foreign_hunts.py"),
+    "episode/_action_override.py": (
+        "episode/test_overruled_agents.py",
+        "episode/test_reference_driver.py",
+        "whatif/test_what_is_counted.py",
+    ),
+    "episode/_fast_path.py": ("native/test_usual_steps.py", "episode/test_episode*.py"),
+    "episode/_splitting.py": ("rates/test_splitting.py",),
     "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),
     "estimation/_gate.py": ("e2e/test_gate.py",),
     # Processes of trials are seen by what is left of trials that harm them.

@@ -127,6 +127,15 @@ def test_it_refuses_a_lane_change_into_a_gap_that_is_not_safe(side, kind):
     assert driver(road, "lateral", (20.0, -1)).act(None) == (20.0, -1)
 
 
+@pytest.mark.parametrize(("word", "side"), [("LANE_LEFT", 1), ("LANE_RIGHT", -1)])
+def test_refused_meta_action_of_either_side_is_idle(word, side):
+    form = MetaAction(("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER"))
+    number = form.space.meanings.index(word)
+    for unsafe, expected in ((side, "IDLE"), (-side, word)):
+        road = Road(300.0, form=form, sides={unsafe: Side(exists=False), -unsafe: Side(exists=True)})
+        assert form.space.meanings[driver(road, "lateral", number).act(None)] == expected
+
+
 def test_each_vehicle_of_an_unsafe_gap_is_noted():
     """The collision partner need not be the vehicle with the least safe gap."""
     ahead = Neighbor(actor="near", gap_m=-2.0, speed_mps=27.0, braking_mps2=BRAKING)
