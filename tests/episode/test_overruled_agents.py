@@ -7,10 +7,12 @@ from types import SimpleNamespace
 import pytest
 from gymnasium import spaces
 
+from crashhunt import recording
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.episode import overruled_agent
+from crashhunt.episode._action_override import HandedOver
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange, action_form
-from crashhunt.trial import Overruled
+from crashhunt.trial import Handover, Overruled
 
 WORDS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 
@@ -107,3 +109,17 @@ def test_of_words_those_are_passed_over_that_would_change_what_is_kept():
     for keeps, lost in (("lane", ("LANE_LEFT", "LANE_RIGHT")), ("speed", ("FASTER", "SLOWER"))):
         agent = overruled_agent(Driver(*range(5)), Lanes(MetaAction(WORDS)), Overruled("ego", 0, keeps=keeps))
         assert said(agent) == [idle if word in lost else number for number, word in enumerate(WORDS)]
+
+
+def test_a_driver_takes_over_after_the_recorded_actions_and_begins_there(monkeypatch):
+    kept = SimpleNamespace(actions=lambda agent: [f"{agent} {step}" for step in range(3)])
+    monkeypatch.setattr(recording, "read_log", lambda path: kept, raising=False)
+    driver = Driver("drive")
+    agent = HandedOver(driver, Handover(agent="ego", log="log.mcap", after=3))
+    for episode in (1, 2):
+        assert said(agent) == ["ego 0", "ego 1", "ego 2", "drive", "drive"]
+        assert driver.asked == [3, 4] * episode
+        assert driver.seeds == [3] * episode
+    agent.close()
+    assert driver.closed == 1
+    HandedOver(SimpleNamespace(act=None, reset=None), Handover(agent="ego", log="log.mcap", after=3)).close()
