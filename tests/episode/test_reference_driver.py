@@ -177,9 +177,11 @@ def test_meta_actions_become_slower_or_idle():
     form = MetaAction()
     slower, idle, faster = (form.space.meanings.index(word) for word in ("SLOWER", "IDLE", "FASTER"))
     assert driver(Road(10.0, 25.0, 15.0, form), "longitudinal", faster).act(None) == slower
-    gap = Road(300.0, 25.0, 25.0, form, sides={1: Side(exists=False)})
-    left = form.space.meanings.index("LANE_LEFT")
-    assert driver(gap, "lateral", left).act(None) == idle
+    left, right = (form.space.meanings.index(f"LANE_{side}") for side in ("LEFT", "RIGHT"))
+    for there, free, taken in ((1, right, left), (-1, left, right)):
+        gap = Road(300.0, 25.0, 25.0, form, sides={there: Side(exists=False)})
+        assert driver(gap, "lateral", taken).act(None) == idle
+        assert driver(gap, "lateral", free).act(None) == free
     assert driver(gap, "longitudinal", faster).act(None) == faster
 
 

@@ -16,6 +16,7 @@ from crashhunt.scenario import (
     AgentSetup,
     Scenario,
     load_scenario,
+    scenario_digest,
     scenario_from_dict,
     shipped_folder,
     shipped_scenarios,
@@ -350,3 +351,25 @@ def test_a_wrong_value_is_named_with_its_key_and_the_fix(changes, where, says, f
     assert fix in caught.value.fix
     assert caught.value.where == "file"
     check(Scenario(simulator="toy", agents={"ego": AgentSetup()}, events={"not_moving": 3.0}), "file", kept=False)
+
+
+def test_arguments_have_their_names_and_a_mistake_in_them_is_found_by_file_and_table(loop):
+    scenario = load_scenario(loop)
+    assert {name: argument.name for name, argument in scenario.scenario_arguments().items()} == {
+        name: name for name in scenario.arguments
+    }
+    name = next(name for name, setup in scenario.arguments.items() if setup.range)
+    change(loop, "arguments", name, "range", value="odd:")
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(loop)
+    assert str(loop) in str(caught.value)
+    assert name in str(caught.value)
+
+
+def test_the_digest_of_a_scenario_is_that_of_its_values_and_files(loop):
+    scenario = load_scenario(loop)
+    before = scenario_digest(scenario)
+    assert scenario_digest(load_scenario(loop)) == before
+    assert scenario_digest(replace(scenario, warmup_s=scenario.warmup_s + 1)) != before
+    (loop / "loop.net.xml").write_bytes((loop / "loop.net.xml").read_bytes() + b"\n")
+    assert scenario_digest(load_scenario(loop)) != before
