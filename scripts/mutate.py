@@ -144,7 +144,7 @@ _TESTS_ELSEWHERE = {
     "testing/_backends.py": ("scenario/test_backends.py",),
     "testing/_disturbances.py": ("testing/test_broken_contracts.py", "disturbances/test_rates.py"),
     "testing/_escapes.py": ("testing/test_broken_contracts.py", "e2e/test_escapes.py"),
-    "testing/_survives.py": ("testing/test_survives.py", "e2e/test_survives.py"),
+    "testing/_survives.py": ("testing/test_assert_survives.py", "e2e/test_survives.py"),
     "whatif/_avoidability.py": ("whatif/test_avoiding.py", "e2e/test_judging.py"),
     "whatif/_causes.py": ("whatif/test_maneuvers.py", "e2e/test_judging.py"),
     "whatif/_engine.py": ("whatif/test_what_is_counted.py", "whatif/test_reruns.py", "e2e/test_what_if.py"),
