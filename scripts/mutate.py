@@ -138,7 +138,12 @@ _TESTS_ELSEWHERE = {
     "scenario": ("scenario/test_*.py",),
     "replays/_debugger.py": ("replays/test_debugged_process.py", "e2e/test_debugger.py"),
     "replays/_prepare.py": ("replays/test_prepare.py", "e2e/test_replay.py"),
-    "replays/_replay.py": ("replays/test_killed_replays.py", "replays/test_verdicts.py", "e2e/test_replay.py"),
+    "replays/_replay.py": (
+        "replays/test_killed_replays.py",
+        "replays/test_prepare.py",
+        "replays/test_verdicts.py",
+        "e2e/test_replay.py",
+    ),
     "snapshots": ("snapshots/test_*.py", "e2e/test_snapshot.py"),
     "suites": ("suites/test_*.py", "e2e/test_suite.py", "e2e/test_gate.py"),
     "testing/_backends.py": ("scenario/test_backends.py",),

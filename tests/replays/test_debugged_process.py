@@ -12,6 +12,7 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.panels import Text
 from crashhunt.replays import Look, _debugger
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 
@@ -107,3 +108,30 @@ def test_leaving_the_debugger_and_closing_the_window_are_interrupts(ends, monkey
     monkeypatch.delenv("DISPLAY")
     with pytest.raises(UsageError, match="needs a display"):
         _debugger.debug(rerun(), Look(until=12, window=1.0))
+
+
+def test_panels_are_those_of_agents_that_draw_from_the_first_step_on(monkeypatch, tmp_path):
+    class Draws:
+        def panels(self):
+            return {"plan": Text("left")}
+
+    class Fails:
+        def panels(self):
+            raise ValueError("no plan yet")
+
+    saved = []
+    monkeypatch.setattr(_debugger, "save_panels", lambda folder, step, panels: saved.append((folder, step, panels)))
+    episode = SimpleNamespace(names=["a", "b", "c"], agents={"a": Draws(), "b": object(), "c": Fails()}, steps=0)
+    space = SimpleNamespace(meanings=("LEFT", "RIGHT"))
+    episode.simulator = SimpleNamespace(actions={name: SimpleNamespace(space=space) for name in episode.names})
+    observer = _debugger._Panels(3, tmp_path)
+    observer.begin(episode)
+    for step in range(1, 5):
+        episode.steps = step - 1
+        for number in range(3):
+            observer.action(number, None)
+    assert [(folder, step, panels[0][0]) for folder, step, panels in saved] == [
+        (tmp_path, 3, "a/plan"), (tmp_path, 3, "c/panels"), (tmp_path, 4, "a/plan"), (tmp_path, 4, "c/panels"),
+    ]  # fmt: skip
+    assert "no plan yet" in " ".join(saved[1][2][0][1].text.split())
+    assert "LEFT" in (tmp_path / "meanings.jsonl").read_text()
