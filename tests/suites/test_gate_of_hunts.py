@@ -143,3 +143,28 @@ def test_limits_out_of_range_are_refused_before_anything_is_written(tmp_path, wr
         gate(tmp_path, **wrong).run(tmp_path / "g")
     assert not (tmp_path / "g").exists()
     assert math.isinf(gate(tmp_path).duration_s)
+
+
+def test_a_version_is_an_agent_or_else_a_commit(tmp_path):
+    assert GateVersion.of("mine:Driver", tmp_path) == GateVersion("mine:Driver", {"": "mine:Driver"})
+    assert GateVersion.of("ego=keep-lane", tmp_path).agents == {"ego": "keep-lane"}
+    for word in ("ego=nobody", "", "no-such-revision"):
+        with pytest.raises(UsageError, match="is neither an agent nor a commit"):
+            GateVersion.of(word, tmp_path)
+    found = GateVersion("v1", {}, commit="0123456789abcdef")
+    assert str(found) == "v1 (0123456789)"
+    assert str(GateVersion("0123", {}, commit="0123456789abcdef")) == "0123"
+    assert str(GateVersion("m:A", {"": "m:A"})) == "m:A"
+
+
+def test_hunts_go_on_until_the_pairs_are_enough(tmp_path, ran, monkeypatch):
+    said = []
+
+    def watched(*words, is_enough, **more):
+        said.append(is_enough())
+        run_all(*words, is_enough=lambda: said.append(is_enough()), **more)
+
+    run_all = _gate.run_all
+    monkeypatch.setattr(_gate, "run_all", watched)
+    gate(tmp_path, ["loop"], most=5).run(tmp_path / "g")
+    assert said == [False, True]

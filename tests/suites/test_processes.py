@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,8 +14,8 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.hunts import hunt_state
-from crashhunt.plans import Request, RunSettings, SnapshotChoices
-from crashhunt.suites import RunRequest, _processes, rerun, run_all
+from crashhunt.plans import Request, RunSettings, SnapshotChoices, plan
+from crashhunt.suites import RunRequest, Suite, SuiteEntry, _processes, _rerun, rerun, run_all
 from crashhunt.suites._processes import REQUEST, check_machine, set_aside, write_request
 
 ASKED = RunRequest(
@@ -177,3 +178,45 @@ def test_options_of_the_machine_are_checked_before_any_hunt_runs(parallel, machi
     with pytest.raises(Exception, match=r".+") as caught:
         check_machine(parallel, machine)
     assert "\n" not in str(caught.value)
+
+
+def test_results_are_moved_aside_also_where_names_cannot_be_exchanged(folders, monkeypatch):
+    monkeypatch.setattr(_processes, "exchange", lambda one, other: False)
+    (folders[0] / "result").write_text("old")
+    aside = set_aside(folders[0], lambda aside: ASKED)
+    assert (aside / "result").read_text() == "old"
+    assert [path.name for path in folders[0].iterdir()] == [REQUEST]
+    assert {path.name for path in folders[0].parent.iterdir() if not path.name.startswith(".")} == {
+        "a", "b", "c", aside.name,
+    }  # fmt: skip
+
+
+def test_the_request_of_settings_results_in_the_same_settings():
+    chosen = {"arguments": {"speed": "4:8"}, "scenario_arguments": {"vehicles": "12"}, "disturb": ("brake=0.1",)}
+    given = Request(scenario="loop", trials=7, max_steps=9, seed=3, sampler="sobol", **chosen,
+                    run=RunSettings(keep_going=True))  # fmt: skip
+    scenario, settings = plan(given)
+    assert [*scenario.agents] == ["ego"]
+    again = _rerun._request_of(settings)
+    assert (again.trials, again.max_steps, again.seed, again.sampler, again.disturb) == (
+        7,
+        9,
+        3,
+        "sobol",
+        ("brake=0.1",),
+    )
+    assert plan(again)[1] == settings
+
+
+@pytest.mark.parametrize(
+    ("entry", "says"),
+    [
+        ({"id": "a", "runs": 0}, "hunts.a.runs = 0"), ({"id": "../a"}, "is not a valid folder name"),
+        ({"id": "a", "agent": "m:A", "agents": {"ego": "m:A"}}, "has both agent and agents"),
+    ],
+)  # fmt: skip
+def test_a_hunt_that_no_folder_could_have_is_refused(entry, says):
+    with pytest.raises(UsageError, match=re.escape(says)):
+        Suite([SuiteEntry(**entry)])
+    with pytest.raises(UsageError, match="the id 'A' is used twice"):
+        Suite([SuiteEntry(id="a"), SuiteEntry(id="A")])
