@@ -94,6 +94,7 @@ _TESTS_ELSEWHERE = {
     "executors/_postmortem.py": ("executors/test_evidence.py", "executors/test_what_is_left.py"),
     "executors/_protocol.py": ("executors/test_what_is_left.py", "executors/test_pool_of_trials.py"),
     "executors/_supervisor.py": (
+        "executors/test_escapes_of_trials.py",
         "executors/test_killed_trials.py",
         "executors/test_maps_of_trials.py",
         "executors/test_warm_traffics.py",

@@ -157,7 +157,7 @@ def test_a_version_is_an_agent_or_else_a_commit(tmp_path):
     assert str(GateVersion("m:A", {"": "m:A"})) == "m:A"
 
 
-def test_hunts_go_on_until_the_pairs_are_enough(tmp_path, ran, monkeypatch):
+def test_hunts_continue_until_the_pairs_are_enough(tmp_path, ran, monkeypatch):
     said = []
 
     def watched(*words, is_enough, **more):
