@@ -68,7 +68,7 @@ def test_a_search_that_is_always_killed_states_so_and_leaves_it_open(search):
 
 
 @pytest.mark.parametrize(("deceleration", "expected"), [(4, 4.0), (7.5, 7.5), (None, None)])
-def test_the_search_brakes_as_the_simulator_says(search, deceleration, expected):
+def test_the_search_brakes_with_the_deceleration_of_the_simulator(search, deceleration, expected):
     search(braking={"how": "with full braking", "deceleration": deceleration})
     assert (search.asked.braking.how, search.asked.braking.deceleration) == ("with full braking", expected)
     search()
