@@ -112,7 +112,8 @@ def test_record_of_a_training_has_its_seeds(make, tmp_path):
     [
         ({"before_s": 0}, "before_s is 0; give a time above 0"), ({"after_s": math.inf}, "after_s is inf"),
         ({"before_s": "5"}, "before_s is '5'; give a number"), ({"share": 1.1}, "share is 1.1"),
-        ({"share": -0.1}, "share is -0.1"), ({"max_steps": 0}, "max_steps is 0"), ({"max_steps": 1.5}, "max_steps is 1.5"),
+        ({"share": -0.1}, "share is -0.1"), ({"max_steps": 0}, "max_steps is 0"),
+        ({"max_steps": 1.5}, "max_steps is 1.5"),
         ({"crash_reward": math.nan}, "crash_reward is nan"), ({"test": 1.0}, "test is 1"), ({"agent": 3}, "agent is 3"),
         ({"render_mode": "human"}, "render_mode is 'human'"), ({"trained_on": 3}, "trained_on is 3"),
         ({"trained_on": "a\0b"}, "trained_on is 'a"),
