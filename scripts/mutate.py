@@ -39,11 +39,12 @@ _SURVEY_S = 900  # of the processor, for all nearest tests of a package
 _TESTS_ELSEWHERE = {
     # Tests of the accelerator compare it with highway-env through the simulator.
     "accelerator": ("simulators/test_accelerator*.py", "simulators/test_kernel.py", "simulators/test_dynamic_*.py"),
-    "api.py": ("test_api.py", "e2e/test_api.py"),
+    "api.py": ("test_python_calls.py", "e2e/test_api.py"),
     "base/codec.py": ("base/test_codec.py", "trial/test_result.py"),
     "base/forks.py": ("base/test_reaper.py", "episode/test_fork.py", "episode/test_questions.py"),
     "base/git.py": ("base/test_git.py",),
     "base/integrity.py": ("base/test_integrity.py", "base/test_authentication.py"),
+    "native/_generators.py": ("native/test_generator_seeds.py",),
     "panels": ("render/test_panels*.py", "render/test_pictures.py"),
     "rates/_rare.py": ("rates/test_rare.py", "rates/test_splitting.py", "hunts/test_rare_hunts.py"),
     # These are tested as users run them: as commands.

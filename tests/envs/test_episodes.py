@@ -138,6 +138,29 @@ def test_wrong_use_is_answered_with_what_to_do(make):
     with pytest.raises(UsageError, match="there is no controlled vehicle 'egon'; did you mean 'ego'"):
         SumoEnv("loop", agent="egon")
     assert make("loop").render() is None
+    with pytest.raises(UsageError, match="render_mode is 'human'; give one of rgb_array"):
+        SumoEnv("loop", render_mode="human")
+
+
+def test_actions_are_those_that_were_chosen(make):
+    assert make("loop", action="meta").action_space.n == 5
+    assert len(make("loop", action="continuous").action_space) == 2  # speed and lane change
+
+
+def test_fork_of_a_process_has_no_simulation_of_its_own_yet(make, monkeypatch):
+    monkeypatch.setattr("crashhunt.envs._sumo_env.RemoteEpisodes", lambda *words: Ended())
+    monkeypatch.setattr("crashhunt.envs._sumo_env._here", weakref.WeakSet())
+    monkeypatch.setattr("crashhunt.envs._sumo_env._process", [])
+    make("loop")
+    assert SumoEnv("loop").agent == "of another process"
+    monkeypatch.setattr("crashhunt.envs._sumo_env.os.getpid", lambda: -5)  # as in a fork
+    first = SumoEnv("loop")
+    assert first.agent == "ego"
+    assert SumoEnv("loop").agent == "of another process"
+    first.close()
+    second = SumoEnv("loop")  # what the parent has does not count
+    assert second.agent == "ego"
+    second.close()
 
 
 def test_only_the_first_environment_of_a_process_has_its_simulation(make, monkeypatch):

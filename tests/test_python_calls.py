@@ -55,7 +55,8 @@ def test_replay_passes_on_what_is_given(work):
     assert (plain[1].code, plain[1].times, plain[1].scenario) == ("snapshot", 1, "")
 
 
-def test_what_if_passes_on_what_is_given(work):
+def test_what_if_passes_on_what_is_given(work, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", {0: range(6)}.__getitem__)  # of this process
     assert crashhunt.what_if("h", from_step=4) == "counts"
     assert crashhunt.what_if(
         "h", "3", changes={"speed": 3}, before_s=2.0, agent="idm", arguments={"b": 1}, futures=True, overrule="brake",
@@ -75,8 +76,8 @@ def test_what_if_passes_on_what_is_given(work):
     found = [words for words, _ in work.counted]
     assert [words[:2] for words in found] == [("found", ("change",))] * 3
     plain, full, chosen = (words[2] for words in found)
-    cores = len(os.sched_getaffinity(0))
-    assert plain == whatif.WhatIfOptions(code="snapshot", times=0, time_s=None, parallel=cores, trusted=None)
+    assert work.found == [(Path("h"), ""), (Path("h"), "3"), (Path("h"), "")]
+    assert plain == whatif.WhatIfOptions(code="snapshot", times=0, time_s=None, parallel=6, trusted=None)
     assert full == whatif.WhatIfOptions(code="current", times=7, time_s=9.0, parallel=2, trusted=True)
     assert chosen.code == "snapshot"
 
@@ -153,6 +154,24 @@ def test_hunt_is_prepared_as_asked(hunt):
     }  # fmt: skip
     crashhunt.prepare("h", 2, 30, 100, snapshot_limit_mb=7)
     assert made[-1][1]["snapshot"] == SnapshotOptions.of(HuntOptions(snapshot_limit_mb=7)) != plain["snapshot"]
+
+
+def test_traffic_is_surveyed_in_the_directory_of_the_hunt(hunt, monkeypatch):
+    surveyed = []
+
+    def survey(directory, *, overwrite):
+        return lambda *words: surveyed.append((directory, overwrite, words)) or "surveyed"
+
+    def plan(request, survey):
+        assert survey("scenario", "request", "settings") == "surveyed"
+        return "scenario", "settings", SimpleNamespace(imported=())
+
+    monkeypatch.setattr("crashhunt.hunts.TrafficSurveyor", survey)
+    monkeypatch.setattr("crashhunt.plans.plan_with_code", plan)
+    crashhunt.prepare("h", 2, 30, 100)
+    crashhunt.prepare("g", 2, 30, 100, overwrite=True)
+    words = ("scenario", "request", "settings")
+    assert surveyed == [(Path("h"), False, words), (Path("g"), True, words)]
 
 
 def test_values_out_of_range_are_refused_before_anything_is_made(hunt):
