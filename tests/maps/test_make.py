@@ -111,6 +111,22 @@ def test_a_folder_has_everything_and_its_scenario_can_be_loaded(made_up, tmp_pat
         make_scenario(GRID, options, place)
 
 
+def test_the_picture_is_of_the_busy_traffic_in_vehicles_per_hour(made_up, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(_make, "draw_map", lambda *words, **more: drawn.append((words, more)))
+    make_scenario(GRID, MapOptions(), tmp_path / "place")
+    (((network, vehicles, file), more),) = drawn
+    assert len(network.edges) == 8
+    assert vehicles == RUN.edge_vehicles
+    assert file.name == "map.png"
+    assert more["hours"] == RUN_S / 3600
+    assert more["title"].endswith(": traffic at demand 1.5")
+    assert more["busiest"] == [("from-north", 360.0), ("from-east", 180.0)]
+    monkeypatch.setattr(_make, "draw_map", lambda *words, **more: __import__("no_such_package"))
+    with pytest.raises(ScenarioError, match="needs Pillow"):
+        make_scenario(GRID, MapOptions(), tmp_path / "other")
+
+
 @pytest.mark.parametrize(
     ("outcome", "words"), [("hang", "--timeout"), ("agent_error", "the agent mine:Driver failed"), ("survived", "")]
 )

@@ -348,6 +348,23 @@ def test_busy_roads_are_drawn_in_other_colors(tmp_path):
     assert blue > 500
 
 
+def test_a_busy_road_is_drawn_over_a_quiet_one_that_it_crosses(tmp_path):
+    image_of = pytest.importorskip("PIL.Image")
+    across = NetworkLane(length_m=100.0, speed_mps=10.0, allowed=None, disallowed=frozenset(),
+                         shape=((50.0, -50.0), (50.0, 50.0)))  # fmt: skip
+    middles = []
+    for names in (("along", "across"), ("across", "along")):
+        roads = {"along": [lane()], "across": [across]}
+        found = network(**{name: roads[name] for name in names})
+        draw_map(found, {"along": 90.0, "across": 3.0}, tmp_path / "m.png", title="t", hours=0.1, busiest=[])
+        with image_of.open(tmp_path / "m.png") as image:
+            pixels = np.asarray(image.convert("RGB")).astype(int)
+        red = (pixels[..., 0] > 180) & (pixels[..., 1] < 80) & (pixels[..., 2] < 80)
+        rows, columns = np.nonzero(red[60:-60])
+        middles.append(red[60 + int(np.median(rows)), int(np.median(columns))])
+    assert middles == [True, True]
+
+
 @pytest.mark.parametrize(("text", "shown"), [("Straße", "Strasse"), ("Łódź", "Lodz"), ("A 9", "A 9"), ("東京通り", "")])
 def test_names_are_drawn_in_letters_that_the_font_has(text, shown):
     pytest.importorskip("PIL")

@@ -42,6 +42,10 @@ def test_name_of_place_is_file_without_ending(tmp_path, name, kind, expected):
     assert source(tmp_path / name, kind).name == expected
 
 
+def test_a_shape_has_its_numbers_in_the_order_in_which_they_are_given():
+    assert parse_shape("3x5", "--grid") == (3, 5)
+
+
 def test_a_generated_map_is_named_by_its_kind_and_shape():
     grid, spider = MapSource(kind="grid", shape=(2, 3)), MapSource(kind="spider", shape=(5, 1))
     assert (grid.name, spider.name) == ("grid-2x3", "spider-5x1")
