@@ -221,11 +221,11 @@ def test_what_sumo_wrote_of_the_traffic_is_counted_without_the_probes(tmp_path):
     values = {"imperfection": 0.5, "speed_spread": 0.1, "trucks_per_100_cars": 10, "demand": 1.0,
               "persons_per_path": 3}  # fmt: skip
     found = run_plain_traffic(
-        DEMAND, read_network(MAP), SimpleNamespace(run=run), tmp_path, values, net="n", scale=2.0, probes_at_s=30.0,
+        DEMAND, read_network(MAP), SimpleNamespace(run=run), tmp_path, values, net="n", scale=3.0, probes_at_s=30.0,
         bicycles=False,
     )  # fmt: skip
     assert found == PlainRun(
-        demand=2.0, wanted=52 + 6 - 2, entered=51, arrived=2, running=20, halting=5, teleports=3, collisions=2,
+        demand=3.0, wanted=52 + 6 - 2, entered=51, arrived=2, running=20, halting=5, teleports=3, collisions=2,
         mean_speed_mps=20.0, persons=4, edge_vehicles={"a": 5.0, "b": 0.0}, probe_delays_s={"r0": 1.5},
     )  # fmt: skip
     assert words[0] == "sumo"
