@@ -140,7 +140,7 @@ _TESTS_ELSEWHERE = {
     "report": ("report/test_*.py",),
     "scenario": ("scenario/test_*.py",),
     "replays/_debugger.py": ("replays/test_debugged_process.py", "e2e/test_debugger.py"),
-    "replays/_prepare.py": ("replays/test_prepare.py", "e2e/test_replay.py"),
+    "replays/_prepare.py": ("replays/test_prepare.py", "e2e/test_foreign_hunts.py", "e2e/test_replay.py"),
     "replays/_replay.py": (
         "replays/test_killed_replays.py",
         "replays/test_prepare.py",

@@ -7,9 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from crashhunt.base.errors import CrashhuntError
 from crashhunt.recording import AgentChannel, Divergence, Prologue
-from crashhunt.replays import _replay
-from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
+from crashhunt.replays import Look, _debugger, _replay
+from crashhunt.trial import Collision, Failure, Outcome, TrialResult, TrialSpec
 
 EGO = AgentChannel("ego", "float32", (8, 7), "float64", (2,))
 PROLOGUE = Prologue((EGO,), 0.1)
@@ -89,3 +90,21 @@ def test_equal_recordings_may_end_differently():
     assert ends(words) == ("collision.x", 1.0, 1.5)
     assert ends(words, "current") is None  # another version may describe it otherwise
     assert ends(FINE, "log", was=replace(CRASH, outcome=Outcome.HANG, collision=None)) is None
+
+
+def test_elsewhere_a_crash_is_another_one_and_none_is_no_fix():
+    rerun = SimpleNamespace(elsewhere=True, worker=SimpleNamespace(crash_on=("collision",)), other_traffic=("the map",))
+    there = _replay.judged(rerun, None, None, CRASH)
+    assert (there.verdict, there.replayed) == ("changed", CRASH)
+    fine = _replay.judged(rerun, None, None, FINE)
+    assert fine.verdict == "not_comparable"
+    assert fine.reason.startswith("no crash, but the map, ")
+
+
+def test_a_replay_that_cannot_be_set_up_is_an_error_with_the_reason(monkeypatch):
+    failure = Failure("invalid", "the agent needs a map")
+    result = replace(FINE, outcome=Outcome.INVALID, steps=0, failure=failure)
+    monkeypatch.setattr(_debugger, "debug", lambda rerun, look: (result, None))
+    with pytest.raises(CrashhuntError, match="as far as the first step: the agent needs a map") as caught:
+        _replay._look_into(SimpleNamespace(bundle=SimpleNamespace(id="000004-collision")), Look(until=3))
+    assert caught.value.where == "000004-collision"
