@@ -71,10 +71,16 @@ _TESTS_ELSEWHERE = {
     "cli/_run.py": ("e2e/test_run_help.py", "e2e/test_commands.py", "e2e/test_stops.py"),
     "cli/_show.py": ("e2e/test_show.py",),
     "cli/_shrink.py": ("e2e/test_shrink.py",),
-    "cli/_split.py": ("training/test_held_out_traffics.py",),
+    "cli/_split.py": (
+        "cli/test_answers.py",
+        "training/test_held_out_traffics.py",
+    ),
     "cli/_status.py": ("cli/test_status.py", "e2e/test_manage.py"),
     "cli/_suite.py": ("cli/test_answers.py", "e2e/test_suite.py"),
-    "cli/_trials.py": ("e2e/test_manage.py",),
+    "cli/_trials.py": (
+        "cli/test_answers.py",
+        "e2e/test_manage.py",
+    ),
     "cli/_trust.py": ("e2e/test_foreign_hunts.py",),
     "cli/_whatif.py": ("e2e/test_what_if.py",),
     "corpus": ("e2e/test_corpus.py",),

@@ -311,3 +311,49 @@ def test_closed_standard_streams_are_opened(monkeypatch):
     assert [stream.mode for stream in opened] == ["r", "w", "w"]
     for stream in opened:
         stream.close()
+
+
+def test_split_lists_both_parts_or_the_folders_of_one(monkeypatch, capsys):
+    def crash(name, seed):
+        return SimpleNamespace(name=f"h/{name}", seed=seed, bundle=SimpleNamespace(path=Path("h") / name))
+
+    one, two, three = (crash(name, number) for number, name in enumerate("abc"))
+    found = SimpleNamespace(
+        training=(one, two), held_out=(three,), crashes=(one, two, three), faults=4, to_json=lambda: {"test": 0.5}
+    )
+    asked = []
+    monkeypatch.setattr("crashhunt.training.split_crashes", lambda *words: asked.append(words) or found)
+    assert run("split", "h", "--test", "0.3") == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "3 crashes: 2 to train on, 1 held out", "training  h/a  seed 0", "training  h/b  seed 1",
+        "test      h/c  seed 2", "omitted: 4 software faults",
+    ]  # fmt: skip
+    assert run("split", "h", "--part", "training") == run("split", "h", "--part", "test") == 0
+    assert capsys.readouterr().out.splitlines() == ["h/a", "h/b", "h/c"]
+    found.held_out = ()
+    assert run("split", "h", "--part", "test", "--json") == 0
+    assert capsys.readouterr() == ('{"test": 0.5}\n', "")
+    assert asked[0] == ([Path("h")], 0.3)
+
+
+def test_table_of_trials_goes_to_its_file_or_to_the_output(monkeypatch, capsys, tmp_path):
+    asked = []
+
+    def write(hunt, file, form, *, outcomes):
+        asked.append((hunt, form, outcomes))
+        file.write("number\n")
+        return 7
+
+    monkeypatch.setattr("crashhunt.hunts.HuntResults", lambda directory: directory)
+    monkeypatch.setattr("crashhunt.hunts.write_text", write)
+    monkeypatch.setattr("crashhunt.hunts.write_parquet", lambda hunt, out, outcomes: 8)
+    assert run("trials", "h", "--outcome", "hang,collision", "--format", "json") == 0
+    assert run("trials", "h", "--out", str(tmp_path / "t.csv")) == 0
+    assert run("trials", "h", "--out", "t.parquet", "--format", "parquet") == 0
+    assert asked == [(Path("h"), "json", ["hang", "collision"]), (Path("h"), "csv", [])]
+    assert (tmp_path / "t.csv").read_text() == "number\n"
+    assert capsys.readouterr() == ("number\n", f"{tmp_path / 't.csv'} has 7 trials\nt.parquet has 8 trials\n")
+    with pytest.raises(UsageError, match="--format parquet cannot be printed on a terminal; give --out FILE"):
+        run("trials", "h", "--format", "parquet")
+    with pytest.raises(UsageError, match="--outcome 'hangs' does not exist; did you mean 'hang'"):
+        run("trials", "nowhere", "--outcome", "hangs")

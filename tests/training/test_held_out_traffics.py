@@ -152,7 +152,8 @@ def test_a_record_of_another_split_or_a_damaged_one_is_refused(tmp_path):
     _write(file, 1)
     with pytest.raises(UsageError, match=r"with test=0.5, but this training has test=0.2"):
         TrainedOn(test=0.2).write(file)
-    for text in ("", "[]", "{}", '{"schema": 1, "test": 2, "seeds": [], "hunt_seeds": []}'):
+    of_wrong_type = '{"schema": 1, "test": 0.5, "seeds": ["1"], "hunt_seeds": []}'
+    for text in ("", "[]", "{}", '{"schema": 1, "test": 2, "seeds": [], "hunt_seeds": []}', of_wrong_type):
         file.write_text(text)
         with pytest.raises(HuntDirectoryError, match="cannot be read: ") as caught:
             read_trained_on(file)
