@@ -42,7 +42,8 @@ def choose(env: AbstractEnv, action: object) -> bool:
         return False
     if [vars(owner).get(name) for owner, name in _MEMBERS] != _ORIGINALS or type(deciding.actions) is not dict:
         return False
-    change = _SPEED_CHANGES.get(deciding.actions.get(action, ""))
+    meaning = deciding.actions.get(action)
+    change = _SPEED_CHANGES.get(meaning) if type(meaning) is str else None
     vehicle = deciding.controlled_vehicle
     if change is None or type(vehicle) is not MDPVehicle:
         return False

@@ -74,9 +74,11 @@ class Prepared:
     def drives_all(self) -> bool:
         """Return whether the kernel knows how all vehicles of the road make decisions and move."""
         road, roster = self.road, self._roster
+        self.checked = False
         if roster is not None and roster.is_of(road):
-            self.checked = roster.traffic is not None
-            return roster.decides and roster.moves
+            drives = roster.decides and roster.moves
+            self.checked = drives and roster.traffic is not None  # other vehicles run foreign code in a sub-step
+            return drives
         return all(kind.drives and kind.moves for kind in kinds_of(road.vehicles))
 
     def keep(self, state: RoadState) -> None:

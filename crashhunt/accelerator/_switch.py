@@ -43,7 +43,7 @@ from crashhunt.accelerator._roads import (
 )
 from crashhunt.accelerator._rules import collide_one_by_one, enforce, finish
 from crashhunt.accelerator._substep_loop import can_run_alone, run_step, simulate
-from crashhunt.accelerator._versions import Watch, kind_of, left_alone, originals, reason_against
+from crashhunt.accelerator._versions import Watch, is_genuine, kind_of, left_alone, originals, reason_against
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -70,8 +70,9 @@ def switch_on() -> str:
     if not reason:
         alone = can_run_alone()
         for owner, name, faster in _REPLACEMENTS:
-            if owner is not AbstractEnv or alone:
-                originals[_name(owner, name)] = getattr(owner, name)
+            current = getattr(owner, name)
+            if alone if owner is AbstractEnv else is_genuine(_qualified(owner, name), current):
+                originals[_name(owner, name)] = current
                 setattr(owner, name, faster)
         # highway-env calls a replacement of one of our methods, so watching them is unnecessary. The exception is
         # `neighbour_vehicles`, which accelerated decisions bypass.
@@ -91,6 +92,10 @@ def _restore() -> None:
     for owner, name, faster in _REPLACEMENTS:
         if vars(owner).get(name) is faster:
             setattr(owner, name, originals[_name(owner, name)])
+
+
+def _qualified(owner: type | ModuleType, name: str) -> str:
+    return f"{owner.__qualname__}.{name}" if isinstance(owner, type) else name
 
 
 def _name(owner: type | ModuleType, name: str) -> str:
@@ -162,7 +167,7 @@ def _simulate(self: AbstractEnv, action: object = None) -> None:
 
 
 def _step_env(self: AbstractEnv, action: object) -> object:
-    return run_step(self, action)
+    return run_step(self, action, _simulate)
 
 
 def _rewards(self: HighwayEnv, action: object) -> dict[str, float]:
@@ -210,9 +215,10 @@ def _enforce_road_rules(self: RegulatedRoad) -> None:
 
 
 def _observe(self: KinematicObservation) -> object:
+    road = self.env.road
+    kept = take_for_observation(road)
     if _is_plain(self, KinematicObservation):
-        road = self.env.road
-        state = (take_for_observation(road) or look(road)) if type(road).close_objects_to is _close_objects_to else None
+        state = (kept or look(road)) if type(road).close_objects_to is _close_objects_to else None
         found = observe_in_kernel(self, state) if state is not None else None
         if found is None:
             found = observe(self, frame_of(road))

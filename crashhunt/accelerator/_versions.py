@@ -7,6 +7,7 @@ import hashlib
 import inspect
 import logging
 import re
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -434,8 +435,21 @@ _FILES = {str(module.__file__) for module in _SOURCES}
 
 def is_genuine(name: str, function: Callable[..., object]) -> bool:
     """Return whether a function comes from highway-env's source and has the given name, such as ``Class.method``."""
-    found = inspect.unwrap(function)
-    return getattr(getattr(found, "__code__", None), "co_filename", "") in _FILES and found.__qualname__ == name
+    place = getattr(getattr(function, "__code__", None), "co_filename", "")
+    return place in _FILES and function.__qualname__ == name
+
+
+def _without_context_manager(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function that `contextlib.contextmanager` wraps, as highway-env does; otherwise the function itself.
+
+    A user's wrapper is not removed, because `functools.wraps` gives it the name of highway-env's function.
+    """
+    wraps = getattr(function, "__code__", None) is _CONTEXT_MANAGER_CODE
+    found: Callable[..., Any] = getattr(function, "__wrapped__", function) if wraps else function
+    return found
+
+
+_CONTEXT_MANAGER_CODE = contextmanager(lambda: iter(())).__code__
 
 
 def _functions() -> Iterator[tuple[str, Callable[..., object]]]:
@@ -448,4 +462,4 @@ def _functions() -> Iterator[tuple[str, Callable[..., object]]]:
             for member, found in members:
                 function = getattr(found, "fget", None) or getattr(found, "__func__", found)
                 if callable(function) and hasattr(function, "__module__") and not isinstance(function, type):
-                    yield f"{name}.{member}".rstrip("."), inspect.unwrap(function)
+                    yield f"{name}.{member}".rstrip("."), _without_context_manager(function)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import partial, wraps
 
 import highway_env
 import numpy as np
 import pytest
 from compiled import needs_kernel
+from highway_env.envs.common import observation
+from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.action import ActionType, DiscreteMetaAction
 from highway_env.envs.common.observation import KinematicObservation
 from highway_env.envs.highway_env import HighwayEnv, HighwayEnvFast
 from highway_env.envs.merge_env import MergeEnv
+from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import MDPVehicle
+from highway_env.vehicle.kinematics import Vehicle
 
 from crashhunt.accelerator import Onlooker, _agent_steps, _substep_loop, switch_off, switch_on
 from crashhunt.simulators.highway import HighwaySimulator, restore_classes
@@ -326,6 +330,112 @@ def test_meta_actions_at_the_end_of_a_road_have_the_effect_that_they_have_in_hig
     slow, fast = both(lambda: made(MergeEnv), change)
     assert slow == fast
     assert slow[0][1][0]["target_lane_index"] != slow[-1][1][0]["target_lane_index"]
+
+
+class Spawning(IDMVehicle):
+    """Places a vehicle into its own way in the middle of a step, so that both crash."""
+
+    def act(self, action=None):
+        super().act(action)
+        self.acts = vars(self).get("acts", 0) + 1
+        if self.acts % 4 == 2:
+            self.road.vehicles.append(IDMVehicle(self.road, self.position + np.array([1.0, 0.0]), 0.0, 5.0))
+
+
+class Unhurt(IDMVehicle):
+    """Replaces the collision check of another vehicle in the middle of a step."""
+
+    def act(self, action=None):
+        super().act(action)
+        self.acts = vars(self).get("acts", 0) + 1
+        other = self.road.vehicles[2]
+        if self.acts == 6:
+            other.handle_collisions = lambda *given: setattr(other, "checks", vars(other).get("checks", 0) + 1)
+
+
+@pytest.mark.parametrize("kind", [Spawning, Unhurt])
+def test_change_by_a_vehicle_of_a_user_in_a_sub_step_is_noticed(kind):
+    def change(env):
+        env.road.vehicles[3].__class__ = kind
+
+    slow, fast = both(made, change)
+    assert slow == fast
+    assert not isinstance(slow[-1], str)
+    egos_and_others = slow[-1][1]
+    assert any("checks" in vehicle or vehicle["crashed"] != exact(False) for vehicle in egos_and_others)
+
+
+def test_simulation_of_all_environments_replaced_during_an_episode_changes_the_observation(monkeypatch):
+    def change(env):
+        run = AbstractEnv._simulate
+        monkeypatch.setattr(AbstractEnv, "_simulate", lambda self, action=None: (run(self, action), push(self.road)))
+
+    found = []
+    for fast in (False, True):
+        monkeypatch.undo()
+        switch_off()
+        if fast:
+            switch_on()
+        found.append(trace(made, change, ACTIONS[:3]))
+    assert found[0] == found[1]
+    assert found[0] != trace(made, lambda env: None, ACTIONS[:3])
+
+
+def test_second_observation_of_an_observation_sees_its_change():
+    def change(env):
+        seeing, second = env.observation_type, KinematicObservation(env)
+        normalize = seeing.normalize_obs
+
+        def change_and_observe(rows):
+            push(env.road)
+            env.extra = second.observe()
+            return normalize(rows)
+
+        seeing.normalize_obs = change_and_observe
+
+    slow, fast = both(made, change, ACTIONS[:3])
+    assert slow == fast
+
+
+def test_meta_action_with_an_unusual_name_has_the_effect_that_it_has_in_highway_env():
+    slow, fast = both(made, lambda env: setattr(env.action_type, "actions", {1: ["FASTER"]}), [1, 1])
+    assert slow == fast
+    assert not isinstance(slow[-1], str)
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [(HighwayEnv, "_rewards"), (AbstractEnv, "_simulate"), (AbstractEnv, "step"), (observation, "compute_ttc_grid")],
+)
+def test_method_that_was_replaced_before_the_accelerator_is_kept(owner, name, monkeypatch):
+    calls = []
+    original = getattr(owner, name)
+
+    @wraps(original)
+    def replacement(*given, **named):
+        calls.append(1)
+        return original(*given, **named)
+
+    monkeypatch.setattr(owner, name, replacement)
+    assert switch_on() == ""
+    assert getattr(owner, name) is replacement
+    seeing = {"type": "TimeToCollision"} if owner is observation else {"type": "Kinematics"}
+    env = made(observation=seeing)
+    calls.clear()
+    env.step(1)
+    assert calls
+    switch_off()
+    assert getattr(owner, name) is replacement
+
+
+def test_wrapper_with_the_name_of_the_method_of_a_vehicle_disables_the_accelerator(monkeypatch):
+    @wraps(Vehicle.step)
+    def slower(self, dt):
+        original(self, dt / 2)
+
+    original = Vehicle.step
+    monkeypatch.setattr(Vehicle, "step", slower)
+    assert switch_on().startswith("Vehicle.step has been replaced by ")
 
 
 @pytest.mark.parametrize("action", [7, 1.0, True, np.float64(3), np.array(4), "FASTER", None])
