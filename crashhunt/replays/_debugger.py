@@ -10,6 +10,7 @@ import pdb
 import random
 import signal
 import stat
+import subprocess
 import sys
 import time
 from contextlib import suppress
@@ -216,6 +217,8 @@ def _run_once(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
                 [str(scratch)],
                 environment=snapshot_environment(settings),
                 apart=False,
+                # A debugger whose prompt is not shown would wait for input without end.
+                stdin=subprocess.DEVNULL if look.quiet else None,
                 stdout=log if look.quiet else 2 if look.to_stderr else None,
                 stderr=log if look.quiet else None,
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,12 +35,13 @@ class Worker:
 @pytest.fixture
 def ends(monkeypatch):
     """Each process ends with the next of `codes`, and leaves `answers` behind; `jobs` are what they were given."""
-    found = SimpleNamespace(codes=[], answers=[], jobs=[])
+    found = SimpleNamespace(codes=[], answers=[], jobs=[], streams=[])
 
     class Kept:
         def __init__(self, module, words, *, environment, apart, **streams):
             self.folder = Path(words[0])
             found.jobs.append(json.loads((self.folder / layout.JOB).read_text()))
+            found.streams.append(streams)
             self.process = self
 
         def wait(self):
@@ -95,6 +97,16 @@ def test_an_end_of_its_own_is_an_error_at_once(ends, code, answer, says):
     with pytest.raises(CrashhuntError, match=says):
         _debugger.debug(rerun(), Look(until=12))
     assert len(ends.jobs) == 1
+
+
+def test_debugger_in_the_agent_reads_the_terminal_only_if_its_prompt_is_shown(ends):
+    ends.codes, ends.answers = [0, 0], [DONE, DONE]
+    _debugger.debug(rerun(), Look(until=12))
+    _debugger.debug(rerun(), Look(until=12, quiet=True))
+    shown, quiet = ends.streams
+    assert set(shown.values()) == {None}  # those of the terminal
+    assert quiet["stdin"] == subprocess.DEVNULL
+    assert quiet["stdout"] is quiet["stderr"] is not None
 
 
 def test_leaving_the_debugger_and_closing_the_window_are_interrupts(ends, monkeypatch):
