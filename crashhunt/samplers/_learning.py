@@ -37,6 +37,7 @@ class Learning:
     wants_hunt = True
     plain_origin = _PLAIN
     origin: ClassVar[str]
+    version = 2  # 1 gave equal scores to all trials with a criticality above 0.999
 
     def __init__(self, space: Space, *, points: int = 10, hunt: HuntFacts = HuntFacts()) -> None:  # noqa: B008
         self._hunt = hunt

@@ -83,8 +83,9 @@ def test_next_peak_is_searched_after_12_trials_and_then_32_trials_after_each_fai
     assert searched == [12, 44, 76]
 
 
-def test_hunts_of_another_version_are_recognized():
-    assert NamedSampler("guided", SPACE, points=4).version == 3
+@pytest.mark.parametrize(("name", "version"), [("guided", 3), ("mutation", 2), ("cross-entropy", 2), ("cma-es", 2)])
+def test_hunts_of_another_version_are_recognized(name, version):
+    assert NamedSampler(name, SPACE, points=4).version == version
 
 
 def test_another_peak_is_abandoned_where_danger_stays_as_far_from_a_crash():
