@@ -217,8 +217,8 @@ def _enforce_road_rules(self: RegulatedRoad) -> None:
 def _observe(self: KinematicObservation) -> object:
     road = self.env.road
     kept = take_for_observation(road)
-    if _is_plain(self, KinematicObservation):
-        state = (kept or look(road)) if type(road).close_objects_to is _close_objects_to else None
+    if _is_plain(self, KinematicObservation) and _searches(road):
+        state = kept or look(road)
         found = observe_in_kernel(self, state) if state is not None else None
         if found is None:
             found = observe(self, frame_of(road))
@@ -227,8 +227,14 @@ def _observe(self: KinematicObservation) -> object:
     return originals["KinematicObservation.observe"](self)
 
 
+def _searches(road: Road) -> bool:
+    """Return whether highway-env searches a road for close objects; a user's search must run exactly once."""
+    kind = type(road)
+    return kind.close_objects_to is _close_objects_to and kind.close_vehicles_to is _CLOSE_VEHICLES_TO
+
+
 def _observe_exit(self: ExitObservation) -> object:
-    if _is_plain(self, ExitObservation):
+    if _is_plain(self, ExitObservation) and _searches(self.env.road):
         found = observe_exit(self, frame_of(self.env.road))
         if found is not None:
             return found
@@ -281,6 +287,7 @@ def _is_plain(observation: KinematicObservation | OccupancyGridObservation, kind
     )
 
 
+_CLOSE_VEHICLES_TO = Road.close_vehicles_to
 _OBSERVATIONS = (KinematicObservation, ExitObservation, KinematicsGoalObservation, OccupancyGridObservation)
 _OBSERVATION_METHODS = {kind: methods_of(kind) for kind in _OBSERVATIONS}
 _REPLACEMENTS: tuple[tuple[type | ModuleType, str, Callable[..., object]], ...] = (

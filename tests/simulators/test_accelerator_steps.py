@@ -12,8 +12,10 @@ from highway_env.envs.common import observation
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.action import ActionType, DiscreteMetaAction
 from highway_env.envs.common.observation import KinematicObservation
+from highway_env.envs.exit_env import ExitEnv
 from highway_env.envs.highway_env import HighwayEnv, HighwayEnvFast
 from highway_env.envs.merge_env import MergeEnv
+from highway_env.road.road import Road
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
@@ -379,6 +381,27 @@ def test_simulation_of_all_environments_replaced_during_an_episode_changes_the_o
         found.append(trace(made, change, ACTIONS[:3]))
     assert found[0] == found[1]
     assert found[0] != trace(made, lambda env: None, ACTIONS[:3])
+
+
+@pytest.mark.parametrize("kind", ["Kinematics", "ExitObservation"])
+def test_search_of_a_user_runs_once_for_an_observation(kind):
+    class Forgetting(Road):
+        """Misses an object at random, and notes each search."""
+
+        def close_objects_to(self, *given, **named):
+            self.searches = vars(self).get("searches", 0) + 1
+            found = super().close_objects_to(*given, **named)
+            return [other for other in found if self.np_random.random() < 0.7]
+
+    def change(env):
+        env.road.__class__ = Forgetting
+        for vehicle in env.road.vehicles[1:]:
+            vehicle.to_dict = partial(_described_elsewhere, vehicle)  # which highway-env has to call
+
+    make = partial(made, ExitEnv if kind == "ExitObservation" else HighwayEnvFast)
+    slow, fast = both(make, change, ACTIONS[:3])
+    assert slow == fast
+    assert not isinstance(slow[-1], str)
 
 
 def test_second_observation_of_an_observation_sees_its_change():
