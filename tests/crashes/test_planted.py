@@ -28,7 +28,7 @@ def test_each_defect_is_a_kind(shell):
     (state,) = shell.crashhunt("status", "h", "--json").json["hunts"]
     assert state["kinds"] == rest["kinds"]
     assert state["newest_kind_s"] >= 0
-    assert "3 kinds" in shell.crashhunt("status", "h").out
+    assert "3 types" in shell.crashhunt("status", "h").out
 
     found = shell.crashhunt("crashes", "h", "--json").json
     bundles = {str(bundle.path.relative_to(shell.folder)): bundle for bundle in list_bundles(shell.folder / "h")}
@@ -53,7 +53,7 @@ def test_each_defect_is_a_kind(shell):
     assert bundles[asleep["shortest"]].result.steps == min(bundles[name].result.steps for name in asleep["members"])
 
     lines = shell.crashhunt("crashes", "h").out.splitlines()
-    assert lines[0] == f"{len(bundles)} crashes of {len(kinds)} kinds:"
+    assert lines[0] == f"{len(bundles)} crashes of {len(kinds)} types:"
     assert len(lines) == 3 + len(kinds)
 
     broken = bundles[asleep["shortest"]].path / "log.mcap"

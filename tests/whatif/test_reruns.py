@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from crashhunt.crashes import find_bundle, open_archive
+from crashhunt.replays import ReplayOptions
 from crashhunt.trial import Disturbance, Overruled, TrialSpec
 from crashhunt.whatif import judge
 from crashhunt.whatif._reruns import NotUnderstoodError, _require_same_trial
@@ -33,7 +34,7 @@ def test_another_trial_than_was_asked_for_is_refused(asked):
 @pytest.mark.nightly
 def test_a_crash_of_the_first_version_is_judged_by_what_it_understands(request):
     with open_archive(request.path.parent.parent / "e2e" / "bundles" / "crashhunt-0.1.0.zip") as archive:
-        found = judge(find_bundle(archive.directory), runs=2, why=10, parallel=2)
+        found = judge(find_bundle(archive.directory), ReplayOptions(trusted=True), runs=2, why=10, parallel=2)
     assert (found.attempts, found.why_not) == (
         (),
         "the snapshot contains a version of crashhunt that is too old for this command",
