@@ -226,6 +226,7 @@ def _bounds(source: MapSource, options: ConvertOptions, tools: Tools, folder: Pa
     """Return the bounding box of a map in degrees; None if the map is not known to have one."""
     words = _command_arguments(source, options, tools, everything=True)
     words += [*_IGNORE_ERROR_OPTIONS, "--xml-validation", "never", "--output-file", NET]
+    (folder / NET).unlink(missing_ok=True)
     tools.run("netconvert", words, folder)
     if not (folder / NET).is_file():
         return None
