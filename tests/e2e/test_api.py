@@ -73,6 +73,7 @@ def test_results_are_typed_objects_and_arrays(hunt):
         found.agent(0, "x")
 
 
+@pytest.mark.nightly  # by day, test_python_calls.py tests what each function passes on
 def test_what_is_not_finished_states_so(hunt):
     (hunt.folder / "s.toml").write_text(
         "[defaults]\nscenario='toy'\ntrials=2\nmax_steps=20\n[[hunts]]\nid='a'\n[[hunts]]\nid='b'\n"

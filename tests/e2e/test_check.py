@@ -75,8 +75,8 @@ ASKED = {
 }
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("seed", "times"), [(10, 2), pytest.param(11, 60, marks=pytest.mark.nightly)])
+@pytest.mark.nightly  # by day, damaged archives, ledgers and files, each by a test of its own
+@pytest.mark.parametrize(("seed", "times"), [(10, 2), (11, 60)])
 def test_damage_is_one_line_or_makes_no_difference(hunt, seed, times):
     """Whatever becomes of whichever file: no traceback, and nobody exits with 0 and other numbers."""
     generator = random.Random(seed)

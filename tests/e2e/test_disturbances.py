@@ -15,6 +15,7 @@ def hunt(shell, *more, trials="6"):
     return shell.crashhunt("run", "h", "1", trials, "100", *WORDS, *more, "--json")
 
 
+@pytest.mark.nightly  # by day, the other tests of this file
 def test_crashes_with_disturbances_from_the_hunt_to_the_report(toy):
     """The leader of the toy brakes now and then by itself; who drives as fast as it does crashes when it stops."""
     done = hunt(toy, "--disturb", "stop=0.05,brake=0.02", "--set", "gap_m=5")

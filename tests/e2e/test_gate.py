@@ -110,6 +110,7 @@ def test_undecided_gate_gives_the_reason_and_resumes_with_more_pairs(drivers):
     assert (found["verdict"], found["pairs"]) == ("worse", 8)
 
 
+@pytest.mark.nightly  # by day, suites/test_gate_of_hunts.py
 def test_both_versions_drive_in_the_same_traffic_with_the_same_disturbances(drivers):
     """What is drawn for a trial follows from its number, whatever the agent has done before."""
     words = ("--disturb", "brake=0.5,stop=0.2,late_action=0.1", "--most", "3", "--margin", "0")

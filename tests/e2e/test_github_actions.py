@@ -200,6 +200,7 @@ def test_arguments_that_cannot_be_split_are_no_hunt(tmp_path):
     assert not (tmp_path / "asked.jsonl").exists()
 
 
+@pytest.mark.nightly  # by day, a hunt and its corpus as a runner does it
 def test_a_crash_that_cannot_be_made_smaller_is_kept_as_it_is(tmp_path):
     crashes = ["h/crashes/000000-collision", "h/crashes/000001-hang", "h/crashes/000002-hang"]
     runner = stubbed(tmp_path, *crashes, directory="h", examples=2, known="my crashes")

@@ -18,6 +18,7 @@ from crashhunt.whatif._causes import _Search
 HUNT = ("--scenario", "toy", "--arg", "speed=14", "--seed", "1")
 
 
+@pytest.mark.nightly  # by day, what a failure hangs on is run and reported
 def test_what_is_found_is_kept_and_reported(toy):
     found = toy.crashhunt("run", "h", "1", "2", "300", *HUNT, "--only-at-fault", "--json").json
     assert (found["stopped_because"], found["trials_run"], found["at_fault"]) == ("crash", 1, [0])

@@ -121,6 +121,7 @@ def test_what_cannot_run_leaves_the_others_untouched_and_is_reported(toy):
 
 
 @pytest.mark.long
+@pytest.mark.nightly  # by day, suites/test_processes.py
 def test_what_failed_runs_again_and_nothing_else(toy):
     written(toy, SUITE.replace("runs = 2\n", "") + BROKEN.partition('[[hunts]]\nid = "raises"')[0])
     toy.crashhunt("suite", "run", "suite.toml", "out", "2", expect=1)

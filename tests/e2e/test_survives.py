@@ -11,6 +11,7 @@ from crashhunt.testing import assert_survives
 
 
 @pytest.mark.long
+@pytest.mark.nightly  # by day, testing/test_assert_survives.py
 def test_what_crashes_fails_and_what_is_printed_can_be_pasted(toy, monkeypatch):
     monkeypatch.chdir(toy.folder)
     words = {"max_steps": 80, "parallel": 1}

@@ -49,6 +49,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.nightly  # by day, test_episodes.py, and one at a time
 def test_several_in_one_process_and_in_gymnasiums_vectors(tmp_path):
     (tmp_path / "several.py").write_text(SEVERAL)
     done = subprocess.run(
