@@ -85,7 +85,8 @@ def test_unknown_escape_is_reported_and_searched_again(bundle, toy):
     (read,) = list_bundles(toy.folder / "h")
     assert read.result.why_no_escape
     said = (
-        "Until when braking would have helped is not known: the process that searched was killed by SIGKILL, 2 times."
+        "The last step at which braking would have helped is unknown: the process that searched was killed by SIGKILL, "
+        "2 times."
     )
     assert said in " ".join(toy.crashhunt("show", "h").out.split())
     words = ("run", "h", "1", "1", "300", "--scenario", "toy", "--arg", "speed=14", "--set", "step_wall_s=0.01")
@@ -95,14 +96,15 @@ def test_unknown_escape_is_reported_and_searched_again(bundle, toy):
     assert read.result.escape == bundle.result.escape
 
 
-def kill_replays(folder, is_time):
-    """Start a thread that sends SIGKILL to the process of each replay in a folder once; return what ends it."""
+def kill_replays(is_time):
+    """Start a thread that sends SIGKILL once to the process of each replay of this process; return what ends it."""
+    usual = Path(tempfile.gettempdir())
     over = threading.Event()
     killed = []
 
     def watch():
         while not over.wait(0.002):
-            for box in Path(folder).glob("crashhunt-replay-*/trial-000000/blackbox.bin"):
+            for box in usual.glob(f"crashhunt-temporary-*/{os.getpid()}-*/replay-*/trial-000000/blackbox.bin"):
                 header = read_header(box)
                 if header is not None and header.pid not in killed and is_time(box.parent.parent, header, len(killed)):
                     killed.append(header.pid)
@@ -120,9 +122,8 @@ def kill_replays(folder, is_time):
 
 
 @pytest.mark.nightly
-def test_replay_killed_at_three_steps_is_run_three_times(bundle, monkeypatch, tmp_path):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    end = kill_replays(tmp_path, lambda _scratch, header, before: before < 3 and header.step >= 3 + 8 * before)
+def test_replay_killed_at_three_steps_is_run_three_times(bundle):
+    end = kill_replays(lambda _scratch, header, before: before < 3 and header.step >= 3 + 8 * before)
     try:
         found = confirm(replace(bundle, confirmed=None))
     finally:
@@ -134,13 +135,11 @@ def test_replay_killed_at_three_steps_is_run_three_times(bundle, monkeypatch, tm
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("kills", [1, 2])
-def test_search_for_the_escape_that_is_killed_is_done_again(bundle, monkeypatch, tmp_path, kills):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-
+def test_search_for_the_escape_that_is_killed_is_done_again(bundle, kills):
     def is_time(scratch, header, before):
         return before < kills and answer_file(scratch, 0).exists()
 
-    end = kill_replays(tmp_path, is_time)
+    end = kill_replays(is_time)
     began = time.monotonic()
     try:
         found = confirm(replace(bundle, confirmed=None))
