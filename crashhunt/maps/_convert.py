@@ -222,13 +222,18 @@ def _run_converter(source: MapSource, options: ConvertOptions, tools: Tools, fol
     raise ScenarioError(f"{program} cannot read the map: {error}", fix=fix, where=_place_in_error(source))
 
 
+def _convert_everything(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> bool:
+    """Convert all ways of a map, whatever they are for, and despite errors; return whether there is a network."""
+    words = [*_command_arguments(source, options, tools, everything=True), *_IGNORE_ERROR_OPTIONS]
+    (folder / NET).unlink(missing_ok=True)
+    if source.path is not None:
+        tools.run("netconvert", [*words, "--xml-validation", "never", "--output-file", NET], folder)
+    return (folder / NET).is_file()
+
+
 def _bounds(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> BBox | None:
     """Return the bounding box of a map in degrees; None if the map is not known to have one."""
-    words = _command_arguments(source, options, tools, everything=True)
-    words += [*_IGNORE_ERROR_OPTIONS, "--xml-validation", "never", "--output-file", NET]
-    (folder / NET).unlink(missing_ok=True)
-    tools.run("netconvert", words, folder)
-    if not (folder / NET).is_file():
+    if not _convert_everything(source, options, tools, folder):
         return None
     with (folder / NET).open("rb") as file:
         found = _BOUNDARY.search(file.read(_HEAD_BYTES))
@@ -302,16 +307,7 @@ def _strip_comment(path: Path) -> None:
 
 def _no_road(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> ScenarioError:
     """Return the error for a map without a road for cars; its message describes the contents of the map."""
-    words = [
-        *_command_arguments(source, options, tools, everything=True),
-        *_IGNORE_ERROR_OPTIONS,
-        "--xml-validation",
-        "never",
-    ]
-    (folder / NET).unlink(missing_ok=True)
-    if source.path is not None:
-        tools.run("netconvert", [*words, "--output-file", NET], folder)
-    held = read_network(folder / NET) if (folder / NET).is_file() else RoadNetwork()
+    held = read_network(folder / NET) if _convert_everything(source, options, tools, folder) else RoadNetwork()
     lanes = [lane for edge in held.edges.values() for lane in edge.lanes]
     fix = "choose a map or a --bbox with streets"
     if not lanes and source.kind == "osm" and _is_lanelet(folder / _safe_name(source)):
