@@ -1,4 +1,4 @@
-"""Car following: whom it follows on a straight road and in a bend, how hard it brakes, and what it remembers."""
+"""Car following: the leader on straight and bent roads, the braking, and what the agent remembers."""
 
 from __future__ import annotations
 

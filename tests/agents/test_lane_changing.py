@@ -34,7 +34,7 @@ def test_behind_a_slower_vehicle_it_changes_to_the_left_when_its_patience_is_ove
 def test_it_waits_only_behind_a_vehicle_that_is_near_and_below_its_desired_speed():
     agent = changer()
     one, free = seen(15.0, SLOW, lane_y=LANE), seen(15.0, lane_y=LANE)
-    assert changes(agent, one, free, one, free, one, steps=5) == [0] * 5  # it begins to wait anew
+    assert changes(agent, one, free, one, free, one, steps=5) == [0] * 5  # the wait begins again
     assert changes(changer(), seen(15.0, {"x": 5 + 38, "vx": 0}, lane_y=LANE)) == [0] * 10  # 2.5 s away
     assert any(changes(changer(), seen(15.0, {"x": 5 + 37, "vx": 0}, lane_y=LANE)))
     assert changes(changer(), seen(20.0, SLOW, lane_y=LANE)) == [0] * 10  # 0.9 of 22 m/s

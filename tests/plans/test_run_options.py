@@ -71,10 +71,11 @@ def test_an_option_that_is_added_to_the_list_is_everywhere(toy):
     copy = toy.folder / "elsewhere" / "crashhunt"
     shutil.copytree(PACKAGE, copy)  # with what Python has compiled, which holds for files of the same age and size
     text = (copy / LIST).read_text()
-    decides, runs = ('"""What a trial is;', '"""How trials are run;')
+    decides, runs = "class TrialOptions(_Options):\n", "class RunOptions(_Options):\n"
     lines = ADDED.partition("    witnesses")
     for marker, added in ((decides, lines[1] + lines[2]), (runs, lines[0])):
-        head, _, rest = text.partition(marker)
+        head, found, rest = text.partition(marker)
+        assert found
         doc, _, body = rest.partition("\n\n")
         text = f"{head}{marker}{doc}\n\n{added}{body}"
     (copy / LIST).write_text(text)

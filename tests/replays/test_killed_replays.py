@@ -7,6 +7,7 @@ import signal
 import tempfile
 import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -107,8 +108,9 @@ def kill_replays(is_time):
             for box in usual.glob(f"crashhunt-temporary-*/{os.getpid()}-*/replay-*/trial-000000/blackbox.bin"):
                 header = read_header(box)
                 if header is not None and header.pid not in killed and is_time(box.parent.parent, header, len(killed)):
-                    killed.append(header.pid)
-                    os.kill(header.pid, signal.SIGKILL)
+                    with suppress(ProcessLookupError):  # it has just ended
+                        os.kill(header.pid, signal.SIGKILL)
+                        killed.append(header.pid)
 
     thread = threading.Thread(target=watch)
     thread.start()

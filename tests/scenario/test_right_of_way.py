@@ -1,4 +1,4 @@
-"""Right of way as a network has it: who gives way to whom, in every junction and lane by lane."""
+"""The right of way of a network: which lane gives way to which lane in each junction."""
 
 from __future__ import annotations
 
