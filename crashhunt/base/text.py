@@ -104,7 +104,16 @@ def one_of(name: str, known: Iterable[str], *, give: str = "give one of", none: 
         none: the text if there are no known names.
     """
     names = list(known)
-    return f"{did_you_mean(name, names)} {give} {listed(names, none=none)}".lstrip()
+    similar = did_you_mean(name, names)
+    if len(names) == 1:  # the question and the list would say the same
+        return f"give {names[0]}" if give == "give one of" else similar or f"{give} {names[0]}"
+    return f"{similar} {give} {listed(names, none=none)}".lstrip()
+
+
+def any_of(names: Iterable[str]) -> str:
+    """Return names as a choice: ``a, b or c``."""
+    *first, last = names
+    return f"{', '.join(first)} or {last}" if first else last
 
 
 def out_of(done: int, planned: int, separator: str = " of ") -> str:

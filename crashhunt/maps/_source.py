@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from crashhunt.base.errors import ScenarioError, UsageError
-from crashhunt.base.text import near_path
+from crashhunt.base.text import any_of, near_path
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -159,9 +159,7 @@ def check_source(source: MapSource) -> None:
         return
     where, allowed = str(path), ENDINGS[source.kind]
     if path.is_dir():
-        raise ScenarioError(
-            "is a folder, not a map", fix=f"give a file that ends in {' or '.join(allowed)}", where=where
-        )
+        raise ScenarioError("is a folder, not a map", fix=f"give a file that ends in {any_of(allowed)}", where=where)
     if not path.is_file() and (path.exists() or path.is_symlink()):
         fix = "give the path of a regular file"
         raise ScenarioError("is a device, a pipe or a broken link, not a map", fix=fix, where=where)
@@ -170,8 +168,8 @@ def check_source(source: MapSource) -> None:
         raise ScenarioError("there is no such map", fix=fix, where=where)
     if not path.name.lower().endswith(allowed):
         other = kind_of_file(path)
-        fix = f"give it with --{other}" if other else f"give a file that ends in {' or '.join(allowed)}"
-        raise ScenarioError(f"{path.name!r} does not have the ending of {_TITLES[source.kind]}", fix=fix, where=where)
+        fix = f"give it with --{other}" if other else f"give a file that ends in {any_of(allowed)}"
+        raise ScenarioError(f"does not have the ending of {_TITLES[source.kind]}", fix=fix, where=where)
     try:
         size = path.stat().st_size
         with path.open("rb") as file:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import crashhunt
-from crashhunt.base.text import did_you_mean, listed, near_path, one_of
+from crashhunt.base.text import any_of, did_you_mean, listed, near_path, one_of
 from crashhunt.cli import main
 from crashhunt.crashes import Bundle, find_bundle
 from crashhunt.errors import BundleError, CallError, CrashhuntError, PluginError, UsageError
@@ -28,7 +28,12 @@ def test_one_is_meant():
     assert did_you_mean("Keep_Lane", ["idm", "keep-lane"]) == "did you mean 'keep-lane'?"
     assert did_you_mean("zzz", ["idm", "keep-lane"]) == ""
     assert one_of("rando", ["grid", "random"]) == "did you mean 'random'? give one of grid, random"
+    assert one_of("rando", ["random"]) == "give random"  # once
+    assert one_of("eg", ["ego"], give="it has") == "did you mean 'ego'?"
+    assert one_of("x", ["ego"], give="it has") == "it has ego"
     assert one_of("x", [], give="it takes", none="nothing") == "it takes nothing"
+    assert any_of(["a", "b", "c"]) == "a, b or c"
+    assert any_of(["a"]) == "a"
     assert listed(map(str, range(1000))).endswith("18, 19, … (1000 in all)")
 
 

@@ -58,6 +58,7 @@ def test_unknown_command_is_named_and_its_own_options_are_left_to_it():
     made = Parser(prog="crashhunt")
     verbs = made.add_subparsers(metavar="COMMAND", required=True)
     verbs.add_parser("show").add_argument("--all", action="store_true")
+    verbs.add_parser("run")
     assert made.parse_args(["show", "--all"]).all is True
     with pytest.raises(UsageError, match="there is no command 'shoe'; did you mean 'show'"):
         made.parse_args(["shoe"])
