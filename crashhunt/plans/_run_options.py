@@ -67,8 +67,8 @@ class Subject(_Options):
 
     scenario: Path | str = option(
         "loop", "name of an included scenario, or a path",
-        help="a shipped scenario (see crashhunt scenarios), a folder, a scenario.toml or a .sumocfg",
-        brief="a shipped scenario, a folder, a scenario.toml or a .sumocfg",
+        help="a shipped one (see crashhunt scenarios), a folder, a scenario.toml, a .sumocfg or a map (.osm, .xodr)",
+        brief="a shipped scenario, a folder, a scenario.toml, a .sumocfg or a map (.osm, .xodr)",
         flag="--scenario", metavar="NAME|PATH", group="what",
     )  # fmt: skip
     ego: str = option(

@@ -16,7 +16,7 @@ from crashhunt.base.errors import ArgumentError, HuntDirectoryError, ScenarioErr
 from crashhunt.base.files import cannot_write
 from crashhunt.base.layout import PACKAGE, SCENARIO
 from crashhunt.base.plugins import registered
-from crashhunt.base.text import did_you_mean, listed, near_path, one_of
+from crashhunt.base.text import any_of, did_you_mean, listed, near_path, one_of
 from crashhunt.base.validation import validate
 from crashhunt.scenario._scenario import (
     AgentSetup,
@@ -225,7 +225,7 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
     if path.suffix == ".toml":
         if ego:
             bare = [known.endings[0] for known in configurations() if known.takes_ego]
-            message = f"--ego {ego!r} is for a bare {' or a '.join(bare)}"
+            message = f"--ego {ego!r} is for a bare {any_of(bare)}"
             raise ScenarioError(message, fix="set the vehicle under [agents] instead", where=str(path))
         scenario = _load_toml(path, kept=kept)
     else:
@@ -330,7 +330,7 @@ def _path_of(name: str | Path) -> Path:
         fix = f"give {listed(inside)}" if inside else "give the folder that has one"
         raise ScenarioError("the folder has no scenario.toml", fix=fix, where=text)
     fix = f"{near_path(path, *_endings()) or did_you_mean(text, shipped_scenarios())} give one of "
-    fix += f"{listed(shipped_scenarios())}, or the path of a folder, a scenario.toml or a {_configuration_endings()}"
+    fix += f"{listed(shipped_scenarios())}, or {_PATH} {_file_names()}"
     raise ScenarioError(f"there is no scenario {text!r}", fix=" ".join(fix.split()))
 
 
@@ -338,16 +338,18 @@ def _endings() -> tuple[str, ...]:
     return (".toml", *(ending for configuration in configurations() for ending in configuration.endings))
 
 
-def _configuration_endings() -> str:
-    return " or a ".join(endings()[1:])
+_PATH = "the path of a folder or of one of these files:"
+
+
+def _file_names() -> str:
+    return any_of([layout.SCENARIO, *(f"*{ending}" for ending in endings()[1:])])
 
 
 def _configuration(path: Path) -> Configuration:
     for configuration in configurations():
         if path.name.endswith(configuration.endings):
             return configuration
-    message, fix = f"{path.name!r} is neither a scenario.toml nor a {_configuration_endings()}", "give one of the two"
-    raise ScenarioError(message, fix=fix, where=str(path))
+    raise ScenarioError("the file is not a scenario", fix=f"give {_PATH} {_file_names()}", where=str(path))
 
 
 def _load_toml(path: Path, *, kept: bool) -> Scenario:

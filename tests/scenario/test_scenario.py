@@ -152,6 +152,16 @@ def test_a_path_that_is_not_there_has_a_neighbour(loop, monkeypatch):
         load_scenario("own")
 
 
+def test_paths_of_scenarios_are_listed_where_the_given_one_is_none(tmp_path, monkeypatch):
+    paths = r"the path of a folder or of one of these files: scenario\.toml, \*\.sumocfg, \*\.osm or \*\.xodr$"
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ScenarioError, match=f"there is no scenario 'nowhere'; give one of highway, .*, or {paths}"):
+        load_scenario("nowhere")
+    Path("nowhere").touch()
+    with pytest.raises(ScenarioError, match=f"^nowhere: the file is not a scenario; give {paths}"):
+        load_scenario("nowhere")
+
+
 @pytest.mark.parametrize("content", ["", "title = ", "\x00", "a = 1\na = 2"])
 def test_what_is_not_toml_is_refused(tmp_path, content):
     (tmp_path / "scenario.toml").write_text(content)
