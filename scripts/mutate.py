@@ -91,7 +91,8 @@ _TESTS_ELSEWHERE = {
         "whatif/test_what_is_counted.py",
     ),
     "episode/_fast_path.py": ("native/test_usual_steps.py", "episode/test_episode*.py"),
-    "episode/_splitting.py": ("rates/test_splitting.py",),
+    "episode/_branches.py": ("episode/test_branches_asked.py", "episode/test_branching.py"),
+    "episode/_splitting.py": ("episode/test_split_episodes.py", "rates/test_splitting.py"),
     "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),
     "estimation/_gate.py": ("e2e/test_gate.py",),
     # Processes of trials are seen by what is left of trials that harm them.

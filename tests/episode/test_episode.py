@@ -16,7 +16,7 @@ from crashhunt.oracles import Overlap, ReportedCollision
 from crashhunt.recording import BlackBox
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.simulators.toy import ToySimulator
-from crashhunt.trial import Outcome, TrialSpec
+from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
 TWO = Scenario(simulator="toy", agents={"ego": AgentSetup(), "second": AgentSetup(action="meta")})
 ONE = Scenario(simulator="toy", agents={"ego": AgentSetup()})
@@ -221,6 +221,28 @@ def test_a_running_episode_can_be_forked(begin):
         theirs = pickle.load(pipe)
     os.waitpid(child, 0)
     assert theirs == drive(episode).to_json() == expected.to_json()
+
+
+def brake(step):
+    return Disturbance(step, "ahead", "brake", 2.0, 0.1, "ego")
+
+
+def test_a_new_plan_replaces_what_begins_after_the_next_step_and_is_in_the_specification(tmp_path):
+    spec = TrialSpec(0, 1, {}, {}, 9, disturbances=tuple(map(brake, (2, 3, 4, 6))))
+    episode = Episode(spec, simulator=ToySimulator(ONE, tmp_path), make_agent=lambda *_: Driver())
+    episode.start()
+    episode.step()
+    episode.step()
+    episode.replan([brake(7), brake(5)])
+    assert [one.step for one in episode.spec.disturbances] == [2, 3, 5, 7]
+    assert [episode.takes_place(brake(step)) for step in (2, 3)] == [True, False]  # the third step has not begun
+    assert [one.step for one in drive(episode).disturbances] == [2, 3, 5, 7]
+    plain = Episode(TrialSpec(0, 1, {}, {}, 9), simulator=ToySimulator(ONE, tmp_path), make_agent=lambda *_: None)
+    with pytest.raises(RuntimeError, match="forks"):
+        plain.disturb(brake(3))
+    plain.replan([brake(3)])
+    assert [one.step for one in plain.spec.disturbances] == [3]
+    assert not plain.takes_place(brake(3))
 
 
 class Failing(Observer):

@@ -8,9 +8,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.episode import Nearness, Observer, Recorder
+from crashhunt.episode import Nearness, Observer, Recorder, ready_recorder
+from crashhunt.episode._observers import _type_of
 from crashhunt.recording import Phase
 from crashhunt.recording.records import Tag
+from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Actor, Contact, Event, Roster, Scene
 
@@ -84,6 +86,22 @@ def test_what_is_seldom_has_records_of_its_own_with_a_zero_for_an_agent(box, rec
     assert recorder.end(replace(RESULT, outcome=Outcome.INVALID)).digest == ""
     # Where nobody looks for events, that none happened says nothing.
     assert Recorder(Box(), SimpleNamespace()).end(RESULT).events is None
+
+
+@pytest.mark.parametrize("form", [SpeedAndLaneChange, MetaAction])
+def test_agent_draws_the_same_actions_with_and_without_a_prepared_recorder(form):
+    def drawn(prepared, episodes=1):
+        its = form()
+        if prepared:
+            ready_recorder(SimpleNamespace(actions={"ego": its}))
+        for _ in range(episodes):
+            kind, shape = _type_of(its)
+            found = [its.encode(its.space.sample()).tolist() for _ in range(4)]
+        example = its.encode(its.space.sample())
+        assert (kind, shape) == (example.dtype.str, example.shape)
+        return found
+
+    assert drawn(prepared=True) == drawn(prepared=False) == drawn(prepared=True, episodes=2)
 
 
 def test_an_observer_that_has_found_nothing_out_leaves_the_result_alone():

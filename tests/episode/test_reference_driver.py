@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
+from gymnasium import spaces
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.episode import overruled_agent
-from crashhunt.simulators import MetaAction, SpeedAndLaneChange
+from crashhunt.simulators import MetaAction, SpeedAndLaneChange, action_form
 from crashhunt.trial import Overruled
 from crashhunt.world import Crossing, Neighbor, Side, Surroundings
 
@@ -183,6 +187,59 @@ def test_meta_actions_become_slower_or_idle():
         assert driver(gap, "lateral", taken).act(None) == idle
         assert driver(gap, "lateral", free).act(None) == free
     assert driver(gap, "longitudinal", faster).act(None) == faster
+
+
+class Steered(Road):
+    """A road whose agent accelerates and steers: its action is its speed after the step, and its lane change."""
+
+    def __init__(self, *given, **more):
+        super().__init__(*given, form=action_form(spaces.Box(-90.0, 90.0, (2,))), **more)
+
+    def is_steered(self, agent):
+        return agent == "ego"
+
+    def motion_of(self, agent, action):
+        assert agent == "ego"
+        return SimpleNamespace(speed_mps=float(action[0]), lane_change=int(action[1]))
+
+    def action_with(self, agent, action, *, speed_mps, keeps_lane):
+        assert (agent, float(action[0])) == ("ego", 28.0)
+        return speed_mps, keeps_lane
+
+
+@pytest.mark.parametrize(
+    ("faculty", "speeds", "lanes"),
+    [("none", False, False), ("longitudinal", True, False), ("lateral", False, True), ("both", True, True)],
+)
+def test_steering_agent_gets_another_speed_or_is_kept_in_its_lane(faculty, speeds, lanes):
+    near, far = (Steered(gap, 25.0, 15.0, sides={1: Side(exists=False), -1: Side(exists=True)}) for gap in (5.0, 900.0))
+    left, right = (np.array([28.0, change]) for change in (1.0, -1.0))
+
+    def corrected(road, action):
+        made = driver(road, faculty, action)
+        found = made.act(None)
+        return (None, False) if found is action else found, [one["faculty"] for one in made.responses]
+
+    (speed, kept), responses = corrected(near, left)
+    assert (speed is not None, kept) == (speeds, lanes)
+    assert speed is None or speed < 15.0
+    assert sorted(responses) == ["lateral", "longitudinal"]
+    (speed, kept), responses = corrected(near, right)
+    assert (speed is not None, kept) == (speeds, False)
+    assert responses == ["longitudinal"]
+    assert corrected(far, left) == ((None, lanes), ["lateral"])
+    assert corrected(far, right) == ((None, False), [])
+
+
+def test_steering_agent_is_corrected_from_its_step_on_and_reported_once():
+    road = Steered(5.0, 25.0, 15.0, sides={1: Side(exists=False), -1: Side(exists=False)})
+    action = np.array([28.0, 1.0])
+    made = driver(road, "both", action, after=2)
+    assert [made.act(None) is action for _ in range(4)] == [True, True, False, False]
+    assert {(one["faculty"], one["first"], one["last"]) for one in made.responses} == {
+        ("lateral", 2, 3),
+        ("longitudinal", 2, 3),
+    }
 
 
 def test_a_simulator_that_knows_no_surroundings_is_refused():
