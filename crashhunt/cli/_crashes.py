@@ -54,7 +54,7 @@ def add_crashes(commands: Commands) -> None:
 
 
 def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.crashes import group_crashes, join_causes, list_bundles
+    from crashhunt.crashes import count_causes, group_crashes, join_causes, list_bundles
     from crashhunt.hunts import dropped_crashes, find_hunts
     from crashhunt.report import describe_causes, describe_groups
 
@@ -74,13 +74,15 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     _print_groups(options, found.groups, known)
     if options.json:
         groups = [dict(group.to_json()) for group in found.groups]
-        joined = {} if causes is None else {"by_cause": [one.to_json() for one in join_causes(found.groups, causes)]}
+        by_cause: dict[str, object] = {}
         if causes is not None:
+            joined = join_causes(found.groups, causes)
+            by_cause = {"types_by_cause": count_causes(joined)[0], "by_cause": [one.to_json() for one in joined]}
             pairs = zip(groups, causes, strict=True)
             groups = [{**one, "causes": [each.to_json() for each in of]} for one, of in pairs]
         if known is not None:
             groups = [{**one, "known": known.get(of.signature)} for one, of in zip(groups, found.groups, strict=True)]
-        print(json.dumps({"groups": groups, **joined, "left_out": list(found.left_out)}))
+        print(json.dumps({"groups": groups, **by_cause, "left_out": list(found.left_out)}))
     if interrupted:
         say("Interrupted: some causes are not known yet. Run the same command to resume.", as_json=options.json)
     return INTERRUPTED if interrupted else DONE

@@ -22,6 +22,7 @@ from ._causes import (
     CauseType as CauseType,
     Division as Division,
     cause_of as cause_of,
+    count_causes as count_causes,
     features_of as features_of,
     join_causes as join_causes,
     without_chance_lengths as without_chance_lengths,

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 __all__ = [
-    "Cause", "CauseGroup", "CauseType", "Division", "cause_of", "features_of", "join_causes", "without_chance_lengths",
+    "Cause", "CauseGroup", "CauseType", "Division", "cause_of", "count_causes", "features_of", "join_causes",
+    "without_chance_lengths",
 ]  # fmt: skip
 
 _LONG_M = 7.0  # a longer actor is a truck, a bus or a trailer, which agents that assume a car's length hit
@@ -166,6 +167,20 @@ def join_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGroup]])
         for variants in found.values()
     ]
     return tuple(sorted(joined, key=lambda one: -one.count))
+
+
+def count_causes(joined: Sequence[CauseType]) -> tuple[int, int]:
+    """Return the number of crash types by cause as a hunt counts them, and the number of crashes that it omits.
+
+    Crashes of an unknown cause may have a cause of the same crash type that already counts. An unknown cause therefore
+    counts only if the crash type has no other cause.
+
+    Args:
+        joined: the crashes by cause, as `join_causes` returns them.
+    """
+    caused = {group.signature for one in joined if one.cause.kind != "unknown" for group, _ in one.variants}
+    rest = [one for one in joined if one.cause.kind == "unknown" and one.variants[0][0].signature in caused]
+    return len(joined) - len(rest), sum(one.count for one in rest)
 
 
 def without_chance_lengths(causes: Collection[Cause]) -> dict[Cause, Cause]:

@@ -313,6 +313,7 @@ class CrashesData(TypedDict):
     """``crashhunt crashes``."""
 
     groups: list[CrashGroup]
+    types_by_cause: NotRequired[int]
     by_cause: NotRequired[list[JsonObject]]
     left_out: list[str]
 

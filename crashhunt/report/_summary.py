@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.text import in_lines, out_of
-from crashhunt.crashes import join_causes
+from crashhunt.crashes import count_causes, join_causes
 from crashhunt.report._rate import describe_rates
 from crashhunt.report._status_screen import describe_types, format_arguments, format_inputs, format_seconds
 from crashhunt.report._words import (
@@ -91,7 +91,10 @@ def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGrou
     dropped = sum(group.dropped for group in groups)
     if dropped:
         rows.append([str(dropped), "not judged: their bundles were deleted (--keep)", "", "", ""])
-    words = f"{describe_types(len(joined), None)} by cause"
+    count, unknown = count_causes(joined)
+    words = f"{describe_types(count, None)} by cause"
+    if unknown:
+        words += f" (the cause of {unknown} more {'crash' if unknown == 1 else 'crashes'} is unknown)"
     return "\n".join(["", f"{words}:", "", *_lines(rows)])
 
 

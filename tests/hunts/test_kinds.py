@@ -8,7 +8,18 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.errors import UsageError
-from crashhunt.crashes import Cause, Factor, Judgement, LeftOut, Why
+from crashhunt.crashes import (
+    Cause,
+    CauseGroup,
+    Factor,
+    Group,
+    Judgement,
+    LeftOut,
+    Signature,
+    Why,
+    count_causes,
+    join_causes,
+)
 from crashhunt.hunts import _crashes
 from crashhunt.hunts._crashes import Judged, Kinds
 from crashhunt.hunts._reports import kind_data
@@ -187,6 +198,31 @@ def test_a_cause_of_several_types_counts_once_and_types_without_an_answer_do_not
     assert (kinds.until, kinds.types_by_cause) == (None, 2)  # one cause, and a type without an answer
     settle(kinds, crashes[2], None)  # it cannot be run again
     assert (kinds.until, kinds.types_by_cause) == (5, 2)
+
+
+@pytest.mark.parametrize(
+    ("kinds_of_causes", "counts"),
+    [
+        (["omission", "unknown"], (1, 1)),
+        (["unknown", "unknown"], (1, 0)),
+        (["traffic", "unknown"], (1, 1)),
+        (["omission", "decision"], (2, 0)),
+    ],
+)
+def test_types_by_cause_are_as_many_as_the_list_of_crashes_counts(one_type, kinds_of_causes, counts):
+    """A judged crash whose runs show no cause may be one of the cause that counts."""
+    kinds, crashes = Kinds(3, by_cause=3), [collision(number) for number in (3, 5)]
+    for bundle, kind in zip(crashes, kinds_of_causes, strict=True):
+        kinds.add(bundle, 1)
+        kinds.settle(Judged(kinds.next_to_judge(), Cause(kind)))
+    group = Group(Signature(outcome="collision", role="collider", manner="rear end"), tuple(crashes))
+    parts = [
+        CauseGroup(cause=Cause(kind), members=members, judged=members)
+        for kind in dict.fromkeys(kinds_of_causes)
+        for members in [tuple(one for one, of in zip(crashes, kinds_of_causes, strict=True) if of == kind)]
+    ]
+    assert count_causes(join_causes([group], [parts])) == counts
+    assert kinds.types_by_cause == counts[0]
 
 
 @pytest.mark.parametrize("kind", ["traffic", "software fault"])
