@@ -85,6 +85,7 @@ _TESTS_ELSEWHERE = {
     "cli/_whatif.py": ("e2e/test_what_if.py",),
     "corpus": ("e2e/test_corpus.py",),
     "crashes/_trust.py": ("crashes/test_trust.py", "e2e/test_foreign_hunts.py"),
+    "envs": ("envs/test_*.py",),
     "episode/_action_override.py": (
         "episode/test_overruled_agents.py",
         "episode/test_reference_driver.py",

@@ -135,10 +135,10 @@ def test_wrong_use_is_answered_with_what_to_do(make):
     assert env.step((5.0, 0))[2] is False
     with pytest.raises(UsageError, match="seed is -1; give 0 or more"):
         env.branch(1, seed=-1)
-    with pytest.raises(UsageError, match="there is no controlled vehicle 'egon'; did you mean 'ego'"):
+    with pytest.raises(UsageError, match="there is no controlled vehicle 'egon'; give ego"):
         SumoEnv("loop", agent="egon")
     assert make("loop").render() is None
-    with pytest.raises(UsageError, match="render_mode is 'human'; give one of rgb_array"):
+    with pytest.raises(UsageError, match="render_mode is 'human'; give rgb_array"):
         SumoEnv("loop", render_mode="human")
 
 
@@ -184,7 +184,53 @@ class Ended:
     agent, observation_space, action_space, step_length_s = "of another process", None, None, 0.3
 
 
-def test_render_rate_is_that_of_the_steps(make, monkeypatch):
+@pytest.mark.parametrize(("step_length_s", "rate"), [(0.3, 3), (0.1, 10), (1.0, 1), (5.0, 1)])
+def test_render_rate_is_that_of_the_steps(monkeypatch, step_length_s, rate):
     monkeypatch.setattr("crashhunt.envs._sumo_env.RemoteEpisodes", lambda *_: Ended())
-    assert SumoEnv("loop", process=True).metadata["render_fps"] == 3
+    monkeypatch.setattr(Ended, "step_length_s", step_length_s)
+    assert SumoEnv("loop", process=True).metadata["render_fps"] == rate
     assert SumoEnv.metadata["render_fps"] == 10
+
+
+class Branching(Ended):
+    """Episodes of another process that note the seeds of their copies."""
+
+    def __init__(self, *words):
+        self.seeds, self.steps = [], 0
+
+    def reset(self, seed, arguments):
+        return "seen", {}
+
+    def step(self, action):
+        self.steps += 1
+        return "seen", 0.0, False, {}
+
+    def branch(self, seeds):
+        self.seeds += seeds
+        return [Branching() for _ in seeds]
+
+
+def test_copies_get_a_seed_each_and_count_their_own_steps(monkeypatch):
+    monkeypatch.setattr("crashhunt.envs._sumo_env.RemoteEpisodes", Branching)
+    env = SumoEnv("loop", process=True, max_steps=3)
+    env.reset(seed=1)
+    assert env.step(0)[3] is False
+    seeds = []
+    for seed in (5, 5, 0):
+        copies = env.branch(3, seed=seed)
+        seeds.append(env._episodes.seeds[-3:])
+        assert len({*seeds[-1]}) == len(copies) == 3
+        assert all(0 <= one < 2**31 for one in seeds[-1])  # as those of trials
+    assert seeds[0] == seeds[1] != seeds[2]
+    env.branch(2)
+    assert env._episodes.seeds[9:] == [None, None]
+    env.branch(1, seed=5)
+    assert env._episodes.seeds[11:] == seeds[0][:1]
+    one, other, _ = copies
+    assert [one.step(0)[3] for _ in range(2)] == [False, True]  # the third step of the episode
+    assert other.step(0)[3] is env.step(0)[3] is False
+    with pytest.raises(UsageError, match="a copy of an episode cannot be reset"):
+        one.reset(seed=1)
+    env.reset(seed=2)
+    with pytest.raises(UsageError, match="n is 0; branch at least 1"):
+        env.branch(0)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import threading
 from multiprocessing.connection import Pipe
+from types import SimpleNamespace
 
 import pytest
 
@@ -235,3 +237,21 @@ def test_handle_of_a_process_waits_for_its_end_and_kills_it():
         process.wait(10)  # at once
         process.kill()  # nothing any more
         assert sleeper.wait(10) == -9
+
+
+def test_program_without_standard_input_may_have_descriptor_0(remote, monkeypatch):
+    passed, closed, killed = [], [], []
+    with monkeypatch.context() as patch:
+        patch.setattr(_process, "send_handle", lambda pipe, handle, pid: passed.append(handle))
+        for handle in (-1, 0, 1):
+            assert remote._ask("agent_name", passes=handle) == "ego"
+        assert passed == [0, 1]
+        patch.setattr(_process, "os", SimpleNamespace(pidfd_open=lambda pid: 0, close=closed.append))
+        patch.setattr(_process, "select", SimpleNamespace(select=lambda *_: ([0], [], [])))
+        patch.setattr(_process.signal, "pidfd_send_signal", lambda *words: killed.append(words))
+        process = _process._Fork(77)
+        process.kill()
+        for _ in range(2):
+            process.wait(1.0)
+        process.kill()  # nothing any more
+    assert (killed, closed) == ([(0, signal.SIGKILL)], [0])
