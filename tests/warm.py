@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 # What Python and its libraries look at when they start.
 _AT_START = ("PYTHON", "LC_", "LANG", "LD_", "COVERAGE", "OMP_", "OPENBLAS_")
 _SET_LATER = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX")
-_OF_SIMULATORS = {"gym": "gymnasium", "highway": "crashhunt.simulators.highway._lean", "sumo": "libsumo"}
+_OF_SIMULATORS = {"gym": "gymnasium", "highway": "crashhunt.simulators.highway._fast_import", "sumo": "libsumo"}
 _MESSAGE = 1 << 20
 _START_S = 300.0  # a server imports for two seconds; on a loaded machine for longer
 _FREE = 500  # where a process has no files of its own
@@ -58,7 +58,7 @@ _made: dict[str, tuple[types.CodeType, bytes]] = {}  # what a module of crashhun
 _imported: dict[str, dict[str, tuple[types.ModuleType, types.CodeType, dict[str, bytes]]]] = {}
 _BEGIN_WITH = ("crashhunt.executors._fork_server", "crashhunt.executors._fresh")
 # What these import as soon as they have read what is to be done.
-_ALL = ("crashhunt.scenario._load", "crashhunt.crashes._escape", "crashhunt.recording._foxglove")
+_ALL = ("crashhunt.scenario._load", "crashhunt.crashes._last_avoidable_step", "crashhunt.recording._foxglove")
 _GO_ON_WITH = {
     "": (*_ALL, "crashhunt.scenario.backends.toy", "crashhunt.simulators.toy"),
     "gym": _ALL,

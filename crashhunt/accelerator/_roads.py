@@ -9,8 +9,8 @@ from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
 from crashhunt.accelerator._frames import TrafficFrame
+from crashhunt.accelerator._kernel_objects import KernelRoster
 from crashhunt.accelerator._network import Network
-from crashhunt.accelerator._roster import KernelRoster
 from crashhunt.accelerator._versions import Own, Watch, is_plain, kinds_of
 
 if TYPE_CHECKING:

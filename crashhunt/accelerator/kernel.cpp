@@ -9,9 +9,9 @@
 //   calls highway-env's own methods: the end of a lane, and a movement by the dynamic bicycle model to numbers that are
 //   not finite.
 //
-// Its parts are kernel_numbers.hpp (arithmetic), kernel_lanes.hpp, kernel_actors.hpp (state), kernel_policies.hpp
-// (decisions), kernel_movement.hpp, kernel_collisions.hpp, kernel_predictions.hpp, kernel_observations.hpp, and
-// kernel_snapshots.hpp (what must stay the same). This file has what Python calls.
+// Its parts are kernel_numbers.hpp (arithmetic), kernel_lanes.hpp, kernel_actors.hpp (state), kernel_neighbours.hpp,
+// kernel_policies.hpp (decisions), kernel_movement.hpp, kernel_collisions.hpp, kernel_predictions.hpp,
+// kernel_observations.hpp, and kernel_snapshots.hpp (what must stay the same). This file has what Python calls.
 
 #include "kernel_observations.hpp"
 #include "kernel_snapshots.hpp"
@@ -181,7 +181,7 @@ PyObject *traffic_new(PyTypeObject *type, PyObject *args, PyObject *) {
             actor = Actor();
             actor.object = PyList_GET_ITEM(actors, static_cast<Py_ssize_t>(row));
             Py_INCREF(actor.object);
-            const int flag = static_cast<const char *>(flags.buf)[row]; // see `_roster._flags_of`
+            const int flag = static_cast<const char *>(flags.buf)[row]; // see `_kernel_objects._flags_of`
             actor.model = static_cast<const char *>(models.buf)[row];
             actor.moves = actor.model != OBJECT;
             actor.has_target = actor.model == CONTROLLED || actor.model == IDM || actor.model == LINEAR;

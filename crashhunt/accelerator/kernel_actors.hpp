@@ -10,10 +10,10 @@
 
 namespace {
 
-// Models of decision, see `_roster._MODELS`. FOREIGN vehicles decide by code that is not highway-env's.
+// Models of decision, see `_kernel_objects._MODELS`. FOREIGN vehicles decide by code that is not highway-env's.
 enum { OBJECT, PASSIVE, CONTROLLED, IDM, LINEAR, FOREIGN };
 
-// The order of the parameters of a vehicle, see `_roster._PARAMETERS`.
+// The order of the parameters of a vehicle, see `_kernel_objects._PARAMETERS`.
 struct Parameters {
     double length, width, max_speed, min_speed;
     double tau_pursuit, kp_lateral, kp_heading, max_steering_angle, kp_a;

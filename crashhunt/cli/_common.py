@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from _typeshed import SupportsWrite
 
-    from crashhunt.base.watching import Watch
+    from crashhunt.base.progress import Watch
     from crashhunt.crashes import Archive, Bundle
     from crashhunt.plans import Given, HuntOption
 

@@ -147,7 +147,7 @@ def _check_agent(name: str) -> None:
         PluginError: the agent does not exist, or its module cannot be imported.
         UsageError: the agent needs an argument.
     """
-    from crashhunt.base.apart import work_apart
+    from crashhunt.base.isolation import work_apart
     from crashhunt.base.plugins import is_foreign, locate
     from crashhunt.trial import Signature, signature_of
 

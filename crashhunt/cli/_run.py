@@ -13,8 +13,8 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from crashhunt.base.apart import OWN_THREAD
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.isolation import OWN_THREAD
 from crashhunt.cli._common import add_json, add_options, chosen_options, integer
 from crashhunt.cli._exit_codes import DONE, INTERRUPTED, NO_ANSWER, NO_VALID_TRIAL, THE_ANSWER_IS_NO
 from crashhunt.cli._rate import exit_code_of

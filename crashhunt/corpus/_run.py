@@ -31,7 +31,7 @@ from crashhunt.trial import Outcome
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from crashhunt.base.watching import Watch
+    from crashhunt.base.progress import Watch
     from crashhunt.plans import HuntSettings
     from crashhunt.trial import TrialResult
 

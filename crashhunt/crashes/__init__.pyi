@@ -39,15 +39,6 @@ from ._encounter import (
     most_dangerous as most_dangerous,
     visible_from as visible_from,
 )
-from ._escape import (
-    Ending as Ending,
-    changes_of as changes_of,
-    ending_of as ending_of,
-    find_escape as find_escape,
-    overruled_trial as overruled_trial,
-    partner as partner,
-    slowing as slowing,
-)
 from ._fault import Fault as Fault, Verdict as Verdict, fault_of as fault_of
 from ._judgement import (
     INTERRUPTED as INTERRUPTED,
@@ -62,6 +53,15 @@ from ._judgement import (
     with_judgement as with_judgement,
 )
 from ._lanes import Borders as Borders, LaneMap as LaneMap
+from ._last_avoidable_step import (
+    Ending as Ending,
+    changes_of as changes_of,
+    ending_of as ending_of,
+    find_escape as find_escape,
+    overruled_trial as overruled_trial,
+    partner as partner,
+    slowing as slowing,
+)
 from ._omission import Omission as Omission, Reference as Reference, ReferenceRun as ReferenceRun, Without as Without
 from ._signature import (
     SIGNATURE_VERSION as SIGNATURE_VERSION,

@@ -19,8 +19,8 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import FILES, parse_object, typed
+from crashhunt.base.progress import watched
 from crashhunt.base.temporary import temporary_folder
-from crashhunt.base.watching import watched
 from crashhunt.crashes._bundle import ArchiveIndex, is_bundle_made_here
 from crashhunt.crashes._trust import is_made_here, signature
 from crashhunt.snapshots import Snapshot
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from crashhunt.base.integrity import FileEntry
-    from crashhunt.base.watching import Watch
+    from crashhunt.base.progress import Watch
     from crashhunt.crashes._bundle import Bundle
 
 __all__ = ["Archive", "export_crash", "open_archive"]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from crashhunt.crashes._bundle import Bundle
-    from crashhunt.crashes._escape import Ending
+    from crashhunt.crashes._last_avoidable_step import Ending
 
 
 __all__ = [

@@ -1,4 +1,4 @@
-from ._apart import ModelApart as ModelApart, described_model as described_model
+from ._foreign_models import ModelApart as ModelApart, described_model as described_model
 from ._models import (
     Choices as Choices,
     brake as brake,

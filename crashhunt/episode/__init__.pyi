@@ -15,6 +15,7 @@ from ._failures import (
 )
 from ._fast_path import FastEpisode as FastEpisode
 from ._forced_onsets import OnsetForcer as OnsetForcer
+from ._forks import FirstCopy as FirstCopy, Questions as Questions
 from ._observers import (
     Nearness as Nearness,
     Observer as Observer,
@@ -30,7 +31,6 @@ from ._probes import (
     Probed as Probed,
     Prober as Prober,
 )
-from ._questions import FirstCopy as FirstCopy, Questions as Questions
 from ._run import (
     Parts as Parts,
     generators as generators,

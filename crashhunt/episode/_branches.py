@@ -24,8 +24,8 @@ from crashhunt.base.forks import NoAnswer, NoProcessError
 from crashhunt.base.json_types import finite
 from crashhunt.base.resources import FREE, free_memory
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates
+from crashhunt.episode._forks import Questions
 from crashhunt.episode._observers import Observer
-from crashhunt.episode._questions import Questions
 from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import SENSOR_KINDS, Branch, Branches, Disturbance, Outcome, in_turn, steps_of
 from crashhunt.world import approaches, dangers

@@ -25,7 +25,7 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.forks import NoAnswer
 from crashhunt.disturbances import SECONDS_PER_COPY, FirstOnsets, disturber_of, parse_rates
-from crashhunt.episode._questions import Questions
+from crashhunt.episode._forks import Questions
 from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import Disturbance, Forced, ForcedCopy, Outcome, in_turn
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal, cast
 
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.episode._questions import Questions
+from crashhunt.episode._forks import Questions
 from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import KINDS, SENSOR_KINDS, Disturbance, Outcome, Stress, steps_of
 

@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from crashhunt.episode._branches import Brancher
     from crashhunt.episode._episode import MakeAgent, Reset
     from crashhunt.episode._forced_onsets import OnsetForcer
+    from crashhunt.episode._forks import FirstCopy
     from crashhunt.episode._observers import Observer
     from crashhunt.episode._probes import Prober
-    from crashhunt.episode._questions import FirstCopy
     from crashhunt.episode._settings import WorkerSettings
     from crashhunt.episode._splitting import Splitter
     from crashhunt.oracles import Oracle

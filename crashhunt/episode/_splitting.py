@@ -33,7 +33,7 @@ import numpy as np
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.forks import NoAnswer
-from crashhunt.episode._questions import Questions
+from crashhunt.episode._forks import Questions
 from crashhunt.simulators import SupportsReseeding
 from crashhunt.trial import Forced, ForcedCopy, Outcome, Reseeding
 from crashhunt.world import closing_rate

@@ -10,7 +10,7 @@ from ._gate import (
     PairedHunts as PairedHunts,
     ScenarioCounts as ScenarioCounts,
 )
-from ._rates import (
+from ._hunt_rate import (
     counts_suffice as counts_suffice,
     measure_rates as measure_rates,
     rate_of_counts as rate_of_counts,

@@ -20,7 +20,7 @@ from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.json_types import finite_values
-from crashhunt.estimation._rates import measure_rates
+from crashhunt.estimation._hunt_rate import measure_rates
 from crashhunt.hunts import HuntResults, counting_rule
 from crashhunt.ledger import Ledger
 from crashhunt.rates import CountingRule, Interval, PairSequence, PairTest, facts_of_plain

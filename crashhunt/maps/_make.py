@@ -26,9 +26,9 @@ from crashhunt.maps._folder import (
 )
 from crashhunt.maps._network import CAR, RoadNetwork
 from crashhunt.maps._picture import draw_map
-from crashhunt.maps._plain_run import RUN_S, PlainRun, calibrate
 from crashhunt.maps._source import check_source
 from crashhunt.maps._tools import find_tools
+from crashhunt.maps._traffic_flow import RUN_S, PlainRun, calibrate
 
 if TYPE_CHECKING:
     from collections.abc import Callable

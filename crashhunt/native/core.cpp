@@ -1526,7 +1526,7 @@ PyObject *write_step(PyObject *, PyObject *const *given, Py_ssize_t count) {
     return PyLong_FromSize_t(static_cast<size_t>(offset) + 8 + payload);
 }
 
-#include "usual.hpp"
+#include "fast_step.hpp"
 
 // ---------------------------------------------------------------------------------------------------------- the module
 

@@ -1,15 +1,6 @@
 from ._code import CodeFacts as CodeFacts, describe_code as describe_code, imported_by as imported_by
-from ._declaration import (
-    RATE_PERS as RATE_PERS,
-    Given as Given,
-    HuntOption as HuntOption,
-    RatePer as RatePer,
-    check_duration as check_duration,
-    check_rate as check_rate,
-    rate_of as rate_of,
-    seconds_of as seconds_of,
-    share_of as share_of,
-)
+from ._declaration import Given as Given, HuntOption as HuntOption
+from ._durations import check_duration as check_duration, seconds_of as seconds_of
 from ._plan import (
     FIXED as FIXED,
     Owners as Owners,
@@ -50,4 +41,11 @@ from ._settings import (
     request_of as request_of,
     spec_words as spec_words,
     write_settings as write_settings,
+)
+from ._shares_and_rates import (
+    RATE_PERS as RATE_PERS,
+    RatePer as RatePer,
+    check_rate as check_rate,
+    rate_of as rate_of,
+    share_of as share_of,
 )

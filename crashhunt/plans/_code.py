@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.base.apart import work_apart
+from crashhunt.base.isolation import work_apart
 from crashhunt.base.plugins import ImportedModules, is_foreign, is_foreign_module, locate
 from crashhunt.disturbances import described_model, modules_of_models, parse_rates
 from crashhunt.oracles import described_oracle, modules_of, oracle_name
@@ -22,7 +22,7 @@ from crashhunt.trial import Signature, signature_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from crashhunt.base.apart import Report
+    from crashhunt.base.isolation import Report
     from crashhunt.base.json_types import Plain
     from crashhunt.base.plugins import Group
     from crashhunt.plans._settings import HuntSettings

@@ -21,15 +21,13 @@ from crashhunt.plans._declaration import (
     HuntOption,
     above_zero,
     at_least,
-    check_duration,
-    check_probe,
-    check_rate,
-    check_share,
     declared,
     declared_options,
     option,
     within,
 )
+from crashhunt.plans._durations import check_duration, check_probe
+from crashhunt.plans._shares_and_rates import check_rate, check_share
 from crashhunt.trial import CRASHES
 
 __all__ = [

@@ -1,10 +1,10 @@
-from ._certain_interval import (
+from ._anytime_interval import (
     Bets as Bets,
     Interval as Interval,
     RateTest as RateTest,
     discordance_evidence as discordance_evidence,
 )
-from ._pairs import (
+from ._paired_test import (
     Pair as Pair,
     PairSequence as PairSequence,
     PairTest as PairTest,

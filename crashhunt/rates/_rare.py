@@ -27,7 +27,7 @@ from their estimates are added as squares. No interval from weighted copies can 
 met. The estimated interval does not include undisturbed crashes before the first undisturbed crash occurs.
 
 The certain interval covers such failure modes as well. The certain interval comes from
-`crashhunt.rates._certain_interval`, so it is valid at any number of roots. A plain trial is a unit with 0 or 1 crashes
+`crashhunt.rates._anytime_interval`, so it is valid at any number of roots. A plain trial is a unit with 0 or 1 crashes
 and exposure 1. A root is a unit with the value V, which is at most B. The forcing fixes B before the root begins. V / B
 therefore counts as events and 1 / B as exposure, and the ratio of their means is the rate. A root without a crash
 counts as 1 / B of a trial. The lower end has a second source, the copies alone. The value of the copies is bounded by
@@ -52,7 +52,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from crashhunt.disturbances import COPIES_PER_ROOT, SECONDS_PER_COPY
-from crashhunt.rates._certain_interval import Bets, RateTest
+from crashhunt.rates._anytime_interval import Bets, RateTest
 from crashhunt.rates._units import MAX_INVALID_SHARE
 from crashhunt.trial import Forcing, Outcome
 
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.ledger import RunningRate
-    from crashhunt.rates._certain_interval import Interval
+    from crashhunt.rates._anytime_interval import Interval
     from crashhunt.trial import Forced, TrialResult
 
 __all__ = [

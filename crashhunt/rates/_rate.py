@@ -11,7 +11,7 @@ from crashhunt.rates._units import MAX_INVALID_SHARE
 
 if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
-    from crashhunt.rates._certain_interval import Interval
+    from crashhunt.rates._anytime_interval import Interval
     from crashhunt.rates._units import Per, RateCounter, UnitSequence
 
 __all__ = ["CrashRate", "RatePart", "check_confidence", "make_rate"]

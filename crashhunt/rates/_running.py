@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from crashhunt.ledger import RunningRate, UntilRate
-    from crashhunt.rates._certain_interval import Interval, RateTest
+    from crashhunt.rates._anytime_interval import Interval, RateTest
     from crashhunt.rates._units import CountingRule, Per, TrialFacts, Unit
     from crashhunt.trial import TrialResult
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from crashhunt.plans import RATE_PERS, RatePer
-from crashhunt.rates._certain_interval import Bets, Interval, RateTest
+from crashhunt.rates._anytime_interval import Bets, Interval, RateTest
 from crashhunt.trial import KILLED, Outcome
 
 if TYPE_CHECKING:

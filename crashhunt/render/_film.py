@@ -13,8 +13,8 @@ from PIL import Image, ImageSequence
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.files import cannot_write, whole_file
+from crashhunt.base.progress import watched
 from crashhunt.base.temporary import temporary_beside
-from crashhunt.base.watching import watched
 from crashhunt.crashes import Encounter
 from crashhunt.panels import Action, Curve, Text
 from crashhunt.recording import is_opaque
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.base.watching import Watch
+    from crashhunt.base.progress import Watch
     from crashhunt.panels import Panel
     from crashhunt.recording import Recording
 

@@ -6,8 +6,8 @@ import inspect
 from functools import partial
 from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 
-from crashhunt.base.apart import work_apart
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.isolation import work_apart
 from crashhunt.base.plugins import is_foreign, locate, registered
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.trial import signature_of, without_folder

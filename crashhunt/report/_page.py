@@ -17,8 +17,8 @@ import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.base.files import whole_file
+from crashhunt.base.progress import watched
 from crashhunt.base.version import __version__
-from crashhunt.base.watching import watched
 from crashhunt.crashes import closest_actors, signature_of
 from crashhunt.hunts import TrialRow, find_crashes
 from crashhunt.ledger import Ledger, has_begun
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.base.watching import Watch
+    from crashhunt.base.progress import Watch
     from crashhunt.crashes import Bundle, Encounter
     from crashhunt.hunts import FoundCrashes
     from crashhunt.ledger import RunningRate

@@ -54,7 +54,7 @@ class Watcher:
         self._title = one_line(title)
         self._last_line = -math.inf
         self._last_progress: tuple[str, int, int] | None = None
-        # Rich's own refresh needs a thread, and with a thread this process could not be forked (`base/apart.py`).
+        # Rich's own refresh needs a thread, and with a thread this process could not be forked (`base/isolation.py`).
         self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
 
     def __enter__(self) -> Self:

@@ -19,7 +19,7 @@ from crashhunt.whatif import Reruns, StoppedError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from crashhunt.base.watching import Watch
+    from crashhunt.base.progress import Watch
     from crashhunt.crashes import Signature
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialResult, TrialSpec

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.base.watching import Watch
+    from crashhunt.base.progress import Watch
     from crashhunt.crashes import Bundle, Signature
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialSpec, Value

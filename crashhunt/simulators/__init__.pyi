@@ -5,7 +5,7 @@ from ._actions import (
     SpeedAndLaneChange as SpeedAndLaneChange,
 )
 from ._gymnasium import action_form as action_form, native as native
-from ._kinematics import Kinematics as Kinematics
+from ._kinematics_observation import Kinematics as Kinematics
 from ._protocol import (
     FACULTIES as FACULTIES,
     ActionForm as ActionForm,

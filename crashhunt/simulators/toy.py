@@ -16,7 +16,7 @@ import numpy as np
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
 from crashhunt.scenario import ObservationSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
-from crashhunt.simulators._kinematics import Kinematics, Unseen
+from crashhunt.simulators._kinematics_observation import Kinematics, Unseen
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.world import Actor, Contact, Lane, Roster, Scene
 

@@ -18,9 +18,9 @@ from crashhunt.crashes import snapshot_of
 from crashhunt.envs import RemoteEpisodes
 from crashhunt.plans import read_settings
 from crashhunt.training._episodes import CrashEpisodes
-from crashhunt.training._record import TrainedOn
-from crashhunt.training._replay import CrashReplay
+from crashhunt.training._prioritized_replay import CrashReplay
 from crashhunt.training._split import check_test_share, is_test_traffic, split_crashes
+from crashhunt.training._trained_on import TrainedOn
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -30,7 +30,7 @@ from crashhunt.whatif._reruns import NotUnderstoodError, Reruns, StoppedError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from crashhunt.base.watching import Watch
+    from crashhunt.base.progress import Watch
     from crashhunt.crashes import Bundle, Ending
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun

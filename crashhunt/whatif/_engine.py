@@ -39,7 +39,7 @@ from crashhunt.whatif._reruns import NotUnderstoodError, Reruns, StoppedError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from crashhunt.base.watching import Watch
+    from crashhunt.base.progress import Watch
     from crashhunt.crashes import Bundle
     from crashhunt.replays import Code, Rerun
     from crashhunt.trial import TrialSpec

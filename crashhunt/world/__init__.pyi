@@ -22,7 +22,7 @@ from ._danger import (
     dangers as dangers,
     followers_danger as followers_danger,
 )
-from ._driven import DrivenMeter as DrivenMeter
+from ._distance_driven import DrivenMeter as DrivenMeter
 from ._events import (
     EVENT_WORDS as EVENT_WORDS,
     LIMITS as LIMITS,

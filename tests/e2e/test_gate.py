@@ -93,7 +93,7 @@ def test_better_agent_passes_the_gate(drivers):
     assert (found["verdict"], found["only_base"], found["only_head"], found["dir"]) == ("better", 8, 0, None)
 
 
-@pytest.mark.nightly  # by day, the verdict within a margin is tested in tests/rates/test_pairs.py
+@pytest.mark.nightly  # by day, the verdict within a margin is tested in tests/rates/test_paired_test.py
 def test_equal_agents_pass_the_gate_once_the_difference_is_within_the_margin(drivers):
     found = gate(drivers, CALM, TWIN, "--margin", "40%", *SEED, "--keep", "kept", "--most", "200", expect=0)
     assert (found["verdict"], found["margin"]) == ("no_difference", 0.4)

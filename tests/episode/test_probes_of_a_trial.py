@@ -10,7 +10,7 @@ import pytest
 
 from crashhunt.base.capabilities import members
 from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
-from crashhunt.episode import BUDGET_BESIDE, Prober, _questions
+from crashhunt.episode import BUDGET_BESIDE, Prober, _forks
 from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import CRASHES, Disturbance, Outcome, Stress, TrialResult, TrialSpec
 
@@ -276,7 +276,7 @@ def test_it_is_due_every_so_often():
 
 @pytest.fixture
 def no_pauses(monkeypatch):
-    monkeypatch.setattr(_questions, "_PAUSES_S", (0.0, 0.0))
+    monkeypatch.setattr(_forks, "_PAUSES_S", (0.0, 0.0))
 
 
 @pytest.mark.parametrize("killed", ["k", "kk", ".k", "..kk", "....kk"])

@@ -10,7 +10,7 @@ from test_comparison import hunt
 
 from crashhunt.errors import HuntDirectoryError, UsageError
 from crashhunt.estimation import measure_rates
-from crashhunt.estimation._rates import _bins, _division, rate_of_counts, rate_of_trials
+from crashhunt.estimation._hunt_rate import _bins, _division, rate_of_counts, rate_of_trials
 from crashhunt.hunts import HuntResults
 from crashhunt.ledger import Ledger
 from crashhunt.training import HeldOutTraffics

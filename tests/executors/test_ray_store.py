@@ -20,9 +20,9 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors.ray import RayExecutor
-from crashhunt.executors.ray._bridge import Node, NodeScheduler, Trial, shares
 from crashhunt.executors.ray._code_archive import CodeArchive, Folder, Store, settings_in, unpack
 from crashhunt.executors.ray._node_actor import Site, code_digest
+from crashhunt.executors.ray._node_scheduler import Node, NodeScheduler, Trial, shares
 from crashhunt.executors.ray._node_worker import Work
 from crashhunt.recording import BlackBox, Tag, read_black_box
 from crashhunt.scenario import Scenario

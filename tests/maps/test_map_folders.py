@@ -23,8 +23,8 @@ from crashhunt.maps._folder import agent_module, arguments_of, next_commands, re
 from crashhunt.maps._make import _thin_traffic
 from crashhunt.maps._network import Edge, NetworkLane, RoadNetwork
 from crashhunt.maps._picture import draw_map, drawable
-from crashhunt.maps._plain_run import PlainRun
 from crashhunt.maps._tools import Tools
+from crashhunt.maps._traffic_flow import PlainRun
 from crashhunt.scenario import scenario_from_dict, shipped_folder
 
 

@@ -7,7 +7,7 @@ import pytest
 from crashhunt.maps import _picture
 from crashhunt.maps._network import Edge, NetworkLane, RoadNetwork
 from crashhunt.maps._picture import _GROUND, _MARGIN, _ROAD, _SIZE, _WAY, _color, _draw_labels, draw_map
-from crashhunt.maps._plain_run import PlainRun
+from crashhunt.maps._traffic_flow import PlainRun
 
 BLUE, ORANGE, RED = (146, 180, 214), (224, 138, 0), (198, 40, 40)
 

@@ -21,7 +21,7 @@ from crashhunt.simulators.toy import ToySimulator
 from crashhunt.space import Choice, Range
 from crashhunt.testing import AgentContract, OracleContract, SamplerContract, SimulatorContract, drive
 from crashhunt.testing._disturbances import DisturbanceContract
-from crashhunt.testing._escapes import EscapeCheck, RecordedThenBrakes
+from crashhunt.testing._last_avoidable_step import EscapeCheck, RecordedThenBrakes
 from crashhunt.world import Event
 
 
@@ -435,7 +435,7 @@ def test_verdict_on_an_escape_needs_both_runs(found, verdict):
 
 def test_driver_repeats_the_log_and_brakes_after_its_step(monkeypatch):
     log = SimpleNamespace(actions=lambda agent: [f"{agent} {n}" for n in range(4)])
-    monkeypatch.setattr("crashhunt.testing._escapes.read_log", lambda path: log)
+    monkeypatch.setattr("crashhunt.testing._last_avoidable_step.read_log", lambda path: log)
     found = []
     for after in (2, 9):
         agent = RecordedThenBrakes("log.mcap", "ego", after, None)

@@ -29,7 +29,7 @@ from crashhunt.errors import CrashhuntError, SimulatorError, UsageError
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.training import CrashEnv, is_test_traffic
 from crashhunt.training._episodes import _Start
-from crashhunt.training._replay import CrashReplay
+from crashhunt.training._prioritized_replay import CrashReplay
 
 TOY = """
 title = "A toy"

@@ -14,7 +14,7 @@ from collections import Counter
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.simulators.highway._lean import highway_env  # before anything else imports it
+from crashhunt.simulators.highway._fast_import import highway_env  # before anything else imports it
 
 # isort: split
 import gymnasium
@@ -33,7 +33,7 @@ from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.highway import BACKEND, HighwaySetup
 from crashhunt.simulators._actions import MetaAction
 from crashhunt.simulators._gymnasium import ObservationForm, action_form, native, reseed_in_place
-from crashhunt.simulators._kinematics import Kinematics, Unseen
+from crashhunt.simulators._kinematics_observation import Kinematics, Unseen
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances

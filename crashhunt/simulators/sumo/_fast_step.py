@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.native import Core, Vehicles
-    from crashhunt.simulators._kinematics import Kinematics
+    from crashhunt.simulators._kinematics_observation import Kinematics
     from crashhunt.simulators._protocol import Observations, Simulator, StepResult
     from crashhunt.simulators.sumo._range_of_sight import Sight
     from crashhunt.simulators.sumo._traffic_events import SumoEvents

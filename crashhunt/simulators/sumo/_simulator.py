@@ -18,12 +18,12 @@ from crashhunt.native import core_for, reseed_generators, why_no_reseeding
 from crashhunt.scenario import ObservationSetup
 from crashhunt.scenario.backends.sumo import BACKEND, StagedFiles, SumoSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
-from crashhunt.simulators._kinematics import Kinematics, Unseen
+from crashhunt.simulators._kinematics_observation import Kinematics, Unseen
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators.sumo._disturbances import SumoDisturbances
 from crashhunt.simulators.sumo._driving import Driving, hold_vehicle
-from crashhunt.simulators.sumo._entering import VehicleFilter, enter, replaced_by, steps_counted
 from crashhunt.simulators.sumo._fast_step import PresentVehicles, UsualSteps
+from crashhunt.simulators.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
 from crashhunt.simulators.sumo._loading import VERSION, Loading, ready_xml
 from crashhunt.simulators.sumo._range_of_sight import Sight
 from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from crashhunt.crashes import find_escape, partner
-from crashhunt.crashes._escape import overruled_trial, slowing
+from crashhunt.crashes._last_avoidable_step import overruled_trial, slowing
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.simulators import FullBraking
 from crashhunt.trial import Collision, Escape, Outcome, TrialResult, TrialSpec

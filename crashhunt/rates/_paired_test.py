@@ -15,7 +15,7 @@ non-negative martingale that begins at 1 / 2. By Ville's inequality, the probabi
 is at most alpha / 2. Each factor grows with d for every Z. The differences that are not rejected are therefore an
 interval, and bisection finds its end. The lower end is the upper end of -Z.
 
-Sources: those of `_certain_interval`, which computes the evidence of discordant pairs. The bets on Z are those of
+Sources: those of `_anytime_interval`, which computes the evidence of discordant pairs. The bets on Z are those of
 Waudby-Smith and Ramdas (2024), with a mixture over fixed shares.
 
 Cost: a pair increments a counter. The bisection for one end of the interval evaluates E(d) 50 times. Each evaluation
@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from crashhunt.rates._certain_interval import Interval, discordance_evidence
+from crashhunt.rates._anytime_interval import Interval, discordance_evidence
 from crashhunt.rates._units import MAX_INVALID_SHARE, has_too_many_invalid
 
 if TYPE_CHECKING:

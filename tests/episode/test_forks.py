@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
-from crashhunt.episode import _questions
-from crashhunt.episode._questions import Questions
+from crashhunt.episode import _forks
+from crashhunt.episode._forks import Questions
 
 KILLED = NoAnswer("was killed by SIGKILL", is_from_outside=True)
 RAISED = NoAnswer("raised KeyError: 3")
@@ -15,7 +15,7 @@ ANSWER = {"steps": 3}
 
 @pytest.fixture(autouse=True)
 def no_pauses(monkeypatch):
-    monkeypatch.setattr(_questions, "_PAUSES_S", (0.0, 0.0))
+    monkeypatch.setattr(_forks, "_PAUSES_S", (0.0, 0.0))
 
 
 def attempts(*ends):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 SCRIPT = """
 import os, subprocess, sys, time
-from crashhunt.base.apart import work_apart
+from crashhunt.base.isolation import work_apart
 
 def work(report):
     started = subprocess.Popen(["sleep", "600"], start_new_session=True)
@@ -80,7 +80,7 @@ def test_a_program_that_the_work_has_started_ends_with_the_command(tmp_path, num
 
 SERVER = """
 import os, signal, sys
-from crashhunt.base.apart import ServerApart
+from crashhunt.base.isolation import ServerApart
 from crashhunt.base.errors import PluginError, UsageError
 
 def answer(request):

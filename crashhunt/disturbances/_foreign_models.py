@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crashhunt.base.apart import ServerApart
 from crashhunt.base.errors import CrashhuntError, PluginError
 from crashhunt.base.exceptions import blamed
+from crashhunt.base.isolation import ServerApart
 from crashhunt.disturbances._protocol import Drawn
 from crashhunt.disturbances._rates import draw_checked, locate_model
 
