@@ -268,6 +268,7 @@ class Supervisor:
             except OSError:
                 data = b""
             if not data:
+                self.retires = True
                 raise LostTrialError(-signal.SIGKILL)
             self._received += data
             if b"\n" not in self._received:
@@ -422,22 +423,25 @@ def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: EndedTr
         how, deceleration = ended.braking["how"], ended.braking["deceleration"]
         braking = FullBraking(None, str(how), float(deceleration) if isinstance(deceleration, int | float) else None)
     numbers = itertools.count(_FIRST_EXTRA_NUMBER + (os.getpid() << 16))
+    kills = 0
 
     def recording(number: int) -> Recording:
         return Recording(read_black_box(scratch_of(settings.scratch, number) / layout.BLACK_BOX))
 
     def run(spec: TrialSpec) -> tuple[TrialResult, Recording]:
-        for left in reversed(range(_MAX_ATTEMPTS)):
+        nonlocal kills
+        kills = 0
+        while True:
             number = next(numbers)
             try:
                 done = supervisor.run(replace(spec, number=number)).result
                 return done, recording(number)
             except LostTrialError:
-                if not left:
+                kills += 1
+                if kills == _MAX_ATTEMPTS or supervisor.retires:  # without a zygote, no attempt can succeed
                     raise
             finally:
                 shutil.rmtree(scratch_of(settings.scratch, number), ignore_errors=True)
-        raise AssertionError
 
     def borders() -> Iterable[Borders]:
         from crashhunt.recording import lane_borders  # MCAP takes long to import, and few crashes need it
@@ -449,5 +453,5 @@ def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: EndedTr
     except BundleError as error:
         return replace(result, escape=Escape(why_not=error.message))
     except LostTrialError as error:
-        why = f"the process that searched {describe_death(error.exit_code)}, {_MAX_ATTEMPTS} times"
+        why = f"the process that searched {describe_death(error.exit_code)}{f', {kills} times' if kills > 1 else ''}"
         return replace(result, why_no_escape=why)

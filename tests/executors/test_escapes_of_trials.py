@@ -33,10 +33,11 @@ def search(monkeypatch, tmp_path):
 
     monkeypatch.setattr(crashes, "find_escape", find, raising=False)
 
-    def search(lost=0, *, result=CRASH, braking=None, retires=False, find_escapes=True):
+    def search(lost=0, *, result=CRASH, braking=None, retires=False, find_escapes=True, zygote_ends=False):
         def run(spec):
             asked.numbers.append(spec.number)
             if len(asked.numbers) <= lost:
+                supervisor.retires = zygote_ends
                 raise LostTrialError(-9)
             return SimpleNamespace(result=result)
 
@@ -65,6 +66,13 @@ def test_a_search_that_is_always_killed_states_so_and_leaves_it_open(search):
     assert len(search.asked.numbers) == 3
     search.asked.error = BundleError("the log is damaged", fix="")
     assert search().escape == Escape(why_not="the log is damaged")
+
+
+def test_a_search_whose_zygote_has_ended_is_not_tried_in_vain(search):
+    """The message counts the kills that happened."""
+    found = search(1, zygote_ends=True)
+    assert (found.escape, found.why_no_escape) == (None, "the process that searched was killed by SIGKILL")
+    assert len(search.asked.numbers) == 1
 
 
 @pytest.mark.parametrize(("deceleration", "expected"), [(4, 4.0), (7.5, 7.5), (None, None)])

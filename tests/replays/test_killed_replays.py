@@ -17,7 +17,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.crashes import list_bundles
 from crashhunt.episode import answer_file
 from crashhunt.executors import _fresh
-from crashhunt.recording import read_header
+from crashhunt.recording import Phase, read_header
 from crashhunt.replays import ReplayOptions, confirm, replay
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult
 
@@ -97,19 +97,26 @@ def test_unknown_escape_is_reported_and_searched_again(bundle, toy):
     assert read.result.escape == bundle.result.escape
 
 
-def kill_replays(is_time):
-    """Start a thread that sends SIGKILL once to the process of each replay of this process; return what ends it."""
+def kill_replays(whom, trials="trial-000000"):
+    """Start a thread that sends SIGKILL to a process that `whom` names, once for each trial; return what ends it.
+
+    `whom` is called with the header of the recording of each trial of the replays of this process, the scratch folder
+    and the number of kills, and returns a process or None.
+    """
     usual = Path(tempfile.gettempdir())
     over = threading.Event()
     killed = []
 
     def watch():
         while not over.wait(0.002):
-            for box in usual.glob(f"crashhunt-temporary-*/{os.getpid()}-*/replay-*/trial-000000/blackbox.bin"):
-                header = read_header(box)
-                if header is not None and header.pid not in killed and is_time(box.parent.parent, header, len(killed)):
-                    with suppress(ProcessLookupError):  # it has just ended
-                        os.kill(header.pid, signal.SIGKILL)
+            for box in usual.glob(f"crashhunt-temporary-*/{os.getpid()}-*/replay-*/{trials}/blackbox.bin"):
+                with suppress(ProcessLookupError, FileNotFoundError):  # it has just ended
+                    header = read_header(box)
+                    if header is None or header.pid in killed:  # a killed one has another parent for a moment
+                        continue
+                    pid = whom(box.parent.parent, header, len(killed))
+                    if pid is not None:
+                        os.kill(pid, signal.SIGKILL)
                         killed.append(header.pid)
 
     thread = threading.Thread(target=watch)
@@ -125,7 +132,9 @@ def kill_replays(is_time):
 
 @pytest.mark.nightly
 def test_replay_killed_at_three_steps_is_run_three_times(bundle):
-    end = kill_replays(lambda _scratch, header, before: before < 3 and header.step >= 3 + 8 * before)
+    end = kill_replays(
+        lambda _scratch, header, before: header.pid if before < 3 and header.step >= 3 + 8 * before else None
+    )
     try:
         found = confirm(replace(bundle, confirmed=None))
     finally:
@@ -135,13 +144,33 @@ def test_replay_killed_at_three_steps_is_run_three_times(bundle):
     assert confirm(found).confirmed is True
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("kills", [1, 2])
-def test_search_for_the_escape_that_is_killed_is_done_again(bundle, kills):
-    def is_time(scratch, header, before):
-        return before < kills and answer_file(scratch, 0).exists()
+def parent_of(pid):
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
-    end = kill_replays(is_time)
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("above", "kills", "why"),
+    [
+        (0, 2, ""),
+        (0, 3, "the process that searched was killed by SIGKILL, 3 times"),
+        (1, 1, "the process that searched was killed by SIGKILL"),
+        (2, 1, ""),
+        (2, 2, "the process that searched was killed by SIGKILL, 2 times"),
+    ],
+)
+def test_search_for_the_escape_that_is_killed_is_done_again(bundle, above, kills, why):
+    """Killed are trials of the search, the zygote that forks them (1 above) or the process that searches (2 above)."""
+
+    def whom(scratch, header, before):
+        if before == kills or header.phase != Phase.SIMULATE or not answer_file(scratch, 0).exists():
+            return None
+        pid = header.pid
+        for _ in range(above):
+            pid = parent_of(pid)
+        return pid
+
+    end = kill_replays(whom, "trial-1*")
     began = time.monotonic()
     try:
         found = confirm(replace(bundle, confirmed=None))
@@ -149,9 +178,5 @@ def test_search_for_the_escape_that_is_killed_is_done_again(bundle, kills):
         count = end()
     assert time.monotonic() - began < 60
     assert (count, found.confirmed) == (kills, True)
-    if kills == 1:
-        assert found.result.escape == bundle.result.escape
-        assert not found.result.why_no_escape
-    else:
-        assert found.result.escape is None
-        assert found.result.why_no_escape == "the process that searched was killed by SIGKILL, 2 times"
+    assert found.result.why_no_escape == why
+    assert found.result.escape == (None if why else bundle.result.escape)
