@@ -102,8 +102,8 @@ def clock(monkeypatch):
     """Time goes by when somebody lets it."""
     found = SimpleNamespace(now=100.0, sleep=lambda seconds: None)
     found.monotonic = lambda: found.now
-    monkeypatch.setattr(_bridge, "time", found)
     monkeypatch.setattr("crashhunt.executors.ray._bridge.time", found)
+    monkeypatch.setattr("crashhunt.executors.ray._node_scheduler.time", found)
     return found
 
 
