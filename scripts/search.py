@@ -29,6 +29,7 @@ from search_kinds import kinds_table, write_kinds
 from search_plot import GIVE_UP, pairs_table, table, write_plot
 from search_pool import trials_on
 from search_wall import wall_table
+from unseen_problems import UNSEEN, unseen_problem
 
 from crashhunt.hunts import GREATEST_LAG, growing_lag, spec_of
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, plan, sampler_of
@@ -233,7 +234,10 @@ def _with_margin(result: TrialResult) -> TrialResult:
 
 def synthetic_run(name: str, sampler: str, seed: int, lag: str = LAG) -> Run:
     """One hunt on a problem without a simulator."""
-    problem = development_problem(name, seed) if name in DEVELOPMENT else PROBLEMS[name]
+    if name in DEVELOPMENT:
+        problem = development_problem(name, seed)
+    else:
+        problem = unseen_problem(name, seed) if name in UNSEEN else PROBLEMS[name]
     settings = HuntSettings(
         scenario=name, scenario_digest="", trials=0, max_steps=1, seed=seed, sampler=PEERS.get(sampler, sampler),
         agents={"ego": AgentSettings(agent="keep-lane", arguments={
@@ -329,7 +333,9 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser("scripts/search", description=__doc__)
     parser.add_argument("--samplers", default=",".join((*OURS, *PEERS)))
     parser.add_argument(
-        "--problems", default=",".join(PROBLEMS), help="some of these, and of " + ", ".join((*REAL, *DEVELOPMENT))
+        "--problems",
+        default=",".join(PROBLEMS),
+        help="some of these, and of " + ", ".join((*REAL, *DEVELOPMENT, *UNSEEN)),
     )
     parser.add_argument("--repetitions", type=int, default=30)
     parser.add_argument("--parallel", type=int, default=2)
@@ -358,7 +364,7 @@ def main(words: Sequence[str] | None = None) -> int:
         setattr(module, name, value)
     seeds = range(options.first_seed, options.first_seed + options.repetitions)
     samplers, names = options.samplers.split(","), options.problems.split(",")
-    unknown = [name for name in names if name not in (*PROBLEMS, *REAL, *DEVELOPMENT)]
+    unknown = [name for name in names if name not in (*PROBLEMS, *REAL, *DEVELOPMENT, *UNSEEN)]
     if unknown:
         parser.error(f"--problems: {', '.join(unknown)} is no problem; see --help")
     if options.faults:
