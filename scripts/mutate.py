@@ -95,7 +95,7 @@ _TESTS_ELSEWHERE = {
     "episode/_branches.py": ("episode/test_branches_asked.py", "episode/test_branching.py"),
     "episode/_splitting.py": ("episode/test_split_episodes.py", "rates/test_splitting.py"),
     "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),
-    "estimation/_gate.py": ("e2e/test_gate.py",),
+    "estimation/_hunt_pairs.py": ("e2e/test_gate.py",),
     # Processes of trials are seen by what is left of trials that harm them.
     "executors/_fork_server.py": ("executors/test_lost_processes.py", "executors/test_warm_traffics.py"),
     "executors/_fresh.py": ("executors/test_last_words.py", "executors/test_harm.py"),

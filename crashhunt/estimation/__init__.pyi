@@ -4,7 +4,7 @@ from ._comparison import (
     compare as compare,
     held_out_of as held_out_of,
 )
-from ._gate import (
+from ._hunt_pairs import (
     GateCase as GateCase,
     GateReport as GateReport,
     PairedHunts as PairedHunts,

@@ -20,9 +20,9 @@ from crashhunt.base.plugins import load_object
 from crashhunt.base.text import encodable, one_of
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.gym import GymSetup
-from crashhunt.simulators._crash_cells import crash_cell
+from crashhunt.simulators._gym_crash_types import crash_cell
 from crashhunt.simulators._gymnasium import ObservationForm, action_form, as_tables, merge, native, reseed_in_place
-from crashhunt.simulators._parallel import OneLearner, is_parallel, takes_turns
+from crashhunt.simulators._pettingzoo import OneLearner, is_parallel, takes_turns
 from crashhunt.world import Contact, Roster, Scene
 
 if TYPE_CHECKING:
