@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import textwrap
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,11 +13,8 @@ from crashhunt.base.errors import UsageError
 from crashhunt.base.files import cannot_write, whole_file
 from crashhunt.base.progress import watched
 from crashhunt.base.temporary import temporary_beside
-from crashhunt.crashes import Encounter
-from crashhunt.panels import Action, Curve, Text
-from crashhunt.recording import is_opaque
+from crashhunt.render._panels import BuiltinPanels, builtin_labels
 from crashhunt.render._scene import SceneView
-from crashhunt.world import approaches
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +23,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.base.progress import Watch
-    from crashhunt.panels import Panel
     from crashhunt.recording import Recording
 
 
@@ -37,12 +31,7 @@ __all__ = [
     "Layout",
     "Shot",
     "check_places",
-    "explanation",
     "frames",
-    "load_meanings",
-    "load_panels",
-    "save_meanings",
-    "save_panels",
     "shown_steps",
     "write_frames",
     "write_gif",
@@ -53,10 +42,6 @@ __all__ = [
 _PANEL_PIXELS = (240, 160)
 _BACKGROUND = 255
 _AROUND_S = 10.0  # of a near miss, half of it before and half after
-_SHOWN_S = 10.0  # of the built-in curves
-_BUILTIN_PANELS = ("time to collision s", "gap m", "speed m/s", "action")
-_NEAREST_PANELS = ("least time to collision s", "nearest gap m")  # of a crash that has no other one
-_PANELS_WITHOUT_SCENE = ("reward", "action")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,7 +174,7 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
     labels: dict[str, None] = {}
     if options.panels:
         for shot in shots:
-            labels |= dict.fromkeys(_builtin_labels(shot) if shot.recording.actors else _PANELS_WITHOUT_SCENE)
+            labels |= dict.fromkeys(builtin_labels(shot.recording, shot.other))
         for shot in shots:
             for panels in shot.panels.values():
                 labels |= dict.fromkeys(panels)
@@ -209,7 +194,9 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
             crash_step=shot.crash_step,
             nearest_step=shot.nearest,
         )
-        builtin = _Builtin(shot) if options.panels else None
+        builtin = None
+        if options.panels:
+            builtin = BuiltinPanels(shot.recording, agent=shot.agent, other=shot.other, meanings=shot.meanings)
         last: tuple[int, NDArray[np.uint8]] | None = None
         for step in _steps(shot, options):
             if last is None or last[0] != step:
@@ -310,65 +297,6 @@ def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions, *, w
     return len(made)
 
 
-def _builtin_labels(shot: Shot) -> tuple[str, ...]:
-    return _BUILTIN_PANELS if shot.other else (*_NEAREST_PANELS, *_BUILTIN_PANELS[2:])
-
-
-class _Builtin:
-    """The panels that every film has: time to collision, gap, speed and action of the agent."""
-
-    def __init__(self, shot: Shot) -> None:
-        recording, agent = shot.recording, shot.agent
-        scenes = recording.scenes()
-        self._dt = recording.prologue.step_length_s
-        self._times, self._gaps, _ = approaches([scene.frame for scene in scenes], agent)
-        if shot.other:
-            moments = {moment.step: moment for moment in Encounter(recording, agent, shot.other).moments}
-            self._gaps, self._times = (
-                np.array([getattr(moments[n], name) if n in moments else np.nan for n in range(len(scenes))])
-                for name in ("gap_m", "time_to_collision_s")
-            )
-        rows = [scene.roster.index.get(agent) for scene in scenes]
-        self._speeds = np.array(
-            [np.nan if row is None else scene.speeds[row] for scene, row in zip(scenes, rows, strict=True)]
-        )
-        self._rewards = np.array([step.rewards.get(agent, 0.0) for step in recording.all_steps if step.whole])
-        self._seconds = np.array([scene.time_s for scene in scenes])
-        self._shot = shot
-        channel = next((found for found in recording.prologue.agents if found.id == agent), None)
-        self._names = tuple(channel.action_names) if channel is not None else ()
-        self._plots_actions = channel is None or not is_opaque(channel.action_shape)
-        every = recording.all_steps if self._plots_actions else []
-        taken = [step.actions[agent] for step in every if agent in step.actions]
-        spread = np.array(taken).reshape(len(taken), -1) if taken else np.zeros((1, 1))
-        # The bounds are not recorded; what was decided in the whole episode says enough.
-        self._low, self._high = np.minimum(spread.min(axis=0), 0.0), np.maximum(spread.max(axis=0), 1.0)
-
-    def panels(self, step: int) -> list[tuple[str, Panel]]:
-        """Return each panel with its label."""
-        first = max(0, step - round(_SHOWN_S / self._dt))
-        part = slice(first, step + 1)
-        x = self._seconds[part]
-        times = np.where(np.isfinite(self._times[part]), np.minimum(self._times[part], 10.0), np.nan)
-        found: list[tuple[str, Panel]] = [
-            (_builtin_labels(self._shot)[0], Curve(times, x, low=0.0, high=10.0)),
-            (_builtin_labels(self._shot)[1], Curve(np.minimum(self._gaps[part], 100.0), x, low=0.0)),
-            (_BUILTIN_PANELS[2], Curve(self._speeds[part], x, low=0.0)),
-        ]
-        if not self._shot.recording.actors:
-            found = [(_PANELS_WITHOUT_SCENE[0], Curve(self._rewards[part], x))]
-        action = self._shot.recording.all_steps[step].actions.get(self._shot.agent)
-        if action is not None and self._plots_actions:
-            value = action.reshape(-1)
-            if value.size == 1 and np.issubdtype(value.dtype, np.integer):
-                found.append((_BUILTIN_PANELS[3], Action(int(value[0]), names=self._shot.meanings)))
-            else:
-                found.append(
-                    (_BUILTIN_PANELS[3], Action(value=value, low=self._low, high=self._high, names=self._names))
-                )
-        return found
-
-
 def shown_steps(recording: Recording, last_s: float, nearest: int) -> tuple[int, int]:
     """Return the first and the last step of a film.
 
@@ -392,65 +320,3 @@ def _steps(shot: Shot, options: FilmOptions) -> list[int]:
     count = math.floor((last - first) * dt * fps + 1e-6) + 1
     steps = [min(last, first + int(number / fps / dt + 1e-6)) for number in range(count)]
     return steps if steps[-1] == last else [*steps, last]
-
-
-# Drawn panels on their way from the process of the agent to the one that makes the film.
-
-_PANEL_SHAPE = (160, 240, 3)  # what a panel draws unless asked for another size
-_MAX_LINE_CHARACTERS = 34  # characters that fit
-
-
-def explanation(error: Exception) -> Text:
-    """Return the panel that replaces a panel that cannot be drawn."""
-    return Text("\n".join(textwrap.wrap(f"cannot be drawn: {type(error).__name__}: {error}", _MAX_LINE_CHARACTERS)[:9]))
-
-
-def save_panels(folder: Path, step: int, panels: Sequence[tuple[str, Panel]]) -> None:
-    """Draw and add the panels of one agent and step; a panel that cannot be drawn is replaced by the reason."""
-    from PIL import Image
-
-    with (folder / "index.jsonl").open("a", encoding="utf-8") as index:
-        for number, (label, panel) in enumerate(panels):
-            name = f"{step:06d}-{index.tell()}-{number}.png"
-            try:
-                picture = panel.draw(label=label)
-                if picture.shape != _PANEL_SHAPE or picture.dtype != np.uint8:
-                    raise ValueError(
-                        f"a panel has type {picture.dtype} and shape {picture.shape}, not uint8 and {_PANEL_SHAPE}"
-                    )
-            except Exception as error:  # an agent may put anything into its panels
-                picture = explanation(error).draw(label=label)
-            Image.fromarray(picture).save(folder / name, compress_level=1)
-            index.write(json.dumps([step, label, name]) + "\n")
-
-
-def save_meanings(folder: Path, agent: str, meanings: Sequence[str]) -> None:
-    """Write the names of an agent's discrete actions to a file; without names, no file is written."""
-    if meanings:
-        with (folder / "meanings.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps([agent, list(map(str, meanings))]) + "\n")
-
-
-def load_meanings(folder: Path) -> dict[str, tuple[str, ...]]:
-    """Return the names of actions that `save_meanings` has written, by agent."""
-    try:
-        lines = (folder / "meanings.jsonl").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return {}
-    return {agent: tuple(meanings) for agent, meanings in map(json.loads, lines)}
-
-
-def load_panels(folder: Path) -> dict[int, dict[str, NDArray[np.uint8]]]:
-    """Return the pictures of panels by step and label, uint8, shape (height, width, 3)."""
-    from PIL import Image
-
-    found: dict[int, dict[str, NDArray[np.uint8]]] = {}
-    try:
-        lines = (folder / "index.jsonl").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return found
-    for line in lines:
-        step, label, name = json.loads(line)
-        with Image.open(folder / name) as image:
-            found.setdefault(step, {})[label] = np.asarray(image.convert("RGB"))
-    return found

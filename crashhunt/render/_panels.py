@@ -1,5 +1,17 @@
-"""Panels under the name from which agents import them: ``from crashhunt.render import Bar``."""
+"""Panels in a film: the built-in curves, and the pictures of an agent's own panels on their way into the film.
 
+Agents import panels under the name of this package: ``from crashhunt.render import Bar``.
+"""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crashhunt.crashes import Encounter
 from crashhunt.panels import (
     Action,
     ActionDistribution,
@@ -14,11 +26,23 @@ from crashhunt.panels import (
     labelled,
     scope,
 )
+from crashhunt.recording import is_opaque
+from crashhunt.world import approaches
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from crashhunt.recording import Recording
+
 
 __all__ = [
     "Action",
     "ActionDistribution",
     "Bar",
+    "BuiltinPanels",
     "Contour",
     "Curve",
     "Curve3D",
@@ -26,6 +50,158 @@ __all__ = [
     "Panel",
     "Picture",
     "Text",
+    "builtin_labels",
+    "explanation",
     "labelled",
+    "load_meanings",
+    "load_panels",
+    "save_meanings",
+    "save_panels",
     "scope",
 ]
+
+
+# The panels that every film has.
+
+_SHOWN_S = 10.0  # of the built-in curves
+_WITH_OTHER = ("time to collision s", "gap m", "speed m/s", "action")
+_WITH_NEAREST = ("least time to collision s", "nearest gap m", "speed m/s", "action")  # a crash without a partner
+_PANELS_WITHOUT_SCENE = ("reward", "action")
+
+
+def builtin_labels(recording: Recording, other: str) -> tuple[str, ...]:
+    """Return the labels of the panels that every film of a recording has.
+
+    Args:
+        recording: recording of the trial.
+        other: identifier of the collision partner; empty if there is none.
+    """
+    if not recording.actors:
+        return _PANELS_WITHOUT_SCENE
+    return _WITH_OTHER if other else _WITH_NEAREST
+
+
+class BuiltinPanels:
+    """The panels that every film has: curves of time to collision, gap and speed of the agent, and its action.
+
+    A recording without a scene has a curve of the reward instead of the three curves.
+
+    Args:
+        recording: recording of the trial.
+        agent: identifier of the vehicle that the curves describe.
+        other: identifier of the collision partner; empty if there is none. The curves then describe the nearest actor.
+        meanings: names of the agent's discrete actions, if they are known.
+    """
+
+    def __init__(self, recording: Recording, *, agent: str, other: str, meanings: Sequence[str] = ()) -> None:
+        self._recording, self._agent, self._meanings = recording, agent, meanings
+        self._labels = builtin_labels(recording, other)
+        scenes = recording.scenes()
+        self._dt = recording.prologue.step_length_s
+        self._times, self._gaps, _ = approaches([scene.frame for scene in scenes], agent)
+        if other:
+            moments = {moment.step: moment for moment in Encounter(recording, agent, other).moments}
+            self._gaps, self._times = (
+                np.array([getattr(moments[n], name) if n in moments else np.nan for n in range(len(scenes))])
+                for name in ("gap_m", "time_to_collision_s")
+            )
+        rows = [scene.roster.index.get(agent) for scene in scenes]
+        self._speeds = np.array(
+            [np.nan if row is None else scene.speeds[row] for scene, row in zip(scenes, rows, strict=True)]
+        )
+        self._rewards = np.array([step.rewards.get(agent, 0.0) for step in recording.all_steps if step.whole])
+        self._seconds = np.array([scene.time_s for scene in scenes])
+        channel = next((found for found in recording.prologue.agents if found.id == agent), None)
+        self._names = tuple(channel.action_names) if channel is not None else ()
+        self._plots_actions = channel is None or not is_opaque(channel.action_shape)
+        every = recording.all_steps if self._plots_actions else []
+        taken = [step.actions[agent] for step in every if agent in step.actions]
+        spread = np.array(taken).reshape(len(taken), -1) if taken else np.zeros((1, 1))
+        # The bounds are not recorded; what was decided in the whole episode says enough.
+        self._low, self._high = np.minimum(spread.min(axis=0), 0.0), np.maximum(spread.max(axis=0), 1.0)
+
+    def panels(self, step: int) -> list[tuple[str, Panel]]:
+        """Return each panel with its label."""
+        first = max(0, step - round(_SHOWN_S / self._dt))
+        part = slice(first, step + 1)
+        x = self._seconds[part]
+        times = np.where(np.isfinite(self._times[part]), np.minimum(self._times[part], 10.0), np.nan)
+        curves = [
+            Curve(times, x, low=0.0, high=10.0),
+            Curve(np.minimum(self._gaps[part], 100.0), x, low=0.0),
+            Curve(self._speeds[part], x, low=0.0),
+        ]
+        if not self._recording.actors:
+            curves = [Curve(self._rewards[part], x)]
+        found: list[tuple[str, Panel]] = list(zip(self._labels, curves, strict=False))  # the action has the last label
+        action = self._recording.all_steps[step].actions.get(self._agent)
+        if action is not None and self._plots_actions:
+            value = action.reshape(-1)
+            if value.size == 1 and np.issubdtype(value.dtype, np.integer):
+                drawn = Action(int(value[0]), names=self._meanings)
+            else:
+                drawn = Action(value=value, low=self._low, high=self._high, names=self._names)
+            found.append((self._labels[-1], drawn))
+        return found
+
+
+# Drawn panels on their way from the process of the agent to the one that makes the film.
+
+_PANEL_SHAPE = (160, 240, 3)  # what a panel draws unless asked for another size
+_MAX_LINE_CHARACTERS = 34  # characters that fit
+
+
+def explanation(error: Exception) -> Text:
+    """Return the panel that replaces a panel that cannot be drawn."""
+    return Text("\n".join(textwrap.wrap(f"cannot be drawn: {type(error).__name__}: {error}", _MAX_LINE_CHARACTERS)[:9]))
+
+
+def save_panels(folder: Path, step: int, panels: Sequence[tuple[str, Panel]]) -> None:
+    """Draw and add the panels of one agent and step; a panel that cannot be drawn is replaced by the reason."""
+    from PIL import Image
+
+    with (folder / "index.jsonl").open("a", encoding="utf-8") as index:
+        for number, (label, panel) in enumerate(panels):
+            name = f"{step:06d}-{index.tell()}-{number}.png"
+            try:
+                picture = panel.draw(label=label)
+                if picture.shape != _PANEL_SHAPE or picture.dtype != np.uint8:
+                    raise ValueError(
+                        f"a panel has type {picture.dtype} and shape {picture.shape}, not uint8 and {_PANEL_SHAPE}"
+                    )
+            except Exception as error:  # an agent may put anything into its panels
+                picture = explanation(error).draw(label=label)
+            Image.fromarray(picture).save(folder / name, compress_level=1)
+            index.write(json.dumps([step, label, name]) + "\n")
+
+
+def save_meanings(folder: Path, agent: str, meanings: Sequence[str]) -> None:
+    """Write the names of an agent's discrete actions to a file; without names, no file is written."""
+    if meanings:
+        with (folder / "meanings.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps([agent, list(map(str, meanings))]) + "\n")
+
+
+def load_meanings(folder: Path) -> dict[str, tuple[str, ...]]:
+    """Return the names of actions that `save_meanings` has written, by agent."""
+    try:
+        lines = (folder / "meanings.jsonl").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return {}
+    return {agent: tuple(meanings) for agent, meanings in map(json.loads, lines)}
+
+
+def load_panels(folder: Path) -> dict[int, dict[str, NDArray[np.uint8]]]:
+    """Return the pictures of panels by step and label, uint8, shape (height, width, 3)."""
+    from PIL import Image
+
+    found: dict[int, dict[str, NDArray[np.uint8]]] = {}
+    try:
+        lines = (folder / "index.jsonl").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return found
+    for line in lines:
+        step, label, name = json.loads(line)
+        with Image.open(folder / name) as image:
+            found.setdefault(step, {})[label] = np.asarray(image.convert("RGB"))
+    return found

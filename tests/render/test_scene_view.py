@@ -13,7 +13,8 @@ pytest.importorskip("PIL")
 from crashhunt.panels import Action, Curve
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.render import FilmOptions, Shot, frames
-from crashhunt.render._film import _Builtin, _steps, save_panels, shown_steps
+from crashhunt.render._film import _steps, shown_steps
+from crashhunt.render._panels import BuiltinPanels, save_panels
 from crashhunt.render._scene import SceneView
 from crashhunt.world import PERSON, Actor, Roster, Scene
 
@@ -144,6 +145,10 @@ def test_a_crash_is_marked_in_its_step_and_a_near_miss_for_a_second():
 # The panels of every film.
 
 
+def builtin_panels(shot):
+    return BuiltinPanels(shot.recording, agent=shot.agent, other=shot.other, meanings=shot.meanings)
+
+
 def following(dt=0.1, steps=40, other="other"):
     """Ego comes closer to a standing truck by 1 m in each step, beginning 90 m behind it."""
     places = [{"ego": (float(n), 0.0, 0.0, 1.0 / dt), "other": (102.0, 0.0, 0.0, 0.0)} for n in range(steps + 1)]
@@ -156,7 +161,7 @@ def following(dt=0.1, steps=40, other="other"):
 def test_panels_show_time_to_collision_gap_and_speed_of_the_last_seconds(other):
     shot = following(other=other, steps=120)
     for step in (60, 75):
-        panels = dict(_Builtin(shot).panels(step))
+        panels = dict(builtin_panels(shot).panels(step))
         times, gaps, speeds = [panel for panel in panels.values() if isinstance(panel, Curve)]
         shown = len(times.x)
         assert times.x[-1] == pytest.approx(step / 10)
@@ -170,8 +175,8 @@ def test_panels_show_time_to_collision_gap_and_speed_of_the_last_seconds(other):
         assert action.value == pytest.approx([3.0 - step, 0.5])
         assert action.low == pytest.approx([-117.0, 0.0])
         assert action.high == pytest.approx([2.0, 1.0])
-    assert len(dict(_Builtin(shot).panels(0))) == 3  # nothing has been decided yet
-    beginning = dict(_Builtin(following(other=other, steps=5)).panels(2))
+    assert len(dict(builtin_panels(shot).panels(0))) == 3  # nothing has been decided yet
+    beginning = dict(builtin_panels(following(other=other, steps=5)).panels(2))
     assert max(next(iter(beginning.values())).series) <= 10.0
 
 
@@ -194,7 +199,7 @@ def test_a_film_has_its_panels_next_to_the_scene_in_every_picture():
 def test_far_gaps_are_cut_so_that_near_ones_can_be_read():
     places = [{"ego": (float(n), 0.0, 0.0, 10.0), "other": (400.0, 0.0, 0.0, 10.0)} for n in range(4)]
     shot = Shot(recording(*places, actors=[CAR, TRUCK]), [], "ego", "other", -1, {})
-    curves = [panel for _, panel in _Builtin(shot).panels(3) if isinstance(panel, Curve)]
+    curves = [panel for _, panel in builtin_panels(shot).panels(3) if isinstance(panel, Curve)]
     assert curves[1].series.tolist() == [100.0] * 4
 
 
