@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import shutil
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.base.errors import CrashhuntError
-from crashhunt.recording import AgentChannel, Divergence, Prologue
-from crashhunt.replays import Look, _debugger, _replay
-from crashhunt.trial import Collision, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError, UsageError
+from crashhunt.recording import AgentChannel, Divergence, Prologue, Tag
+from crashhunt.replays import Look, ReplayOptions, ReplayReport, _debugger, _replay
+from crashhunt.trial import KILLED, Collision, Failure, Outcome, TrialResult, TrialSpec
 
 EGO = AgentChannel("ego", "float32", (8, 7), "float64", (2,))
 PROLOGUE = Prologue((EGO,), 0.1)
@@ -79,6 +80,7 @@ def test_other_channels_cannot_be_compared(judge, now, says):
 def test_equal_recordings_may_end_differently():
     def ends(now, code="snapshot", was=CRASH):
         found = _replay._end_divergence(was, now, code)
+        assert found is None or (found.step, found.agent) == (now.steps, "ego" if "." in found.field else "")
         return found and (found.field, found.recorded, found.replayed)
 
     assert ends(CRASH) is None
@@ -108,3 +110,177 @@ def test_a_replay_that_cannot_be_set_up_is_an_error_with_the_reason(monkeypatch)
     with pytest.raises(CrashhuntError, match="as far as the first step: the agent needs a map") as caught:
         _replay._look_into(SimpleNamespace(bundle=SimpleNamespace(id="000004-collision")), Look(until=3))
     assert caught.value.where == "000004-collision"
+
+
+def report(verdict, result=CRASH, divergence=None):
+    rerun = SimpleNamespace(
+        bundle=BUNDLE, code="snapshot", edits=("speed was 5",), warnings=("numpy",), recorded=SimpleNamespace(steps=30)
+    )
+    recording = SimpleNamespace(steps=29)
+    return ReplayReport(rerun=rerun, verdict=verdict, replayed=result, recording=recording, divergence=divergence)
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """In place of the bundle of a crash."""
+
+    id: str = "000004-collision"
+    result: TrialResult = CRASH
+    confirmed: bool | None = None
+    divergence: object = None
+    why_unconfirmed: str = "it was stopped"
+
+
+BUNDLE = Bundle()
+
+
+@pytest.fixture
+def replays(monkeypatch):
+    """Each replay ends as the next of `ends`; `options` and `runs` are what it was asked for."""
+    found = SimpleNamespace(ends=[], options=[], runs=[])
+
+    def prepare(bundle, options):
+        found.options.append(options)
+        return Prepared()
+
+    def run(rerun, stopped=lambda: False, executors=None):
+        found.runs.append((rerun.worker.find_escapes, stopped, executors))
+        end = found.ends.pop(0)
+        if isinstance(end, Exception):
+            raise end
+        return end
+
+    monkeypatch.setattr(_replay, "prepare", prepare)
+    monkeypatch.setattr(_replay, "_run", run)
+    return found
+
+
+@dataclass(frozen=True)
+class Worker:
+    find_escapes: bool = False
+    scratch: object = None
+
+
+@dataclass(frozen=True)
+class Prepared:
+    worker: Worker = Worker()
+
+
+def test_of_several_replays_the_first_that_deviates_is_shown(replays):
+    replays.ends = [report("reproduced"), report("diverged"), report("fixed"), report("reproduced")]
+    shown = _replay.replay(BUNDLE, ReplayOptions(times=4))
+    assert shown.verdict == "diverged"
+    assert shown.verdicts == {"reproduced": 2, "diverged": 1, "fixed": 1}
+    replays.ends = [report("reproduced")]
+    written = _replay.replay(BUNDLE).to_json()
+    assert [run[0] for run in replays.runs] == [False] * 5
+    assert replays.options[-1] == ReplayOptions()
+    assert written == {
+        "crash": "000004-collision", "verdict": "reproduced", "code": "snapshot", "steps_recorded": 30,
+        "steps_replayed": 29, "digest_recorded": CRASH.digest, "digest_replayed": CRASH.digest, "divergence": None,
+        "outcome_recorded": "collision", "outcome_replayed": "collision", "reason": "", "edits": ["speed was 5"],
+        "warnings": ["numpy"], "times": 1, "agreed": 1, "verdicts": {"reproduced": 1},
+    }  # fmt: skip
+    with pytest.raises(UsageError, match="--times is 0"):
+        _replay.replay(BUNDLE, ReplayOptions(times=0))
+
+
+def test_confirmation_keeps_what_the_replay_shows(replays):
+    braked = replace(CRASH, escape=12, why_no_escape="the search was killed")
+    stopped, executors, failed = (lambda: False), object(), []
+    replays.ends = [report("reproduced", braked)]
+    found = _replay.confirm(BUNDLE, stopped, failed=failed, executors=executors, trusted=True)
+    assert found == Bundle(result=braked, confirmed=True, why_unconfirmed="")
+    assert replays.runs == [(True, stopped, executors)]
+    assert replays.options == [ReplayOptions(force=True, trusted=True)]
+    replays.ends = [report("diverged", braked, THERE)] * 2
+    found = _replay.confirm(BUNDLE, failed=failed)
+    assert found == Bundle(confirmed=False, divergence=THERE.to_json(), why_unconfirmed="")
+    assert failed == [braked]
+    assert _replay.confirm(BUNDLE) == found
+    replays.ends = [_replay._NotSetUpError("no map")]
+    found = _replay.confirm(BUNDLE, failed=failed)
+    divergence = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": "no map"}
+    assert found == Bundle(confirmed=False, divergence=divergence, why_unconfirmed="")
+    replays.ends = [CrashhuntError("it was killed")]
+    found = _replay.confirm(replace(BUNDLE, confirmed=True, divergence=THERE))
+    assert found == Bundle(confirmed=None, divergence=None, why_unconfirmed="it was killed")
+    replays.ends = [_replay._StoppedError()]
+    assert _replay.confirm(BUNDLE) is None
+    replays.ends = [UntrustedError("it is not yours")]
+    with pytest.raises(UntrustedError):
+        _replay.confirm(BUNDLE)
+    assert failed == [braked]
+
+
+class Recorded(SimpleNamespace):
+    """In place of a recording: one number for each record."""
+
+    def beginning(self, count):
+        return Recorded(records=self.records[:count])
+
+
+def records(*steps):
+    """Records of a prologue, of steps that are complete, and of one that is not."""
+    found = [SimpleNamespace(tag=Tag.PROLOGUE, number=-1)]
+    for number in steps:
+        found += [SimpleNamespace(tag=Tag.ACTION, number=number), SimpleNamespace(tag=Tag.STEP, number=number)]
+    return Recorded(records=[*found, SimpleNamespace(tag=Tag.ACTION, number=99)], steps=len(steps) - 1)
+
+
+def test_beginning_of_a_recording_ends_with_a_whole_step():
+    recording = records(0, 1, 2)
+    ends = [_replay.up_to(recording, step).records[-1] for step in range(4)]
+    assert [(end.tag, end.number) for end in ends] == [
+        (Tag.STEP, 0), (Tag.STEP, 1), (Tag.STEP, 2), (Tag.ACTION, 99),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("code", ["snapshot", "log"])
+@pytest.mark.parametrize("shared", [True, False])
+def test_run_of_a_replay_reads_its_recording_and_removes_it(monkeypatch, tmp_path, code, shared):
+    ends = {"result": CRASH, "error": None}
+    stopped, here = (lambda: False), tmp_path / "here"
+
+    def run(worker, spec, asked):
+        assert (worker.scratch is not None, spec, asked) == (not shared, CRASH.spec, stopped)
+        folder = here if shared else _replay.scratch_of(worker.scratch, spec.number)
+        folder.mkdir(parents=True)
+        used.append(folder)
+        return ends["result"] and ((ends["result"], here) if shared else ends["result"])
+
+    def read(path):
+        assert path == used[-1] / "blackbox.bin"
+        if ends["error"]:
+            raise ends["error"]
+        return path
+
+    used = []
+    monkeypatch.setattr(_replay, "run_alone", run)
+    monkeypatch.setattr(_replay, "read_black_box", read)
+    monkeypatch.setattr(_replay, "Recording", lambda path: records(0, 1))
+    monkeypatch.setattr(_replay, "judged", lambda *compared: compared)
+    rerun = SimpleNamespace(worker=Worker(), spec=CRASH.spec, code=code, bundle=BUNDLE, recorded=records(0, 1))
+    executors = SimpleNamespace(run=run) if shared else None
+    first, recorded, replayed, result = _replay._run(rerun, stopped, executors)
+    assert (first, result) == (rerun, CRASH)
+    last = 99 if code == "snapshot" else 1
+    assert [found.records[-1].number for found in (recorded, replayed)] == [last, last]
+
+    def fails(result, says, error=None):
+        ends.update(result=result, error=error)
+        with pytest.raises(CrashhuntError, match=says) as caught:
+            _replay._run(rerun, stopped, executors)
+        assert caught.value.where == BUNDLE.id
+        return type(caught.value)
+
+    killed = replace(FINE, outcome=Outcome.INVALID, failure=Failure(KILLED, "killed 3 times", exit_code=-9))
+    assert fails(killed, "collision: the replay was killed 3 times") is CrashhuntError
+    shutil.rmtree(used[-1], ignore_errors=True)
+    invalid = replace(FINE, outcome=Outcome.INVALID, steps=0, failure=Failure("invalid", "the agent needs a map"))
+    assert fails(invalid, "as far as the first step: the agent needs a map") is _replay._NotSetUpError
+    assert fails(CRASH, "it left no recording", BundleError("empty")) is _replay._NotSetUpError
+    assert not any(folder.exists() for folder in used)
+    ends.update(result=None)
+    with pytest.raises(_replay._StoppedError):
+        _replay._run(rerun, stopped, executors)
