@@ -277,6 +277,9 @@ class Kinds:
         self._dropped_at_fault = {number for number in dropped_at_fault if number not in there}
         for bundle in crashes:
             self._add_signature(bundle)
+        for signature in self._seen:
+            for number in self.dropped.get(str(signature), ()):
+                self._count(number, signature, None)
 
     def add(self, bundle: Bundle, ended: int) -> None:
         """Add a saved crash.
@@ -382,7 +385,7 @@ class Kinds:
         return len(self._counted()) if self._by_cause else None
 
     def _count(self, number: int, signature: Signature, cause: Cause | None) -> None:
-        if number in self._at_fault or not self._only_at_fault:
+        if number in self._at_fault or number in self._dropped_at_fault or not self._only_at_fault:
             known = None if cause is None or cause.kind == "unknown" else cause
             self._first[signature, known] = min(number, self._first.get((signature, known), number))
 

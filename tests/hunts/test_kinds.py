@@ -120,7 +120,7 @@ def test_what_was_hunted_for_is_kept_before_what_is_shorter(monkeypatch):
     again = Kinds(
         1, [crash(3, "KeyError", 6)], only_at_fault=True, dropped=kinds.dropped, dropped_at_fault=kinds.dropped_at_fault
     )
-    assert (again.until, again.at_fault) == (3, (2, 3))
+    assert (again.until, again.at_fault) == (kinds.until, (2, 3))
 
 
 def test_the_one_that_wants_several_kinds_continues_after_the_first_crash():
@@ -295,6 +295,20 @@ def test_resumed_hunt_counts_causes_that_bundles_contain(one_type):
     kinds = Kinds(1, [collision(4, judgement=Judgement(why=Why((factor,)))), collision(6)], by_cause=8)
     assert (kinds.until, kinds.types_by_cause, kinds.count_to_judge()) == (4, 1, 1)
     assert kinds.next_to_judge().id == "c6"
+
+
+def test_resumed_hunt_ends_at_the_same_trial_although_the_first_crash_of_a_type_was_deleted(three_types):
+    crashes = [collision(3, steps=9), collision(6, steps=4), collision(5)]
+    kinds = Kinds(2, crashes)
+    assert kinds.until == 5
+    assert [bundle.id for bundle in kinds.drop_excess(1)] == ["c3"]
+    assert Kinds(2, crashes[1:], dropped=kinds.dropped).until == 5
+
+
+def test_resumed_hunt_counts_a_type_of_which_the_crash_at_fault_was_deleted(three_types, monkeypatch):
+    monkeypatch.setattr(_crashes, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=False))
+    assert Kinds(1, [collision(3)], only_at_fault=True, dropped={"0": [9]}).until is None
+    assert Kinds(1, [collision(3)], only_at_fault=True, dropped={"0": [9]}, dropped_at_fault=[9]).until == 9
 
 
 def test_software_faults_need_no_runs_for_their_cause():
