@@ -22,6 +22,7 @@ from crashhunt.space import Choice, Range
 from crashhunt.testing import AgentContract, OracleContract, SamplerContract, SimulatorContract, drive
 from crashhunt.testing._disturbances import DisturbanceContract
 from crashhunt.testing._last_avoidable_step import EscapeCheck, RecordedThenBrakes
+from crashhunt.testing._oracles import _LANES
 from crashhunt.world import Event
 
 
@@ -122,6 +123,18 @@ def test_scenes_of_the_oracle_contract_have_what_their_description_states():
     assert [scene.time_s for scene in scenes] == pytest.approx([n / 10 for n in range(60)])
     assert any(scene.contacts for scene in scenes)
     assert any(abs(scene.points[0][0] - scene.points[3][0]) < 1 for scene in scenes)
+
+
+def test_lanes_of_the_oracle_contract_lie_side_by_side_under_its_scenes():
+    lanes = {lane.id: lane for lane in _LANES}
+    right, left = lanes.values()
+    (first, *_, last), (other, *_) = right.shape, left.shape
+    assert other[1] - first[1] == right.width == left.width
+    for scene in drive():
+        for name, row in scene.roster.index.items():
+            (x, y), lane = scene.points[row], lanes[scene.lanes[row]]
+            assert abs(y - lane.shape[0][1]) < lane.width / 2
+            assert name == "second" or first[0] <= x <= last[0]  # it stands behind the map
 
 
 class Forgetful(ReportedCollision):
@@ -336,6 +349,30 @@ class Errs(ToySimulator):
         return SimpleNamespace(how_strong=1.0, keep=lambda: self._disturbed.update({vehicle: 0.0}), end=lambda: None)
 
 
+class Lasts(ToySimulator):
+    """A disturbance that ends early leaves something behind for the next episode."""
+
+    late_s = 0.0
+
+    def disturb(self, vehicle, disturbance):
+        def end():
+            self.late_s += 1.0
+
+        return SimpleNamespace(how_strong=1.0, keep=lambda: None, end=end)
+
+    def scene(self):
+        found = copy.copy(super().scene())
+        found.time_s += self.late_s
+        return found
+
+
+class Declines(ToySimulator):
+    """Disturbs no vehicle, which is allowed."""
+
+    def disturb(self, vehicle, disturbance):
+        return None
+
+
 class Slow(ToySimulator):
     """Its scenes are later than its step length states."""
 
@@ -385,6 +422,116 @@ class Leaves(ToySimulator):
         return (observations, {**rewards, "gone": 0.0}, *more)
 
 
+class Live(ToySimulator):
+    """Writes into what it has handed out."""
+
+    def step(self, actions):
+        found = super().step(actions)
+        self.shown["ego"][:] = 0.0
+        return found
+
+    def reset(self, *, seed, options=None):
+        observations, infos = super().reset(seed=seed, options=options)
+        self.shown = {agent: observation.copy() for agent, observation in observations.items()}
+        return self.shown, infos
+
+
+class TwoNames(ToySimulator):
+    """Names two columns alike."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        first, _, *others = self.observation_names
+        self.observation_names = (first, first, *others)
+
+
+class TooFewNames(ToySimulator):
+    """Names all columns but one."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.observation_names = self.observation_names[1:]
+
+
+class Talks(ToySimulator):
+    """Has a notice of two lines."""
+
+    notices = ("one line", "two\nlines")
+
+
+class Warms(ToySimulator):
+    """Simulates more before each episode than before the last."""
+
+    setup_steps = 0
+
+    def step(self, actions):
+        self.setup_steps += 1
+        return super().step(actions)
+
+
+class Tidies(ToySimulator):
+    """Its episodes are others after tidying."""
+
+    tidied = 0
+
+    def tidy(self):
+        self.tidied += 1
+
+    def reset(self, *, seed, options=None):
+        return super().reset(seed=seed + self.tidied, options=options)
+
+
+class ClosesOnce(ToySimulator):
+    """Can be closed once only."""
+
+    closed = 0
+
+    def close(self):
+        self.closed += 1
+        assert self.closed < 2
+        super().close()
+
+
+class Thin(ToySimulator):
+    """Has a lane without a width."""
+
+    def lanes(self):
+        first, *others = super().lanes()
+        return [replace(first, width=0.0), *others]
+
+
+class Point(ToySimulator):
+    """Has a lane of one point."""
+
+    def lanes(self):
+        first, *others = super().lanes()
+        return [replace(first, shape=first.shape[:1]), *others]
+
+
+class Moves(ToySimulator):
+    """Its map is another each time."""
+
+    asked = 0
+
+    def lanes(self):
+        self.asked += 1
+        first, *others = super().lanes()
+        return [replace(first, width=float(self.asked)), *others]
+
+
+class AnyAction(SpeedAndLaneChange):
+    """Takes a text for an action."""
+
+    def encode(self, action):
+        return super().encode((5.0, 0) if isinstance(action, str) else action)
+
+
+class Lenient(ToySimulator):
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.actions = {**self.actions, "ego": AnyAction()}
+
+
 ONLY_SEED, INSTANCE, TIME, RESEEDED = (
     "test_an_episode_depends_on_its_seed_alone",
     "test_a_second_instance_does_the_same",
@@ -392,6 +539,7 @@ ONLY_SEED, INSTANCE, TIME, RESEEDED = (
     "test_another_seed_within_an_episode_changes_only_what_follows",
 )
 ERRS = "test_others_err_and_the_next_episode_knows_nothing_of_it"
+NAMES, MAP = "test_columns_have_a_name_each", "test_the_map_has_every_lane_once"
 
 
 @pytest.mark.parametrize(
@@ -401,18 +549,31 @@ ERRS = "test_others_err_and_the_next_episode_knows_nothing_of_it"
         (SameTraffic, {ONLY_SEED}),
         (Remembers, {ONLY_SEED, RESEEDED}),
         (Errs, {ERRS}),
+        (Lasts, {ERRS}),
+        (Declines, set()),
         (OwnInstance, {INSTANCE}),
         (Slow, {TIME}),
         (Partial, {"test_it_offers_faculties_as_a_whole"}),
-        (Half, {"test_the_map_has_every_lane_once"}),
+        (Half, {MAP}),
         (Accelerates, {"test_braking_as_hard_as_it_can_is_an_action_that_does_not_speed_up"}),
         (Untold, {"test_only_events_that_it_looks_for_happen"}),
         (Leaves, {ONLY_SEED, INSTANCE, TIME, RESEEDED, ERRS}),
+        (Live, {"test_what_is_handed_out_stays_as_it_is"}),
+        (TwoNames, {NAMES}),
+        (TooFewNames, {NAMES}),
+        (Talks, {"test_notices_are_lines"}),
+        (Warms, {"test_what_is_simulated_before_the_first_step_is_the_same_again"}),
+        (Tidies, {"test_tidying_changes_no_episode"}),
+        (ClosesOnce, {"test_closing_twice_is_fine"}),
+        (Thin, {MAP}),
+        (Point, {MAP}),
+        (Moves, {MAP}),
+        (Lenient, {"test_actions_are_checked_and_encoded_once_and_for_all"}),
     ],
 )
 def test_simulator_contract_finds_what_is_broken(simulator, fails, tmp_path):
     scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(), "second": AgentSetup(action="meta")})
-    if simulator is Errs:
+    if simulator in (Errs, Lasts, Declines):
         scenario = replace(scenario, agents={"ego": AgentSetup()})  # which follows the leader, the only one to disturb
     assert failing(SimulatorContract, lambda: {"make": lambda: simulator(scenario, tmp_path)}) == fails
 
