@@ -161,7 +161,7 @@ _TESTS_ELSEWHERE = {
         "simulators/test_any_space.py",
         "simulators/test_gym.py",
     ),
-    "simulators/_kinematics.py": (
+    "simulators/_kinematics_observation.py": (
         "simulators/test_left_hand.py",
         "simulators/test_sumo.py",
         "simulators/test_highway.py",

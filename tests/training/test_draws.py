@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from crashhunt.errors import SimulatorError, UsageError
+from crashhunt.errors import HuntDirectoryError, SimulatorError, UsageError
 from crashhunt.training import CrashEnv, TrainedOn, _crash_env, is_test_traffic, read_trained_on
 from crashhunt.training._episodes import _seeded
 from crashhunt.training._prioritized_replay import CrashReplay
@@ -96,6 +96,33 @@ def test_episodes_get_the_options_and_the_crashes_of_the_training_part(make):
     assert make()._episodes.words == (("h/0-x", "h/1-x", "h/2-x"), "", 5.0, 10.0, 0)
     env.close()
     assert env._episodes.closed == 1
+
+
+def test_record_that_cannot_be_written_is_an_error(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(HuntDirectoryError) as caught:
+        TrainedOn(test=0.5).write(tmp_path / "file" / "trained_on.json")
+    assert caught.value.message == "cannot be written: File exists"
+    assert (caught.value.fix, caught.value.where) == (
+        "name a file in a writable folder",
+        str(tmp_path / "file" / "trained_on.json"),
+    )
+    (tmp_path / "folder" / "trained_on.json").mkdir(parents=True)
+    with pytest.raises(HuntDirectoryError, match="cannot be read: Is a directory"):
+        TrainedOn(test=0.5).write(tmp_path / "folder" / "trained_on.json")
+
+
+def test_record_is_written_only_where_it_grows(tmp_path):
+    file = tmp_path / "new" / "trained_on.json"
+    TrainedOn(test=0.5, seeds=frozenset({2, 1}), hunt_seeds=frozenset({7})).write(file)
+    text = file.read_text()
+    assert text.endswith("]\n}\n")
+    TrainedOn(test=0.5, seeds=frozenset({1}), hunt_seeds=frozenset({7})).write(file)
+    assert file.read_text() == text
+    TrainedOn(test=0.5, seeds=frozenset({1}), hunt_seeds=frozenset({8})).write(file)
+    assert read_trained_on(file) == TrainedOn(test=0.5, seeds=frozenset({1, 2}), hunt_seeds=frozenset({7, 8}))
+    TrainedOn(test=0.5, seeds=frozenset({3})).write(file)
+    assert read_trained_on(file).seeds == {1, 2, 3}
 
 
 def test_record_of_a_training_has_its_seeds(make, tmp_path):
