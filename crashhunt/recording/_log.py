@@ -24,6 +24,8 @@ from crashhunt.recording._foxglove import MESSAGES, NAMESPACE, LogWriter, messag
 from crashhunt.recording._reading import Prologue
 from crashhunt.recording._recording import Compact, Recording
 from crashhunt.recording.records import RECORD_TYPES
+from crashhunt.recording.records._agents import ACTION, OBSERVATION
+from crashhunt.recording.records._events import DISTURBANCES
 from crashhunt.recording.records._scene import STEP, time_of
 from crashhunt.recording.records._type import BytesForm, TextForm
 
@@ -41,6 +43,7 @@ SCHEMA = "1"
 _COMPACT_KEY = "crashhunt_compact"  # key of the metadata that says what a compact recording lacks
 _KNOWN_BY_TOPIC = 11
 """The last tag of the types that have been there from the beginning: a channel of any other says its tag."""
+_DECISIONS = frozenset({OBSERVATION.tag, ACTION.tag, DISTURBANCES.tag})
 
 
 def write_log(
@@ -164,17 +167,30 @@ def _channel(tag: int, aux: int, prologue: Prologue) -> _Channel:
 def _write_evidence(log: LogWriter, recording: Recording) -> None:
     prologue = recording.prologue
     channels: dict[tuple[int, int], _Channel] = {}
-    time_ns = 0
-    for sequence, (tag, aux, payload) in enumerate(recording.records, 1):
+    times_ns = _times_ns(recording.records)
+    for sequence, ((tag, aux, payload), time_ns) in enumerate(zip(recording.records, times_ns, strict=True), 1):
         channel = channels.get((tag, aux))
         if channel is None:
             channel = channels[tag, aux] = _channel(tag, aux, prologue)
-        if tag == STEP.tag:
-            time_ns = to_ns(time_of(payload))
         name, fields = channel.form.to_message(payload, prologue, aux)
         kind = MESSAGES[name]
         metadata = None if tag <= _KNOWN_BY_TOPIC else {"tag": str(tag), "aux": str(aux)}
         log.write(channel.topic, kind, kind(**fields).SerializeToString(), time_ns, sequence, metadata)
+
+
+def _times_ns(records: Sequence[Record]) -> list[int]:
+    """Return the simulation time of each record, in ns.
+
+    The records of a scene precede its step and have its time. A viewer that shows the latest message of each topic
+    then shows the actors and events of the scene. Decisions have the time of the scene that the agent observed.
+    """
+    steps_ns = [to_ns(time_of(payload)) for tag, _, payload in records if tag == STEP.tag]
+    times_ns, step = [], 0
+    for tag, _, _ in records:
+        at = step - 1 if tag in _DECISIONS else step
+        times_ns.append(steps_ns[min(max(at, 0), len(steps_ns) - 1)] if steps_ns else 0)
+        step += tag == STEP.tag
+    return times_ns
 
 
 def _read_evidence(messages: Sequence[_Message]) -> Iterator[Record]:
