@@ -60,6 +60,24 @@ def test_a_change_to_the_left_is_one(tmp_path, options, action):
             assert shown[2] - before[2] == pytest.approx(-moved, abs=1e-3)
 
 
+def test_a_sidewalk_does_not_move_the_lanes_of_the_observation(tmp_path):
+    """The sidewalk is lane 0 and 2 m wide; the other lanes have 3.2 m."""
+    shutil.copy(NET.with_name("sidewalk.net.xml"), tmp_path / "left.net.xml")
+    (tmp_path / "r.rou.xml").write_text('<routes><vType id="car" sigma="0"/></routes>')
+    (tmp_path / "scenario.toml").write_text(SCENARIO.replace('"st"', '"e"') % ("", "continuous"))
+    stage = tmp_path / "stage"
+    stage.mkdir()
+    with closing(SumoSimulator(load_scenario(str(tmp_path)), stage)) as simulator:
+        observations, *_ = simulator.reset(seed=1, options={})
+        assert observations["ego"][0][2] == pytest.approx(3.2)
+        for _ in range(20):
+            observations, *_ = simulator.step({"ego": simulator.actions["ego"].encode((10.0, 1))})
+            if observations["ego"][0][2] == 0:
+                break
+            assert observations["ego"][0][2] == pytest.approx(3.2)
+        assert observations["ego"][0][2] == 0
+
+
 @pytest.mark.parametrize(("who", "lane", "side"), [("left ahead", "0", 1), ("right ahead", "2", -1)])
 def test_who_cuts_in_from_the_left_is_there(tmp_path, who, lane, side):
     shutil.copy(NET, tmp_path)

@@ -36,7 +36,7 @@ class Driving:
 
     def __init__(self, setups: Mapping[str, AgentSetup], step_length_s: float) -> None:
         self._setups, self._step_length_s = setups, step_length_s
-        self._edges: dict[str, tuple[int, float]] = {}
+        self._edges: dict[str, list[float]] = {}
         self._closed_lanes: dict[tuple[str, str], bool] = {}
         self._targets: dict[str, int] = {}
         self._is_left_hand: bool | None = None
@@ -90,7 +90,7 @@ class Driving:
         edge = sumo.vehicle_getRoadID(agent)
         if edge.startswith(":"):
             return None
-        lanes, _ = self.edge(edge)
+        lanes = self.lanes(edge)
         direction = -change if self.left_hand else change
         target = sumo.vehicle_getLaneIndex(agent) + direction
         exists = 0 <= target < lanes
@@ -98,11 +98,16 @@ class Driving:
             exists = False
         return exists, direction
 
-    def edge(self, edge: str) -> tuple[int, float]:
-        """Return the number of lanes of an edge, and the width of its first lane in m."""
+    def lanes(self, edge: str) -> int:
+        """Return the number of lanes of an edge."""
+        return len(self._widths(edge))
+
+    def _widths(self, edge: str) -> list[float]:
+        """Return the widths in m of the lanes of an edge; sidewalks and bicycle lanes often have another."""
         found = self._edges.get(edge)
         if found is None:
-            found = self._edges[edge] = sumo.edge_getLaneNumber(edge), sumo.lane_getWidth(f"{edge}_0")
+            lanes = sumo.edge_getLaneNumber(edge)
+            found = self._edges[edge] = [sumo.lane_getWidth(f"{edge}_{lane}") for lane in range(lanes)]
         return found
 
     @property
@@ -115,8 +120,11 @@ class Driving:
 
     def from_left(self, edge: str, lane: int) -> float:
         """Return the distance in m from the centre line of an edge's leftmost lane to that of the given lane."""
-        lanes, width = self.edge(edge)
-        return (lane if self.left_hand else lanes - 1 - lane) * width
+        widths = self._widths(edge)
+        between = widths[: lane + 1] if self.left_hand else widths[lane:]
+        if all(width == between[0] for width in between):
+            return (len(between) - 1) * between[0]  # exact, where a sum would be rounded
+        return sum(between) - (between[0] + between[-1]) / 2
 
     def aside(self, agent: str) -> tuple[float, float]:
         """Return how far a vehicle is right of its lane's centre line, in m, and its speed to the right, in m/s."""

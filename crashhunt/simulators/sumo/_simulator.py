@@ -371,7 +371,7 @@ class SumoSimulator:
 
     def _observe(self, agent: str, row: int) -> NDArray[np.float32]:
         edge = sumo.vehicle_getRoadID(agent)
-        lanes, lane = self._driving.edge(edge)[0], sumo.vehicle_getLaneIndex(agent)
+        lanes, lane = self._driving.lanes(edge), sumo.vehicle_getLaneIndex(agent)
         self._scene.agent_lanes[agent] = f"{edge}_{lane}"
         from_left, lateral_speed = self._driving.from_left(edge, lane), 0.0
         if self._lateral:
