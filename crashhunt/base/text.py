@@ -16,7 +16,18 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-__all__ = ["did_you_mean", "encodable", "in_lines", "listed", "near_path", "one_line", "one_of", "out_of", "visible"]
+__all__ = [
+    "count_of",
+    "did_you_mean",
+    "encodable",
+    "in_lines",
+    "listed",
+    "near_path",
+    "one_line",
+    "one_of",
+    "out_of",
+    "visible",
+]
 
 
 # Control and format characters, lone surrogates, and separators of lines that are no newline.
@@ -48,6 +59,11 @@ def _visible_character(character: str) -> str:
 def one_line(text: str) -> str:
     """Return a text as one line without control characters."""
     return visible(_LINE_BREAKS.sub(" ", text.rstrip())).replace("\t", " ")
+
+
+def count_of(number: int, noun: str) -> str:
+    """Return a number with its noun, which has a plural in s."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def in_lines(lines: Iterable[str]) -> str:

@@ -12,6 +12,7 @@ from crashhunt.base.errors import HuntDirectoryError, ScenarioError, UsageError
 from crashhunt.base.files import cannot_write, is_empty_folder, sync_tree
 from crashhunt.base.git import work_tree
 from crashhunt.base.temporary import temporary_beside, temporary_folder
+from crashhunt.base.text import count_of
 from crashhunt.maps._convert import NET, ConvertOptions, convert
 from crashhunt.maps._demand import ROUTES, Demand, find_demand, route_file
 from crashhunt.maps._folder import (
@@ -398,7 +399,7 @@ def describe_place(found: MadeScenario) -> list[str]:
     ]
     if found.trial is not None:
         lines.append(
-            f"one trial of {found.agent}: {found.trial.outcome} after {found.trial.steps} steps "
+            f"one trial of {found.agent}: {found.trial.outcome} after {count_of(found.trial.steps, 'step')} "
             f"({found.trial.wall_s:.1f} s, with the start of its processes)"
         )
     return [*lines, *(f"note: {note}" for note in found.notes)]

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from crashhunt.base.text import in_lines
+from crashhunt.base.text import count_of, in_lines
 from crashhunt.crashes import (
     Encounter,
     contact_record,
@@ -435,7 +435,7 @@ def _shrunk(bundle: Bundle) -> list[str]:
         cut = shrunk.get("steps_cut")
         who = ", ".join(script.names)
         moved = f"{who} moved along recorded paths, independent of the agent" if who else "without any traffic"
-        lines.append(f"  scripted: {moved}" + (f"; it begins {cut} steps later" if cut else ""))
+        lines.append(f"  scripted: {moved}" + (f"; it begins {count_of(cut, 'step')} later" if cut else ""))
     return lines
 
 

@@ -7,7 +7,7 @@ import shlex
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.text import in_lines, out_of
+from crashhunt.base.text import count_of, in_lines, out_of
 from crashhunt.crashes import count_causes, join_causes
 from crashhunt.report._rate import describe_rates
 from crashhunt.report._status_screen import describe_types, format_arguments, format_inputs, format_seconds
@@ -297,7 +297,7 @@ def _describe_crash(bundle: Bundle) -> list[str]:
     lines = [
         f"{bundle.id}  ({result.outcome.category})",
         f"  {result.summary}",
-        f"  after {result.steps} steps, simulation time {result.sim_time_s:.1f} s",
+        f"  after {count_of(result.steps, 'step')}, simulation time {result.sim_time_s:.1f} s",
         f"  {format_inputs(result)}",
     ]
     lines += [f"  {line}" for line in (*_evidence(result), *list_disturbances(result))]

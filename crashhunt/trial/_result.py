@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 from crashhunt.base.codec import OMIT_DEFAULT, Serializable, from_plain, null_is, written_if
+from crashhunt.base.text import count_of
 from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._evidence import KILLED, Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
@@ -220,7 +221,7 @@ def summarize(result: TrialResult) -> str:
                 whose = f"{failure.party} ({failure.place}): "
             return f"{whose}{failure.kind}: {failure.message}"
         return failure.message
-    return f"{result.outcome} after {result.steps} steps"
+    return f"{result.outcome} after {count_of(result.steps, 'step')}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given, strategies as st
 
-from crashhunt.base.text import in_lines, one_line, out_of, visible
+from crashhunt.base.text import count_of, in_lines, one_line, out_of, visible
 
 SPOKEN = "\x1b[2J\x1b]0;title\x07 up\x1b[1A\r\x9b2K \u202eesrever\u2066 a\u0085b\u2028c [bold red]x[/] z"
 HOSTILE = f"{SPOKEN} \udc80"
@@ -100,3 +100,7 @@ def test_who_made_it_is_asked_in_one_line(tmp_path, capsys, monkeypatch):
 def test_trials_are_a_share_of_the_planned_ones_only_where_they_are_fewer():
     assert [out_of(3, 8), out_of(8, 8), out_of(9, 8), out_of(0, 0), out_of(3, 0)] == ["3 of 8", "8 of 8", "9", "0", "3"]
     assert out_of(3, 8, "/") == "3/8"
+
+
+def test_one_step_is_no_plural():
+    assert [count_of(number, "step") for number in (0, 1, 2)] == ["0 steps", "1 step", "2 steps"]
