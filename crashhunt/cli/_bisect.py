@@ -36,7 +36,7 @@ def add_bisect(commands: Commands) -> None:
     )
     bisect.add_argument(
         "--from", metavar="FOLDER", type=Path, dest="folder",
-        help="folder of the repository from which the agent is imported; default: the current folder",
+        help="folder in the repository from which Python imports the agent; default: the current folder",
     )  # fmt: skip
     add_trust(bisect)
     add_json(bisect)

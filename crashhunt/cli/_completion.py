@@ -34,7 +34,7 @@ def add_completion(commands: Commands) -> None:
     completion = commands.add_parser(
         "completion",
         help="print a shell script that adds tab completion",
-        description="Print a script for a shell, in which the tab key then completes commands, options, scenarios, "
+        description="Print a script for a shell. With the script, the tab key completes commands, options, scenarios, "
         "agents, samplers, arguments, outcomes, directories and crashes.",
         epilog=_INSTRUCTIONS,
         formatter_class=argparse.RawDescriptionHelpFormatter,

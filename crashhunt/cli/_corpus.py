@@ -54,7 +54,7 @@ def _add_add(commands: Commands) -> None:
         "add",
         help="put crashes into a corpus",
         description="Add crashes to a corpus. A crash in a corpus consists of its seed, its arguments, its scenario "
-        "and its log, which is shortened if it would be large. The code of crashhunt and of the agent is excluded, "
+        "and its log; a large log is shortened. The code of crashhunt and of the agent is excluded, "
         "because a corpus tests the current code.",
     )
     add.add_argument(

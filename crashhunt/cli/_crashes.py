@@ -37,7 +37,7 @@ def add_crashes(commands: Commands) -> None:
     crashes.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="directories of hunts or suites")
     crashes.add_argument(
         "--known", metavar="CORPUS", type=Path,
-        help="mark the crash types that this corpus contains as cases that are expected to reproduce",
+        help="mark the crash types of which this corpus contains a case that is expected to reproduce",
     )  # fmt: skip
     crashes.add_argument(
         "--sarif", metavar="FILE", type=Path, help="write the crash types as SARIF 2.1.0, for code scanning and editors"

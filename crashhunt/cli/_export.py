@@ -29,7 +29,9 @@ def add_export(commands: Commands) -> None:
         "file in place of a DIR. With --as, write the recorded crash as a scenario for other tools.",
     )
     add_crash(export)
-    export.add_argument("file", metavar="FILE", type=Path, help="the file to write: a zip file, or the format of --as")
+    export.add_argument(
+        "file", metavar="FILE", type=Path, help="the file to write: a zip file, or with --as a file in that format"
+    )
     export.add_argument(
         "--as",
         dest="form",

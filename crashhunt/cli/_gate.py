@@ -82,8 +82,8 @@ def add_gate(commands: Commands) -> None:
     )  # fmt: skip
     how.add_argument(
         "--margin", metavar="SHARE", default=str(_MARGIN),
-        help="the greatest difference in crashes per trial that still counts as no difference, such as 0.01 or 1%%; 0: "
-            f"never report that verdict; default: {_MARGIN}",
+        help="the greatest difference in crashes per trial that still counts as no difference, such as 0.01 or 1%%; "
+        f"0: never report the verdict no difference; default: {_MARGIN}",
     )  # fmt: skip
     how.add_argument(
         "--confidence",
@@ -94,7 +94,8 @@ def add_gate(commands: Commands) -> None:
     )
     how.add_argument(
         "--parallel", metavar="N", type=integer, default=0,
-        help="number of trials of BASE and HEAD together that run at a time, at least 2; default: one per core",
+        help="number of trials that run at a time, counted over BASE and HEAD together; at least 2; default: one per "
+        "core",
     )  # fmt: skip
     how.add_argument(
         "--keep", metavar="DIR", type=Path,
@@ -164,7 +165,9 @@ def _margin(text: str) -> float:
     try:
         return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
     except ValueError:
-        raise UsageError(f"--margin is {text}", fix="give a share from 0 to below 1, such as 0.01 or 1%") from None
+        raise UsageError(
+            f"--margin {text!r} is not a share", fix="give a share from 0 to below 1, such as 0.01 or 1%"
+        ) from None
 
 
 def _of_options(options: argparse.Namespace, folder: Path) -> dict[str, RunRequest]:

@@ -46,12 +46,12 @@ def add_init(commands: Commands) -> None:
         "--bbox",
         metavar="W,S,E,N",
         help="use only the part of the map between longitudes W and E and latitudes S and N, in degrees; write "
-        "--bbox=W,S,E,N",
+        "--bbox=W,S,E,N with =, because W may be negative",
     )
     how.add_argument(
         "--demand", metavar="LOW:HIGH", default="0.2:1.5",
-        help="range LOW:HIGH of the factor that multiplies the traffic (default: %(default)s); init ensures that the "
-        "traffic does not jam at HIGH",
+        help="range LOW:HIGH of the factor that multiplies the traffic (default: %(default)s); init reduces the "
+        "traffic until it does not jam at the factor HIGH",
     )  # fmt: skip
     how.add_argument("--people", action="store_true", help="add persons on foot, on sidewalks and crossings")
     how.add_argument("--bicycles", action="store_true", help="add cyclists, and lanes for bicycles")
@@ -130,7 +130,7 @@ def _demand(text: str) -> tuple[float, float]:
     except ValueError:
         raise UsageError(f"--demand {text!r} is not a range", fix=fix) from None
     if not 0 < found[0] <= found[1] <= _MAX_DEMAND:  # NaN is neither
-        raise UsageError(f"--demand {text!r} is not a range within 0 and {_MAX_DEMAND:g}", fix=fix)
+        raise UsageError(f"--demand {text!r} is not a range between 0 and {_MAX_DEMAND:g}", fix=fix)
     return found
 
 
@@ -159,7 +159,7 @@ def _check_agent(name: str) -> None:
     data = work_apart(described, task=task, timeout_s=_IMPORT_S) if is_foreign("agents", name) else described()
     required = Signature.from_json(data).required
     if required:
-        fix = "give it a default: the new scenario has no value for it"
+        fix = "give the argument a default in the agent's code, because the new scenario sets no value"
         raise UsageError(f"--agent {name}: the agent needs the argument {required[0]!r}", fix=fix)
 
 

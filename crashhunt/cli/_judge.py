@@ -81,7 +81,7 @@ def _judge(options: argparse.Namespace, _words: list[str]) -> int:
     if options.runs < 1:
         raise UsageError(f"--runs is {options.runs}", fix="give at least 1")
     if options.why < 0:
-        raise UsageError(f"--why is {options.why}", fix="give at least 0 (0: do not ask what it hangs on)")
+        raise UsageError(f"--why is {options.why}", fix="give at least 0 (0: do not search for the causes)")
     if options.reference < 0:
         raise UsageError(f"--reference is {options.reference}", fix="give at least 0 (0: no reference driver)")
     if options.parallel < 0:

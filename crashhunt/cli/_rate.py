@@ -46,8 +46,8 @@ def add_rate(commands: Commands) -> None:
     )
     rate.add_argument(
         "--by", metavar="PART", default="",
-        help="report the rate for each group of trials or crashes: by kind, fault, disturbance, or the value of "
-        "argument ARG in BINS bins (default: 4)",
+        help="report the rate of each part: kind, fault or disturbance divides the crashes; ARG or ARG:BINS divides "
+        "the trials by the value of the argument ARG, into BINS bins (default: 4)",
     )  # fmt: skip
     rate.add_argument(
         "--bar", metavar="RATE", default="",

@@ -62,8 +62,8 @@ def add_film_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for films to the parser."""
     film = parser.add_argument_group(
         "to watch it",
-        "With --from-log no code is run, and nothing is simulated; otherwise what the replay does is shown, with the "
-        "agent's own panels. Needs pip install 'crashhunt[video]'.",
+        "With --from-log, the film shows the recording, and no code runs. Otherwise it shows the replay, with the "
+        "agent's own panels. Needs: pip install 'crashhunt[video]'.",
     )
     film.add_argument("--video", metavar="FILE", type=Path, help="write an MP4 file")
     film.add_argument("--gif", metavar="FILE", type=Path, help="write an animated GIF")
@@ -251,8 +251,8 @@ def add_replay(commands: Commands) -> None:
     )  # fmt: skip
     replay.add_argument(
         "--scenario", metavar="NAME|PATH", default="",
-        help="run the same agents with the same arguments and seed in another scenario, also of another simulator, to "
-        "see whether they crash there too",
+        help="run the same agents with the same arguments and seed in another scenario, which may use another "
+        "simulator, to see whether they crash there too",
     )  # fmt: skip
     replay.add_argument("--no-accelerate", action="store_true", help="run highway-env without the accelerator")
     replay.add_argument(
@@ -295,8 +295,8 @@ def add_replay(commands: Commands) -> None:
     )  # fmt: skip
     look.add_argument(
         "--sleep", metavar="S", type=number,
-        help="with --gui: wall time between two steps, in s; default: the length of "
-        "a simulation step, for real time",
+        help="with --gui: wall time between two steps, in s; default: the length of a simulation step, so that the "
+        "replay runs in real time",
     )  # fmt: skip
     add_film_options(replay)
     add_trust(replay)
@@ -323,7 +323,8 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
     crashes = options.crash.split(",")
     if len(crashes) > 1 and film is None:
         raise UsageError(
-            f"--crash {options.crash!r} names several crashes", fix="give one crash, or make a film of all"
+            f"--crash {options.crash!r} names several crashes",
+            fix="give one crash, or add --video, --gif or --frames for one film of them",
         )
     _refuse_what_would_be_ignored(options, film)
     answers, shots, good = [], [], True
@@ -364,7 +365,10 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
         for name in [
             name for name, given in {**look, "--print": options.fields, "a film": film is not None}.items() if given
         ]:
-            raise UsageError(f"--scenario: {name} needs the scenario of the crash", fix="omit one of the two")
+            raise UsageError(
+                f"{name} cannot be combined with --scenario, because it needs the scenario of the crash",
+                fix="omit one of the two",
+            )
     if film is not None and options.from_log:
         look |= {"--print": options.fields, "--set": options.sets, "--times": options.times != 1}
         for name in [name for name, given in look.items() if given]:
@@ -375,7 +379,10 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
         if film is not None:
             look |= {"a film": True}
         for name in [name for name, given in look.items() if given]:
-            raise UsageError(f"--times {options.times}: {name} examines one run", fix="omit one of the two")
+            raise UsageError(
+                f"{name} examines one run, so it cannot be combined with --times {options.times}",
+                fix="omit one of the two",
+            )
 
 
 def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions) -> tuple[ReplayReport, JsonObject]:
@@ -403,9 +410,9 @@ def _view_of(options: argparse.Namespace, bundle: Bundle) -> Look | None:
     from crashhunt.replays import Look
 
     if options.json and options.pdb:
-        raise UsageError("--pdb needs a terminal, so it cannot be combined with --json", fix="omit one of them")
+        raise UsageError("--pdb needs a terminal, so it cannot be combined with --json", fix="omit --pdb or --json")
     if options.sleep is not None and not (options.gui and 0 <= options.sleep < math.inf):
-        raise UsageError(f"--sleep is {options.sleep:g}", fix="give at least 0, and --gui, which it slows down")
+        raise UsageError(f"--sleep is {options.sleep:g}", fix="give a time of at least 0 s, together with --gui")
     until = _last_step(options, bundle)
     if options.gui:
         whole = look_at_all(bundle)

@@ -80,8 +80,8 @@ def add_run(commands: Commands) -> None:
     run = commands.add_parser(
         "run",
         help="hunt for a crash",
-        description="Hunt for a crash: run trials in parallel, each with its own seed and arguments, and stop as soon "
-        "as one crashes. The same command on the same DIR resumes the hunt.",
+        description="Hunt for a crash: run trials in parallel, each with its own seed and arguments, and stop after "
+        "the first crash. The same command on the same DIR resumes the hunt.",
         usage="%(prog)s [option]... DIR PARALLEL TRIALS MAX_STEPS",
         add_help=False,
     )

@@ -38,8 +38,9 @@ def add_shrink(commands: Commands) -> None:
         "shrink",
         help="minimize a crash while its crash type stays the same",
         description="Minimize a crash while its crash type stays the same: remove other actors, drop disturbances, and "
-        "set arguments to their defaults and to round numbers. If the crash needs many other actors, move them along "
-        "their recorded paths, remove the unnecessary ones, and cut off the beginning. Each candidate is run with the "
+        "set arguments to their defaults and to round numbers. If the crash still needs more than a few other actors, "
+        "shrink moves these along their recorded paths, tries again to remove each of them, and cuts off the "
+        "beginning of the trial. Each candidate is run with the "
         "code of the snapshot. The result is a new crash next to the first, ID.small. If you interrupt the command, it "
         "keeps the best result, and the same command resumes. Exits with 1 if the crash does not reproduce.",
     )

@@ -43,9 +43,9 @@ def add_suite(commands: Commands) -> None:
     verbs = suite.add_subparsers(title="commands", metavar="COMMAND", required=True)
     run = verbs.add_parser(
         "run",
-        help="run what has not ended",
-        description="In DIR, make a folder for every run of a hunt, and run all runs that have not ended, even if some "
-        "runs fail. The same command resumes the suite. Exits with 1 if a hunt could not run.",
+        help="run the hunts of a suite that have not ended",
+        description="Make a folder in DIR for each run of each hunt, and start all runs that have not ended. If a run "
+        "fails, the others continue. The same command resumes the suite. Exits with 1 if a hunt could not run.",
     )
     run.add_argument("file", metavar="FILE", type=Path, help="the file that lists the hunts, such as suite.toml")
     run.add_argument("directory", metavar="DIR", type=Path, help="directory of the suite; created if it does not exist")
@@ -58,7 +58,7 @@ def add_suite(commands: Commands) -> None:
     run.set_defaults(command=_run)
     defaults = verbs.add_parser(
         "defaults",
-        help="print a suite of every shipped scenario",
+        help="print a suite file with a hunt for every shipped scenario",
         description="Print a suite file with a hunt for every shipped scenario, which you can edit.",
     )
     defaults.set_defaults(command=_defaults)
@@ -81,8 +81,9 @@ def add_rerun(commands: Commands) -> None:
     which.add_argument("--failed", action="store_true", help="run only failed hunts and trials again (the default)")
     which.add_argument("--all", action="store_true", help="run all hunts again from the start")
     rerun.add_argument("--set", metavar="NAME=SPEC", action="append", default=[], dest="sets",
-                       help="with --to or --all: new values for an argument (of several agents, ID.NAME names one), or "
-                       "a new number for trials, max_steps or seed")  # fmt: skip
+                       help="with --to or --all: new values for an argument, or a new number for trials, max_steps or "
+                       "seed; if there are several agents, write ID.NAME for the argument NAME of the agent "
+                       "ID")  # fmt: skip
     rerun.add_argument(
         "--to",
         metavar="NEW",

@@ -55,7 +55,7 @@ def _trials(options: argparse.Namespace, _words: list[str]) -> int:
     known = in_order([*Outcome, *brought])
     for name in outcomes:
         if name not in known:
-            raise UsageError(f"--outcome {name!r} does not exist", fix=one_of(name, known, give="give some of"))
+            raise UsageError(f"--outcome: there is no outcome {name!r}", fix=one_of(name, known, give="give some of"))
     hunt = HuntResults(options.directory)
     if options.out is None:
         if options.format == "parquet":

@@ -43,8 +43,8 @@ def add_whatif(commands: Commands) -> None:
     add_crash(whatif)
     whatif.add_argument(
         "--set", metavar="NAME=VALUE", action="append", default=[], dest="sets",
-        help="another value for an argument, as with crashhunt replay; with --from-step or --before, an argument of "
-        "the agent that changes only from that step on",
+        help="another value for an argument, as with crashhunt replay; with --from-step or --before, only an argument "
+        "of the agent, which has the other value from that step on",
     )  # fmt: skip
     moment = whatif.add_mutually_exclusive_group()
     moment.add_argument(
@@ -81,7 +81,7 @@ def add_whatif(commands: Commands) -> None:
         "let a reference driver correct unsafe speeds, unsafe lane changes, or both",
     )  # fmt: skip
     whatif.add_argument(
-        "--leave-out", metavar="ID,…", default="", help="ids of actors that are removed from the start of the run"
+        "--leave-out", metavar="ID,…", default="", help="run the trial without these actors; ids of the actors"
     )
     whatif.add_argument(
         "--code", choices=("snapshot", "current"), default=None,
@@ -96,7 +96,8 @@ def add_whatif(commands: Commands) -> None:
     )
     whatif.add_argument(
         "--for", metavar="TIME", default="", dest="time",
-        help="stop after this time; then only the runs before the first unfinished run count",
+        help="stop after this time; the counts then include only the runs with lower numbers than the first "
+        "unfinished run",
     )  # fmt: skip
     add_trust(whatif)
     add_json(whatif)

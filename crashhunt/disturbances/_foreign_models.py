@@ -90,5 +90,5 @@ class ModelApart:
             except CrashhuntError:
                 raise
             except Exception as error:  # of user code
-                raise blamed(f"the disturbance {self._name!r} has no likelihood", error) from error
+                raise blamed(f"the likelihood of the disturbance {self._name!r} cannot be computed", error) from error
         return {"what": described_model(self._name)}

@@ -41,8 +41,8 @@ class Choices:
     """A model that draws place, strength and duration independently of each other.
 
     Args:
-        what: kind of the disturbance.
-        who: places around the agent, each with its weight.
+        what: kind of the disturbance, such as ``brake``.
+        who: the possible places of the disturbed actor, relative to the agent, such as ``ahead``, each with its weight.
         how_strong: possible strengths with their weights, in the unit of the kind.
         how_long: possible durations with their weights, in s.
     """

@@ -131,7 +131,7 @@ class Questions:
         self.may_be_answered = self.may_be_answered or is_from_outside
 
     def stop(self, why_not: str) -> None:
-        """Run no more forks in this process."""
+        """Start no more forks of trials in this process, and record the reason; forks that run already continue."""
         self.why_not = self.why_not or why_not
 
 

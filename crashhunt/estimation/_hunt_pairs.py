@@ -172,7 +172,7 @@ class GateReport:
 
 
 class PairedHunts:
-    """The hunts of BASE and HEAD in one scenario, which other processes run.
+    """Reads the pairs of trials from BASE's hunt and HEAD's hunt in one scenario, while other processes run both hunts.
 
     Args:
         name: name of the hunt.

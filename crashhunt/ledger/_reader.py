@@ -555,11 +555,11 @@ class LedgerReader:
         return {outcome: (trials, least, most) for outcome, trials, least, most in rows}
 
     def parts_of(self, width: int, outcome: str) -> Iterator[tuple[int, int, int]]:
-        """Yield each part of the trials with an outcome: the part, its number of trials and of steps, from an index.
+        """Count the trials with an outcome in each part of the hunt; yield the part, their number and their steps.
 
         Args:
             width: number of trials in a part; part i begins with trial i * width.
-            outcome: outcome of the trials.
+            outcome: the outcome; only trials with this outcome are counted.
         """
         yield from self._select(
             "SELECT number / ?, count(*), sum(steps) FROM trials WHERE outcome = ? GROUP BY number / ?",

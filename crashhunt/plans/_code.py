@@ -37,11 +37,12 @@ IMPORT_S = 60.0  # besides the time limit of a trial
 
 @dataclass(frozen=True, slots=True)
 class CodeFacts:
-    """The facts that a command knows about the code that a hunt names.
+    """The declarations of the code that a hunt names: of its agents, user-defined oracles and disturbances.
 
     Args:
         signatures: arguments of each agent, by the agent's locator.
-        oracles: outcomes of each user-defined oracle with their categories, by the oracle's choice on the command line.
+        oracles: outcomes of each user-defined oracle with their categories, by the text that chooses the oracle in
+            ``--oracle``.
         disturbances: the kind of each user-defined disturbance model, by name.
         imported: the modules that a process with all of this code has imported; None if all modules are crashhunt's
             own.
@@ -56,7 +57,7 @@ class CodeFacts:
 def describe_code(
     scenario: Scenario, *, oracles: Sequence[str], disturb: Sequence[str], sampler: str, executor: str, timeout_s: float
 ) -> CodeFacts:
-    """Return the facts about the agents of a scenario, and about other code that options name.
+    """Return the declarations of a scenario's agents, and of the other code that options name.
 
     Args:
         scenario: the scenario with its agents.

@@ -39,22 +39,22 @@ _METADATA_KEY = "crashhunt"  # the key of a field's metadata
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class About:
-    """The declaration of an option in addition to its name, type and default.
+    """The declaration of an option, except its name, type and default: its texts, its group in the help and its check.
 
     Args:
         meaning: description of the option's value.
         help: help text for the command line, if it differs from `meaning`.
-        unset: description of the effect if the option is not given; empty for the default value.
+        unset: description of the effect if the option is not given; if empty, the help shows the default value.
         flag: option on the command line; empty if the command line has no such option.
         metavar: placeholder for the value in the help.
         group: group in the help of ``crashhunt run``: what is tested, search, faults and probes, what is kept, how it
             runs, output.
         brief: help text in one line, for the short help of ``crashhunt run``; empty for options that the short help
             only names.
-        check: function that returns the fix for an invalid value; empty for a valid value.
+        check: function that returns the fix for an invalid value, and an empty text for a valid value.
         separator: separator of a list that is written as one word on the command line; empty if the option may be
             repeated.
-        named: for a table, whether every value has a name.
+        named: for an option of the form ``NAME=VALUE``, whether the name is required.
         anywhere: whether ``suite run`` and ``rerun`` have the option as well, for all their hunts. Such an option
             belongs to the machine that runs a hunt, and not to the hunt itself.
     """
@@ -119,7 +119,7 @@ class HuntOption:
 
     @property
     def line(self) -> str:
-        """The line about the option in the documentation of a function."""
+        """The line that describes the option in the docstring of a function."""
         return f"{self.name}: {self.about.meaning}{f'; by default {self.about.unset}' if self.about.unset else ''}."
 
     @property
@@ -135,7 +135,7 @@ class HuntOption:
         return f"{self.about.help or self.about.meaning}{f'; default: {default}' if default else ''}"
 
     def checked(self, value: object) -> object:
-        """Return a valid value of this option after conversion: a NumPy number becomes a Python number.
+        """Validate a value of this option; return it in plain Python types, such as a NumPy number as a Python number.
 
         Raises:
             UsageError: the value is invalid.

@@ -65,7 +65,7 @@ FIXED = "fixed"
 
 
 def load_order_of(scenario: Scenario) -> str | None:
-    """Return ``fixed`` or ``not fixed: REASON``; None if the simulator's results do not depend on an order."""
+    """Return ``fixed`` or ``not fixed: REASON`` for the load order; None if the results do not depend on an order."""
     order = scenario.backend.load_order
     if order is None:
         return None
@@ -74,7 +74,7 @@ def load_order_of(scenario: Scenario) -> str | None:
 
 
 def with_recorded_load_order(scenario: Scenario, recorded: str | None) -> Scenario:
-    """Return the scenario with the load order of a recorded crash: a fixed order, or the simulator's own order.
+    """Return the scenario with the load order that a recorded crash had: the fixed order, or the simulator's own order.
 
     The load order is the order in which the simulator processes objects when it loads the scenario.
 
@@ -146,7 +146,7 @@ class Takes:
 
 @dataclass(frozen=True, slots=True)
 class Owners:
-    """The owner of each argument: an agent or the scenario.
+    """Finds the owner of an argument: an agent or the scenario.
 
     ``AGENT.NAME`` is an argument of that agent, and ``scenario.NAME`` is an argument of the scenario. A bare ``NAME``
     belongs to the agent or the scenario that declares it, or else to the agent that accepts any argument. If there are
@@ -187,7 +187,9 @@ class Owners:
         return (takers[0], word) if takers else None
 
     def of_record(self, word: str, ask: Callable[[str], Takes] | None, *, option: str) -> tuple[str, str] | None:
-        """Return owner and name like `of`, for recorded arguments; the record lacks arguments without a plain default.
+        """Return the owner and the name of an argument of a recorded crash; None if no owner has it.
+
+        The record lacks arguments whose default is not a number, a string or a Boolean; for these, `ask` is called.
 
         Args:
             word: name of the argument as the user wrote it.
@@ -226,7 +228,7 @@ class Owners:
 
 
 def agent_of(word: str, agents: Collection[str]) -> str:
-    """Return the agent whose id and a dot begin the given word; empty if the word has no such prefix.
+    """Return the agent whose id, followed by a dot, is a prefix of the given word; empty if there is none.
 
     Identifiers may contain dots, and an identifier may be a prefix of another identifier. If several match, the longest
     is used.
@@ -235,7 +237,7 @@ def agent_of(word: str, agents: Collection[str]) -> str:
 
 
 def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None) -> Takes:
-    """Return the arguments of an agent from its code, read in another process, as the code may be a snapshot's.
+    """Read the arguments of an agent from its code in another process, because the code may belong to a snapshot.
 
     Args:
         locator: locator of the agent, ``module:attribute`` or a registered name.
@@ -364,7 +366,7 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
     missing = scenario.agents.keys() ^ settings.agents.keys()
     if missing:
         raise UsageError(
-            f"hunt.toml and the scenario name different controlled vehicles: {min(missing)!r}",
+            f"only one of hunt.toml and the scenario has the controlled vehicle {min(missing)!r}",
             fix="name the same vehicles in both",
         )
     if scenario.backend.accelerator is not None and not settings.run.accelerate:
@@ -382,8 +384,11 @@ def _agents_in(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
     """Return the scenario with the requested forms of actions; an empty form keeps the scenario's form."""
     for agent, action in actions.items():
         if action and not scenario.backend.actions:
-            meant, fix = titles(lambda backend: bool(backend.actions)), "omit the option; the environment has its own"
-            raise UsageError(f"--action {action} is for {meant}, but the scenario {scenario.name} is not", fix=fix)
+            meant = titles(lambda backend: bool(backend.actions))
+            fix = "omit --action, because the environment defines the form of its actions"
+            raise UsageError(
+                f"--action {action} is for {meant}, but the scenario {scenario.name} has another simulator", fix=fix
+            )
         if action:
             scenario = with_action(scenario, agent, action)
     return scenario
@@ -500,14 +505,15 @@ def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str]
             raise UsageError("--splitting needs --rare", fix="add --rare")
         return
     if not settings.splitting and not parse_rates(settings.disturb):
-        fix = "say how often what happens, such as --disturb brake=0.02,cut_in=0.02"
+        fix = "give rates, such as --disturb brake=0.02,cut_in=0.02"
         raise UsageError("--rare needs disturbances with rates, but the hunt has none", fix=fix)
     agents = tuple(settings.agents)
     if not settings.splitting and (fixed := parse_fixed(settings.disturb, agents)):
-        message = f"--rare: --disturb {word_of(fixed[0], agents)} begins in every trial"
-        raise UsageError(message, fix="give rates only")
+        begun = word_of(fixed[0], agents)
+        message = f"--rare needs disturbances with rates, but --disturb {begun} begins in every trial"
+        raise UsageError(message, fix="give only rates, such as --disturb brake=0.02")
     if not sampler_of(settings).independent:
-        message = f"--rare: the sampler {settings.sampler} does not draw trials independently"
+        message = f"--rare needs independent trials, but --sampler {settings.sampler} draws dependent trials"
         raise UsageError(message, fix="use --sampler random")
     excluded = {
         "--seeds": settings.seeds, "--probe": settings.probe, "--branch": settings.branch, "--distinct": run.distinct,
@@ -520,7 +526,10 @@ def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str]
         assert sampler is not None
         if sampler.chance(name) > _MAX_RARE_CHANCE:
             most = _MAX_RARE_CHANCE / sampler.step_length_s
-            message = f"--rare: --disturb {name}={rate:g} has a chance of {sampler.chance(name):.2g} per step"
+            message = (
+                f"--rare: --disturb {name}={rate:g} begins with the probability {sampler.chance(name):.2g} in each "
+                f"step, which is above {_MAX_RARE_CHANCE:g}"
+            )
             raise UsageError(message, fix=f"give at most {most:g} a second, or omit --rare")
     if sys.platform != "linux":
         raise UsageError("--rare forks processes, which needs Linux", fix="omit --rare")
@@ -560,7 +569,10 @@ def parse_crash_on(
     for word in words:
         name, colon, limit = str(word).partition(":")
         if name not in crashes:
-            raise UsageError(f"--crash-on {name!r} is not a crash", fix=one_of(name, crashes, give="give some of"))
+            raise UsageError(
+                f"--crash-on {name!r} is not an outcome that can count as a crash",
+                fix=one_of(name, crashes, give="give some of"),
+            )
         if colon:
             limits[name] = _limit(name, limit)
         names.append(name)
@@ -571,7 +583,10 @@ def parse_crash_on(
 
 def _limit(name: str, text: str) -> float:
     if name not in LIMITS:
-        raise UsageError(f"--crash-on {name}:{text}: {name} has no limit", fix=f"{' and '.join(LIMITS)} have one")
+        raise UsageError(
+            f"--crash-on {name}:{text}: {name} has no limit",
+            fix=f"write {name} alone; only {' and '.join(LIMITS)} have a limit",
+        )
     unit = LIMITS[name][1]
     try:
         value = float(text)
@@ -589,7 +604,7 @@ def _locators(request: Request, scenario: Scenario) -> dict[str, str]:
     for agent, locator in request.agents.items():
         if not agent and len(scenario.agents) > 1:
             raise UsageError(
-                f"--agent {locator!r} does not say which vehicle, and the scenario has {ids}",
+                f"--agent {locator!r} names no vehicle, but the scenario has several: {ids}",
                 fix=f"write --agent {next(iter(scenario.agents))}={locator}",
             )
         if agent and agent not in scenario.agents:
@@ -641,7 +656,9 @@ def _owner(name: str, scenario: Scenario, signatures: Mapping[str, Signature]) -
         where = f"--arg {name}: {scenario.agents[agent].agent}"
         signatures[agent].check([name.removeprefix(f"{agent}.")], where=where)
     if name in scenario.arguments:
-        raise ArgumentError(f"--arg {name}: it is an argument of the scenario", fix=f"write --set {name}=SPEC")
+        raise ArgumentError(
+            f"--arg {name}: {name} is an argument of the scenario, not of an agent", fix=f"write --set {name}=SPEC"
+        )
     first = next(iter(scenario.agents))
     signatures[first].check([name], where=f"--arg: {scenario.agents[first].agent}")
     raise AssertionError(name)  # the agent that accepts it is its owner

@@ -70,7 +70,7 @@ class Subject(_Options):
         flag="--scenario", metavar="NAME|PATH", group="what",
     )  # fmt: skip
     ego: str = option(
-        "", "controlled vehicle of a bare ``.sumocfg``",
+        "", "if the scenario is a ``.sumocfg``, the vehicle that the agent controls",
         help="for a .sumocfg: the id of the vehicle that the agent controls; route=ID or edges=FROM,TO adds a vehicle; "
         "any: a random vehicle in each trial",
         unset="any",
@@ -84,29 +84,30 @@ class Subject(_Options):
         flag="--action", metavar="FORM", group="what",
     )  # fmt: skip
     agents: Mapping[str, Driver] | None = option(
-        {}, "vehicle to its agent, for several controlled vehicles",
-        help="the agent that drives: a class or function, or a name that crashhunt agents lists; with ID=, the agent "
-        "of the controlled vehicle ID, if the scenario has several",
-        brief="the class, function or listed name that drives",
+        {}, "identifier of each controlled vehicle to its agent, if there are several",
+        help="the agent that drives: a class or function, or a name that crashhunt agents lists; if the scenario has "
+        "several controlled vehicles, ID= names the vehicle that this agent drives",
+        brief="the agent that drives: a class, a function, or a name that crashhunt agents lists",
         flag="--agent", metavar="[ID=]MODULE:ATTR", group="what", named=False,
     )  # fmt: skip
     arguments: Mapping[str, Spec] | None = option(
         {}, '``NAME`` or ``AGENT.NAME`` to a value or a specification such as ``"5:40"``',
         help=f"values to try for an argument of the agent: {_SPEC}; if there are several agents, ID.NAME=SPEC names "
         "the agent",
-        brief="values of an argument of the agent: 20, 5:40, log:1e-3:1, a|b|c",
+        brief="values of an agent's argument: one (20), a range (5:40 or log:1e-3:1) or a choice (a|b|c)",
         flag="--arg", metavar="NAME=SPEC", group="what",
     )  # fmt: skip
     scenario_arguments: Mapping[str, Spec] | None = option(
-        {}, "name of an argument of the scenario to a value or a specification",
+        {}, 'name of an argument of the scenario to a value, or to a specification such as ``"0.5:1.5"``',
         help="values to try for an argument of the scenario, such as its traffic demand",
-        brief="the same for an argument of the scenario, such as its traffic",
+        brief="values of an argument of the scenario, such as its traffic, written as for --arg",
         flag="--set", metavar="NAME=SPEC", group="what",
     )  # fmt: skip
     oracles: Sequence[str] = option(
-        (), "additional oracles, next to those for reported collisions, overlaps and the edge of the road",
+        (), "additional oracles; by default, oracles detect collisions that the simulator reports, overlaps, and "
+        "leaving the road",
         help="an additional oracle that detects crashes, with its arguments; crashhunt oracles lists all oracles; "
-        "none: no default oracles; may be repeated",
+        "none switches off the default oracles; may be repeated",
         flag="--oracle", metavar="NAME[:KEY=VALUE,…]", group="what",
     )  # fmt: skip
 
@@ -119,7 +120,7 @@ class TrialOptions(_Options):
         "random", "name of the sampler",
         help="the sampler that chooses the arguments of trials: random, halton, sobol, grid or sweep; or a sampler "
         "that learns from results: guided, cross-entropy, mutation, cma-es or optuna:NAME, such as optuna:tpe",
-        brief="random, grid, guided and others: how arguments are chosen",
+        brief="how the arguments of trials are chosen: random, grid, guided or others",
         flag="--sampler", group="search", metavar="NAME",
     )  # fmt: skip
     points: int = option(
@@ -129,14 +130,16 @@ class TrialOptions(_Options):
         check=at_least(1),
     )  # fmt: skip
     seed: int | None = option(
-        None, "seed of the hunt", unset="a new one, which is printed", brief="the same seed runs the same trials",
+        None, "seed of the hunt", unset="a new one, which is printed",
+        brief="seed of the hunt; the same seed runs the same trials again",
         flag="--seed", group="search", metavar="N", check=at_least(0),
     )  # fmt: skip
     crash_on: Sequence[str] = option(
         CRASHES, "outcomes that count as a crash",
         help="the outcomes that count as a crash. By default: collision, off_road, agent_error, simulator_error, "
-        "process_died, hang. Also possible are traffic events: red_light, wrong_way, off_route, not_moving (for 60 s, "
-        "or not_moving:S), others_collided, hard_braking (or hard_braking:M/S²), teleport",
+        "process_died, hang. Traffic events may also count: red_light, wrong_way, off_route, not_moving (no motion "
+        "for 60 s, or for S seconds with not_moving:S), others_collided, hard_braking (or hard_braking:M/S² for "
+        "another limit), teleport",
         flag="--crash-on", group="what", metavar="KIND,…", separator=",",
     )  # fmt: skip
     disturb: Sequence[str] = option(
@@ -147,15 +150,15 @@ class TrialOptions(_Options):
         "ignore_priority, unseen, late_observation, noisy_observation, late_action or module:attribute. A fault at a "
         "given step of every trial: brake@124=ahead:4:2 (the vehicle ahead, 4 m/s², 2 s). none: no faults",
         unset="those of the scenario, if it has any",
-        brief="faults of other actors or of sensors, such as brake=0.02",
+        brief="faults to inject, with their rates per second, such as brake=0.02",
         flag="--disturb", group="faults", metavar="NAME=RATE,…", separator=",",
     )  # fmt: skip
     probe: str = option(
-        "", "interval at which copies of a trial search for the mildest disturbance that makes it crash, such as "
-            "``4s``",
+        "", "interval of simulation time, such as ``4s``, at which forks of a trial search for the mildest "
+        "disturbance that makes the trial crash",
         help="at this interval of simulation time, such as 4s, try disturbances in forks of the running trial, and "
-        "find the mildest disturbance with "
-        "which it crashes", unset="never", flag="--probe", group="faults", metavar="TIME",
+        "find the mildest disturbance with which the trial crashes",
+        unset="never", flag="--probe", group="faults", metavar="TIME",
         check=check_probe,
     )  # fmt: skip
     branch: bool = option(
@@ -165,14 +168,15 @@ class TrialOptions(_Options):
         flag="--branch", group="faults",
     )  # fmt: skip
     rare: bool = option(
-        False, "whether to estimate the rate of rare crashes from copies of trials with forced disturbances",
-        help="estimate how often rare crashes happen: one of five trials runs undisturbed, and its forks begin with "
-        "one forced disturbance each, weighted by its probability; needs --disturb with rates "
-        "and implies --keep-going",
+        False, "whether to estimate the rate of rare crashes, from forks of trials in which a disturbance is forced",
+        help="estimate the rate of rare crashes: one of five trials runs undisturbed and is forked; each fork is "
+        "forced to begin with one disturbance, and its result is weighted by the probability of this disturbance; "
+        "needs --disturb with rates and implies --keep-going",
         flag="--rare", group="faults",
     )  # fmt: skip
     splitting: bool = option(
-        False, "with ``rare``, whether copies of a trial differ by the noise of other drivers, and not by disturbances",
+        False, "with ``rare``, whether forks of a trial differ by the random numbers of SUMO's drivers, and not by "
+        "disturbances",
         help="with --rare: fork trials that come close to the vehicle ahead, each fork with other random numbers of "
         "SUMO's drivers; the same as --rare splitting; needs no --disturb",
         flag="--splitting", group="faults",
@@ -193,7 +197,7 @@ class RunOptions(_Options):
     duration: str = option(
         "", "time limit of the hunt: ``90s``, ``30m``, ``1h30m``; TRIALS may then be 0",
         help="start no trial after this time, such as 90s, 30m or 1h30m; TRIALS may then be 0 (no limit)",
-        unset="no time limit", brief="begin no trial after this time, such as 30m",
+        unset="no time limit", brief="start no trial after this time, such as 30m",
         flag="--for", group="search", metavar="TIME", check=check_duration,
     )  # fmt: skip
     keep_going: bool = option(
@@ -228,10 +232,10 @@ class RunOptions(_Options):
         flag="--keep", group="kept", metavar="N", check=at_least(0, zero="keep all"),
     )  # fmt: skip
     by_cause: int = option(
-        0, "with ``distinct`` or ``keep``, number of crashes of each type to judge, so that each cause counts; 0: "
-           "none",
-        help="--distinct counts causes instead of types, and --keep keeps crashes of each cause of a type. To find "
-        "the causes, up to N crashes of each type run again; 0: do not search for causes",
+        0, "with ``distinct`` or ``keep``: find the causes of up to this number of crashes of each type; the options "
+        "then apply to causes instead of types; 0: none",
+        help="find the causes of up to N crashes of each type, by running them again; --distinct then counts causes "
+        "instead of crash types, and --keep applies to each cause of a type; 0: do not search for causes",
         flag="--by-cause", group="search", metavar="N", check=at_least(0, zero="count types"),
     )  # fmt: skip
     only_at_fault: bool = option(
@@ -243,11 +247,13 @@ class RunOptions(_Options):
     until_error: str = option(
         "", "with ``rare``, largest ratio of half the interval's width to the estimate, such as ``0.3``: the hunt "
             "ends when it is reached",
-        help="with --rare: stop when half the width of the interval is at most this share of the estimate, such as "
-            "0.3", unset="all trials", flag="--until-error", group="faults", metavar="SHARE", check=check_share,
+        help="with --rare: stop when half the width of the confidence interval is at most this share of the estimated "
+        "crash rate, such as 0.3",
+        unset="all trials", flag="--until-error", group="faults", metavar="SHARE", check=check_share,
     )  # fmt: skip
     deterministic: bool = option(
-        False, "after a crash, wait for the running trials with lower numbers, so the same seed gives the same crash",
+        False, "after a crash, wait for the running trials with lower numbers, so that the same seed always finds the "
+        "same crash",
         flag="--deterministic", group="run",
     )  # fmt: skip
     timeout_s: float = option(
@@ -273,7 +279,8 @@ class RunOptions(_Options):
         flag="--recycle-after", group="run", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
     warm_copies: int = option(
-        8, "with ``seeds``, the number of warmed-up traffics of which each worker keeps a suspended fork; 0: none",
+        8, "with ``seeds``, the number of traffics for which each worker keeps a suspended process with the "
+        "simulation after its warm-up; 0: none",
         help="with --seeds: number of traffics whose warmed-up simulation each worker keeps in memory as a suspended "
         "process; 0: none",
         flag="--warm-copies", group="run", metavar="N", check=at_least(0, zero="none"),
@@ -312,16 +319,19 @@ class RunOptions(_Options):
             )
         if found.until_rate and (found.distinct or found.only_at_fault):
             other = "--distinct" if found.distinct else "--only-at-fault"
-            raise UsageError(f"--until-rate and {other} both end a hunt", fix=f"omit {other}")
+            message = f"--until-rate and {other} contradict each other: both decide when the hunt ends"
+            raise UsageError(message, fix=f"omit {other}")
         if found.keep and not (found.keep_going or found.distinct or found.only_at_fault or found.until_rate):
             message = f"--keep {found.keep} requires a hunt that continues after a crash"
             raise UsageError(message, fix="give --keep-going or --distinct as well")
         if found.by_cause and not (found.distinct or found.keep):
-            raise UsageError(f"--by-cause {found.by_cause} has no effect alone", fix="add --distinct or --keep")
+            message = f"--by-cause {found.by_cause} has no effect without --distinct or --keep"
+            raise UsageError(message, fix="add one of them")
         if found.by_cause and found.distinct and found.deterministic:
             message = "--deterministic and --by-cause contradict each other with --distinct"
             raise UsageError(
-                f"{message}: which crashes are analysed would depend on which trials end first", fix="omit one"
+                f"{message}: which crashes are analysed would depend on which trials end first",
+                fix="omit --deterministic or --by-cause",
             )
         return replace(found, keep_going=True) if found.distinct or found.until_rate else found
 
@@ -332,7 +342,7 @@ class SnapshotChoices(_Options):
 
     snapshot_roots: Sequence[str | Path] = option(
         (), "files and folders to add to the snapshot, in addition to the agents' projects",
-        help="a file or folder to add to the snapshot, in addition to the agent's project; may be repeated",
+        help="a file or folder that the snapshot contains in addition to the agent's project; may be repeated",
         flag="--snapshot-root", group="kept", metavar="PATH",
     )  # fmt: skip
     snapshot_limit_mb: float = option(

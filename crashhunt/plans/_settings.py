@@ -163,7 +163,7 @@ class HuntSettings(TrialOptions):
         return found
 
     def differences(self, other: HuntSettings) -> list[str]:
-        """Return a description of the differences between the trials of two hunts; how they run is ignored."""
+        """Return the differences between the settings that determine trials, as texts; ``[run]`` is ignored."""
         mine, theirs = _flat(asdict(self)), _flat(asdict(other))
         missing = "(not there)"
         return [
@@ -316,7 +316,7 @@ def executor_of(word: str) -> Callable[..., Any]:
 
 
 def executor_name(word: str) -> str:
-    """Return the registered name or ``module:attribute`` in the choice of an executor; no module is imported."""
+    """Return the executor's name or ``module:attribute`` without its argument ``:ARG``; no module is imported."""
     return _name_and_argument(word)[0]
 
 

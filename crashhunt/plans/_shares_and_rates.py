@@ -9,7 +9,7 @@ __all__ = ["RATE_PERS", "RatePer", "check_rate", "check_share", "rate_of", "shar
 
 
 def share_of(text: str) -> float:
-    """Return the share that a text such as ``30%`` or ``0.3`` means.
+    """Return the share in a text such as ``30%`` or ``0.3``, as a number from 0 to 1.
 
     >>> share_of("30%")
     0.3

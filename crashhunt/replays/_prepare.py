@@ -177,8 +177,8 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     if code == "log":
         if edits.all:
             raise UsageError(
-                f"recorded actions are valid only for the unchanged trial, but {edits.all[0]}",
-                fix="replay with --code snapshot",
+                f"the recorded actions cannot be repeated, because the trial was changed: {edits.all[0]}",
+                fix="run the agent's code in the changed trial, with --code snapshot",
             )
         if not trusted:
             refuse_side_effects(scenario, settings, spec.scenario_arguments)

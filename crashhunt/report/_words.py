@@ -263,7 +263,7 @@ def traffic_of(bundle: Bundle, likeliest: str) -> str:
 
 
 def by_likelihood(crashes: Sequence[Bundle]) -> list[Bundle]:
-    """Return crashes in order: first those in undisturbed traffic, unsorted, then the others, the likeliest first."""
+    """Return the undisturbed crashes in the given order, then the disturbed crashes, the most likely first."""
     return sorted(crashes, key=lambda bundle: (1, -_likelihood_words(bundle)) if bundle.result.disturbed else (0, 0.0))
 
 

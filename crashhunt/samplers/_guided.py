@@ -183,7 +183,13 @@ class KnownCrashes:
         return bool(len(self._radii))
 
     def cover(self, point: NDArray[np.float64], seed: int | None = None) -> bool:
-        """Return whether a point is near a known crash or in its basin, or a seed is the seed of a known crash."""
+        """Return whether a trial would likely repeat a known crash, because of its point or its seed.
+
+        Args:
+            point: arguments of the trial as a point in the unit cube. The point is covered if it is near a known crash,
+                or if criticality rises from it towards a known crash.
+            seed: seed of the trial, which is covered if a known crash has the same seed; None to ignore seeds.
+        """
         return seed in self._seeds or bool(self._covered(point[None])[0])
 
     def is_new(self, trial: ScoredTrial) -> bool:

@@ -447,7 +447,7 @@ class RunsForeignCode(Protocol):
 
 
 class RestoresState(Protocol):
-    """A simulator whose episodes change state outside the simulator object, such as class attributes of a library."""
+    """A simulator that can restore state outside of the simulator object, such as class attributes of a library."""
 
     def tidy(self) -> None:
         """Restore the state outside of the simulator as it was at first; called around every episode."""

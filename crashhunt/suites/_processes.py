@@ -89,7 +89,7 @@ class RunRequest:
         return {"request": asdict(self.request), "folder": self.folder, **asdict(self.snapshot)}
 
     def to_plain(self) -> object:
-        """Return the request as read from its file."""
+        """Return the request as the dictionaries, lists, texts and numbers that `json.load` reads from its file."""
         return json.loads(json.dumps(self.to_json(), default=str))
 
     @classmethod

@@ -83,7 +83,7 @@ def test_gate_ends_with_its_verdict(verdict, interrupted, code):
 def test_margin_is_a_share_or_percent():
     assert _gate._margin("0.02") == 0.02
     assert _gate._margin("2%") == 0.02
-    with pytest.raises(UsageError, match="--margin is two%"):
+    with pytest.raises(UsageError, match="--margin 'two%' is not a share"):
         _gate._margin("two%")
 
 
@@ -355,5 +355,5 @@ def test_table_of_trials_goes_to_its_file_or_to_the_output(monkeypatch, capsys, 
     assert capsys.readouterr() == ("number\n", f"{tmp_path / 't.csv'} has 7 trials\nt.parquet has 8 trials\n")
     with pytest.raises(UsageError, match="--format parquet cannot be printed on a terminal; give --out FILE"):
         run("trials", "h", "--format", "parquet")
-    with pytest.raises(UsageError, match="--outcome 'hangs' does not exist; did you mean 'hang'"):
+    with pytest.raises(UsageError, match="--outcome: there is no outcome 'hangs'; did you mean 'hang'"):
         run("trials", "nowhere", "--outcome", "hangs")

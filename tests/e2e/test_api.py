@@ -112,7 +112,7 @@ def test_mistakes_are_errors_of_ours(hunt):
         ({"agent": Local}, "is not in a module that workers can import"),
         ({"agent": "nothing:There"}, "cannot be imported"),
         ({"arguments": {"sped": 3}}, "did you mean"),
-        ({"crash_on": ["boom"]}, "'boom' is not a crash"),
+        ({"crash_on": ["boom"]}, "'boom' is not an outcome that can count as a crash"),
     ):
         with pytest.raises(CrashhuntError, match=message):
             crashhunt.run("x", 1, 1, 1, scenario="toy", **words)

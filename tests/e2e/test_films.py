@@ -177,8 +177,8 @@ def test_film_of_a_replay_that_is_killed_once_is_made(toy, number):
         (("--video", "a.mp4", "--size", "10x10"), "--size is 10"),
         (("--video", "a.mp4", "--fps", "-1"), "--fps is -1"),
         (("--video", "a.mp4", "--last-seconds", "nan"), "--last-seconds is nan"),
-        (("--video", "a.mp4", "--times", "3"), "--times 3: a film examines one run"),
-        (("--until", "5", "--times", "3"), "--times 3: --until examines one run"),
+        (("--video", "a.mp4", "--times", "3"), "a film examines one run, so it cannot be combined with --times 3"),
+        (("--until", "5", "--times", "3"), "--until examines one run, so it cannot be combined with --times 3"),
         (
             ("--video", "a.mp4", "--from-log", "--until", "5"),
             "--until cannot be used with --from-log, which simulates nothing",

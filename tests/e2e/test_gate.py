@@ -186,7 +186,10 @@ def test_crash_that_comes_back_in_the_corpus_of_head_is_worse_without_any_trial(
             "HEAD (drivers:Nobody): the hunt cannot run: 'drivers:Nobody': drivers has",
         ),
         (("drivers:Calm", "drivers:Wild", "--most", "0"), "--most is 0; give at least 1"),
-        (("drivers:Calm", "drivers:Wild", "--margin", "x"), "--margin is x; give a share from 0 to below 1"),
+        (
+            ("drivers:Calm", "drivers:Wild", "--margin", "x"),
+            "--margin 'x' is not a share; give a share from 0 to below 1",
+        ),
         (("drivers:Calm", "drivers:Wild", "--margin", "-1"), "--margin is -1; give a share from 0 to below 1"),
         (("drivers:Calm", "drivers:Wild", "--confidence", "3"), "--confidence is 3; give percent from 50"),
         (("drivers:Calm", "drivers:Wild", "--for", "soon"), "--for is soon; give a time above 0"),

@@ -230,7 +230,7 @@ def test_tables_of_trials(toy, made_once):
     assert [json.loads(line) for line in (toy.folder / "t.jsonl").read_text().splitlines()] == table
     for words, says in (
         (("--format", "parquet"), "cannot be printed on a terminal"),
-        (("--outcome", "boom"), "--outcome 'boom' does not exist"),
+        (("--outcome", "boom"), "--outcome: there is no outcome 'boom'"),
         (("--out", "no/where.csv"), "cannot be written"),
     ):
         assert says in toy.crashhunt("trials", "h", *words, expect=2).err

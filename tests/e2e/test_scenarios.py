@@ -198,7 +198,7 @@ def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     assert told["divergence"] is None
     assert crashhunt.replay(shell.folder / "h", scenario="motorway").verdict == told["verdict"]
     for more, says in (
-        ("--from-log", "recorded actions are valid only"),
+        ("--from-log", "recorded actions cannot be repeated"),
         ("--scenario=loop-two-agents", "2 controlled"),
         ("--frames=f", "a film applies to the scenario of the crash"),
         ("--until=3", "--until applies to the scenario of the crash"),

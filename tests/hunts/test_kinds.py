@@ -320,7 +320,7 @@ def test_software_faults_need_no_runs_for_their_cause():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"by_cause": 8}, "--by-cause 8 has no effect alone"),
+        ({"by_cause": 8}, "--by-cause 8 has no effect without --distinct or --keep"),
         ({"by_cause": 8, "distinct": 2, "deterministic": True}, "--deterministic and --by-cause"),
         ({"by_cause": -1}, "--by-cause is -1"),
     ],

@@ -38,8 +38,8 @@ def test_names_and_limits():
     [
         (["red-light"], "did you mean 'red_light'?"),
         (["redlight"], "did you mean 'red_light'?"),
-        (["survived"], "'survived' is not a crash"),
-        (["teleport:3"], "teleport has no limit; not_moving and hard_braking have one"),
+        (["survived"], "'survived' is not an outcome that can count as a crash"),
+        (["teleport:3"], "teleport has no limit; write teleport alone; only not_moving and hard_braking have a limit"),
         (["not_moving:"], "'' is not a limit; give s above 0, such as not_moving:30"),
         (["not_moving:0"], "'0' is not a limit"),
         (["hard_braking:nan"], "'nan' is not a limit; give m/s² above 0"),

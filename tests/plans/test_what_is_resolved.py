@@ -171,7 +171,10 @@ def test_what_an_agent_needs_has_to_be_given(folder):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"arguments": {"gap_m": "3"}}, "it is an argument of the scenario; write --set gap_m=SPEC"),
+        (
+            {"arguments": {"gap_m": "3"}},
+            "gap_m is an argument of the scenario, not of an agent; write --set gap_m=SPEC",
+        ),
         ({"arguments": {"spede": "3"}}, "did you mean 'speed'"),
         ({"arguments": {"ego.spede": "3"}}, "--arg ego.spede: drives:Agent"),
         ({"scenario_arguments": {"gap": "3"}}, "the scenario has no argument 'gap'"),

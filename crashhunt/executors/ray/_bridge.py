@@ -83,7 +83,8 @@ class Bridge:
 
     Args:
         control: the socket to the hunt.
-        job: the job of the bridge; see `RayExecutor`.
+        job: the settings of the bridge, such as the address of the cluster and the number of parallel trials; see
+            `BridgeJob`.
     """
 
     def __init__(self, control: socket.socket, job: BridgeJob) -> None:

@@ -99,7 +99,7 @@ class NodeScheduler:
 
     @property
     def capacity(self) -> int:
-        """The number of trials that run at a time on ready nodes."""
+        """The number of trials that the ready nodes can run at a time, in total."""
         return sum(node.slots for node in self.nodes.values() if node.ready)
 
     @property
