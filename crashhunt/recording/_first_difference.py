@@ -58,13 +58,22 @@ def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | N
     return None
 
 
+_STEPS_AROUND = 2  # steps to report before and after the first difference
+
+
 def values_around(
-    recorded: Recording, replayed: Recording, divergence: Divergence, *, reach: int
+    recorded: Recording, replayed: Recording, divergence: Divergence, *, reach: int = _STEPS_AROUND
 ) -> list[tuple[int, object, object]]:
     """Return (step, recorded value, replayed value) of the divergent field in the steps around the divergence.
 
     The result is empty if the divergence does not concern a single value. A value is None if a recording lacks the
     step.
+
+    Args:
+        recorded: recording of the trial.
+        replayed: recording of its replay.
+        divergence: the first difference of the two recordings.
+        reach: number of steps before and after the divergence.
     """
     if divergence.place is None:
         return []

@@ -34,8 +34,6 @@ __all__ = ["ReplayReport", "Verdict", "confirm", "judged", "replay", "up_to"]
 
 # Whether a replay is the same as what was recorded, and where it first is not.
 
-_STEPS_AROUND = 2  # steps to report before and after the first difference
-
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]
 
 
@@ -117,7 +115,7 @@ def judged(
     if divergence is None and whole:
         divergence = _end_divergence(rerun.bundle.result, result, rerun.code)
     verdict, reason = _judge(rerun, replayed, result, divergence, whole=whole)
-    around = tuple(values_around(recorded, replayed, divergence, reach=_STEPS_AROUND)) if divergence is not None else ()
+    around = tuple(values_around(recorded, replayed, divergence)) if divergence is not None else ()
     return ReplayReport(
         rerun=rerun,
         verdict=verdict,
