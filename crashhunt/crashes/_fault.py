@@ -51,6 +51,7 @@ _STEP_M = 1.0  # lateral distance from a car's side; a nearer person walks in it
 _OFF_M = 2.5  # lateral distance from a car's axis; a nearer person may be on the road
 _WALKING_SPEED_MPS = 3.0  # m/s; a slower vehicle can stop for any actor
 _CLEARS_S = 3.0
+_SOURCES = {"red_light": "Vienna, article 23; StVO § 37", "wrong_way": "Vienna, article 10; StVO § 2"}
 _RED_S = 8.0  # after a red light, a junction is left by then
 
 
@@ -98,7 +99,7 @@ def _red_light(case: ContactRecord) -> FaultFinding | None:
         return None
     blames = "both" if len(ran) == 2 else _name_of(case, *ran)
     return FaultFinding(
-        rule="red light", blames=blames, words=", and ".join(ran.values()), source="Vienna, article 23; StVO § 37"
+        rule="red light", blames=blames, words=", and ".join(ran.values()), source=_SOURCES["red_light"]
     )
 
 
@@ -110,7 +111,7 @@ def _wrong_way(case: ContactRecord) -> FaultFinding | None:
                 rule="wrong way",
                 blames=_name_of(case, event.agent),
                 words=event.what,
-                source="Vienna, article 10; StVO § 2",
+                source=_SOURCES["wrong_way"],
             )
     return None
 
@@ -369,6 +370,10 @@ def fault_of(bundle: Bundle, recording: Recording | None = None, record: Contact
                 ),
             ),
         )
+    event = result.event
+    if event is not None and event.kind in _SOURCES and result.steps * (result.step_length_s or math.inf) >= 1.0:
+        rule, source = event.kind.replace("_", " "), _SOURCES[event.kind]
+        return Fault("ego", (FaultFinding(rule=rule, blames="ego", words=event.what, source=source),))
     if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
         return Fault("nobody can tell")
     contact = record or contact_record(bundle, recording)

@@ -145,6 +145,7 @@ class Story:
             whose = "Its" if result.event is None else f"{self.agent}'s"
             decision = self._opaque_action(end) or _words(before, self._names())
             sentences.append(f"{whose} last decision was {decision}.")
+            sentences += self._about_fault() if self.fault.findings else []
         if self.danger is not None:
             words = about_danger(self.danger, touched=self.bundle.result.collision is not None and bool(self.other))
             sentences += [words] if words else []

@@ -279,6 +279,19 @@ def test_alone_it_is_the_agents_own(tmp_path):
     assert fault_of(Bundle(tmp_path, replace(failed, outcome=Outcome.HANG), 1, "abc")).verdict == "nobody can tell"
 
 
+@pytest.mark.parametrize(
+    ("kind", "steps", "expected"),
+    [("red_light", 40, "ego"), ("wrong_way", 40, "ego"), ("red_light", 9, "nobody can tell"),
+     ("off_route", 40, "nobody can tell"), ("hard_braking", 40, "nobody can tell")],
+)  # fmt: skip
+def test_an_event_that_breaks_a_rule_is_the_agents_own(tmp_path, kind, steps, expected):
+    event = Event(kind, "ego", "ego ran the red light 'c'")
+    result = TrialResult(
+        TrialSpec(1, 1, {"ego": {}}, {}, max_steps=99), Outcome(kind), steps, event=event, step_length_s=0.1
+    )
+    assert fault_of(Bundle(tmp_path, result, 1, "abc")).verdict == expected
+
+
 def crossing(speed):
     return lambda t: (0.0, -speed * t, math.pi / 2, speed)
 
