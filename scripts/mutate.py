@@ -49,28 +49,58 @@ _TESTS_ELSEWHERE = {
     "rates/_rare.py": ("rates/test_rare.py", "rates/test_splitting.py", "hunts/test_rare_hunts.py"),
     # These are tested as users run them: as commands.
     "cli/__init__.py": ("cli/test_answers.py", "e2e/test_commands.py"),
-    "cli/_bisect.py": ("e2e/test_bisect.py",),
-    "cli/_check.py": ("e2e/test_check.py",),
+    "cli/_bisect.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_bisect.py",
+    ),
+    "cli/_check.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_check.py",
+    ),
     "cli/_common.py": ("cli/test_common.py", "e2e/test_commands.py"),
-    "cli/_compare.py": ("e2e/test_manage.py",),
+    "cli/_compare.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_manage.py",
+    ),
     "cli/_completion.py": ("cli/test_completers.py", "e2e/test_completion.py"),
     "cli/_corpus.py": ("cli/test_answers.py", "e2e/test_corpus.py"),
-    "cli/_crashes.py": ("e2e/test_types_by_cause.py",),
+    "cli/_crashes.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_types_by_cause.py",
+    ),
     "cli/_dashboard.py": ("dashboard/test_command.py",),
     "cli/_exit_codes.py": ("cli/test_answers.py",),
-    "cli/_export.py": ("e2e/test_export.py",),
+    "cli/_export.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_export.py",
+    ),
     "cli/_gate.py": ("cli/test_answers.py", "e2e/test_gate.py"),
-    "cli/_guide.py": ("e2e/test_guide.py",),
+    "cli/_guide.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_guide.py",
+    ),
     "cli/_init.py": ("e2e/test_init.py",),
     "cli/_judge.py": ("cli/test_answers.py", "e2e/test_judging.py"),
     "cli/_list.py": ("e2e/test_listing.py",),
-    "cli/_logs.py": ("e2e/test_manage.py",),
+    "cli/_logs.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_manage.py",
+    ),
     "cli/_rate.py": ("cli/test_answers.py", "e2e/test_crash_rates.py"),
-    "cli/_replay.py": ("e2e/test_replay.py",),
+    "cli/_replay.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_replay.py",
+    ),
     "cli/_report.py": ("report/test_page.py",),
     "cli/_run.py": ("e2e/test_run_help.py", "e2e/test_commands.py", "e2e/test_stops.py"),
-    "cli/_show.py": ("e2e/test_show.py",),
-    "cli/_shrink.py": ("e2e/test_shrink.py",),
+    "cli/_show.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_show.py",
+    ),
+    "cli/_shrink.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_shrink.py",
+    ),
     "cli/_split.py": (
         "cli/test_answers.py",
         "training/test_held_out_traffics.py",
@@ -81,9 +111,16 @@ _TESTS_ELSEWHERE = {
         "cli/test_answers.py",
         "e2e/test_manage.py",
     ),
-    "cli/_trust.py": ("e2e/test_foreign_hunts.py",),
-    "cli/_whatif.py": ("e2e/test_what_if.py",),
-    "corpus": ("e2e/test_corpus.py",),
+    "cli/_trust.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_foreign_hunts.py",
+    ),
+    "cli/_whatif.py": (
+        "cli/test_answers_on_crashes.py",
+        "e2e/test_what_if.py",
+    ),
+    "corpus": ("corpus/test_*.py", "e2e/test_corpus.py"),
+    "corpus/_bisect.py": ("corpus/test_bisection.py", "e2e/test_bisect.py"),
     "crashes/_trust.py": ("crashes/test_trust.py", "e2e/test_foreign_hunts.py"),
     "envs": ("envs/test_*.py",),
     "episode/_action_override.py": (
