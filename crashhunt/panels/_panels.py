@@ -372,6 +372,7 @@ def _one_line(text: object) -> str:
 
 
 _TOP, _LEFT, _BOTTOM, _RIGHT = 20, 38, 18, 10  # room for title and labels, in pixels
+_NAME_ROW_PIXELS = 11  # height of a row of names below bars
 _LARGE_NAME_CHARACTERS = 12  # characters of a name that are written large
 _MAX_DRAWN_VALUE = 1e100  # beyond it, the difference of two numbers may overflow; drawn as missing
 
@@ -591,6 +592,9 @@ def _bars(canvas: Canvas, names: Sequence[str], values: NDArray[np.float64], low
     if not len(values):
         return
     room, top, bottom = (canvas.width - 16) / len(values), _TOP + 12, canvas.height - _BOTTOM
+    names = [_one_line(name) for name in names]
+    rows = 1 if all(font(10).getlength(name) <= room - 4 for name in names) else 2  # rows of names
+    bottom -= _NAME_ROW_PIXELS * (rows - 1)
     scale = (bottom - top) / span_of(low, high)
     zero = bottom - (min(max(0.0, low), high) - low) * scale
     for place, (name, value) in enumerate(zip(names, values.tolist(), strict=True)):
@@ -600,8 +604,22 @@ def _bars(canvas: Canvas, names: Sequence[str], values: NDArray[np.float64], low
             end = bottom - (min(max(value, low), high) - low) * scale
             canvas.draw.rectangle((left + room * 0.15, min(end, zero), left + room * 0.85, max(end, zero)), COLORS[0])
             canvas.text((middle, min(end, zero) - 2), number(value), INK, 10, anchor="mb")
-        canvas.text((middle, bottom + 3), name, FAINT, 10, anchor="mt")
+        limit = min(rows * room - 4, 2 * (middle - 3), 2 * (canvas.width - 3 - middle))
+        at = middle, bottom + 2 + _NAME_ROW_PIXELS * (place % rows)
+        canvas.text(at, _shortened(name, limit), FAINT, 10, anchor="ma")  # one line, whatever letters a name has
     canvas.draw.line((8, zero, canvas.width - 8, zero), FAINT)
+
+
+@lru_cache(maxsize=256)
+def _shortened(name: str, width: float) -> str:
+    """Return a name that is at most so many pixels wide; the middle is cut, as names often differ in their ends."""
+    if font(10).getlength(name) <= width:
+        return name
+    for kept in range(len(name) - 1, 1, -1):
+        text = f"{name[: kept // 2]}…{name[kept // 2 - kept :]}"
+        if font(10).getlength(text) <= width:
+            return text
+    return name[:1]
 
 
 def _matrix_of(values: ArrayLike) -> NDArray[np.float64]:
@@ -666,7 +684,7 @@ def _color_bar(canvas: Canvas, low: float, high: float) -> None:
 
 
 def _draw_legend(canvas: Canvas, place: int, name: str) -> None:
-    canvas.text((canvas.width - _RIGHT - 3, _TOP + 2 + 12 * place), name, COLORS[place % len(COLORS)], 10, anchor="rt")
+    canvas.text((canvas.width - _RIGHT - 3, _TOP + 1 + 12 * place), name, COLORS[place % len(COLORS)], 10, anchor="ra")
 
 
 def _name(names: Sequence[str], place: int) -> str:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
+    from PIL import ImageFont
 
     from crashhunt.recording import Recording
     from crashhunt.trial import Disturbance
@@ -28,6 +29,11 @@ _TRAIL_S = 4.0  # of where the agent has been
 _PERSON_PIXELS = 4  # radius at least; a person is 20 cm long
 _OVERSAMPLING = 2  # drawn so many times larger, for smooth edges
 _LEGEND_STEP_PIXELS = 22  # pixels
+_FULL_SIZE_PIXELS = 640, 360  # of a picture whose labels have their full size; those of a smaller one are smaller
+_MIN_FONT_PIXELS = 10  # what is smaller cannot be read
+_MIN_SHRINK = 0.3  # of the distances between labels
+_EDGE_PIXELS = 1  # of the letters in a small picture
+_MIN_LEGEND_PIXELS = 200, 120  # a picture that is smaller has room for one line of text
 
 
 class SceneView:
@@ -64,6 +70,9 @@ class SceneView:
         self._agent, self._other = agent, other
         self._agents = set(recording.agents)
         self._scale = scale
+        shrink = min(1.0, width / _FULL_SIZE_PIXELS[0], height / _FULL_SIZE_PIXELS[1])
+        self._shrink = max(_MIN_SHRINK, shrink)
+        self._has_legend = width >= _MIN_LEGEND_PIXELS[0] and height >= _MIN_LEGEND_PIXELS[1]
         self._crash_step, self._nearest_step = crash_step, nearest_step
         self._second = round(1.0 / recording.prologue.step_length_s)
         self._center = np.zeros(2)
@@ -180,27 +189,81 @@ class SceneView:
         return _AGENT if name in self._agents else _OTHER
 
     def _label(self, draw: ImageDraw.ImageDraw, scene: Scene, step: int, row: int | None) -> None:
-        speed = f"{scene.speeds[row]:.1f} m/s" if row is not None else "gone" if self._recording.actors else ""
-        draw.text((12, 10), f"{scene.time_s:.1f} s   step {step}   {self._agent} {speed}", INK, font(15))
-        names = [(self._agent, _EGO), (self._other, _CRASH)]
-        names += [(name, _AGENT) for name in sorted(self._agents - {self._agent, self._other})]
-        for place, (name, color) in enumerate((name, color) for name, color in names if name):
-            top = 36 + _LEGEND_STEP_PIXELS * place
-            draw.rectangle((13, top + 3, 25, top + 15), fill=color)
-            draw.text((32, top), name, INK, font(13))
-        for place, one in enumerate(self._active_disturbances(step)):
-            top = 40 + _LEGEND_STEP_PIXELS * (len([name for name, _ in names if name]) + place)
-            draw.text((12, top), one.words.replace("²", "^2"), _DISTURBANCE_COLOR, font(13))  # the font has no ²
-        if mark := self._marked(step):
-            draw.text((self.width / 2, 14), mark, _CRASH, font(26), anchor="ma")
+        margin = self._pixels(12)
+        self._headline(draw, scene, step, row)
+        if self._has_legend:
+            self._legend(draw, step)
         if not self._recording.actors:
             middle = self.width / 2, self.height / 2
-            draw.text(middle, "this simulator shows no scene", FAINT, font(15), anchor="mm")
+            self._write(draw, middle, "this simulator shows no scene", FAINT, 15, anchor="mm")
             return
-        meters = next((length for length in (5, 10, 20, 50, 100) if length * self._scale > 60), 200)
-        bottom = self.height - 12
-        draw.line((14, bottom, 14 + meters * self._scale, bottom), FAINT, 2)
-        draw.text((14, bottom - 6), f"{meters} m", FAINT, font(12), anchor="ls")
+        wanted = 60 * self._shrink
+        meters = next((length for length in (5, 10, 20, 50, 100) if length * self._scale > wanted), 200)
+        left, bottom = margin + self._pixels(2), self.height - margin
+        draw.line((left, bottom, left + meters * self._scale, bottom), FAINT, 2)
+        self._write(draw, (left, bottom - self._pixels(6)), f"{meters} m", FAINT, 12, anchor="ls")
+
+    def _headline(self, draw: ImageDraw.ImageDraw, scene: Scene, step: int, row: int | None) -> None:
+        """Write time, step and speed, and the text of a marked step: as much of the former as there is room for."""
+        margin, top = self._pixels(12), self._pixels(10)
+        speed = f"{scene.speeds[row]:.1f} m/s" if row is not None else "gone" if self._recording.actors else ""
+        parts = [f"{scene.time_s:.1f} s", f"step {step}", f"{self._agent} {speed}"]
+        mark, large, plain = self._marked(step), self._font(26), self._font(15)
+        room = float(self.width - 2 * margin)
+        if mark:
+            room -= large.getlength(mark) + margin
+        while parts and plain.getlength("   ".join(parts)) > room:
+            parts.pop()
+        words = "   ".join(parts)
+        self._write(draw, (margin, top), words, INK, 15)
+        if mark:
+            half = large.getlength(mark) / 2
+            overlaps = bool(words) and margin + plain.getlength(words) + margin > self.width / 2 - half
+            middle = self.width - margin - half if overlaps else self.width / 2
+            self._write(draw, (middle, self._pixels(14)), mark, _CRASH, 26, anchor="ma")
+
+    def _legend(self, draw: ImageDraw.ImageDraw, step: int) -> None:
+        """Write the names of vehicles with their colours, and active disturbances, down to the scale of the picture."""
+        names = [(self._agent, _EGO), (self._other, _CRASH)]
+        names += [(name, _AGENT) for name in sorted(self._agents - {self._agent, self._other})]
+        names = [(name, color) for name, color in names if name]
+        margin = self._pixels(12)
+        row = max(_MIN_FONT_PIXELS + 3, self._pixels(_LEGEND_STEP_PIXELS))
+        first = max(self._pixels(36), self._pixels(10) + _MIN_FONT_PIXELS + 5)
+        side, lowest = max(7, self._pixels(12)), self.height - max(30, self._pixels(56))
+        for place, (name, color) in enumerate(names):
+            top = first + row * place
+            if top > lowest:
+                return
+            square = margin + 1, top + self._pixels(3)
+            draw.rectangle((*square, square[0] + side, square[1] + side), fill=color)
+            self._write(draw, (margin + side + max(4, self._pixels(8)), top), name, INK, 13)
+        for place, one in enumerate(self._active_disturbances(step)):
+            top = first + self._pixels(4) + row * (len(names) + place)
+            if top > lowest:
+                return
+            words = one.words.replace("²", "^2")  # the font has no ²
+            self._write(draw, (margin, top), words, _DISTURBANCE_COLOR, 13)
+
+    def _write(
+        self,
+        draw: ImageDraw.ImageDraw,
+        at: tuple[float, float],
+        text: str,
+        color: tuple[int, int, int],
+        size: int,
+        anchor: str = "la",
+    ) -> None:
+        """Write one line; in a small picture, it has an edge, since it may lie on vehicles."""
+        edge = _EDGE_PIXELS if self._shrink < 1.0 else 0
+        draw.text(at, text, color, self._font(size), anchor=anchor, stroke_width=edge, stroke_fill=_SKY)
+
+    def _pixels(self, full: float) -> int:
+        """Return a distance in pixels from that in a picture of full size."""
+        return round(full * self._shrink)
+
+    def _font(self, full: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+        return font(max(_MIN_FONT_PIXELS, round(full * self._shrink)))
 
 
 def _box(right: NDArray[np.float64], left: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

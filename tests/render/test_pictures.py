@@ -42,6 +42,8 @@ PANELS = {
     "box": Action([0.5, -20.0, 3.0], low=[-1.0, -5.0, 2.0], high=[1.0, 5.0, 6.0], names=("steer", "brake")),
     "unit box": Action([0.25, -0.5]),
     "probabilities": ActionDistribution([0.2, 0.7, 0.1], names=("LEFT", "IDLE")),
+    "long names": ActionDistribution([0.2, 0.4, 0.1, 0.3], names=("LANE_LEFT_OR_IDLE", "IDLE", "LANE_RIGHT", "gap")),
+    "many names": Bar({f"gap to {place}": place - 4.5 for place in range(12)}),
     "normal": ActionDistribution(mean=[0.0, 2.0], std=[1.0, 0.5], names=("steer", "brake")),
     "picture beyond black and white": Picture([[-2.0, 0.0, 0.25, np.nan], [0.5, 1.0, 1.5, np.inf]]),
     "wide picture": Picture(np.linspace(0, 1, 200).reshape(10, 20)),

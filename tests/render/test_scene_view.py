@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from types import SimpleNamespace
 
@@ -106,8 +107,9 @@ def test_the_trail_shows_where_the_agent_was_in_the_last_4_seconds():
 
 @pytest.mark.parametrize(("scale", "meters"), [(8.0, 10), (2.0, 50), (20.0, 5), (0.5, 200)])
 def test_the_scale_is_a_line_of_a_round_length(scale, meters):
-    picture = view(recording({"ego": (0.0, 0.0, 0.0, 0.0)}, actors=[CAR]), scale=scale).draw(0)
-    row = (np.abs(picture[HEIGHT - 12].astype(int) - (93, 107, 125)).max(axis=1) < 3).nonzero()[0]
+    found = recording({"ego": (0.0, 0.0, 0.0, 0.0)}, actors=[CAR])
+    picture = view(found, scale=scale, width=640, height=360).draw(0)
+    row = (np.abs(picture[360 - 12].astype(int) - (93, 107, 125)).max(axis=1) < 3).nonzero()[0]
     assert (row.min(), row.max()) == (14, pytest.approx(14 + meters * scale, abs=1))
 
 
@@ -123,7 +125,7 @@ def test_lanes_in_sight_are_drawn_between_their_borders():
     assert tuple(with_lanes[150 + 28, 300]) == (228, 232, 237)
 
 
-TOP, BELOW = slice(8, 44), slice(55, 110)
+TOP, BELOW = slice(44), slice(55, 110)
 
 
 def test_a_crash_is_marked_in_its_step_and_a_near_miss_for_a_second():
@@ -132,14 +134,34 @@ def test_a_crash_is_marked_in_its_step_and_a_near_miss_for_a_second():
 
     def marked(**more):
         pictures = view(found, width=200, height=160, **more)
-        shown = [pictures.draw(step) == CRASH for step in range(14)]
-        words, ring = ([step for step in range(14) if shown[step][part].all(axis=2).any()] for part in (TOP, BELOW))
+        apart = [np.abs(pictures.draw(step).astype(int) - CRASH).max(axis=2) for step in range(14)]
+        words = [step for step in range(14) if (apart[step][TOP] < 60).any()]  # small letters are blurred
+        ring = [step for step in range(14) if (apart[step][BELOW] == 0).any()]
         assert words == ring
         return words
 
     assert marked() == []
     assert marked(crash_step=7) == [7]
     assert marked(nearest_step=5) == [5, 6, 7, 8, 9]
+
+
+@pytest.mark.parametrize("size", [(64, 64), (100, 80), (160, 90), (240, 135), (320, 200), (480, 270), (960, 540)])
+def test_texts_of_a_crash_stand_apart_and_within_a_picture_of_any_size(monkeypatch, size):
+    boxes = []
+
+    def text(self, at, words, color, letters, anchor, **_):
+        boxes.append(self.textbbox(at, words, letters, anchor))
+
+    monkeypatch.setattr("PIL.ImageDraw.ImageDraw.text", text)
+    found = recording(*[{"ego": (2.5, 0.0, 0.0, 0.0), "other": (30.0, 0.0, 0.0, 0.0)}] * 8, actors=[CAR, TRUCK])
+    view(found, width=size[0], height=size[1], other="other", crash_step=7).draw(7)
+    assert len(boxes) >= 2  # the mark and the scale
+    boxes = [box for box in boxes if box[2] > box[0]]
+    for left, top, right, bottom in boxes:
+        assert 0 <= left < right <= size[0]
+        assert 0 <= top < bottom <= size[1]
+    for one, other in itertools.combinations(boxes, 2):
+        assert one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
 
 
 # The panels of every film.
