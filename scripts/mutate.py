@@ -134,23 +134,46 @@ _TESTS_ELSEWHERE = {
     "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),
     "estimation/_hunt_pairs.py": ("e2e/test_gate.py",),
     # Processes of trials are seen by what is left of trials that harm them.
-    "executors/_fork_server.py": ("executors/test_lost_processes.py", "executors/test_warm_traffics.py"),
-    "executors/_fresh.py": ("executors/test_last_words.py", "executors/test_harm.py"),
-    "executors/_pool.py": ("executors/test_pool_of_trials.py", "executors/test_lost_processes.py"),
+    "executors/_fork_server.py": (
+        "executors/test_lost_processes.py",
+        "executors/test_warm_traffics.py",
+        "executors/test_zygotes.py",
+    ),
+    "executors/_fresh.py": (
+        "executors/test_harm.py",
+        "executors/test_last_words.py",
+        "executors/test_new_processes.py",
+        "executors/test_shared_executors.py",
+    ),
+    "executors/_pool.py": (
+        "executors/test_lost_processes.py",
+        "executors/test_new_processes.py",
+        "executors/test_pool_of_trials.py",
+    ),
     "executors/_postmortem.py": ("executors/test_evidence.py", "executors/test_what_is_left.py"),
-    "executors/_protocol.py": ("executors/test_what_is_left.py", "executors/test_pool_of_trials.py"),
+    "executors/_protocol.py": (
+        "executors/test_new_processes.py",
+        "executors/test_pool_of_trials.py",
+        "executors/test_what_is_left.py",
+    ),
     "executors/_supervisor.py": (
         "executors/test_escapes_of_trials.py",
         "executors/test_killed_trials.py",
         "executors/test_maps_of_trials.py",
+        "executors/test_supervisors.py",
         "executors/test_warm_traffics.py",
     ),
-    "executors/_time_limits.py": ("executors/test_last_words.py", "executors/test_what_is_left.py"),
+    "executors/_time_limits.py": (
+        "executors/test_last_words.py",
+        "executors/test_what_is_left.py",
+        "executors/test_zygotes.py",
+    ),
     "executors/_trial_process.py": ("executors/test_harm.py", "executors/test_warm_traffics.py"),
     "executors/_zygote.py": (
         "executors/test_harm.py",
         "executors/test_warm_traffics.py",
         "executors/test_what_is_left.py",
+        "executors/test_zygotes.py",
     ),
     "executors/ray": ("executors/test_ray_address.py", "executors/test_ray_bridge.py", "executors/test_ray_store.py"),
     # What a hunt does is seen by whole hunts.

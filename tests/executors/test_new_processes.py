@@ -1,0 +1,505 @@
+"""Trials in new Python processes, all trials of one caller, and the answers of a pool: no process is started."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.episode import WorkerSettings, answer_file, scratch_of
+from crashhunt.executors import PoolExecutor, _fresh, _pool, _protocol
+from crashhunt.executors._fresh import FreshProcessExecutor
+from crashhunt.executors._postmortem import TrialAttempt
+from crashhunt.executors._protocol import run_trials
+from crashhunt.executors._supervisor import EndedTrial, LostTrialError, UnfitZygoteError
+from crashhunt.executors._time_limits import ImportKilledError
+from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.trial import Escape, Outcome, TrialResult, TrialSpec
+
+KILL = -signal.SIGKILL
+
+
+def spec(number):
+    return TrialSpec(number, 7, {"ego": {}}, {}, 12)
+
+
+def survived(number):
+    return TrialResult(spec(number), Outcome.SURVIVED, steps=12)
+
+
+@pytest.fixture
+def settings(tmp_path):
+    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
+    return WorkerSettings(scenario=scenario, oracles=(), crash_on=(), scratch=tmp_path, timeout_s=9.0)
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """The processes that were started; each runs until `code` is set."""
+    found = []
+
+    class Kept:
+        def __init__(self, module, words, *, environment, stdin, stdout, stderr):
+            self.job = json.loads(stdin.read())
+            self.words, self.code, self.ended, self.pid = words, None, 0, 4321
+            self.process = self
+            stderr.write(b"first\nlast words\n" if module == "crashhunt.executors._fresh" else b"")
+            found.append(self)
+
+        def poll(self):
+            return self.code
+
+        def end(self):
+            self.ended += 1
+
+        def answers(self, content, code=0):
+            with open(self.job["answer"], "w") as file:
+                json.dump(content, file)
+            self.code = code
+
+    monkeypatch.setattr(_fresh, "Kept", Kept)
+    monkeypatch.setattr(_fresh, "_LOOK_EVERY_S", 0.001)
+    return found
+
+
+def numbers(started):
+    return [kept.job["spec"]["number"] for kept in started]
+
+
+def test_as_many_new_processes_run_as_asked(settings, started):
+    executor = FreshProcessExecutor(settings, parallel=2)
+    assert executor.capacity == 2
+    stale = answer_file(settings.scratch, 0)
+    stale.write_text("stale")
+    for number in range(4):
+        executor.submit(spec(number))
+    assert numbers(started) == [0, 1]
+    assert not stale.exists()
+    assert started[0].job["settings"] == settings.to_json()
+    assert list(executor.completed(0.01)) == []
+    started[1].answers({"result": survived(1).to_json()})
+    assert list(executor.completed(5)) == [survived(1)]
+    assert (numbers(started), started[1].ended) == ([0, 1, 2], 1)
+    names = {path.name for path in settings.scratch.iterdir()}
+    assert {layout.numbered(0, layout.JOB), "start-000000.log"} <= names
+    assert not {layout.numbered(1, layout.JOB), "start-000001.log", answer_file(settings.scratch, 1).name} & names
+    executor.cancel(above=0)
+    assert [kept.ended for kept in started] == [0, 1, 1]
+    started[0].answers({"result": survived(0).to_json()})
+    assert list(executor.completed(5)) == [survived(0)]
+    executor.submit(spec(5))
+    executor.close()
+    assert started[-1].ended == 1
+    assert list(executor.completed(0)) == []
+    assert executor.notes() == []
+
+
+def test_trial_that_was_killed_runs_again_and_alone(settings, started):
+    executor = FreshProcessExecutor(settings, parallel=3)
+    for number in range(3):
+        executor.submit(spec(number))
+    started[1].answers({"lost": -signal.SIGTERM})
+    assert list(executor.completed(0)) == []
+    assert numbers(started) == [0, 1, 2]  # it waits for the others
+    started[0].answers({"result": survived(0).to_json()})
+    started[2].code = KILL
+    assert list(executor.completed(0)) == [survived(0)]
+    assert numbers(started) == [0, 1, 2, 2]
+    executor.submit(spec(4))
+    assert numbers(started) == [0, 1, 2, 2]  # it runs alone
+    started[3].answers({"result": survived(2).to_json()})
+    assert list(executor.completed(0)) == [survived(2)]
+    assert numbers(started) == [0, 1, 2, 2, 1]
+    assert executor.notes() == [
+        "trial 1 was ended by SIGTERM from outside, and is run again",
+        "trial 2 was ended by SIGKILL from outside, and is run again",
+    ]
+    executor.close()
+
+
+def test_process_that_cannot_start_or_fails_is_an_error(settings, started):
+    executor = FreshProcessExecutor(settings)
+    executor.submit(spec(0))
+    started[0].code = 1
+    with pytest.raises(CrashhuntError, match="the process of trial 0 could not start: last words") as caught:
+        list(executor.completed(0))
+    assert caught.value.where.endswith("start-000000.log")
+    executor.submit(spec(1))
+    started[1].answers(CrashhuntError("no map", fix="draw one").to_json())
+    with pytest.raises(CrashhuntError, match="no map"):
+        list(executor.completed(0))
+    executor.submit(spec(2))
+    started[2].code = 0
+    (died,) = executor.completed(0)
+    assert died.failure.message == "the process exited with 0 while the episode was being set up"
+    executor.submit(spec(3))
+    for _ in range(3):
+        started[-1].answers({"lost": KILL, "importing": "the module planner"})
+        if len(started) == 6:
+            break
+        assert list(executor.completed(0)) == []
+    with pytest.raises(
+        CrashhuntError, match="the module planner: its process was killed by SIGKILL meanwhile, 3 times"
+    ):
+        list(executor.completed(0))
+
+
+def test_process_that_hangs_is_ended(settings, started, monkeypatch):
+    asked = []
+    header = SimpleNamespace(pid=55, step=3)
+    monkeypatch.setattr(_fresh, "where_it_is", lambda scratch, number: header)
+    monkeypatch.setattr(_fresh, "children_of", lambda pid: [55] if pid == 4321 else [])
+    monkeypatch.setattr(_fresh, "hung", lambda *given: given)
+    monkeypatch.setattr(_fresh, "has_hung", lambda found, **given: asked.append((found, given)) or given["limit_s"] < 0)
+    executor = FreshProcessExecutor(settings)
+    executor.submit(spec(0))
+    assert executor.where() == {0: header}
+    ((found, given),) = asked if list(executor.completed(0)) == [] else ()
+    assert found is header
+    assert (given["begun"], given["limit_s"]) == (False, 9 + _fresh.START_UP_S)  # its supervisor has begun it
+    header.pid = 56
+    answer_file(settings.scratch, 0).write_text("{")
+    list(executor.completed(0))
+    assert (asked[-1][1]["begun"], asked[-1][1]["limit_s"]) == (True, 60 + 2 * 9)
+    answer_file(settings.scratch, 0).unlink()
+    stack = scratch_of(settings.scratch, 0) / layout.STACK
+    assert not asked[-1][1]["has_words"]()
+    stack.parent.mkdir(parents=True)
+    stack.write_text("")
+    assert not asked[-1][1]["has_words"]()
+    stack.write_text("File")
+    assert asked[-1][1]["has_words"]()
+    monkeypatch.setattr(_fresh, "has_hung", lambda found, **given: True)
+    assert list(executor.completed(0)) == []
+    assert started[0].ended == 1
+    started[0].code = KILL
+    assert list(executor.completed(0)) == [(spec(0), settings.scratch, 9.0)]
+
+
+def test_search_for_an_escape_that_was_killed_is_done_again(settings, started):
+    executor = FreshProcessExecutor(replace(settings, find_escapes=True))
+    executor.submit(spec(0))
+    for count in range(3):
+        started[count].answers({"result": survived(0).to_json()}, KILL)
+        found = list(executor.completed(0))
+        if found:
+            break
+    assert executor.notes() == ["trial 0 was ended by SIGKILL from outside, and is run again"]
+    why = "the process that searched was killed by SIGKILL, 3 times"
+    assert (numbers(started), found) == ([0, 0, 0], [replace(survived(0), why_no_escape=why)])
+    escaped = replace(survived(1), escape=Escape(why_not="it was too late"))
+    executor.submit(spec(1))
+    started[-1].answers({"result": escaped.to_json()}, 0)
+    assert list(executor.completed(0)) == [escaped]
+    plain = FreshProcessExecutor(settings)
+    plain.submit(spec(2))
+    started[-1].answers({"result": survived(2).to_json()}, KILL)
+    assert list(plain.completed(0)) == [survived(2)]
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_new_process_answers_before_it_searches_for_an_escape(settings, monkeypatch, late):
+    forked, answers, sealed = [], [], []
+    escaped = replace(survived(0), escape=Escape(why_not="it was too late"))
+
+    def run(given):
+        assert given == spec(0)
+        if late and len(forked) == 1:
+            raise UnfitZygoteError
+        return EndedTrial(survived(0))
+
+    def fork(given, *, late=False):
+        forked.append(late)
+        return "zygote"
+
+    monkeypatch.setattr(_fresh, "require_origin", lambda name, code: sealed.append((name, code)))
+    monkeypatch.setattr(_fresh, "seal", lambda given: sealed.append(given.scratch == settings.scratch))
+    monkeypatch.setattr(_fresh, "fork_zygote", fork)
+    monkeypatch.setattr(_fresh, "Supervisor", lambda given, zygote: SimpleNamespace(run=run, zygote=zygote))
+    monkeypatch.setattr(_fresh, "with_escape", lambda supervisor, given, ended: escaped)
+    job = {"settings": settings.to_json(), "spec": spec(0).to_json()}
+    assert _fresh._run(job, answers.append) == 0
+    assert answers == [{"result": survived(0).to_json()}, {"result": escaped.to_json()}]
+    assert (forked, sealed) == ([False, True][: 1 + late], [("crashhunt", ()), True])
+    monkeypatch.setattr(_fresh, "with_escape", lambda supervisor, given, ended: ended.result)
+    _fresh._run(job, answers.append)
+    assert len(answers) == 3
+    for error, said in (
+        (LostTrialError(-15), {"lost": -15}),
+        (ImportKilledError(-9, "a module"), {"lost": -9, "importing": "a module"}),
+        (CrashhuntError("no map", fix="x"), CrashhuntError("no map", fix="x").to_json()),
+    ):
+
+        def fails(given, failure=error, **_):
+            raise failure
+
+        monkeypatch.setattr(_fresh, "fork_zygote", fails)
+        assert _fresh._run(job, answers.append) == 0
+        assert answers[-1] == said
+
+
+def test_new_process_writes_its_answer_at_once_and_exits(monkeypatch, tmp_path):
+    class Left(BaseException):
+        pass
+
+    def leave(code):
+        raise Left(code)
+
+    def run(job, answer):
+        assert json.loads(path.read_text()) == job
+        answer({"lost": -9})
+        assert not (tmp_path / "answer.part").exists()
+        return 0
+
+    signals = []
+    path = tmp_path / "job"
+    path.write_text(json.dumps({"answer": str(tmp_path / "answer")}))
+    monkeypatch.setattr(_fresh.sys, "argv", ["it", str(path)])
+    monkeypatch.setattr(_fresh.signal, "signal", lambda *given: signals.append(given))
+    monkeypatch.setattr(os, "_exit", leave)
+    monkeypatch.setattr(_fresh, "_run", run)
+    with pytest.raises(Left, match="0"):
+        _fresh.main()
+    assert json.loads((tmp_path / "answer").read_text()) == {"lost": -9}
+    assert signals == [(signal.SIGINT, signal.SIG_DFL)]
+    monkeypatch.setattr(_fresh, "_run", None)  # it fails
+    with pytest.raises(Left, match="1"):
+        _fresh.main()
+
+
+class Executor:
+    """Each call of `completed` yields the next of `ends`."""
+
+    def __init__(self, *ends):
+        self.ends, self.submitted, self.cancelled, self.timeouts = list(ends), [], [], []
+
+    def submit(self, given):
+        self.submitted.append(given.number)
+
+    def completed(self, timeout_s):
+        self.timeouts.append(timeout_s)
+        yield from map(survived, self.ends.pop(0))
+
+    def cancel(self, *, above=-1):
+        self.cancelled.append(above)
+
+
+def test_trials_of_one_caller_end_in_any_order():
+    executor = Executor([], [6, 99], [5, 7])
+    found = list(run_trials(executor, [spec(number) for number in (5, 6, 7)], check_every_s=3.0))
+    assert found == [(1, survived(6)), (0, survived(5)), (2, survived(7))]
+    assert (executor.submitted, executor.cancelled, executor.timeouts) == ([5, 6, 7], [], [3.0] * 3)
+
+
+def test_trials_that_are_not_needed_or_not_awaited_are_cancelled():
+    executor = Executor([6], [8, 7, 5])
+    needed = lambda index: index < 2  # noqa: E731
+    found = list(run_trials(executor, [spec(number) for number in (5, 6, 7, 8)], needed=needed))
+    assert [index for index, _ in found] == [1, 0]
+    assert executor.cancelled == [6]
+    executor = Executor([6], [5])
+    runs = run_trials(executor, [spec(5), spec(6)])
+    next(runs)
+    runs.close()
+    assert executor.cancelled == [-1]
+    stops = iter([False, True])
+    executor = Executor([5])
+    assert len(list(run_trials(executor, [spec(5), spec(6)], stopped=lambda: next(stops)))) == 1
+    assert executor.cancelled == [-1]
+
+
+def test_one_trial_that_is_run_alone_ends_with_its_executor(settings, monkeypatch):
+    closed, made = [], []
+
+    def make(given):
+        made.append(given)
+        executor = Executor([3])
+        executor.close = lambda: closed.append(True)
+        return executor
+
+    monkeypatch.setattr(_fresh, "FreshProcessExecutor", make)
+    assert _fresh.run_alone(settings, spec(3)) == survived(3)
+    assert _fresh.run_alone(settings, spec(3), lambda: True) is None
+    assert (closed, made) == ([True, True], [settings, settings])
+
+
+def test_code_of_a_snapshot_is_compiled_outside_of_it_and_few_are_kept(settings, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", "/mine")
+    plain = _protocol.snapshot_environment(settings)
+    assert plain["PYTHONPATH"] == "/mine"
+    assert plain["PYTHONHASHSEED"] == "0"
+    assert {plain[f"{name}_NUM_THREADS"] for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")} == {"1"}
+    compiled = tmp_path / "crashhunt/compiled"
+    for number in range(20):
+        (compiled / f"{number}").mkdir(parents=True)
+        os.utime(compiled / f"{number}", (number, number))
+    ours = replace(settings, code=("/hunt/snapshots/abc/snapshots/0f/code", "/more"))
+    found = _protocol.snapshot_environment(ours)
+    assert found["PYTHONPATH"] == os.pathsep.join((*ours.code, "/mine"))
+    assert found["PYTHONPYCACHEPREFIX"] == str(compiled / "0f")
+    assert found["PYTHONDONTWRITEBYTECODE"] == ""
+    assert {path.name for path in compiled.iterdir()} == {"0f", *(str(number) for number in range(5, 20))}
+    for other in (replace(ours, code=("/elsewhere/code",)), replace(ours, sealed=())):
+        found = _protocol.snapshot_environment(other)
+        assert found["PYTHONDONTWRITEBYTECODE"] == "1"
+        assert found.get("PYTHONPYCACHEPREFIX") == os.environ.get("PYTHONPYCACHEPREFIX")
+
+
+def test_crashhunt_of_a_snapshot_may_have_no_fork_server(settings, monkeypatch, tmp_path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    (old / "crashhunt").mkdir(parents=True)
+    (new / "crashhunt/executors").mkdir(parents=True)
+    (new / "crashhunt/executors/_fork_server.py").touch()
+    made = []
+    monkeypatch.setattr(_fresh, "PoolExecutor", lambda *given, **more: made.append(("pool", more)))
+    monkeypatch.setattr(_fresh, "FreshProcessExecutor", lambda *given, **more: made.append(("fresh", more)))
+    for code in ((), (str(tmp_path),), (str(new),), (str(tmp_path), str(old))):
+        _fresh.snapshot_executor(replace(settings, code=code), parallel=3)
+    pool = ("pool", {"parallel": 3, "snapshot": True})
+    assert made == [pool, pool, pool, ("fresh", {"parallel": 3})]
+
+
+@pytest.fixture
+def pool(settings):
+    executor = PoolExecutor(settings, parallel=2)
+    yield executor
+    executor.close()
+
+
+@pytest.fixture
+def worker(pool):
+    """A supervisor of a pool; `end` is its end of the connection."""
+    pool._link = SimpleNamespace(
+        fork=lambda slot, theirs: forked.append((slot, os.dup(theirs.fileno()))), deaths=2, end=lambda: None, killed=[]
+    )
+    pool._link.kill = pool._link.killed.append
+    forked = []
+    found = pool._start_worker(pool._link)
+    ((slot, descriptor),) = forked
+    assert found.slot == slot
+    end = socket.socket(fileno=descriptor)
+    end.setblocking(False)
+    pool._send_trial(found, TrialAttempt(spec(3)))
+    assert json.loads(end.recv(1 << 16)) == spec(3).to_json()
+    assert not found.socket.getblocking()
+    found_end = SimpleNamespace(worker=found, end=end)
+    with end:
+        yield found_end
+
+
+def test_answer_of_a_supervisor_is_put_together_and_counts(pool, worker):
+    text = json.dumps({"result": survived(3).to_json(), "notices": ["a"], "retires": False}).encode() + b"\n"
+    worker.end.sendall(text[:20])
+    pool._read_messages(worker.worker)
+    assert list(pool.completed(0)) == []
+    worker.end.sendall(text[20:] + text)
+    pool._read_messages(worker.worker)
+    assert list(pool.completed(0)) == [survived(3)]  # the second answers no trial
+    assert (pool.notes(), pool._link.deaths) == (["a"], 0)
+    assert not worker.worker.retired
+    pool._read_messages(worker.worker)  # nothing
+    pool._send_trial(worker.worker, TrialAttempt(spec(4)))
+    worker.end.recv(1 << 16)
+    worker.end.sendall(text.replace(b'"retires": false', b'"retires": true'))
+    pool._read_messages(worker.worker)
+    assert worker.worker.retired
+    assert worker.end.recv(10) == b""  # it is told to end
+
+
+def test_trial_that_a_supervisor_lost_runs_again(pool, worker):
+    worker.end.sendall(b'{"lost": -15}\n')
+    pool._read_messages(worker.worker)
+    assert [attempt.spec.number for attempt in pool._waiting] == [3]
+    assert worker.worker.retired
+    assert pool.notes() == ["trial 3 was ended by SIGTERM from outside, and is run again"]
+    for _ in range(2):
+        pool._end_attempt(pool._waiting.popleft(), KILL)
+    (result,) = pool.completed(0)
+    assert result.failure.exit_code == KILL
+
+
+def test_error_of_a_supervisor_is_one_of_the_pool(pool, worker):
+    worker.end.sendall(json.dumps(CrashhuntError("no map", fix="x").to_json()).encode() + b"\n")
+    with pytest.raises(CrashhuntError, match="no map"):
+        pool._read_messages(worker.worker)
+
+
+@pytest.mark.parametrize("code", [0, 3, -signal.SIGTERM])
+def test_end_of_a_supervisor_ends_its_trial(pool, worker, code):
+    pool._ended(99, code)  # another one
+    assert pool._waiting == type(pool._waiting)()
+    pool._ended(worker.worker.slot, code)
+    (attempt,) = pool._waiting
+    assert attempt.ends == [(code if code < 0 else KILL, -1)]
+    assert pool._workers == {}
+    assert worker.worker.socket.fileno() == -1
+
+
+def test_last_words_of_a_supervisor_count(pool, worker):
+    worker.end.sendall(json.dumps({"result": survived(3).to_json()}).encode() + b"\n")
+    pool._ended(worker.worker.slot, 0)
+    assert list(pool.completed(0)) == [survived(3)]
+    assert not pool._waiting
+
+
+def test_cancelled_trial_ends_its_supervisor(pool, worker):
+    pool.cancel(above=3)
+    assert (pool._link.killed, worker.worker.retired) == ([], False)
+    pool.cancel(above=2)
+    assert (pool._link.killed, worker.worker.retired, worker.worker.attempt) == ([worker.worker.slot], True, None)
+
+
+def test_fork_server_that_ended_is_replaced_and_its_trials_run_again(pool, worker, monkeypatch):
+    ours, theirs = socket.socketpair()
+    fresh, fresh_theirs = socket.socketpair()
+    new = SimpleNamespace(control=fresh, end=lambda: None, kill=lambda slot: None)
+    pool._link.control, pool._link.unfit = ours, False
+    pool._link.restart = lambda: new
+    pool._link.receive = lambda: None
+    pool._selector.register(ours, _pool.selectors.EVENT_READ)
+    pool._waiting.extend(TrialAttempt(spec(number)) for number in (9, 2))
+    with ours, theirs, fresh, fresh_theirs:
+        pool._read_fork_server()
+        assert pool._link is new
+        assert [attempt.spec.number for attempt in pool._waiting] == [2, 3, 9]
+        assert pool._workers == {}
+        assert "the process that starts the workers was killed from outside, and was started again" in pool.notes()
+        new.receive = lambda: [{"slot": 5, "pid": 1, "exit_code": 0}]
+        pool._read_fork_server()
+        assert pool._link is new
+
+
+def test_messages_of_a_fork_server_are_read_until_there_are_no_more():
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setblocking(False)
+    link = _pool.ForkServerLink.__new__(_pool.ForkServerLink)
+    link.control, link.ready, link.unfit, link._importing = ours, False, False, ""
+    with ours, theirs:
+        assert link.receive() == []
+        theirs.send(b'{"importing": "a module"}')
+        theirs.send(b'{"slot": 1, "pid": 2, "exit_code": 3}')
+        assert link.receive() == [{"slot": 1, "pid": 2, "exit_code": 3}]
+        assert (link.ready, link.unfit, link._importing) == (False, False, "a module")
+        theirs.send(b'{"ready": 5}')
+        theirs.send(b'{"unfit": true}')
+        link.receive()
+        assert (link.ready, link.unfit, link._importing) == (True, True, "a module")
+        theirs.send(json.dumps(CrashhuntError("no map", fix="x").to_json()).encode())
+        with pytest.raises(CrashhuntError, match="no map"):
+            link.receive()
+        link.kill(4)
+        link.fork(7, ours)
+        assert json.loads(theirs.recv(100)) == {"kill": 4}
+        data, descriptors, _, _ = socket.recv_fds(theirs, 100, 1)
+        assert json.loads(data) == {"slot": 7}
+        os.close(descriptors[0])
+        theirs.close()
+        assert link.receive() is None

@@ -1,0 +1,538 @@
+"""What zygotes and fork servers do with each message and each end of a process; forks and their ends are made up."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+from contextlib import suppress
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.base import forks
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.episode import stage_of
+from crashhunt.executors import _fork_server, _time_limits, _zygote
+from crashhunt.executors._time_limits import ImportKilledError
+from crashhunt.executors._zygote import Imported, WarmTraffics
+from crashhunt.trial import TrialSpec
+
+PID = 4321  # of each fork
+
+
+class Left(BaseException):
+    """In place of the end of this process."""
+
+
+def leave(code):
+    raise Left(code)
+
+
+def sent(connection):
+    """Return the messages that wait in a connection whose messages stay apart, or stand in lines."""
+    found = b""
+    with suppress(BlockingIOError):
+        while data := connection.recv(1 << 16, socket.MSG_DONTWAIT):
+            found += data if data.endswith(b"\n") else data + b"\n"
+    return [json.loads(line) for line in found.splitlines()]
+
+
+def spec(number, seed=1, **arguments):
+    return TrialSpec(number, seed, {"ego": {}}, arguments, 30)
+
+
+def job(number, seed=1, **arguments):
+    return {"spec": spec(number, seed, **arguments).to_json()}
+
+
+@pytest.fixture
+def copies(monkeypatch):
+    """Suspended processes that answer the next of `answers`; an exception is that of a fork that cannot be made."""
+    found = SimpleNamespace(answers=[], asked=[], ended=[], killed=[], pids=iter(range(100, 200)), says={}, made=[])
+
+    def fork(run, held, *, keeps=()):
+        answer = found.answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        wakes, says = map(os.dup, keeps)
+        pid = next(found.pids)
+        found.says[pid] = wakes, says
+        found.made.append((run.args[-1].number, pid))
+        reply(pid, answer)
+        return pid
+
+    def reply(pid, answer):
+        wakes, says = found.says[pid]
+        if answer is None:
+            os.close(says)
+            found.says[pid] = wakes, None
+        else:
+            os.write(says, json.dumps(answer).encode() + b"\n")
+
+    def wait(descriptor, kill):
+        """In place of the zygote's: it has the process answer what it was asked."""
+        for pid, (wakes, says) in list(found.says.items()):
+            if select.select([wakes], [], [], 0)[0] and (data := os.read(wakes, 1 << 16)):
+                found.asked.append((pid, json.loads(data)["spec"]["number"]))
+                if says is not None:
+                    reply(pid, found.answers.pop(0))
+        found.kill = kill
+        assert select.select([descriptor], [], [], 1)[0]
+
+    def ended(pid):
+        found.ended.append(pid)
+        return -signal.SIGTERM
+
+    monkeypatch.setattr(forks, "fork", fork)
+    monkeypatch.setattr(forks, "ended", ended)
+    monkeypatch.setattr(forks, "held", lambda: "held")
+    monkeypatch.setattr(_zygote, "free_memory", lambda: 1.0)
+    monkeypatch.setattr(_zygote, "children_of", lambda pid: [pid + 1000] if pid in found.says else [])
+    monkeypatch.setattr(_zygote, "kill", found.killed.append)
+    found.wait = wait
+    yield found
+    for pair in found.says.values():
+        for descriptor in pair:
+            if descriptor is not None:
+                os.close(descriptor)
+
+
+@pytest.fixture
+def warm(copies):
+    """Makes suspended processes for so many traffics; `notes` are the texts for the user."""
+    made = []
+
+    def make(limit, **more):
+        copies.notes = []
+        found = WarmTraffics(limit, copies.notes.append, **more)
+        found.prepare("trial", "simulator")
+        made.append(found)
+        return found
+
+    yield make
+    for one in made:
+        one.forget()
+
+
+SLOW, FAST, RAN = {"took_s": 0.5}, {"took_s": 0.001}, {"pid": 77, "ended": 0}
+
+
+def test_trials_of_one_traffic_run_in_its_copy(warm, copies):
+    traffics = warm(2)
+    copies.answers = [SLOW, RAN, {"pid": 78, "ended": -9}, SLOW, RAN]
+    ran = [traffics.run(one, copies.wait) for one in (job(0), job(1), job(2, seed=2))]
+    assert ran == [(77, 0), (78, -9), (77, 0)]
+    assert copies.asked == [(100, 0), (100, 1), (101, 2)]
+    assert copies.made == [(0, 100), (2, 101)]
+    assert traffics.processes == {100, 101}
+    # A trial that has to be killed is a child of the copy; a copy that is still warming up has none.
+    copies.kill()
+    assert copies.killed == [1101]
+    copies.says[101], kept = None, copies.says.pop(101)
+    copies.says.pop(101)
+    copies.kill()
+    assert copies.killed == [1101, 101]
+    copies.says[101] = kept
+    assert traffics.run(job(3, density=0.5), copies.wait) is None  # the oldest copy is used too recently
+    assert (copies.ended, copies.notes) == ([], [])
+    traffics.forget()
+    assert traffics.processes == frozenset()
+
+
+def test_copy_that_is_not_used_makes_room(warm, copies):
+    traffics = warm(1)
+    copies.answers = [SLOW, RAN] + [RAN] * 2
+    for number in range(3):
+        traffics.run(job(number), copies.wait)
+    assert [traffics.run(job(number, seed=2), copies.wait) for number in range(7)] == [None] * 7
+    copies.answers = [SLOW, RAN]
+    assert traffics.run(job(11, seed=3), copies.wait) == (77, 0)
+    assert copies.ended == [100]
+    assert sorted(copies.killed) == [100, 1100]
+    assert traffics.processes == {101}
+
+
+def test_without_free_memory_no_copy_is_made(warm, copies, monkeypatch):
+    monkeypatch.setattr(_zygote, "free_memory", lambda: 0.0)
+    assert warm(2).run(job(0), copies.wait) is None
+    assert "of the memory is free: fewer warmed-up copies are kept" in copies.notes[0]
+    assert copies.made == []
+
+
+def test_warm_up_that_is_short_ends_the_search_for_one(warm, copies):
+    traffics = warm(2)
+    copies.answers = [FAST]
+    assert traffics.run(job(0), copies.wait) is None
+    assert traffics.run(job(1, seed=2), copies.wait) is None
+    assert len(copies.made) == 1
+    assert copies.ended == [100]
+    assert copies.notes == []
+    traffics = warm(2, worth_s=0.001)
+    copies.answers = [FAST, RAN]
+    assert traffics.run(job(0), copies.wait) == (77, 0)
+    assert warm(0).run(job(0), copies.wait) is None
+    unprepared = WarmTraffics(2, copies.notes.append)
+    assert unprepared.run(job(0), copies.wait) is None
+
+
+@pytest.mark.parametrize("answer", [{}, None])
+def test_reset_that_fails_concerns_its_own_traffic(warm, copies, answer):
+    traffics = warm(2)
+    copies.answers = [answer, SLOW, RAN]
+    assert traffics.run(job(0), copies.wait) is None
+    assert traffics.processes == frozenset()
+    assert traffics.run(job(1, seed=2), copies.wait) == (77, 0)
+    assert copies.ended == [100]
+
+
+def test_copy_that_was_killed_loses_its_trial(warm, copies):
+    traffics = warm(2)
+    copies.answers = [SLOW, None, SLOW, RAN]
+    assert traffics.run(job(0), copies.wait) == (100, -signal.SIGTERM)
+    assert traffics.processes == frozenset()
+    assert traffics.run(job(1), copies.wait) == (77, 0)
+
+
+def test_traffic_that_cannot_be_forked_is_reported_once(warm, copies):
+    traffics = warm(2)
+    copies.answers = [SLOW, {"unfit": "it has threads"}]
+    assert [traffics.run(job(number), copies.wait) for number in range(2)] == [None, None]
+    assert copies.notes == ["trials in the same traffic do not share its warm-up: it has threads"]
+    assert copies.ended == [100]
+    traffics = warm(2)
+    copies.answers = [forks.CannotForkError("no memory")]
+    assert [traffics.run(job(number), copies.wait) for number in range(2)] == [None, None]
+    assert copies.notes == ["trials in the same traffic do not share its warm-up: no memory"]
+
+
+@pytest.fixture
+def zygote(monkeypatch, tmp_path):
+    """A zygote whose trials are forks that have ended; `supervisor` is the other end of its connection."""
+    ours, theirs = socket.socketpair()
+    settings = SimpleNamespace(warm_copies=0, scratch=tmp_path)
+    trial = SimpleNamespace(
+        make_simulator=lambda: "simulator", record_shared_state=lambda control: "", run=lambda job: leave("trial")
+    )
+    spared, killed, adopted = [], [], []
+    monkeypatch.setattr(_zygote, "TrialProcess", lambda *given: trial)
+    monkeypatch.setattr(_zygote, "adopt_orphans", lambda: adopted.append(True))
+    monkeypatch.setattr(_zygote, "end_descendants", lambda *given: spared.extend(given or [None]))
+    monkeypatch.setattr(_zygote, "kill", killed.append)
+    monkeypatch.setattr(_zygote.gc, "freeze", lambda: None)
+    monkeypatch.setattr(os, "_exit", leave)
+    found = _zygote._Zygote(theirs, settings, Imported(None, makes_simulator=True))
+    assert adopted
+    found.test = SimpleNamespace(supervisor=ours, trial=trial, spared=spared, killed=killed, settings=settings)
+    with ours, theirs:
+        yield found
+
+
+def test_zygote_reports_each_trial_and_whether_another_may_follow(zygote, monkeypatch):
+    supervisor, codes = zygote.test.supervisor, iter([0, -9, 3])
+    stage = stage_of(zygote.test.settings.scratch, os.getpid())
+    stage.mkdir(parents=True)
+
+    def run(given):
+        if given["spec"]["number"] == 1:
+            zygote._notices.append("a notice")
+        if given["spec"]["number"] == 2:
+            (stage / "a file").touch()
+            os.utime(stage, (1, 1))
+        return PID, next(codes)
+
+    monkeypatch.setattr(zygote, "_run", run)
+    zygote.test.trial.record_shared_state = lambda control: "a pipe" if control == zygote._control.fileno() else ""
+    for number in range(3):
+        supervisor.sendall(json.dumps(job(number)).encode() + b"\n" + b'{"kill": true}\n')
+    supervisor.shutdown(socket.SHUT_WR)
+    zygote.serve()
+    notice = "trials are not wholly apart: a module shares a pipe with every one of them"
+    assert sent(supervisor) == [
+        {"ready": os.getpid()},
+        {"ended": 0, "pid": PID, "unfit": False, "notices": [notice]},
+        {"ended": -9, "pid": PID, "unfit": False, "notices": ["a notice"]},
+        {"ended": 3, "pid": PID, "unfit": True},
+    ]
+
+
+def test_simulator_that_cannot_be_made_is_reported(zygote):
+    def reports(error):
+        def fails():
+            raise error
+
+        zygote.test.trial.make_simulator = fails
+        zygote.serve()
+        ((said),) = sent(zygote.test.supervisor)
+        return said["error"]["message"], said["error"]["fix"]
+
+    assert reports(CrashhuntError("no map", fix="draw one")) == ("no map", "draw one")
+    message, fix = reports(OSError(28, "No space left"))
+    assert message.startswith("the simulator cannot be made: OSError: ")
+    assert fix == "free some space, and run the same command again"
+    assert reports(ValueError("odd")) == (
+        "the simulator cannot be made: ValueError: odd", "see to what it needs, and run the same command again",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("reports", [True, False])
+def test_trial_runs_in_a_fork_that_is_waited_for(zygote, monkeypatch, reports):
+    supervisor, opened = zygote.test.supervisor, []
+    waited = iter([(0, 0), (0, 0), (PID, 3 << 8)])
+
+    def pidfd_open(pid):
+        if not reports:
+            raise OSError
+        read, write = os.pipe()
+        os.write(write, b".")
+        opened.append((pid, write))
+        return read
+
+    monkeypatch.setattr(os, "fork", lambda: PID)
+    monkeypatch.setattr(os, "pidfd_open", pidfd_open)
+    monkeypatch.setattr(os, "waitpid", lambda pid, options: next(waited))
+    monkeypatch.setattr(_zygote, "ended", lambda pid: 3 if pid == PID else None)
+    zygote._makes_simulator = False
+    stage = stage_of(zygote.test.settings.scratch, PID)
+    stage.mkdir(parents=True)
+    supervisor.sendall(b'{"kill": true}\n')
+    assert zygote._run(job(0)) == (PID, 3)
+    assert zygote.test.killed == [PID]
+    assert zygote.test.spared == [frozenset()]
+    assert not stage.exists()
+    assert [pid for pid, _ in opened] == [PID] * reports
+    for _, write in opened:
+        os.close(write)
+
+
+def test_zygote_without_a_supervisor_ends_its_trial(zygote):
+    zygote.test.supervisor.close()
+    killed = []
+    with pytest.raises(Left, match="0"):
+        zygote._wait(None, lambda: killed.append(True))
+    assert killed
+    assert zygote.test.spared == [None]  # all of them
+
+
+def test_copies_are_spared_when_a_trial_has_ended(zygote, monkeypatch):
+    waits = []
+
+    def run(given, wait):
+        waits.append(wait)
+        return PID, 0
+
+    zygote._warm = SimpleNamespace(run=run, processes=frozenset({5}))
+    assert zygote._run(job(0)) == (PID, 0)
+    assert zygote.test.spared == [frozenset({5})]
+    assert waits == [zygote._wait]
+
+
+def test_process_of_a_trial_has_no_connection_to_the_supervisor(zygote, monkeypatch):
+    died, forgotten = [], []
+    monkeypatch.setattr(os, "fork", lambda: 0)
+    monkeypatch.setattr(_zygote, "die_with", died.append)
+    zygote._warm = SimpleNamespace(run=lambda *_: None, processes=frozenset(), forget=lambda: forgotten.append(True))
+    with pytest.raises(Left, match="trial"):
+        zygote._run(job(0))
+    assert (died, forgotten) == ([os.getpid()], [True])
+    assert zygote._control.fileno() == -1
+
+
+@pytest.fixture
+def server(monkeypatch):
+    """A fork server whose forks are made up; `pool` and `template` are the other ends of its connections."""
+    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2)]
+    (pool, control), (template, orders) = pairs
+    found = _fork_server._Server(control, orders, 55, SimpleNamespace(timeout_s=9.0))
+    found.test = SimpleNamespace(
+        pool=pool, template=template, killed=[], waits=[], resumed=[], spared=[], own_kills=[], signals=[]
+    )
+    monkeypatch.setattr(_fork_server, "kill", found.test.killed.append)
+    monkeypatch.setattr(_fork_server, "resume", found.test.resumed.append)
+    monkeypatch.setattr(_fork_server, "end_descendants", lambda *given: found.test.spared.extend(given or [None]))
+    monkeypatch.setattr(os, "_exit", leave)
+    monkeypatch.setattr(os, "fork", lambda: PID)
+    monkeypatch.setattr(os, "kill", lambda pid, number: found.test.own_kills.append((pid, number)))
+    monkeypatch.setattr(_fork_server.signal, "signal", lambda *given: found.test.signals.append(given))
+
+    def waitpid(pid, options):
+        if not found.test.waits:
+            raise ChildProcessError
+        return found.test.waits.pop(0)
+
+    monkeypatch.setattr(os, "waitpid", waitpid)
+    yield found
+    for descriptor in found._ends.values():
+        os.close(descriptor)
+    for one in (*pairs[0], *pairs[1]):
+        one.close()
+
+
+def start(server, slot):
+    """Ask for the supervisor of a slot."""
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        socket.send_fds(server.test.pool, [json.dumps({"slot": slot}).encode()], [theirs.fileno()])
+        return server._handle_request()
+
+
+def test_supervisor_is_started_killed_and_reported(server, monkeypatch):
+    opened = []
+
+    def pidfd_open(pid):
+        opened.append(pid)
+        return os.open(os.devnull, os.O_RDONLY)
+
+    monkeypatch.setattr(os, "pidfd_open", pidfd_open)
+    assert start(server, 3)
+    monkeypatch.setattr(os, "fork", lambda: PID + 1)
+    assert start(server, 4)
+    for _ in range(2):
+        data, descriptors, _, _ = socket.recv_fds(server.test.template, 100, 1)
+        assert data == b"zygote"
+        os.close(descriptors[0])
+    assert opened == [PID, PID + 1]
+    server.test.pool.send(b'{"kill": 4}')
+    assert server._handle_request()
+    assert server.test.killed == [PID + 1]
+    server.test.waits = [(PID, 3 << 8), (9, 0), (0, 0)]
+    assert not server._reap()
+    assert sent(server.test.pool) == [{"slot": 3, "pid": PID, "exit_code": 3}]
+    assert (set(server._slots), set(server._ends)) == ({PID + 1}, {PID + 1})
+    assert server._reap()  # no process is left
+    server.test.pool.close()
+    assert not server._handle_request()
+
+
+def test_messages_of_the_template_are_forwarded_but_for_its_imports(server):
+    template = server.test.template
+    assert server._watch.importing
+    template.send(b'{"importing": "the module planner"}')
+    assert server._forward_template_messages()
+    assert (server._watch.importing, sent(server.test.pool)) == ("the module planner", [])
+    for text in (b'{"ready": 5}', b'{"unfit": true}', b'{"unfit": 1}', b"[", b"5"):
+        template.send(text)
+    error = CrashhuntError("no planner", fix="write one", where="here").to_json()
+    template.send(json.dumps(error).encode())
+    assert server._forward_template_messages()
+    assert sent(server.test.pool) == [{"ready": 5}, {"unfit": True}, {}, {}, {}, error]
+    assert server._watch.importing == ""
+    template.close()
+    assert not server._forward_template_messages()
+
+
+@pytest.mark.parametrize(
+    ("importing", "code", "says"),
+    [
+        ("", 3, []),
+        ("", -signal.SIGKILL, []),
+        ("the module planner", -signal.SIGKILL, [{"importing": "the module planner"}]),
+        ("the module planner", 3, ["the module planner: its process exited with 3 meanwhile"]),
+        ("", -signal.SIGSEGV, []),
+    ],
+)
+def test_server_ends_as_its_template_did(server, importing, code, says):
+    server._watch.begin(importing)
+    server.test.waits = [(55, -code if code < 0 else code << 8)]
+    with pytest.raises(Left) as caught:
+        server._reap()
+    assert caught.value.args == (code,)
+    assert server.test.own_kills == [(os.getpid(), -code)] * (code < 0)
+    assert server.test.spared == [None] * (code < 0)
+    assert server.test.signals == [(-code, signal.SIG_DFL)] * (code == -signal.SIGSEGV)
+    found = [message if "importing" in message else message["error"]["message"] for message in sent(server.test.pool)]
+    assert found == says
+
+
+@pytest.mark.parametrize("end", ["pool", "template", "hangs", "no process"])
+def test_server_serves_until_the_pool_or_the_template_has_ended(server, monkeypatch, end):
+    server.test.waits = [(0, 0), (55, 4 << 8)]
+    server._watch.begin("the module planner" if end == "hangs" else "")
+    rounds = []
+
+    def over(*given):
+        server.test.spared.extend(given)
+        rounds.append(True)
+        if end == "pool":
+            server.test.pool.close()
+        elif end == "template":
+            server.test.template.close()
+        elif end == "hangs":
+            server._watch._ends_at = 0.0
+        else:
+            server.test.waits.clear()
+
+    monkeypatch.setattr(_fork_server, "end_descendants", over)
+    monkeypatch.setattr(_fork_server, "_ORPHANS_EVERY_S", 0.01)
+    server._slots[PID] = 3
+    if end == "template":
+        with pytest.raises(Left, match="4"):
+            server.serve()
+    else:
+        server.serve()
+    assert len(rounds) == 1
+    assert server.test.spared == [frozenset({PID, 55})]
+    assert server.test.resumed == [55, PID]
+    assert server.test.killed == [55] * (end == "hangs")
+    if end == "hangs":
+        (said,) = sent(server.test.pool)
+        assert said["error"]["message"].startswith("the module planner: it takes more than ")
+
+
+def test_server_whose_template_is_gone_gives_no_supervisor(server):
+    server.test.template.close()
+    server.test.waits = [(55, 6 << 8)]
+    server._watch.begin("")
+    with pytest.raises(Left, match="6"):
+        start(server, 3)
+
+
+@pytest.fixture
+def imports(monkeypatch):
+    """A child that imports; `reported` is its end of the connection, and `ends` how it ended, if it has."""
+    reports, reported = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    found = SimpleNamespace(reports=reports, reported=reported, ends=[], resumed=[], killed=[], waited=[])
+
+    def waitid(how, pid, options):
+        assert (how, pid, options) == (os.P_PID, PID, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+        return found.ends.pop(0) if found.ends else None
+
+    monkeypatch.setattr(_time_limits, "_LOOK_EVERY_S", 0.005)
+    monkeypatch.setattr(os, "waitid", waitid)
+    monkeypatch.setattr(_time_limits, "resume", found.resumed.append)
+    monkeypatch.setattr(_time_limits, "kill", found.killed.append)
+    monkeypatch.setattr(_time_limits, "ended", lambda pid: found.waited.append(pid) or found.code)
+    with reports, reported:
+        yield found
+
+
+def test_imports_are_awaited_up_to_the_last(imports):
+    imports.ends = [None, None]
+    for text in (b'"a module"', b"[", b'""'):
+        imports.reported.send(text)
+    _time_limits.await_imports(imports.reports, PID, 5.0)
+    assert (imports.killed, imports.waited) == ([], [])
+
+
+def test_import_that_ends_its_process_or_hangs_is_named(imports, monkeypatch):
+    imports.reported.send(b'"a module"')
+    imports.ends, imports.code = [None, "ended"], 3
+    with pytest.raises(CrashhuntError, match="a module: its process exited with 3 meanwhile") as caught:
+        _time_limits.await_imports(imports.reports, PID, 5.0)
+    assert "meanwhile," not in caught.value.message
+    assert (imports.resumed, imports.waited) == ([PID], [PID])
+    imports.reported.send(b'"a module"')
+    imports.ends, imports.code = ["ended"], -signal.SIGKILL
+    with pytest.raises(ImportKilledError) as killed:
+        _time_limits.await_imports(imports.reports, PID, 5.0)
+    assert killed.value.args == (-signal.SIGKILL, "a module")
+    imports.reported.send(b'"a module"')
+    monkeypatch.setattr(_time_limits, "START_UP_S", 0.01)
+    with pytest.raises(CrashhuntError, match=r"a module: it takes more than 0.02 s"):
+        _time_limits.await_imports(imports.reports, PID, 0.01)
+    assert imports.killed == [PID]
+    assert imports.waited == [PID] * 3
+    again = _time_limits.import_died("a module", -signal.SIGKILL, times=2).message
+    assert again == "a module: its process was killed by SIGKILL meanwhile, 2 times"
