@@ -175,7 +175,12 @@ _TESTS_ELSEWHERE = {
         "executors/test_what_is_left.py",
         "executors/test_zygotes.py",
     ),
-    "executors/ray": ("executors/test_ray_address.py", "executors/test_ray_bridge.py", "executors/test_ray_store.py"),
+    "executors/ray": (
+        "executors/test_ray_address.py",
+        "executors/test_ray_bridge.py",
+        "executors/test_ray_connection.py",
+        "executors/test_ray_store.py",
+    ),
     # What a hunt does is seen by whole hunts.
     "hunts/_check.py": ("hunts/test_check_parts.py", "e2e/test_check.py"),
     "hunts/_crashes.py": ("hunts/test_kinds.py", "hunts/test_tally.py", "hunts/test_whole_hunts.py"),

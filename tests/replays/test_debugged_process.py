@@ -239,6 +239,7 @@ def test_command_back_goes_by_the_number_that_is_given(capsys, leaves):
     assert went == [25, 29, 29, 29, 29]
     assert capsys.readouterr().out == "*** not so far\n" * 5
     assert code_of(debugger.set_quit) == _debugger._LEFT_EXIT_CODE
+    assert capsys.readouterr().out == "\n"  # the shell's prompt begins a line
 
 
 def test_copies_wait_before_each_of_the_last_steps_and_the_user_goes_back_to_those(monkeypatch, tmp_path, leaves):
