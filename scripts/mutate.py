@@ -168,7 +168,11 @@ _TESTS_ELSEWHERE = {
         "executors/test_what_is_left.py",
         "executors/test_zygotes.py",
     ),
-    "executors/_trial_process.py": ("executors/test_harm.py", "executors/test_warm_traffics.py"),
+    "executors/_trial_process.py": (
+        "executors/test_harm.py",
+        "executors/test_trial_processes.py",
+        "executors/test_warm_traffics.py",
+    ),
     "executors/_zygote.py": (
         "executors/test_harm.py",
         "executors/test_warm_traffics.py",
