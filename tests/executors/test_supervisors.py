@@ -215,8 +215,13 @@ def test_zygote_that_does_not_get_ready_is_an_error(zygote, settings, monkeypatc
     theirs.sendall(json.dumps(CrashhuntError("no map", fix="draw one").to_json()).encode() + b"\n")
     with pytest.raises(CrashhuntError, match="no map"):
         Supervisor(settings, zygote.ours).run(spec())
-    monkeypatch.setattr(_supervisor, "START_UP_S", 0.02)
     monkeypatch.setattr(_supervisor, "_LOOK_EVERY_S", 0.01)
+    slow = Supervisor(settings, zygote.ours)
+    messages = iter([None, None, {"ready": 99}])
+    monkeypatch.setattr(slow, "_next", lambda timeout_s: next(messages))
+    slow._await_zygote()
+    assert slow._zygote_pid == 99
+    monkeypatch.setattr(_supervisor, "START_UP_S", 0.02)
     with pytest.raises(CrashhuntError, match=r"its start takes more than 0.04 s"):
         Supervisor(replace(settings, timeout_s=0.02), zygote.ours).run(spec())
 
