@@ -8,11 +8,19 @@ from dataclasses import replace
 import pytest
 from hypothesis import given, settings as examples, strategies as st
 
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import Parts, WorkerSettings, run_episode
-from crashhunt.executors._postmortem import check_report, encode_report
+from crashhunt.executors._postmortem import (
+    _contradiction,
+    _fault_of,
+    agent_in_stack,
+    check_report,
+    encode_report,
+)
 from crashhunt.recording import BlackBox, BlackBoxFile, read_header
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.trial import Outcome, TrialSpec
+from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
 KEY = bytes(range(16))
 SPEC = TrialSpec(3, 7, {"ego": {"speed": 5.0}}, {}, 12)
@@ -138,3 +146,60 @@ def test_black_box_file_states_what_the_process_wrote(tmp_path):
 def test_outcome_of_the_toy_is_what_the_test_expects(left_behind):
     assert left_behind[2].outcome is Outcome.SURVIVED
     assert left_behind[2].steps == 12
+
+
+@pytest.mark.parametrize(
+    ("frames", "agent"),
+    [
+        (["/site/numpy/core.py", "/my/planner.py"], "a"),
+        (["/my/package/driver/__init__.py"], "b"),
+        (["/my/package/driver.py"], "b"),
+        (["/my/other.py"], ""),
+        ([str(layout.PACKAGE / "episode/_episode.py"), "/my/planner.py"], ""),
+        (["/my/notplanner.py"], ""),
+        ([], ""),
+    ],
+)
+def test_stack_of_a_dead_process_names_the_agent_whose_code_ran(frames, agent):
+    agents = {"a": "planner", "b": "package.driver"}
+    other = '\nThread 0x1:\n  File "/my/package/driver.py", line 3 in wait\n'
+    lines = "".join(f'  File "{frame}", line 3 in act\n' for frame in frames)
+    stack = f"Fatal Python error{other}\nCurrent thread 0x2 (most recent call first):\n{lines}\nExtension modules: x"
+    assert agent_in_stack(stack, agents) == agent
+    assert agent_in_stack(stack, {}) == ""
+    assert agent_in_stack(stack, {"a": "planner", "c": "planner"}) == ""  # either of both
+
+
+@pytest.mark.parametrize(
+    ("changes", "steps", "time_s", "says"),
+    [
+        ({}, 12, 1.2, ""),
+        ({"digest": "1"}, 12, 1.2, "it reports the digest 1, and its recording has 0"),
+        ({"outcome": Outcome.AGENT_ERROR, "digest": "1"}, 12, 1.2, "it reports the digest 1, and its recording has 0"),
+        ({"outcome": Outcome.AGENT_ERROR, "digest": ""}, 12, 1.2, ""),
+        ({"digest": ""}, 12, 1.2, "it reports the digest none, and its recording has 0"),
+        ({}, 11, 1.2, "it reports 12 steps, and its recording has 11"),
+        ({"steps": 5, "outcome": Outcome.FINISHED}, 6, 9.9, ""),
+        ({"steps": 5, "outcome": Outcome.FINISHED}, 7, 1.2, "it reports 5 steps, and its recording has 7"),
+        ({"steps": 13, "outcome": Outcome.FINISHED}, 13, 1.2, "it reports finished after 13 of 12 steps"),
+        ({"steps": 11}, 11, 1.2, "it reports survived after 11 of 12 steps"),
+        ({}, 12, 1.3, "it reports a simulation time of 1.2 s, and its recording has 1.3 s"),
+        ({"outcome": Outcome.AGENT_ERROR}, 12, 1.3, ""),
+        ({}, 12, float("nan"), ""),
+        ({"outcome": Outcome.INVALID, "digest": "1"}, 3, 7.0, ""),
+    ],
+)
+def test_result_and_recording_may_not_contradict_each_other(changes, steps, time_s, says):
+    failure = Failure("ValueError", "odd")
+    result = replace(
+        TrialResult(SPEC, Outcome.SURVIVED, steps=12, sim_time_s=1.2, digest="0", failure=failure), **changes
+    )
+    assert _contradiction(result, SPEC, steps, time_s, "0") == says
+
+
+def test_fault_of_crashhunt_itself_in_a_trial_ends_the_hunt(left_behind):
+    records = left_behind[1]
+    fault = encode_report({"fault": CrashhuntError("no map", fix="draw one").to_json()}, KEY, "")
+    with pytest.raises(CrashhuntError, match="no map"):
+        check(left_behind, fault, records=records)
+    assert "cannot be read" in _fault_of({}).message

@@ -154,13 +154,15 @@ def test_process_that_cannot_start_or_fails_is_an_error(settings, started):
 def test_process_that_hangs_is_ended(settings, started, monkeypatch):
     asked = []
     header = SimpleNamespace(pid=55, step=3)
-    monkeypatch.setattr(_fresh, "where_it_is", lambda scratch, number: header)
+    looked = []
+    monkeypatch.setattr(_fresh, "where_it_is", lambda *given: looked.append(given) or header)
     monkeypatch.setattr(_fresh, "children_of", lambda pid: [55] if pid == 4321 else [])
     monkeypatch.setattr(_fresh, "hung", lambda *given: given)
     monkeypatch.setattr(_fresh, "has_hung", lambda found, **given: asked.append((found, given)) or given["limit_s"] < 0)
     executor = FreshProcessExecutor(settings)
     executor.submit(spec(0))
     assert executor.where() == {0: header}
+    assert looked == [(settings.scratch, 0)]
     ((found, given),) = asked if list(executor.completed(0)) == [] else ()
     assert found is header
     assert (given["begun"], given["limit_s"]) == (False, 9 + _fresh.START_UP_S)  # its supervisor has begun it
@@ -503,3 +505,104 @@ def test_messages_of_a_fork_server_are_read_until_there_are_no_more():
         os.close(descriptors[0])
         theirs.close()
         assert link.receive() is None
+
+
+@pytest.mark.parametrize("snapshot", [False, True])
+def test_fork_server_is_started_with_its_job(settings, monkeypatch, snapshot):
+    started = []
+
+    class Kept:
+        def __init__(self, module, words, *, environment, inherited, stdin, stdout, stderr):
+            with open(words[1]) as file:
+                started.append((module, json.load(file), environment, inherited == [int(words[0])]))
+            stdout.write(b"it cannot")
+
+        def end(self):
+            started.append("ended")
+
+    monkeypatch.setattr(_pool, "Kept", Kept)
+    monkeypatch.setattr(_pool, "snapshot_environment", lambda given: {"OF": "snapshot"})
+    link = _pool.ForkServerLink(settings, late=True, deaths=1, snapshot=snapshot)
+    ((module, job, environment, inherited),) = started
+    assert module == "crashhunt.executors._fork_server"
+    assert job == {"settings": settings.to_json(), "sys_path": [] if snapshot else _pool.sys.path, "late": True}
+    assert (environment == {"OF": "snapshot"}) is snapshot
+    assert environment.get("PYTHONHASHSEED") == (None if snapshot else "0")
+    assert inherited
+    assert (link.ready, link.unfit, link.deaths, link._importing) == (False, False, 1, "")
+    assert not link.control.getblocking()
+    link._kept.process = SimpleNamespace(wait=lambda timeout_s: 1)
+    link.unfit, made = True, []
+    monkeypatch.setattr(_pool, "ForkServerLink", lambda given, **more: made.append((given, more)) or "next")
+    assert link.restart() == "next"
+    assert made == [(settings, {"late": True, "deaths": 1, "snapshot": snapshot})]
+    assert started[-1] == "ended"
+    link.unfit, link._importing = False, "a module"
+    with pytest.raises(CrashhuntError, match="a module: its process exited with 1 meanwhile, 2 times"):
+        link.restart()
+
+
+def test_pool_serves_in_a_thread_of_its_own(pool, monkeypatch):
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    made = []
+
+    class Link:
+        """Starts a supervisor that ends each trial at once."""
+
+        def __init__(self, settings, *, snapshot):
+            made.append((settings, snapshot))
+            self.control, self.ready, self.deaths, self.ended, self.ends = ours, False, 0, 0, []
+
+        def receive(self):
+            ours.recv(100)
+            self.ready = True
+            return [{"slot": 99, "pid": 1, "exit_code": 0}]
+
+        def fork(self, slot, end):
+            self.ends.append(os.dup(end.fileno()))
+            os.write(self.ends[-1], json.dumps({"result": survived(3).to_json(), "retires": True}).encode() + b"\n")
+
+        def kill(self, slot):
+            pass
+
+        def end(self):
+            self.ended += 1
+
+    monkeypatch.setattr(_pool, "ForkServerLink", Link)
+    with ours, theirs:
+        pool.submit(spec(3))
+        assert pool.capacity == 2
+        assert list(pool.completed(0.05)) == []  # the fork server is not ready
+        theirs.send(b"ready")
+        assert list(pool.completed(20)) == [survived(3)]
+        assert made == [(pool._settings, False)]
+        thread = pool._thread
+        pool.close()
+        assert not thread.is_alive()
+        assert pool._link.ended == 1
+        pool._link.end = lambda: None
+        pool._thread = None
+        for end in pool._link.ends:
+            os.close(end)
+    pool._wake_up, pool._woken = socket.socketpair()  # for the fixture, which closes it again
+
+
+def test_pool_starts_no_more_supervisors_than_it_has_slots(pool):
+    forked = []
+    pool._link = SimpleNamespace(
+        ready=True, fork=lambda slot, end: forked.append(slot), kill=lambda slot: None, end=lambda: None
+    )
+    for number in range(5):
+        pool._waiting.append(TrialAttempt(spec(number)))
+    pool._assign_trials()
+    assert forked == [1, 2]
+    assert [attempt.spec.number for attempt in pool._waiting] == [2, 3, 4]
+    for worker in pool._workers.values():
+        worker.retired = True
+        worker.attempt = None
+    pool._link.ready = False
+    pool._assign_trials()
+    assert forked == [1, 2]
+    pool._link.ready = True
+    pool._assign_trials()
+    assert forked == [1, 2, 3, 4]  # those that have retired hold no slot

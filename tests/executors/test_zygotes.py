@@ -536,3 +536,289 @@ def test_import_that_ends_its_process_or_hangs_is_named(imports, monkeypatch):
     assert imports.waited == [PID] * 3
     again = _time_limits.import_died("a module", -signal.SIGKILL, times=2).message
     assert again == "a module: its process was killed by SIGKILL meanwhile, 2 times"
+
+
+@pytest.fixture
+def template(monkeypatch):
+    """What a template or a fork server is made of: `imported` is the result of its imports, or its error."""
+    found = SimpleNamespace(imported="imported", late=[], forked=0, called=[], orphans=[], signals=[])
+    made = []
+
+    class Tracked(socket.socket):
+        """Closed at the end of the test: what would be another process closes nothing."""
+
+        def __init__(self, *given, **more):
+            super().__init__(*given, **more)
+            made.append(self)
+
+    monkeypatch.setattr(socket, "socket", Tracked)
+    found.pool, found.orders = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+
+    def imports(settings, report=None):
+        if report:
+            report("a module")
+        found.late.append(report is None)
+        if isinstance(found.imported, Exception):
+            raise found.imported
+        return found.imported
+
+    def zygote(control, settings, imported):
+        found.called.append(("zygote", control.fileno() >= 0, settings, imported))
+        leave("zygote")
+
+    monkeypatch.setattr(_fork_server, "import_parts", imports)
+    monkeypatch.setattr(_fork_server, "import_nothing", lambda settings: imports(settings))
+    monkeypatch.setattr(_fork_server, "be_zygote", zygote)
+    monkeypatch.setattr(_fork_server, "adopt_orphans", lambda: found.called.append("adopts"))
+    monkeypatch.setattr(_fork_server, "die_with", lambda pid: found.called.append(("dies with", pid)))
+    monkeypatch.setattr(_fork_server, "prepare", lambda what: found.called.append("prepared"))
+    monkeypatch.setattr(_fork_server, "end_descendants", found.orphans.append)
+    monkeypatch.setattr(_fork_server, "_ORPHANS_EVERY_S", 0.01)
+    monkeypatch.setattr(_fork_server, "gc", SimpleNamespace(freeze=lambda: None, collect=lambda: None))
+    monkeypatch.setattr(_fork_server.signal, "signal", lambda *given: found.signals.append(given))
+    monkeypatch.setattr(os, "setsid", lambda: found.called.append("own session"))
+    monkeypatch.setattr(os, "_exit", leave)
+    monkeypatch.setattr(os, "fork", lambda: found.forked)
+    yield found
+    for one in made:
+        one.close()
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_template_forks_a_zygote_for_each_request(template, monkeypatch, late):
+    ours, theirs = socket.socketpair()
+    ends = iter([(0, 0), (PID, 0), (0, 0), None])
+
+    def waitpid(pid, options):
+        assert (pid, options) == (-1, os.WNOHANG)
+        end = next(ends)
+        if end is None:
+            sent(template.pool)
+            template.pool.close()
+            raise ChildProcessError
+        return end
+
+    monkeypatch.setattr(os, "waitpid", waitpid)
+    template.forked = PID
+    with ours, theirs:
+        socket.send_fds(template.pool, [b"zygote"], [theirs.fileno()])
+        with pytest.raises(Left, match="0"):
+            _fork_server._be_template(template.orders, "settings", late=late)
+    assert template.late == [late]
+    assert template.orphans == [frozenset({PID}), frozenset(), frozenset()]
+    assert template.called == ["adopts"]
+
+
+def test_template_reports_imports_and_readiness(template, monkeypatch):
+    template.imported = None
+    _fork_server._be_template(template.orders, "settings", late=False)
+    assert sent(template.pool) == [{"importing": "a module"}, {"unfit": True}]
+    template.imported = CrashhuntError("no planner", fix="write one")
+    _fork_server._be_template(template.orders, "settings", late=True)
+    assert sent(template.pool) == [template.imported.to_json()]
+    template.imported = "imported"
+    ours, theirs = socket.socketpair()
+    with ours, theirs:  # as the zygote
+        socket.send_fds(template.pool, [b"zygote"], [theirs.fileno()])
+        with pytest.raises(Left, match="zygote"):
+            _fork_server._be_template(template.orders, "settings", late=True)
+    assert sent(template.pool) == [{"ready": os.getpid()}]
+    assert template.called[-3:] == [
+        ("dies with", os.getpid()), "own session", ("zygote", True, "settings", "imported"),
+    ]  # fmt: skip
+    assert template.signals == [(number, signal.SIG_DFL) for number in _fork_server._IGNORED_SIGNALS]
+    assert {signal.SIGINT, signal.SIGTERM} <= {number for number, _ in template.signals}
+    assert template.orders.fileno() == -1
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_zygote_of_a_new_process_is_awaited(template, monkeypatch, late):
+    awaited = []
+
+    def wait(reports, pid, timeout_s):
+        awaited.append((pid, timeout_s))
+        assert reports.recv(10) == b""  # the end of the child is closed here
+
+    settings = SimpleNamespace(timeout_s=9.0)
+    template.forked = PID
+    monkeypatch.setattr(_fork_server, "await_imports", wait)
+    with _fork_server.fork_zygote(settings) as control:
+        assert awaited == [(PID, 9.0)]
+        assert control.recv(10) == b""
+    template.forked = 0
+    heard = []
+
+    def zygote(control, given, imported):
+        heard.append((given, imported))
+        leave("zygote")
+
+    monkeypatch.setattr(_fork_server, "be_zygote", zygote)
+    with pytest.raises(Left, match="1"):
+        _fork_server.fork_zygote(settings, late=late)
+    assert heard == [(settings, "imported")]
+    assert ("dies with", os.getpid()) in template.called
+    assert template.late == [late]
+
+
+def test_fork_zygote_imports_early_unless_told_otherwise(template):
+    with pytest.raises(Left):
+        _fork_server.fork_zygote(SimpleNamespace(timeout_s=9.0))
+    assert template.late == [False]
+
+
+def test_imports_of_a_new_process_are_reported_with_their_error(template):
+    control, theirs = socket.socketpair()
+    with control, theirs:
+        for imported, said in ((None, {"unfit": True}), (CrashhuntError("no planner", fix="write one"), None)):
+            reports, reported = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            with reports, reported:
+                template.imported = imported
+                _fork_server._import_for_zygote(theirs, reported, "settings", late=False)
+                assert sent(control) == [said or imported.to_json()]
+                assert sent(reports) == ["a module", ""]
+                assert reported.fileno() == -1
+        assert template.called == []
+
+
+@pytest.mark.parametrize("sys_path", [[], ["/mine"]])
+def test_fork_server_begins_with_its_job(template, monkeypatch, tmp_path, sys_path):
+    began = []
+    job = tmp_path / "job"
+    job.write_text(json.dumps({"settings": "plain", "sys_path": sys_path, "late": True}))
+    control, pool = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    settings = SimpleNamespace(code=("code",), timeout_s=9.0)
+    monkeypatch.setattr(_fork_server.sys, "argv", ["it", str(os.dup(control.fileno())), str(job)])
+    monkeypatch.setattr(_fork_server.sys, "path", ["before"])
+    monkeypatch.setattr(_fork_server.WorkerSettings, "from_json", lambda plain: plain == "plain" and settings)
+    monkeypatch.setattr(_fork_server, "require_origin", lambda *given: began.append(("origin", *given)))
+    monkeypatch.setattr(_fork_server, "seal", lambda given: began.append(("sealed", given)))
+    monkeypatch.setattr(_fork_server._Server, "serve", lambda self: began.append((self._template, self._settings)))
+    template.forked = PID
+    with control, pool:
+        _fork_server.main()
+        origin = [] if sys_path else [("origin", "crashhunt", ("code",))]
+        assert began == [*origin, ("sealed", settings), (PID, settings)]
+        assert _fork_server.sys.path == (sys_path or ["before"])
+        assert template.signals == [(number, signal.SIG_IGN) for number in _fork_server._IGNORED_SIGNALS]
+        assert template.called == ["adopts", "prepared"]
+
+        def fails(given):
+            raise CrashhuntError("no sandbox", fix="x")
+
+        monkeypatch.setattr(_fork_server, "seal", fails)
+        monkeypatch.setattr(_fork_server.sys, "argv", ["it", str(os.dup(control.fileno())), str(job)])
+        _fork_server.main()
+        assert sent(pool) == [CrashhuntError("no sandbox", fix="x").to_json()]
+        monkeypatch.setattr(_fork_server, "seal", lambda given: None)
+        monkeypatch.setattr(_fork_server.sys, "argv", ["it", str(os.dup(control.fileno())), str(job)])
+        be_template = lambda orders, given, *, late: began.append((given, late))  # noqa: E731
+        monkeypatch.setattr(_fork_server, "_be_template", be_template)
+        template.forked = 0
+        with pytest.raises(Left, match="1"):
+            _fork_server.main()
+        assert began[-1] == (settings, True)
+        assert template.called[-1] == ("dies with", os.getpid())
+
+
+def test_supervisor_has_the_connections_of_its_slot_only(server, monkeypatch):
+    became = []
+
+    def become(pool, zygote, settings, parent):
+        became.append((pool.fileno() >= 0, zygote.fileno() >= 0, settings, parent))
+        leave("supervisor")
+
+    monkeypatch.setattr(os, "fork", lambda: 0)
+    monkeypatch.setattr(_fork_server, "be_supervisor", become)
+    read, write = os.pipe()
+    os.close(write)
+    server._ends[77] = read
+    with pytest.raises(Left, match="supervisor"):
+        start(server, 3)
+    assert became == [(True, True, server._settings, os.getpid())]
+    assert (server._control.fileno(), server._orders.fileno()) == (-1, -1)
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.close(server._ends.pop(77))
+    defaults = [(number, signal.SIG_DFL) for number in _fork_server._IGNORED_SIGNALS]
+    assert server.test.signals == [*defaults, (signal.SIGINT, signal.SIG_IGN)]
+
+
+def test_suspended_process_resets_once_and_runs_each_trial_in_a_fork(monkeypatch):
+    wakes, asks = os.pipe()
+    told, says = os.pipe()
+    forked, drawn, resets, ran = [], [], [], []
+    simulator = SimpleNamespace(setup_steps=40)
+
+    def fork(run, held):
+        forked.append(held)
+        if len(forked) == 2:
+            raise forks.CannotForkError("it has threads")
+        run()
+        return PID
+
+    def reset(*, seed, options):
+        resets.append((seed, options))
+        return "observations"
+
+    simulator.reset = reset
+    monkeypatch.setattr(_zygote, "adopt_orphans", lambda: None)
+    monkeypatch.setattr(_zygote, "seed_everything", drawn.append)
+    monkeypatch.setattr(_zygote, "options_of", lambda given, made: (given.number, made is simulator))
+    monkeypatch.setattr(_zygote, "generators", lambda: "drawn")
+    monkeypatch.setattr(_zygote, "set_generators", drawn.append)
+    monkeypatch.setattr(_zygote, "supports", lambda made, what: True)
+    monkeypatch.setattr(_zygote, "end_descendants", lambda: drawn.append("ended"))
+    monkeypatch.setattr(forks, "fork", fork)
+    monkeypatch.setattr(forks, "held", lambda: "held")
+    monkeypatch.setattr(forks, "ended", lambda pid: 3 if pid == PID else None)
+    trial = SimpleNamespace(run=lambda given, again: ran.append((given["spec"]["number"], again(seed=1))))
+    for number in range(2):
+        os.write(asks, json.dumps(job(number)).encode() + b"\n")
+    os.close(asks)
+    _zygote._be_suspended(wakes, says, trial, simulator, spec(7, seed=5))
+    first, *answers = map(json.loads, os.read(told, 1 << 16).splitlines())
+    assert 0 <= first["took_s"] < 5
+    assert answers == [{"pid": PID, "ended": 3}, {"unfit": "it has threads"}]
+    assert resets == [(5, (7, True))]
+    assert ran == [(0, "observations")]
+    assert drawn == [5, "drawn", "ended"]
+    assert simulator.setup_steps == 0
+    assert forked == ["held", "held"]
+
+    def fails(**given):
+        raise KeyboardInterrupt
+
+    simulator.reset = fails
+    _zygote._be_suspended(wakes, says, trial, simulator, spec(7))
+    assert json.loads(os.read(told, 100)) == {}
+    for descriptor in (wakes, told, says):
+        os.close(descriptor)
+
+
+def test_traffic_is_that_of_seed_and_arguments_of_the_scenario():
+    plain = _zygote._traffic_key(spec(1))
+    assert _zygote._traffic_key(spec(2)) == plain
+    for other in (spec(1, seed=2), spec(1, density=0.5)):
+        assert _zygote._traffic_key(other) != plain
+    assert _zygote._traffic_key(spec(1, a=1, b=2)) == _zygote._traffic_key(spec(1, b=2, a=1))
+
+
+@pytest.mark.parametrize(
+    ("forkable", "forks_well", "makes"), [(True, None, True), (False, True, True), (False, False, False)]
+)
+def test_imports_decide_who_makes_the_simulator(monkeypatch, forkable, forks_well, makes):
+    said = []
+    backend = SimpleNamespace(forkable=forkable)
+    settings = SimpleNamespace(scenario=SimpleNamespace(backend=backend, simulator="toy"))
+    monkeypatch.setattr(_zygote, "loaded", lambda given, report: report("a module") or "parts")
+    monkeypatch.setattr(_zygote, "_is_forkable_with", lambda parts: forks_well if parts == "parts" else None)
+    monkeypatch.setattr(_zygote, "_can_be_forked", lambda: True)
+    assert _zygote.import_parts(settings, said.append) == Imported("parts", makes_simulator=makes)
+    assert said == ["a module", "the simulator cannot be made", ""]
+    monkeypatch.setattr(_zygote, "_can_be_forked", lambda: False)
+    assert _zygote.import_parts(settings, said.append) is None
+    located = []
+    monkeypatch.setattr(_zygote, "locate", lambda *given: located.append(given))
+    assert _zygote.import_nothing(settings) == Imported(None, makes_simulator=False)
+    settings.scenario.simulator = "mine:Simulator"
+    _zygote.import_nothing(settings)
+    assert located == [("simulators", "toy")]
