@@ -660,7 +660,7 @@ def test_zygote_of_a_new_process_is_awaited(template, monkeypatch, late):
     assert template.late == [late]
 
 
-def test_fork_zygote_imports_early_unless_told_otherwise(template):
+def test_fork_zygote_imports_early_by_default(template):
     with pytest.raises(Left):
         _fork_server.fork_zygote(SimpleNamespace(timeout_s=9.0))
     assert template.late == [False]

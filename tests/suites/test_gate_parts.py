@@ -319,7 +319,7 @@ def test_failed_hunt_is_an_error_of_its_version(tmp_path):
     assert caught.value.where == "HEAD (mine:New)"
 
 
-def test_gate_without_a_verdict_says_why(tmp_path):
+def test_gate_without_a_verdict_has_a_reason(tmp_path):
     run = started(gate(tmp_path), tmp_path / "g")
     (real,) = run._hunts
 
