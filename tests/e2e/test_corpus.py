@@ -285,6 +285,7 @@ def pytest_run(kept, *words, plugins=("crashhunt.corpus.pytest_plugin",)):
     )  # fmt: skip
 
 
+@pytest.mark.nightly  # by day, corpus/test_pytest_cases.py
 def test_pytest_runs_each_case_and_reports_it_readably(kept):
     expect(kept, 0, "fixed")
     done = pytest_run(kept, "kept crashes", "--junit-xml", "junit.xml", "-rx")
