@@ -300,10 +300,11 @@ def test_as_many_cases_run_at_a_time_as_are_asked_for(run, monkeypatch):
     watched = []
     run(*[Outcome.SURVIVED] * 3, parallel=2, watch=lambda done, count: watched.append(done))
     assert watched == [0, 2, 2, 3]
-    monkeypatch.setattr(_run.os, "cpu_count", lambda: 3)
-    watched.clear()
-    run(*[Outcome.SURVIVED] * 3, parallel=0, watch=lambda done, count: watched.append(done))
-    assert watched == [0, 3]
+    for cores, expected in ((3, [0, 3]), (None, [0, 1, 1, 2, 2, 3])):
+        monkeypatch.setattr(_run.os, "cpu_count", lambda cores=cores: cores)
+        watched.clear()
+        run(*[Outcome.SURVIVED] * 3, parallel=0, watch=lambda done, count: watched.append(done))
+        assert watched == expected
     asked = []
     found = run(*[Outcome.SURVIVED] * 3, stopped=lambda: asked.append(1) or len(asked) > 3)
     assert [one.path.name for one in found] == ["0"]
